@@ -1,0 +1,3 @@
+"""pyrcal: the calibration service of an adaptive telescope with a pyramid wavefront sensor."""
+
+__version__ = "0.1.0"

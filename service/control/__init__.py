@@ -1,0 +1,1 @@
+"""Registration to reconstructor: inversion, stability, gate. Pure numerics."""

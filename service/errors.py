@@ -1,0 +1,48 @@
+"""The exception tree of pyrcal.
+
+::
+
+    PyrcalError
+    ├── ConfigurationError   a settings or instrument file that cannot be used: file, key, found, expected
+    ├── ModelError           numbers the optical model cannot work with
+    ├── WireError            bytes from the RTC that break the contract
+    ├── LinkError            the zenoh session cannot be opened or an RTC does not answer
+    ├── CommandError         an operator's request that cannot be carried out now
+    │   └── UnknownId        a reconstructor, session or product nobody has heard of
+    └── ArchiveError         a product that cannot be written, read, or fails its checksum
+
+Expected outcomes (a rejected fit, a refused reconstructor, too few frames) are values, not
+exceptions: their text tells the operator what to do.
+"""
+
+
+class PyrcalError(Exception):
+    """Anything pyrcal raises on purpose; the message says what was found and what was expected."""
+
+
+class ConfigurationError(PyrcalError):
+    """A settings or instrument file cannot be used; the message names the file and the key."""
+
+
+class ModelError(PyrcalError):
+    """The optical model was given numbers it cannot work with."""
+
+
+class WireError(PyrcalError):
+    """A message from the RTC breaks the wire contract and was not used."""
+
+
+class LinkError(PyrcalError):
+    """The zenoh session cannot be opened, or the RTC did not answer."""
+
+
+class CommandError(PyrcalError):
+    """An operator's request cannot be carried out in the present state."""
+
+
+class UnknownId(CommandError):
+    """The id names nothing this service knows."""
+
+
+class ArchiveError(PyrcalError):
+    """A product cannot be written or read, or its checksum does not match."""

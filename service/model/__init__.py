@@ -1,0 +1,1 @@
+"""The optics: pupil, mirror, modes, pyramid, registration, interaction matrix. Pure numerics."""

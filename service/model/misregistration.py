@@ -1,0 +1,78 @@
+"""Mis-registration: where the mirror's image falls on the sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+
+PARAMETERS = ("shift_x_subap", "shift_y_subap", "rotation_deg", "magnification")
+"""Names of the four parameters at every boundary, in the order of every 4-vector and covariance."""
+
+BOUNDARY_SCALE = np.array([1.0, 1.0, 180.0 / np.pi, 1.0])
+"""Multiply a 4-vector in numeric units (rotation in radians) by this to get boundary units."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Misregistration:
+    """Registration of the mirror's actuators on the sensor's subapertures.
+
+    A mirror point ``p`` lands on the sensor at ``magnification * R(rotation) p + shift``
+    (Heritier et al. 2018, section 4.1). The default is perfect registration.
+    """
+
+    shift_x_subap: float = 0.0
+    """Shift along sensor +x, in subaperture widths."""
+
+    shift_y_subap: float = 0.0
+    """Shift along sensor +y, in subaperture widths."""
+
+    rotation_rad: float = 0.0
+    """Rotation from sensor +x towards +y, in radians."""
+
+    magnification: float = 1.0
+    """Size of the mirror's image over its nominal size."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers no registration can have.
+
+        Raises
+        ------
+        ModelError
+            If a parameter is not finite or the magnification is not positive.
+        """
+        if not np.all(np.isfinite(self.vector)) or self.magnification <= 0.0:
+            raise ModelError(f"a registration needs finite numbers and a magnification > 0: {self}")
+
+    @property
+    def vector(self) -> NDArray[np.float64]:
+        """Numeric 4-vector: shifts in subapertures, rotation in radians, magnification."""
+        return np.array(
+            [self.shift_x_subap, self.shift_y_subap, self.rotation_rad, self.magnification]
+        )
+
+    @classmethod
+    def from_vector(cls, vector: NDArray[np.float64]) -> Self:
+        """Build from a numeric 4-vector (shape ``(4,)``, rotation in radians)."""
+        shift_x, shift_y, rotation, magnification = (float(v) for v in vector)
+        return cls(
+            shift_x_subap=shift_x,
+            shift_y_subap=shift_y,
+            rotation_rad=rotation,
+            magnification=magnification,
+        )
+
+    @classmethod
+    def from_boundary(cls, values: dict[str, float]) -> Self:
+        """Build from the four named numbers used on the wire, in files and in REST (degrees)."""
+        vector = np.array([values[name] for name in PARAMETERS]) / BOUNDARY_SCALE
+        return cls.from_vector(vector)
+
+    def to_boundary(self) -> dict[str, float]:
+        """Return the four named numbers used on the wire, in files and in REST (degrees)."""
+        values = self.vector * BOUNDARY_SCALE
+        return dict(zip(PARAMETERS, (float(v) for v in values), strict=True))

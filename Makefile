@@ -1,0 +1,58 @@
+# Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help setup demo test check clean FORCE
+
+PYTHON ?= python3
+PY := .venv/bin/python
+STAMP := .venv/.installed-for
+
+# The stamp names the folder it was made in: a copied or moved checkout gets an environment of its own.
+ifneq ($(wildcard $(PY)),)
+INSTALLED_FOR := $(shell cat $(STAMP) 2>/dev/null)
+endif
+ifneq ($(INSTALLED_FOR),$(CURDIR))
+$(STAMP): FORCE
+endif
+
+help:
+	@grep -E '^[a-z]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /:\t/' | expand -t 8
+
+setup: $(STAMP) ## install pyrcal and its tools into .venv
+
+demo: $(STAMP) ## service and simulated RTC together; ARGS="--seconds 60" and the like
+	@.venv/bin/pyrcal demo $(ARGS)
+
+test: $(STAMP) ## run the tests; ARGS go to pytest
+	@$(PY) -m pytest $(ARGS)
+
+check: $(STAMP) ## lint, formatting, types and import contracts
+	@$(PY) -m ruff check .
+	@$(PY) -m ruff format --check .
+	@$(PY) -m mypy
+	@.venv/bin/lint-imports
+
+clean: ## remove what make made; never var/, which holds calibration products
+	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+	    .import_linter_cache .coverage
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# A working environment is brought up to date in place; one made elsewhere or broken is made anew.
+$(STAMP): pyproject.toml constraints.txt
+	@if [ -e $@ ] && [ "$$(cat $@)" != "$(CURDIR)" ] || \
+	    ! $(PY) -c 'import pip, sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	    for python in $(PYTHON) python3.14 python3.13 python3.12 python3.11 none; do \
+	        "$$python" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
+	            2>/dev/null && break; \
+	    done; \
+	    if [ "$$python" = none ]; then \
+	        echo "setup: found no Python >= 3.11 with the venv module ($(PYTHON) is" \
+	            "$$($(PYTHON) --version 2>&1)); install one or name it: make PYTHON=/path/to/python3" >&2; \
+	        exit 1; \
+	    fi; \
+	    echo "setup: making .venv with $$("$$python" --version)"; \
+	    "$$python" -m venv --clear .venv || exit 1; \
+	fi
+	@echo "setup: installing pyrcal and its tools (the first time takes a minute or two)"
+	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,test]'
+	@printf '%s\n' '$(CURDIR)' > $@

@@ -18,7 +18,7 @@ class FftPyramid:
     """A pyramid sensor behind a pupil of given illumination."""
 
     amplitude: NDArray[np.float64]
-    """``(n, n)`` pupil field amplitude, grey at the edge, at ``u_i = (i - (n - 1) / 2) / sampling``."""
+    """``(n, n)`` amplitude of the pupil field, grey at the edge; both axes are ``coordinates``."""
 
     sampling: int
     """Pupil points per subaperture."""

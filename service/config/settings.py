@@ -1,0 +1,238 @@
+"""The service's settings: command line > environment > TOML file > defaults."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, get_args, get_origin
+
+from pydantic import Field, model_validator
+
+from service.config.strict import Id, Table, Tuple, in_file, nearest, read_toml, validated
+from service.errors import ConfigurationError
+from service.state import Mode
+
+PREFIX = "PYRCAL_"
+"""Of the environment variables: ``PYRCAL_<SECTION>__<KEY>``, like ``PYRCAL_API__PORT``."""
+
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class ServiceTable(Table):
+    """``[service]``: the service as a whole."""
+
+    instrument: str = Field(default="flao-lbt", min_length=1)
+    """Packaged name or path of the instrument file."""
+
+    system: Id | None = None
+    """The ``{system}`` of the wire; None: the instrument's name."""
+
+    mode: Mode = Field(default=Mode.PROPOSE, strict=False)
+    """How much the service may do by itself when it starts."""
+
+    data_dir: Path = Field(default=Path("var"), strict=False)
+    """Where products, index and audit trail live; relative to the working directory."""
+
+
+class ZenohTable(Table):
+    """``[zenoh]``: the way to the RTC."""
+
+    listen: Tuple[str] = ("tcp/127.0.0.1:7447",)
+    """Endpoints the embedded router listens on."""
+
+    connect: Tuple[str] = ()
+    """Endpoints of an observatory's own routers; not empty: no router is embedded."""
+
+    chunk_bytes: int = Field(default=4_000_000, ge=1024, le=4_000_000)
+    """Size of a reconstructor's chunks; a default build of zenoh-pico drops more than 4 KB."""
+
+
+class ApiTable(Table):
+    """``[api]``: REST and dashboard."""
+
+    host: str = Field(default="127.0.0.1", min_length=1)
+    """Address to listen on."""
+
+    port: int = Field(default=8080, ge=0, le=65535)
+    """TCP port; 0: any free one."""
+
+
+class DitherTable(Table):
+    """``[dither]``: the small signal that tells the truth."""
+
+    enabled: bool = True
+    """Whether the service asks for it by itself."""
+
+    amplitude_m: float = Field(default=5e-9, gt=0.0, le=1e-7)
+    """RMS of each mode, metres OPD."""
+
+    modes: Tuple[Annotated[int, Field(ge=0)]] | None = None
+    """0-based basis indices; None: four the loop does not control."""
+
+    frequencies_hz: Tuple[Positive] | None = None
+    """One for each mode; None: spread over 0.2-0.35 of the frame rate."""
+
+    window_s: float = Field(default=2.0, ge=0.1, le=60.0)
+    """Telemetry in one estimate, seconds; faint stars need 5 or more."""
+
+    @model_validator(mode="after")
+    def _one_frequency_for_each_mode(self) -> DitherTable:
+        n_frequencies = len(self.frequencies_hz or ())
+        if self.frequencies_hz is not None and n_frequencies != len(self.modes or ()):
+            raise ValueError(
+                f"found {n_frequencies} frequencies_hz for {len(self.modes or ())} modes, "
+                "expected one for each"
+            )
+        return self
+
+
+class TrackingTable(Table):
+    """``[tracking]``: how fast α may move and how far the model itself is to be trusted."""
+
+    drift_subap_per_minute: Positive = 0.05
+    """Random walk of each shift, 1 σ after a minute, subapertures."""
+
+    drift_deg_per_minute: Positive = 0.05
+    """Of the rotation, degrees."""
+
+    drift_magnification_per_minute: Positive = 0.0005
+    """Of the magnification."""
+
+    floor_shift_subap: float = Field(default=0.003, ge=0.0)
+    """1 σ model error of each shift, subapertures; no integration removes it."""
+
+    floor_rotation_deg: float = Field(default=0.005, ge=0.0)
+    """Of the rotation, degrees."""
+
+    floor_magnification: float = Field(default=0.0003, ge=0.0)
+    """Of the magnification."""
+
+
+class ControlTable(Table):
+    """``[control]``: when a reconstructor is made and what it must withstand."""
+
+    n_modes_target: int = Field(default=500, ge=1)
+    """Modes to control once the registration is known."""
+
+    pole_radius_bound: float = Field(default=0.95, gt=0.0, lt=1.0)
+    """Largest closed-loop pole radius, anywhere in α ± 3σ, of a matrix that may be published."""
+
+    update_shift_subap: Positive = 0.01
+    """Change of a shift that makes a new reconstructor worthwhile, subapertures."""
+
+    update_rotation_deg: Positive = 0.02
+    """Of the rotation, degrees."""
+
+    update_magnification: Positive = 0.001
+    """Of the magnification."""
+
+    minimum_interval_s: float = Field(default=5.0, ge=0.0)
+    """Least time between two reconstructors, seconds."""
+
+
+class ComputeTable(Table):
+    """``[compute]``: what the heavy work may use, and how finely it samples the optics."""
+
+    threads: int = Field(default=2, ge=1, le=256)
+    """Threads of the worker process."""
+
+    nice: int = Field(default=10, ge=0, le=19)
+    """Its niceness: the ingest of telemetry goes first."""
+
+    pupil_sampling: int = Field(default=3, ge=1, le=16)
+    """Pupil points per subaperture (q of the model)."""
+
+    detector_nodes: int = Field(default=3, ge=1, le=16)
+    """Quadrature nodes per detector pixel and axis (nd of the model)."""
+
+
+class Settings(Table):
+    """Everything the user may decide about the service."""
+
+    service: ServiceTable = ServiceTable()
+    zenoh: ZenohTable = ZenohTable()
+    api: ApiTable = ApiTable()
+    dither: DitherTable = DitherTable()
+    tracking: TrackingTable = TrackingTable()
+    control: ControlTable = ControlTable()
+    compute: ComputeTable = ComputeTable()
+
+
+_Key = tuple[str, ...]
+
+
+def load_settings(
+    path: Path | None,
+    env: Mapping[str, str],
+    command_line: Mapping[str, object] | None = None,
+) -> Settings:
+    """Return the settings: command line > environment > TOML file > defaults.
+
+    Parameters
+    ----------
+    path
+        TOML file; None: no file.
+    env
+        Environment variables; those that begin with ``PYRCAL_`` count. A value is read as TOML
+        where its key takes more than text: ``PYRCAL_DITHER__MODES="[501, 450]"``.
+    command_line
+        Values by dotted key: ``{"api.port": 8080}``.
+
+    Raises
+    ------
+    ConfigurationError
+        One line that names the key and the file, variable or command line it came from.
+    """
+    tables = read_toml(path) if path is not None else {}
+    file_place = in_file(path) if path is not None else ".".join
+    overrides: dict[_Key, tuple[str, object]] = {}
+    for name in sorted(n for n in env if n.startswith(PREFIX)):
+        key = _environment_key(name)
+        overrides[key] = (f"environment: {name}", _environment_value(key, env[name]))
+    for dotted, value in (command_line or {}).items():
+        overrides[tuple(dotted.split("."))] = (f"command line: {dotted}", value)
+    for (section, name), (_, value) in overrides.items():
+        table = tables.setdefault(section, {})
+        if isinstance(table, dict):
+            table[name] = value
+
+    def place(key: _Key) -> str:
+        origin = overrides.get(key[:2])
+        return origin[0] if origin is not None else file_place(key)
+
+    return validated(Settings, tables, place)
+
+
+def _environment_key(name: str) -> _Key:
+    match = re.fullmatch(r"([A-Z]+)__([A-Z0-9_]+)", name.removeprefix(PREFIX))
+    if match is None:
+        raise ConfigurationError(
+            f"environment: {name}: expected {PREFIX}<SECTION>__<KEY>, like {PREFIX}API__PORT"
+        )
+    section, key = match[1].lower(), match[2].lower()
+    if section not in Settings.model_fields:
+        raise ConfigurationError(
+            f"environment: {name}: unknown section {section}"
+            f"{nearest(section, Settings.model_fields)}"
+        )
+    return section, key
+
+
+def _environment_value(key: _Key, text: str) -> object:
+    section, name = key
+    field = type(getattr(Settings(), section)).model_fields.get(name)
+    if field is not None and _takes_text(field.annotation):
+        return text
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _takes_text(annotation: object) -> bool:
+    if get_origin(annotation) is tuple:
+        return False
+    alternatives = {annotation, *get_args(annotation)}
+    return bool(alternatives & {str, Path, Mode, Id})

@@ -1,0 +1,122 @@
+"""Read TOML against a pydantic schema and say in one line what is wrong with it."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, StringConstraints, ValidationError
+from pydantic_core import ErrorDetails
+
+from service.errors import ConfigurationError
+
+_EXPECTED = "Input should be "
+
+
+class Table(BaseModel):
+    """One table of a file: frozen, no unknown keys, no guessing between types, finite numbers."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+    )
+
+
+def _as_tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
+
+
+Item = TypeVar("Item")
+Tuple = Annotated[tuple[Item, ...], BeforeValidator(_as_tuple)]
+"""A TOML array, kept as a tuple."""
+
+Id = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
+"""An id as the wire allows it."""
+
+Schema = TypeVar("Schema", bound=Table)
+Place = Callable[[tuple[str, ...]], str]
+"""Says where a value came from, given its key path."""
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file cannot be read or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{path}: not UTF-8 text: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{path}: not valid TOML: {error}") from error
+
+
+def validated(schema: type[Schema], data: Mapping[str, Any], place: Place) -> Schema:
+    """Return ``data`` as a ``schema``.
+
+    Raises
+    ------
+    ConfigurationError
+        One line: where, what was found, what was expected; the first problem of several.
+    """
+    try:
+        return schema.model_validate(data)
+    except ValidationError as error:
+        problems = error.errors(include_url=False)
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise ConfigurationError(_line(schema, problems[0], place) + more) from error
+
+
+def in_file(path: Path) -> Place:
+    """Return a place that names this file and the dotted key."""
+    return lambda key: f"{path}: {'.'.join(key)}" if key else str(path)
+
+
+def refuse(place: str, found: str, expected: str) -> NoReturn:
+    """Raise the one-line error for a value that the schema alone cannot judge."""
+    raise ConfigurationError(f"{place}: found {found}, expected {expected}")
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return ``, did you mean ...?`` for the nearest known word, or what is known."""
+    known = sorted(known)
+    close = difflib.get_close_matches(word, known, n=1)
+    return f", did you mean {close[0]}?" if close else f"; known: {', '.join(known)}"
+
+
+def _line(schema: type[Table], problem: ErrorDetails, place: Place) -> str:
+    key = tuple(str(part) for part in problem["loc"])
+    where = place(key)
+    kind, message = problem["type"], problem["msg"]
+    if kind == "extra_forbidden":
+        return f"{where}: unknown key{nearest(key[-1], _known_keys(schema, key[:-1]))}"
+    if kind == "missing":
+        return f"{where}: missing, this key is mandatory"
+    if kind == "value_error":
+        return f"{where}: {message.removeprefix('Value error, ')}"
+    if kind in {"model_type", "model_attributes_type"}:
+        return f"{where}: found {problem['input']!r}, expected a table [{'.'.join(key)}]"
+    if kind == "string_pattern_mismatch":
+        message = f"text that matches {problem['ctx']['pattern']}"
+    return f"{where}: found {problem['input']!r}, expected {message.removeprefix(_EXPECTED)}"
+
+
+def _known_keys(schema: type[Table], key: tuple[str, ...]) -> Iterable[str]:
+    fields = schema.model_fields
+    for part in key:
+        inner = fields[part].annotation if part in fields else None
+        if not (isinstance(inner, type) and issubclass(inner, Table)):
+            break
+        fields = inner.model_fields
+    return fields

@@ -3,7 +3,7 @@
 ::
 
     PyrcalError
-    ├── ConfigurationError   a settings or instrument file that cannot be used: file, key, found, expected
+    ├── ConfigurationError   a settings or instrument file that cannot be used
     ├── ModelError           numbers the optical model cannot work with
     ├── WireError            bytes from the RTC that break the contract
     ├── LinkError            the zenoh session cannot be opened or an RTC does not answer

@@ -1,4 +1,4 @@
-"""What pyrcal knows of an instrument: frozen records, filled from a TOML file by ``service.config``."""
+"""What pyrcal knows of an instrument: frozen records, filled from a TOML file elsewhere."""
 
 from __future__ import annotations
 

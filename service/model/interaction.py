@@ -1,0 +1,268 @@
+"""The interaction matrix D(α) = K(shift) Φ(rotation, magnification), and how it moves with α."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.instrument import Instrument, Stop
+from service.model.misregistration import Misregistration
+from service.model.modes import ModalBasis
+from service.model.pupil import PupilGrid, annular_pupil
+from service.model.pyramid import Mapper, Nodes, PyramidOptics, Response
+
+Array = NDArray[Any]
+Value = TypeVar("Value")
+
+_ROW_CHUNK = 512
+"""Rows of a product per task: large enough for BLAS, small enough to share between cores."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Linearisation:
+    """D and its four derivatives at one registration: D(α) nearby costs one sum."""
+
+    alpha: Misregistration
+    """Where it was taken."""
+
+    matrix: NDArray[np.float32]
+    """``(n_slopes, n_modes)`` slope per metre OPD."""
+
+    derivatives: NDArray[np.float32]
+    """``(4, n_slopes, n_modes)`` per subaperture, subaperture, radian, unit of magnification."""
+
+    def matrix_at(self, alpha: Misregistration) -> NDArray[np.float32]:
+        """Return D at a registration close by, to first order, ``(n_slopes, n_modes)``."""
+        step = (alpha.vector - self.alpha.vector).astype(np.float32)
+        return np.asarray(self.matrix + np.tensordot(step, self.derivatives, axes=1))
+
+
+class InteractionModel:
+    """Noise-free interaction matrices of one instrument at any registration.
+
+    Keeps what does not depend on α, and the last sensor Jacobian and the last rendered modes, so
+    that a new rotation costs no optics and a new shift no rendering.
+    """
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        basis: ModalBasis,
+        *,
+        pupil_sampling: int = 3,
+        detector_nodes: int = 3,
+        n_modulation: int = 28,
+        dtype: type[np.float32] | type[np.float64] = np.float32,
+        mapper: Mapper = map,
+    ) -> None:
+        self.instrument = instrument
+        self.basis = basis
+        self.pupil = instrument_pupil(instrument, pupil_sampling)
+        self.optics = PyramidOptics(
+            wfs=instrument.wfs,
+            pupil=self.pupil,
+            n_nodes=detector_nodes,
+            n_modulation=n_modulation,
+            dtype=dtype,
+        )
+        self.valid = valid_subapertures(instrument, self.optics)
+        self._map = mapper
+        self._dtype = dtype
+        self._jacobian: _Last[Array] = _Last()
+        self._modes: _Last[Array] = _Last()
+
+    @property
+    def n_slopes(self) -> int:
+        """Twice the number of valid subapertures."""
+        return 2 * int(self.valid.sum())
+
+    def interaction_matrix(self, alpha: Misregistration) -> Array:
+        """Return D(α), ``(n_slopes, n_modes)``, slope per metre of OPD.
+
+        References
+        ----------
+        Heritier et al. 2018, equation 6: D = M_WFS M_DM.
+        """
+        return self._product(self.sensor_jacobian(alpha), self._rendered(alpha))
+
+    def derivatives(self, alpha: Misregistration) -> Array:
+        """Return dD/dα ``(4, n_slopes, n_modes)``: per subaperture, radian, magnification."""
+        return np.stack([*self._shift_derivatives(alpha), *self._shape_derivatives(alpha)])
+
+    def linearise(self, alpha: Misregistration) -> Linearisation:
+        """Return D(α) and its derivatives together."""
+        return Linearisation(
+            alpha=alpha,
+            matrix=self.interaction_matrix(alpha).astype(np.float32),
+            derivatives=self.derivatives(alpha).astype(np.float32),
+        )
+
+    def sensor_jacobian(self, alpha: Misregistration) -> Array:
+        """Return K, slopes against pupil OPD, ``(n_slopes, n_points)``, slope per metre."""
+        shift = self._image_shift(alpha)
+        return self._jacobian.get(
+            shift,
+            lambda: self._per_metre(
+                normalised_jacobian(
+                    self.optics.response(self.valid, shift, mapper=self._map), self.valid
+                )
+            ),
+        )
+
+    def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
+        """Shift of the pupil images: with the telescope as stop they stay where they are."""
+        if self.instrument.stop is Stop.TELESCOPE:
+            return (0.0, 0.0)
+        return (alpha.shift_x_subap, alpha.shift_y_subap)
+
+    def _mirror_points(self, alpha: Misregistration) -> NDArray[np.float64]:
+        """Return where each lit pupil point lies on the mirror, ``(n_points, 2)``."""
+        points = self.pupil.points
+        if self.instrument.stop is Stop.TELESCOPE:
+            points = points - alpha.vector[:2]
+        return points @ rotation(alpha.rotation_rad) / alpha.magnification
+
+    def _rendered(self, alpha: Misregistration) -> Array:
+        points = self._mirror_points(alpha)
+        shift = self._image_shift(alpha)
+        moved = alpha.vector - np.array([*shift, 0.0, 0.0])
+        return self._modes.get(
+            tuple(moved), lambda: self._by_rows(self.basis.render, points).astype(self._dtype)
+        )
+
+    def _shape_derivatives(self, alpha: Misregistration) -> tuple[Array, Array]:
+        jacobian, points = self.sensor_jacobian(alpha), self._mirror_points(alpha)
+        turned = np.column_stack([points[:, 1], -points[:, 0]])
+        return (
+            self._product(jacobian, self._moved(points, turned)),
+            self._product(jacobian, self._moved(points, -points / alpha.magnification)),
+        )
+
+    def _shift_derivatives(self, alpha: Misregistration) -> tuple[Array, Array]:
+        if self.instrument.stop is Stop.TELESCOPE:
+            jacobian, points = self.sensor_jacobian(alpha), self._mirror_points(alpha)
+            steps = -rotation(alpha.rotation_rad) / alpha.magnification
+            along_x, along_y = (np.broadcast_to(step, points.shape) for step in steps)
+            return (
+                self._product(jacobian, self._moved(points, along_x)),
+                self._product(jacobian, self._moved(points, along_y)),
+            )
+        shift, modes = self._image_shift(alpha), self._rendered(alpha)
+        at_rest = self.optics.response(self.valid, shift, mapper=self._map)
+        by_axis = (
+            self.optics.response(self.valid, shift, nodes_x=Nodes.edges(), mapper=self._map),
+            self.optics.response(self.valid, shift, nodes_y=Nodes.edges(), mapper=self._map),
+        )
+        along_x, along_y = (
+            self._product(
+                self._per_metre(normalised_derivative(at_rest, moving, self.valid)), modes
+            )
+            for moving in by_axis
+        )
+        return along_x, along_y
+
+    def _moved(self, points: NDArray[np.float64], direction: NDArray[np.float64]) -> Array:
+        both = np.hstack([points, direction])
+        moved = self._by_rows(lambda p: self.basis.render_slope(p[:, :2], p[:, 2:]), both)
+        return moved.astype(self._dtype)
+
+    def _per_metre(self, jacobian: Array) -> Array:
+        jacobian *= np.asarray(2 * np.pi / self.instrument.wfs.wavelength_m, dtype=jacobian.dtype)
+        return jacobian
+
+    def _by_rows(self, function: Callable[[Array], Array], rows: Array) -> Array:
+        starts = range(0, len(rows), _ROW_CHUNK)
+        return np.concatenate(
+            list(self._map(lambda start: function(rows[start : start + _ROW_CHUNK]), starts))
+        )
+
+    def _product(self, jacobian: Array, modes: Array) -> Array:
+        return self._by_rows(lambda rows: rows @ modes, jacobian)
+
+
+def instrument_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
+    """Return the instrument's pupil on a grid of ``sampling`` points per subaperture."""
+    return annular_pupil(
+        n_subapertures=instrument.wfs.n_subapertures,
+        diameter_subap=instrument.wfs.pupil_diameter,
+        obscuration_ratio=instrument.obscuration_ratio,
+        sampling=sampling,
+    )
+
+
+def valid_subapertures(instrument: Instrument, optics: PyramidOptics) -> NDArray[np.bool_]:
+    """Return the mask ``(n, n)`` [y, x]: the instrument's own, or by flux at α = 0.
+
+    The flux is the pupil's light on each subaperture, so that the mask depends neither on the
+    sampling nor on the light diffracted out of the images.
+    """
+    if instrument.wfs.valid_subapertures is not None:
+        return instrument.wfs.valid_subapertures
+    fine = instrument_pupil(instrument, 8).amplitude
+    n = instrument.wfs.n_subapertures
+    margin = (len(fine) // 8 - n) // 2 * 8
+    inner = fine[margin : margin + 8 * n, margin : margin + 8 * n]
+    flux = inner.reshape(n, 8, n, 8).mean(axis=(1, 3))
+    return np.asarray(flux >= instrument.wfs.flux_threshold)
+
+
+def reference_slopes(images: Array, valid: NDArray[np.bool_]) -> tuple[Array, float]:
+    """Return the slopes ``(n_slopes,)`` of four images and the mean flux per valid subaperture.
+
+    Global normalisation, signs of conventions.md. ``images`` is ``(2, n, 2, n)``.
+    """
+    differences, flux = _differences(images, valid)
+    return differences / flux, flux
+
+
+def _differences(images: Array, valid: NDArray[np.bool_]) -> tuple[Array, float]:
+    """Return x then y differences of the four images, and the mean flux per valid subaperture."""
+    by_x, by_y = images.sum(axis=0), images.sum(axis=2)
+    x = (by_x[:, 0] - by_x[:, 1])[valid]
+    y = (by_y[0] - by_y[1])[valid]
+    return np.concatenate([x, y]), float(by_y.sum(axis=0)[valid].mean())
+
+
+def normalised_jacobian(response: Response, valid: NDArray[np.bool_]) -> Array:
+    """Return the gradient of the normalised slopes, ``(n_slopes, n_points)`` per radian."""
+    slopes, flux = reference_slopes(response.images, valid)
+    dtype = response.gradient.dtype
+    jacobian = response.gradient - np.outer(slopes, response.flux_gradient).astype(dtype)
+    jacobian /= np.asarray(flux, dtype=dtype)
+    return np.asarray(jacobian)
+
+
+def normalised_derivative(at_rest: Response, moving: Response, valid: NDArray[np.bool_]) -> Array:
+    """Return the rate of ``normalised_jacobian`` when the images move, by the product rule."""
+    slopes, flux = reference_slopes(at_rest.images, valid)
+    difference_rate, flux_rate = _differences(moving.images, valid)
+    slope_rate = (difference_rate - slopes * flux_rate) / flux
+    dtype = at_rest.gradient.dtype
+    rate = moving.gradient - np.outer(slopes, moving.flux_gradient).astype(dtype)
+    rate -= np.outer(slope_rate, at_rest.flux_gradient).astype(dtype)
+    rate -= normalised_jacobian(at_rest, valid) * np.asarray(flux_rate, dtype=dtype)
+    rate /= np.asarray(flux, dtype=dtype)
+    return np.asarray(rate)
+
+
+def rotation(angle_rad: float) -> NDArray[np.float64]:
+    """Return R with ``R @ p`` turned from +x towards +y; ``p @ R`` turns rows back."""
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cosine, -sine], [sine, cosine]])
+
+
+@dataclass(slots=True)
+class _Last(Generic[Value]):
+    """The last value computed, by its key."""
+
+    key: tuple[float, ...] = ()
+    value: Value | None = None
+
+    def get(self, key: tuple[float, ...], compute: Callable[[], Value]) -> Value:
+        if self.value is None or key != self.key:
+            self.key, self.value = key, compute()
+        return self.value

@@ -1,0 +1,107 @@
+"""The separable interaction matrix against an FFT pyramid that shares no code with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.config.instrument import load_instrument
+from service.model.interaction import InteractionModel
+from service.model.misregistration import Misregistration
+from service.model.modes import ModalBasis, karhunen_loeve_basis
+from tests.physics.fft_pyramid import FftPyramid
+
+AGREEMENT = 0.003
+"""Relative Frobenius norm of the difference: the FFT's images wrap around at 160 subapertures."""
+
+MODES = [0, 1, 2, 3, 5, 8, 12, 18, 25, 35, 50, 75, 110, 160, 230, 300, 400, 501, 550, 593]
+"""Twenty modes from the tilts to the last one."""
+
+REGISTRATIONS = {
+    "aligned": Misregistration(),
+    "shifted by parts of a subaperture": Misregistration(shift_x_subap=0.23, shift_y_subap=-0.31),
+    "turned and scaled": Misregistration(rotation_rad=np.deg2rad(-1.5), magnification=1.02),
+    "everything at once": Misregistration(
+        shift_x_subap=-0.7, shift_y_subap=0.4, rotation_rad=np.deg2rad(65.08), magnification=0.985
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def basis() -> ModalBasis:
+    return karhunen_loeve_basis(load_instrument("flao-lbt"))
+
+
+def optics(basis: ModalBasis, sampling: int, n_nodes: int) -> tuple[InteractionModel, FftPyramid]:
+    """The model and the reference with the same sampling, quadrature and modulation."""
+    instrument = load_instrument("flao-lbt")
+    model = InteractionModel(
+        instrument, basis, pupil_sampling=sampling, detector_nodes=n_nodes, n_modulation=28
+    )
+    reference = FftPyramid(
+        amplitude=model.pupil.amplitude,
+        sampling=sampling,
+        wavelength_m=instrument.wfs.wavelength_m,
+        n_subapertures=instrument.wfs.n_subapertures,
+        n_modulation=28,
+        n_nodes=n_nodes,
+    )
+    return model, reference
+
+
+def moved_modes(basis: ModalBasis, reference: FftPyramid, alpha: Misregistration) -> np.ndarray:
+    """OPD maps ``(n_maps, n, n)`` of the mirror turned and scaled about the pupil centre."""
+    u = reference.coordinates
+    x, y = (axis.ravel() for axis in np.meshgrid(u, u))
+    cosine, sine = np.cos(alpha.rotation_rad), np.sin(alpha.rotation_rad)
+    on_mirror = np.column_stack([cosine * x + sine * y, cosine * y - sine * x])
+    maps = basis.render(on_mirror / alpha.magnification)[:, MODES]
+    return maps.T.reshape(len(MODES), len(u), len(u))
+
+
+def disagreement(basis: ModalBasis, sampling: int, n_nodes: int, alpha: Misregistration) -> float:
+    model, reference = optics(basis, sampling, n_nodes)
+    maps = moved_modes(basis, reference, alpha)
+    expected = reference.jacobian(maps, model.valid, (alpha.shift_x_subap, alpha.shift_y_subap))
+    found = model.interaction_matrix(alpha)[:, MODES]
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+@pytest.mark.parametrize("alpha", REGISTRATIONS.values(), ids=REGISTRATIONS)
+def test_interaction_matrix_agrees_with_the_fft_pyramid(basis, alpha):
+    assert disagreement(basis, 2, 2, alpha) <= AGREEMENT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("alpha", REGISTRATIONS.values(), ids=REGISTRATIONS)
+def test_agreement_holds_at_the_sampling_of_the_service(basis, alpha):
+    assert disagreement(basis, 3, 3, alpha) <= AGREEMENT
+
+
+def test_a_wavefront_rising_along_an_axis_gives_positive_mean_slopes_on_that_axis_only(basis):
+    model, reference = optics(basis, 2, 2)
+    u = reference.coordinates
+    n_valid = model.n_slopes // 2
+    for axis, tilt in enumerate(np.broadcast_arrays(u, u[:, None])):
+        jacobian = reference.jacobian(tilt[None], model.valid)[:, 0]
+        mean = np.array([jacobian[:n_valid].mean(), jacobian[n_valid:].mean()])
+        assert mean[axis] > 0
+        assert abs(mean[1 - axis]) < 1e-4 * mean[axis]
+
+
+def test_the_model_sees_the_tilt_modes_rise_along_their_axes(basis):
+    """Mode 0 is the tilt along +x, mode 1 the one along +y."""
+    model, _ = optics(basis, 2, 2)
+    tilts = model.interaction_matrix(Misregistration())[:, :2]
+    mean = tilts.reshape(2, -1, 2).mean(axis=1)
+    assert mean[0, 0] > 0
+    assert mean[1, 1] > 0
+    assert abs(mean[1, 0]) < 0.01 * mean[0, 0]
+    assert abs(mean[0, 1]) < 0.01 * mean[1, 1]
+
+
+def test_a_shift_of_one_subaperture_along_x_moves_the_images_by_one_column(basis):
+    _, reference = optics(basis, 2, 2)
+    flat = np.zeros_like(reference.amplitude)
+    at_rest, moved = reference.images(flat), reference.images(flat, (1.0, 0.0))
+    np.testing.assert_allclose(moved[..., 1:], at_rest[..., :-1], rtol=1e-9)

@@ -1,0 +1,192 @@
+"""Matrices in parts: cutting, checksums, and putting together what arrives in any order."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import WireError
+
+CHUNK_LIMIT: Final = 4_000_000
+"""Bytes of the largest part."""
+
+MATRIX_LIMIT: Final = 2**31
+"""Bytes of the largest matrix."""
+
+DTYPE: Final = "<f4"
+"""Every matrix on the wire: little-endian float32, C order."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatrixLayout:
+    """Shape, parts and checksum of a float32 matrix on the wire."""
+
+    shape: tuple[int, int]
+    """Rows and columns, C order, little-endian float32."""
+
+    n_chunks: int
+    """Parts it travels in; 0: there is no matrix (a measurement that failed)."""
+
+    chunk_bytes: int
+    """Bytes of each part but the last, which may be shorter."""
+
+    sha256: str
+    """Of all its bytes, 64 lower-case hex digits."""
+
+    @property
+    def n_bytes(self) -> int:
+        """Bytes of the whole matrix."""
+        return 4 * self.shape[0] * self.shape[1]
+
+    def size_of(self, index: int) -> int:
+        """Return the bytes part ``index`` must have."""
+        return min(self.chunk_bytes, self.n_bytes - index * self.chunk_bytes)
+
+
+def layout_of(matrix: NDArray[np.float32], chunk_bytes: int) -> MatrixLayout:
+    """Return the layout of a matrix that will travel in parts of ``chunk_bytes``.
+
+    Raises
+    ------
+    WireError
+        If it is not a finite, two-dimensional matrix or the chunk size is out of range.
+    """
+    if matrix.ndim != 2 or not np.all(np.isfinite(matrix)):
+        raise WireError(
+            f"range: a matrix of shape {matrix.shape} with {np.sum(~np.isfinite(matrix))} "
+            "non-finite numbers cannot travel, expected a finite two-dimensional one"
+        )
+    rows, columns = matrix.shape
+    if not 1 <= chunk_bytes <= CHUNK_LIMIT:
+        raise WireError(f"range: chunk_bytes is {chunk_bytes}, expected 1 to {CHUNK_LIMIT}")
+    return MatrixLayout(
+        shape=(rows, columns),
+        n_chunks=math.ceil(4 * rows * columns / chunk_bytes),
+        chunk_bytes=chunk_bytes,
+        sha256=checksum(matrix),
+    )
+
+
+def checksum(matrix: NDArray[np.float32]) -> str:
+    """Return the SHA-256 of a matrix as it travels, 64 lower-case hex digits."""
+    return hashlib.sha256(np.ascontiguousarray(matrix, dtype=DTYPE).data).hexdigest()
+
+
+def split(matrix: NDArray[np.float32], chunk_bytes: int) -> list[bytes]:
+    """Return the bytes of a matrix in parts of ``chunk_bytes``, the last one shorter."""
+    data = np.ascontiguousarray(matrix, dtype=DTYPE).tobytes()
+    return [data[start : start + chunk_bytes] for start in range(0, len(data), chunk_bytes)]
+
+
+class ChunkAssembler:
+    """Parts of one matrix, collected in any order; the manifest may overtake them.
+
+    Until the manifest is known only the bound on memory is checked; then every part is held
+    against it, and those that do not fit are dropped so that they can be asked for again.
+    """
+
+    __slots__ = ("_layout", "_limit_bytes", "_parts")
+
+    def __init__(self, limit_bytes: int = MATRIX_LIMIT) -> None:
+        self._limit_bytes = limit_bytes
+        self._parts: dict[int, bytes] = {}
+        self._layout: MatrixLayout | None = None
+
+    def add(self, index: int, data: bytes) -> None:
+        """Take one part; the first of each index wins.
+
+        Raises
+        ------
+        WireError
+            If it is too long, does not fit the manifest, or would break the bound on memory.
+        """
+        if index in self._parts:
+            return
+        if not 0 < len(data) <= CHUNK_LIMIT:
+            raise WireError(
+                f"range: chunk {index} has {len(data)} bytes, expected 1 to {CHUNK_LIMIT}"
+            )
+        if self.n_bytes + len(data) > self._limit_bytes:
+            raise WireError(
+                f"range: chunk {index} brings the matrix to {self.n_bytes + len(data)} bytes, "
+                f"expected at most {self._limit_bytes}"
+            )
+        if self._layout is not None:
+            _check_part(self._layout, index, len(data))
+        self._parts[index] = data
+
+    def announce(self, layout: MatrixLayout) -> None:
+        """Take the manifest's layout.
+
+        Raises
+        ------
+        WireError
+            If parts that are already there do not fit it; they are dropped.
+        """
+        if layout.n_bytes > self._limit_bytes:
+            raise WireError(
+                f"range: shape {layout.shape} is {layout.n_bytes} bytes, "
+                f"expected at most {self._limit_bytes}"
+            )
+        self._layout = layout
+        refusals = []
+        for index in list(self._parts):
+            try:
+                _check_part(layout, index, len(self._parts[index]))
+            except WireError as error:
+                del self._parts[index]
+                refusals.append(error)
+        if refusals:
+            raise refusals[0]
+
+    @property
+    def n_bytes(self) -> int:
+        """Bytes held."""
+        return sum(map(len, self._parts.values()))
+
+    @property
+    def complete(self) -> bool:
+        """Whether the manifest and every part are there."""
+        return self._layout is not None and len(self._parts) == self._layout.n_chunks
+
+    def missing(self) -> tuple[int, ...]:
+        """Return the parts still to come; empty before the manifest is known."""
+        if self._layout is None:
+            return ()
+        return tuple(k for k in range(self._layout.n_chunks) if k not in self._parts)
+
+    def matrix(self) -> NDArray[np.float32]:
+        """Return the matrix, whole, with the announced checksum, and finite (read-only).
+
+        Raises
+        ------
+        WireError
+            If parts are missing, the checksum differs, or a number is not finite.
+        """
+        layout = self._layout
+        if layout is None or not self.complete:
+            expected = "a manifest" if layout is None else f"chunks {self.missing()[:8]} as well"
+            raise WireError(f"missing: {len(self._parts)} chunks are here, expected {expected}")
+        data = b"".join(self._parts[k] for k in range(layout.n_chunks))
+        found = hashlib.sha256(data).hexdigest()
+        if found != layout.sha256:
+            raise WireError(f"range: the matrix has sha256 {found}, expected {layout.sha256}")
+        matrix = np.frombuffer(data, dtype=DTYPE).reshape(layout.shape)
+        if not np.all(np.isfinite(matrix)):
+            n_bad = int(np.sum(~np.isfinite(matrix)))
+            raise WireError(f"range: {n_bad} numbers of the matrix are not finite, expected none")
+        return matrix
+
+
+def _check_part(layout: MatrixLayout, index: int, n_bytes: int) -> None:
+    if not 0 <= index < layout.n_chunks:
+        raise WireError(f"range: chunk {index}, expected 0 to {layout.n_chunks - 1}")
+    if n_bytes != layout.size_of(index):
+        raise WireError(
+            f"range: chunk {index} has {n_bytes} bytes, expected {layout.size_of(index)}"
+        )

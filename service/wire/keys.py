@@ -1,0 +1,184 @@
+"""Names on the wire: key expressions, ids and encodings."""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+
+from service.errors import WireError
+
+ID_PATTERN = re.compile(r"[A-Za-z0-9._-]{1,64}")
+RESERVED_IDS = frozenset({"ack", "current"})
+
+
+def checked_id(value: object, where: str) -> str:
+    """Return ``value`` if it is an id, so that it may become part of a key or a file name.
+
+    Raises
+    ------
+    WireError
+        If it is not 1 to 64 of ``A-Z a-z 0-9 . _ -``, or is a reserved word.
+    """
+    if not isinstance(value, str) or ID_PATTERN.fullmatch(value) is None:
+        raise WireError(f"id: {value!r:.80} in {where}, expected 1 to 64 of A-Z a-z 0-9 . _ -")
+    if value in RESERVED_IDS:
+        raise WireError(f"id: {value!r} in {where} is reserved")
+    return value
+
+
+class Role(StrEnum):
+    """Who holds a liveliness token."""
+
+    RTC = "rtc"
+    SERVICE = "service"
+
+
+class Encodings(StrEnum):
+    """Informative zenoh encodings of what travels."""
+
+    FRAMES = "application/octet-stream;ao.v1.frames"
+    BYTES = "application/octet-stream"
+    STATUS = "application/msgpack;ao.v1.status"
+    COMMIT = "application/msgpack;ao.v1.commit"
+    ACKNOWLEDGEMENT = "application/msgpack;ao.v1.ack"
+    COMMAND = "application/msgpack;ao.v1.command"
+    REPLY = "application/msgpack;ao.v1.reply"
+    MEASURED_COMMIT = "application/msgpack;ao.v1.im-commit"
+    STATE = "application/msgpack;ao.v1.state"
+    ALARM = "application/msgpack;ao.v1.alarm"
+
+
+class Keys:
+    """Key expressions of one system, all below ``ao/v1/{system}``."""
+
+    __slots__ = ("root", "system")
+
+    def __init__(self, system: str) -> None:
+        self.system = checked_id(system, "the name of the system")
+        self.root = f"ao/v1/{system}"
+
+    @property
+    def frames(self) -> str:
+        """Telemetry frames."""
+        return f"{self.root}/tel/frames"
+
+    @property
+    def status(self) -> str:
+        """Status messages of the RTC."""
+        return f"{self.root}/tel/status"
+
+    def chunk(self, matrix_id: str, index: int) -> str:
+        """Part ``index`` of a reconstructor."""
+        return f"{self.matrix(matrix_id)}/chunk/{index}"
+
+    def commit(self, matrix_id: str) -> str:
+        """Manifest of a reconstructor: the order to stage and swap."""
+        return f"{self.matrix(matrix_id)}/commit"
+
+    def matrix(self, matrix_id: str) -> str:
+        """Queryable of one reconstructor: its manifest, or with ``?chunk=k`` its bytes."""
+        return f"{self.root}/cm/{checked_id(matrix_id, 'a matrix key')}"
+
+    @property
+    def all_matrices(self) -> str:
+        """Every :meth:`matrix`, and :attr:`current`."""
+        return f"{self.root}/cm/*"
+
+    @property
+    def all_chunks(self) -> str:
+        """Every :meth:`chunk`."""
+        return f"{self.root}/cm/*/chunk/*"
+
+    @property
+    def all_commits(self) -> str:
+        """Every :meth:`commit`."""
+        return f"{self.root}/cm/*/commit"
+
+    @property
+    def current(self) -> str:
+        """Queryable: the manifest of the reconstructor the RTC should be using."""
+        return f"{self.root}/cm/current"
+
+    @property
+    def acknowledgement(self) -> str:
+        """Acknowledgements of reconstructors."""
+        return f"{self.root}/cm/ack"
+
+    @property
+    def applied(self) -> str:
+        """Queryable of the RTC: the matrix in use."""
+        return f"{self.root}/rtc/cm/applied"
+
+    def command(self, kind: str) -> str:
+        """Queryable of the RTC: commands of this :class:`~service.wire.CommandKind`."""
+        return f"{self.root}/cmd/rtc/{kind}"
+
+    def measured_chunk(self, matrix_id: str, index: int) -> str:
+        """Part ``index`` of a measured interaction matrix."""
+        return f"{self.root}/im/{checked_id(matrix_id, 'a matrix key')}/chunk/{index}"
+
+    def measured_commit(self, matrix_id: str) -> str:
+        """Manifest of a measured interaction matrix."""
+        return f"{self.root}/im/{checked_id(matrix_id, 'a matrix key')}/commit"
+
+    @property
+    def all_measured(self) -> str:
+        """Every :meth:`measured_chunk` and :meth:`measured_commit`."""
+        return f"{self.root}/im/**"
+
+    @property
+    def state(self) -> str:
+        """What the service knows, for whoever listens."""
+        return f"{self.root}/state"
+
+    @property
+    def alarm(self) -> str:
+        """Alarms of the service, for whoever listens."""
+        return f"{self.root}/alarm"
+
+    def alive(self, role: Role) -> str:
+        """Liveliness token of one side."""
+        return f"{self.root}/alive/{role}"
+
+    def matrix_id_of(self, key: str) -> str:
+        """Return the id in a key of a matrix, a chunk or a commit (``cm`` and ``im`` alike).
+
+        Raises
+        ------
+        WireError
+            If the key is none of these or its id is not one.
+        """
+        return checked_id(self._parts(key)[0], key)
+
+    def chunk_index_of(self, key: str) -> int | None:
+        """Return k of ``.../chunk/{k}``, None for any other key of a matrix.
+
+        Raises
+        ------
+        WireError
+            If k is not a number from 0 on.
+        """
+        parts = self._parts(key)
+        if len(parts) != 3 or parts[1] != "chunk":
+            return None
+        return chunk_index(parts[2], key)
+
+    def _parts(self, key: str) -> list[str]:
+        for branch in ("cm", "im"):
+            prefix = f"{self.root}/{branch}/"
+            if key.startswith(prefix):
+                return key.removeprefix(prefix).split("/")
+        raise WireError(f"id: {key!r:.120} is no key of a matrix of {self.root}")
+
+
+def chunk_index(text: str, where: str) -> int:
+    """Return the chunk number written in a key or a query.
+
+    Raises
+    ------
+    WireError
+        If ``text`` is not a plain decimal number of at most 6 digits.
+    """
+    if not (text.isascii() and text.isdigit() and len(text) <= 6):
+        raise WireError(f"range: chunk {text!r:.40} in {where}, expected a number from 0 on")
+    return int(text)

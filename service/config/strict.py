@@ -109,6 +109,8 @@ def _line(schema: type[Table], problem: ErrorDetails, place: Place) -> str:
         return f"{where}: found {problem['input']!r}, expected a table [{'.'.join(key)}]"
     if kind == "string_pattern_mismatch":
         message = f"text that matches {problem['ctx']['pattern']}"
+    elif kind == "tuple_type":
+        message = "an array"
     return f"{where}: found {problem['input']!r}, expected {message.removeprefix(_EXPECTED)}"
 
 

@@ -61,7 +61,7 @@ class FftPyramid:
             intensity += np.abs(to_y @ (focus * mask) @ to_x.T) ** 2
         n, nd = self.n_subapertures, self.n_nodes
         nodes = intensity.reshape(2, n, nd, 2, n, nd) / self.n_modulation
-        return np.einsum("iyaJxb,a,b->iyJx", nodes, weights, weights)
+        return np.asarray(np.einsum("iyaJxb,a,b->iyJx", nodes, weights, weights))
 
     def slopes(
         self,
@@ -74,7 +74,7 @@ class FftPyramid:
         flux = images.sum(axis=(0, 2))[valid].mean()
         across_x = (images[:, :, 0] - images[:, :, 1]).sum(axis=0)
         across_y = (images[0] - images[1]).sum(axis=1)
-        return np.concatenate([across_x[valid], across_y[valid]]) / flux
+        return np.asarray(np.concatenate([across_x[valid], across_y[valid]]) / flux)
 
     def jacobian(
         self,
@@ -102,7 +102,8 @@ class FftPyramid:
 
     @property
     def _frequencies(self) -> NDArray[np.float64]:
-        return np.fft.fftfreq(self.sampling * self.padded_subap, d=1 / self.sampling)
+        n = self.sampling * self.padded_subap
+        return np.fft.fftfreq(n, d=1 / self.sampling).astype(np.float64)
 
     def _pyramid_mask(self) -> NDArray[np.complex128]:
         """Each face tilts the light of its quadrant, half the image separation in x and in y."""
@@ -125,4 +126,5 @@ class FftPyramid:
         x = (side[:, None, None] + centre[:, None] + nodes / 2 - shift).ravel()
         nu = self._frequencies
         start = self.coordinates[0]  # the transform takes the first pupil point for the origin
-        return np.exp(2j * np.pi * np.outer(x - start, nu)) / len(nu), weights / 2
+        transform = np.exp(2j * np.pi * np.outer(x - start, nu)) / len(nu)
+        return transform.astype(np.complex128), weights / 2

@@ -12,7 +12,11 @@ from service.model.modes import ModalBasis, karhunen_loeve_basis
 from tests.physics.fft_pyramid import FftPyramid
 
 AGREEMENT = 0.003
-"""Relative Frobenius norm of the difference: the FFT's images wrap around at 160 subapertures."""
+"""Relative Frobenius norm of the difference when the reference is padded to 160 subapertures.
+
+Nearly all of it is light that leaves the reference's detector plane on one side and comes back on
+the other: 0.22 % at 160 subapertures, 0.06 % at 320, 0.03 % at 480.
+"""
 
 MODES = [0, 1, 2, 3, 5, 8, 12, 18, 25, 35, 50, 75, 110, 160, 230, 300, 400, 501, 550, 593]
 """Twenty modes from the tilts to the last one."""
@@ -32,7 +36,9 @@ def basis() -> ModalBasis:
     return karhunen_loeve_basis(load_instrument("flao-lbt"))
 
 
-def optics(basis: ModalBasis, sampling: int, n_nodes: int) -> tuple[InteractionModel, FftPyramid]:
+def optics(
+    basis: ModalBasis, sampling: int, n_nodes: int, padded_subap: int = 160
+) -> tuple[InteractionModel, FftPyramid]:
     """The model and the reference with the same sampling, quadrature and modulation."""
     instrument = load_instrument("flao-lbt")
     model = InteractionModel(
@@ -45,37 +51,50 @@ def optics(basis: ModalBasis, sampling: int, n_nodes: int) -> tuple[InteractionM
         n_subapertures=instrument.wfs.n_subapertures,
         n_modulation=28,
         n_nodes=n_nodes,
+        padded_subap=padded_subap,
     )
     return model, reference
 
 
-def moved_modes(basis: ModalBasis, reference: FftPyramid, alpha: Misregistration) -> np.ndarray:
+def moved_modes(
+    basis: ModalBasis, reference: FftPyramid, alpha: Misregistration, modes: list[int]
+) -> np.ndarray:
     """OPD maps ``(n_maps, n, n)`` of the mirror turned and scaled about the pupil centre."""
     u = reference.coordinates
     x, y = (axis.ravel() for axis in np.meshgrid(u, u))
     cosine, sine = np.cos(alpha.rotation_rad), np.sin(alpha.rotation_rad)
     on_mirror = np.column_stack([cosine * x + sine * y, cosine * y - sine * x])
-    maps = basis.render(on_mirror / alpha.magnification)[:, MODES]
-    return maps.T.reshape(len(MODES), len(u), len(u))
+    maps = basis.render(on_mirror / alpha.magnification)[:, modes]
+    return maps.T.reshape(len(modes), len(u), len(u))
 
 
-def disagreement(basis: ModalBasis, sampling: int, n_nodes: int, alpha: Misregistration) -> float:
-    model, reference = optics(basis, sampling, n_nodes)
-    maps = moved_modes(basis, reference, alpha)
+def disagreement(
+    model: InteractionModel,
+    reference: FftPyramid,
+    alpha: Misregistration,
+    modes: list[int] = MODES,
+) -> float:
+    maps = moved_modes(model.basis, reference, alpha, modes)
     expected = reference.jacobian(maps, model.valid, (alpha.shift_x_subap, alpha.shift_y_subap))
-    found = model.interaction_matrix(alpha)[:, MODES]
+    found = model.interaction_matrix(alpha)[:, modes]
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
 @pytest.mark.parametrize("alpha", REGISTRATIONS.values(), ids=REGISTRATIONS)
 def test_interaction_matrix_agrees_with_the_fft_pyramid(basis, alpha):
-    assert disagreement(basis, 2, 2, alpha) <= AGREEMENT
+    assert disagreement(*optics(basis, 2, 2), alpha) <= AGREEMENT
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("alpha", REGISTRATIONS.values(), ids=REGISTRATIONS)
 def test_agreement_holds_at_the_sampling_of_the_service(basis, alpha):
-    assert disagreement(basis, 3, 3, alpha) <= AGREEMENT
+    assert disagreement(*optics(basis, 3, 3), alpha) <= AGREEMENT
+
+
+def test_most_of_the_disagreement_goes_away_when_the_reference_is_padded_more(basis):
+    alpha = REGISTRATIONS["everything at once"]
+    near, far = (disagreement(*optics(basis, 2, 2, w), alpha, MODES[::6]) for w in (160, 320))
+    assert far <= near / 3
 
 
 def test_a_wavefront_rising_along_an_axis_gives_positive_mean_slopes_on_that_axis_only(basis):

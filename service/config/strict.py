@@ -6,7 +6,7 @@ import difflib
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, StringConstraints, ValidationError
 from pydantic_core import ErrorDetails
@@ -117,8 +117,9 @@ def _line(schema: type[Table], problem: ErrorDetails, place: Place) -> str:
 def _known_keys(schema: type[Table], key: tuple[str, ...]) -> Iterable[str]:
     fields = schema.model_fields
     for part in key:
-        inner = fields[part].annotation if part in fields else None
-        if not (isinstance(inner, type) and issubclass(inner, Table)):
-            break
-        fields = inner.model_fields
+        annotation = fields[part].annotation
+        alternatives = (annotation, *get_args(annotation))
+        fields = next(
+            a.model_fields for a in alternatives if isinstance(a, type) and issubclass(a, Table)
+        )
     return fields

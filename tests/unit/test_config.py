@@ -207,6 +207,10 @@ def test_values_that_ask_for_nothing_new_are_accepted(write):
             "modes.n_modes: found 594, expected at most 96: 97 actuators make 96 modes",
         ),
         (ABOUT + WFS + '[mirror]\nlayout = "positions"\n', "mirror.positions: missing"),
+        (
+            ABOUT + WFS + MIRROR + "[slopes]\norientation = { flip_z = true }\n",
+            "slopes.orientation.flip_z: unknown key, did you mean flip_",
+        ),
         ("[instrument\n", "not valid TOML"),
     ],
 )

@@ -1,0 +1,26 @@
+ARG BASE=python:3.12-slim
+FROM ${BASE}
+
+WORKDIR /opt/pyrcal
+COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY service service
+COPY sim_rtc sim_rtc
+RUN pip install --no-cache-dir -c constraints.txt . \
+    && useradd --system --create-home --home-dir /var/lib/pyrcal pyrcal
+
+# Inside a container loopback reaches nobody: listen on all its interfaces and publish what you want.
+ENV PYRCAL_API__HOST=0.0.0.0 \
+    PYRCAL_API__PORT=8080 \
+    PYRCAL_ZENOH__LISTEN='["tcp/0.0.0.0:7447"]' \
+    PYRCAL_SERVICE__DATA_DIR=/var/lib/pyrcal
+
+USER pyrcal
+WORKDIR /var/lib/pyrcal
+VOLUME /var/lib/pyrcal
+EXPOSE 8080 7447
+
+HEALTHCHECK --interval=10s --timeout=3s --start-period=60s \
+    CMD ["python", "-c", "import os, urllib.request as u; u.urlopen(f\"http://127.0.0.1:{os.environ['PYRCAL_API__PORT']}/healthz\", timeout=2)"]
+
+ENTRYPOINT ["pyrcal"]
+CMD ["run"]

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.stability import pole_radius
+from service.model.interaction import Linearisation
+from service.model.misregistration import Misregistration
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateVerdict:
@@ -26,3 +33,78 @@ class GateVerdict:
 
     reason: str
     """What the operator should know, and do when it was refused."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopSettings:
+    """The loop a reconstructor would run in."""
+
+    gains: NDArray[np.float64]
+    """``(n_controlled,)`` integrator gain of each mode the reconstructor commands."""
+
+    leak: float
+    delay_frames: float
+    optical_gain: float = 1.0
+    """How much of the model's response the sensor shows, 0..1; 1 is the cautious choice."""
+
+
+def judge(
+    reconstructor: NDArray[np.float32],
+    linearisation: Linearisation,
+    registration: Misregistration,
+    covariance: NDArray[np.float64],
+    loop: LoopSettings,
+    *,
+    bound: float,
+) -> GateVerdict:
+    """Return whether the loop would hold everywhere within α ± 3σ.
+
+    Tries the estimate and the eight ends of the axes of its 3σ ellipsoid; ``covariance``
+    ``(4, 4)`` includes the model-error floor. The bound is never tighter than half-way between
+    the aligned loop and the edge of stability, or a slow loop could never be served at all.
+    """
+    n = len(reconstructor)
+    centre = reconstructor @ linearisation.matrix_at(registration)[:, :n]
+    slopes = [reconstructor @ derivative[:, :n] for derivative in linearisation.derivatives]
+    gains = (loop.gains * loop.optical_gain).astype(np.float32)
+    radii = []
+    for step in _ellipsoid_ends(covariance):
+        moved = centre + np.tensordot(step.astype(np.float32), np.array(slopes), axes=1)
+        eigenvalues = np.linalg.eigvals(gains[:, None] * moved)
+        radii.append(pole_radius(eigenvalues, leak=loop.leak, delay_frames=loop.delay_frames).max())
+    aligned = float(pole_radius(gains, leak=loop.leak, delay_frames=loop.delay_frames).max())
+    return _verdict(float(max(radii)), aligned, max(bound, (1.0 + aligned) / 2), len(radii))
+
+
+def _ellipsoid_ends(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the centre and the ends of the 3σ axes, ``(9, 4)``.
+
+    The axes are those of the correlation matrix, so that units play no part.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    power, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    ends = 3.0 * (axes * np.sqrt(np.maximum(power, 0.0))).T * sigma
+    return np.vstack([np.zeros(len(sigma)), ends, -ends])
+
+
+def _verdict(worst: float, aligned: float, bound: float, n_points: int) -> GateVerdict:
+    if worst >= 1.0:
+        reason = (
+            f"unstable: worst pole radius {worst:.3f} within 3 sigma; use fewer modes, a lower "
+            "gain, or dither longer for a smaller sigma"
+        )
+    elif worst > bound:
+        reason = (
+            f"too little margin: worst pole radius {worst:.3f}, bound {bound:.3f}; use fewer "
+            "modes, a lower gain, or dither longer for a smaller sigma"
+        )
+    else:
+        reason = f"stable: worst pole radius {worst:.3f}, aligned {aligned:.3f}, bound {bound:.3f}"
+    return GateVerdict(
+        accepted=worst <= bound and worst < 1.0,
+        worst_pole_radius=worst,
+        aligned_pole_radius=aligned,
+        bound=bound,
+        n_points=n_points,
+        reason=reason,
+    )

@@ -1,0 +1,259 @@
+"""Streaming demodulation of telemetry at the dither's frequencies and beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.estimation.frames import FrameBlock
+
+Array = NDArray[Any]
+
+SIDE_OFFSETS_HZ = np.concatenate([np.arange(-20.0, -2.0), np.arange(3.0, 21.0)])
+"""Where the noise is measured, relative to each dither line: 36 bins; 6 were too few."""
+
+MAX_MISSING_FRACTION = 0.05
+"""A window with more frames missing than this is refused."""
+
+MIN_AMPLITUDE_RATIO = 0.5
+"""A dither weaker than this share of its request was not applied as asked."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LockInPlan:
+    """What is demodulated: one sinusoid on each of a few modes."""
+
+    modes: tuple[int, ...]
+    """0-based basis indices."""
+
+    frequencies_hz: tuple[float, ...]
+    """One for each mode."""
+
+    amplitude_m: tuple[float, ...]
+    """RMS of each sinusoid, metres OPD."""
+
+    frame_rate_hz: float
+    n_frames: int
+    """Length of a window: an integer number of periods of every frequency."""
+
+    first_seq: int
+    """No window starts before this frame: the dither is on and the loop has settled."""
+
+    def __post_init__(self) -> None:
+        """Refuse a plan whose lines or side bins would leave the spectrum or be cut short.
+
+        Raises
+        ------
+        ModelError
+            If the lists differ in length, a frequency leaves (20 Hz, Nyquist - 20 Hz), two lines
+            lie within 4 bins of one another, or the window cuts a period.
+        """
+        lines = np.array(self.frequencies_hz)
+        edge = SIDE_OFFSETS_HZ.max()
+        if not len(self.modes) == len(lines) == len(self.amplitude_m) > 0:
+            raise ModelError("lock-in: modes, frequencies and amplitudes differ in length")
+        if lines.min() <= edge or lines.max() >= self.frame_rate_hz / 2 - edge:
+            raise ModelError(
+                f"lock-in: found lines at {lines.min()} to {lines.max()} Hz; expected between "
+                f"{edge} and {self.frame_rate_hz / 2 - edge} Hz, room for the side bins"
+            )
+        periods = lines * self.n_frames / self.frame_rate_hz
+        if np.abs(periods - np.round(periods)).max() > 1e-6:
+            raise ModelError(
+                f"lock-in: {self.n_frames} frames cut a period; expected whole periods of {lines} Hz"
+            )
+        gaps = np.diff(np.sort(lines)) * self.n_frames / self.frame_rate_hz
+        if gaps.size and gaps.min() < 4:
+            raise ModelError(f"lock-in: lines {lines} Hz closer than 4 bins in one window")
+
+    @property
+    def bins_hz(self) -> NDArray[np.float64]:
+        """``(n_lines, 1 + n_side)`` frequencies: each line, then its side bins."""
+        lines = np.array(self.frequencies_hz)[:, None]
+        return np.hstack([lines, lines + SIDE_OFFSETS_HZ])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Spectra:
+    """One window of telemetry at the plan's bins: sums of ``h_k x_k exp(-i w k)``, Hann h."""
+
+    plan: LockInPlan
+    session: str
+    cm_id: str | None
+    first_seq: int
+    t_end_ns_utc: int
+    """End of exposure of the last frame."""
+
+    n_missing: int
+    """Frames that never came; they count as zeros, which the side bins notice."""
+
+    slopes: NDArray[np.complex64]
+    """``(n_lines, 1 + n_side, n_slopes)``."""
+
+    commands: NDArray[np.complex64]
+    """``(n_lines, 1 + n_side, n_modes)`` total command on the mirror, metres."""
+
+    dither: NDArray[np.complex64]
+    """``(n_lines, n_modes)`` its known dither part at the lines, metres."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowRefused:
+    """A window that gave no estimate."""
+
+    reason: str
+    """What was found, and what to do about it."""
+
+    t_ns_utc: int
+    """When it was given up."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LockIn:
+    """Windows under way: feed it blocks with ``accumulate``."""
+
+    plan: LockInPlan
+    window: _Window | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Window:
+    session: str
+    cm_id: str | None
+    first_seq: int
+    next_seq: int
+    n_missing: int
+    next_t_ns: int
+    slopes: Array
+    commands: Array
+    dither: Array
+
+
+def accumulate(lock_in: LockIn, block: FrameBlock) -> tuple[LockIn, list[Spectra | WindowRefused]]:
+    """Add a block of frames; return the new state and the windows that ended in it."""
+    ended: list[Spectra | WindowRefused] = []
+    done = 0
+    while done < block.n_frames:
+        lock_in, used, outcome = _advance(lock_in, block, done)
+        done += used
+        if outcome is not None:
+            ended.append(outcome)
+    return lock_in, ended
+
+
+def _advance(
+    lock_in: LockIn, block: FrameBlock, start: int
+) -> tuple[LockIn, int, Spectra | WindowRefused | None]:
+    """Consume rows of the block from ``start``: into the open window, or up to the next one."""
+    plan, window = lock_in.plan, lock_in.window
+    seq = block.first_seq + start
+    if window is None:
+        if seq < plan.first_seq:
+            return lock_in, min(plan.first_seq - seq, block.n_frames - start), None
+        window = _open(plan, block, start)
+    reason = _why_broken(plan, window, block, start)
+    if reason is not None:
+        refused = WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
+        return replace(lock_in, window=None), 0, refused
+    end_seq = window.first_seq + plan.n_frames
+    stop = min(block.n_frames, end_seq - block.first_seq)
+    rows = slice(start, max(stop, start))
+    window = _add(plan, window, block, rows)
+    if window.next_seq < end_seq:
+        return replace(lock_in, window=window), rows.stop - rows.start, None
+    return replace(lock_in, window=None), rows.stop - rows.start, _close(plan, window)
+
+
+def _open(plan: LockInPlan, block: FrameBlock, start: int) -> _Window:
+    shape = plan.bins_hz.shape
+    return _Window(
+        session=block.session,
+        cm_id=block.cm_id,
+        first_seq=block.first_seq + start,
+        next_seq=block.first_seq + start,
+        n_missing=0,
+        next_t_ns=block.t0_ns_utc + start * block.dt_ns,
+        slopes=np.zeros((*shape, block.slopes.shape[1]), np.complex64),
+        commands=np.zeros((*shape, block.commands_m.shape[1]), np.complex64),
+        dither=np.zeros((shape[0], block.commands_m.shape[1]), np.complex64),
+    )
+
+
+def _why_broken(plan: LockInPlan, window: _Window, block: FrameBlock, start: int) -> str | None:
+    """Return why the open window cannot take this block, or None."""
+    seq = block.first_seq + start
+    expected_ns = window.next_t_ns + (seq - window.next_seq) * block.dt_ns
+    if block.session != window.session:
+        return "the RTC started a new session inside the window"
+    if block.cm_id != window.cm_id:
+        return f"the reconstructor changed inside the window: {window.cm_id} -> {block.cm_id}"
+    if block.dither_m is None:
+        return "the dither ended inside the window"
+    if abs(block.t0_ns_utc + start * block.dt_ns - expected_ns) > block.dt_ns / 2:
+        return "the RTC's clock stepped or it paused inside the window"
+    missing = window.n_missing + min(seq, window.first_seq + plan.n_frames) - window.next_seq
+    if missing > MAX_MISSING_FRACTION * plan.n_frames:
+        return (
+            f"{missing} of {plan.n_frames} frames missing, more than "
+            f"{MAX_MISSING_FRACTION:.0%}: check the link to the RTC"
+        )
+    return None
+
+
+def _add(plan: LockInPlan, window: _Window, block: FrameBlock, rows: slice) -> _Window:
+    n_rows = rows.stop - rows.start
+    seq = block.first_seq + rows.start
+    if n_rows == 0:
+        return replace(window, next_seq=window.first_seq + plan.n_frames)
+    index = np.arange(n_rows) + (seq - window.first_seq)
+    hann = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / plan.n_frames)
+    turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, index)
+    phasors = (hann * np.exp(-2j * np.pi * turns)).astype(np.complex64)
+    lines = phasors.reshape(*plan.bins_hz.shape, n_rows)[:, 0]
+    dither = block.dither_m
+    assert_dither = dither[rows] if dither is not None else np.zeros((n_rows, 1), np.float32)
+    shape = plan.bins_hz.shape
+    return replace(
+        window,
+        next_seq=seq + n_rows,
+        n_missing=window.n_missing + seq - window.next_seq,
+        next_t_ns=block.t0_ns_utc + rows.stop * block.dt_ns,
+        slopes=window.slopes + _project(phasors, block.slopes[rows]).reshape(*shape, -1),
+        commands=window.commands + _project(phasors, block.commands_m[rows]).reshape(*shape, -1),
+        dither=window.dither + _project(lines, assert_dither),
+    )
+
+
+def _project(phasors: Array, columns: Array) -> Array:
+    """Return ``phasors @ columns`` for real columns, as two real products."""
+    return np.asarray(phasors.real @ columns + 1j * (phasors.imag @ columns))
+
+
+def _close(plan: LockInPlan, window: _Window) -> Spectra | WindowRefused:
+    """Return the finished window, or why its dither is not the one asked for."""
+    weight = 0.5 * plan.n_frames / np.sqrt(2.0)
+    applied = np.abs(window.dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
+    ratio = applied / np.array(plan.amplitude_m)
+    if ratio.min() < MIN_AMPLITUDE_RATIO:
+        weakest = int(ratio.argmin())
+        return WindowRefused(
+            reason=f"mode {plan.modes[weakest]} carries {applied[weakest] * 1e9:.2f} nm of dither "
+            f"at {plan.frequencies_hz[weakest]} Hz, {plan.amplitude_m[weakest] * 1e9:.2f} nm were "
+            "asked for: see whether the RTC clips it",
+            t_ns_utc=window.next_t_ns,
+        )
+    return Spectra(
+        plan=plan,
+        session=window.session,
+        cm_id=window.cm_id,
+        first_seq=window.first_seq,
+        t_end_ns_utc=window.next_t_ns,
+        n_missing=window.n_missing,
+        slopes=window.slopes,
+        commands=window.commands,
+        dither=window.dither,
+    )

@@ -1,0 +1,145 @@
+"""The watchdog: registration from ordinary telemetry, without a dither.
+
+First differences of slopes and commands of the same frame give a noisy interaction matrix. It is
+a measurement to fit a model to, never a matrix to control with. Differencing once is the most a
+two-frame delay allows: more lets slope noise re-enter through the loop. Frozen flow biases the
+shifts by 1.6 % of a subaperture at 8 m/s and 16 % at 25 m/s, and no integration removes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.frames import FrameBlock
+from service.model.interaction import Linearisation
+from service.model.misregistration import Misregistration
+
+Array = NDArray[Any]
+
+BIAS_FLOOR = np.array([0.10, 0.10, np.deg2rad(0.05), 0.001])
+"""1 σ nobody may go below without a dither: wind bias for the shifts, measured bias for the rest."""
+
+MIN_FRAMES_PER_MODE = 5
+"""Fewer effective frames leave the command covariance too noisy to invert."""
+
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Passive:
+    """Forgetting sums over first differences: feed it blocks with ``accumulate``."""
+
+    n_modes: int
+    """Controlled modes: the only ones that move by themselves."""
+
+    memory_frames: float
+    """Frames after which a sample's weight has fallen to 1/e."""
+
+    command_power: NDArray[np.float32] | None = None
+    """``(n_modes, n_modes)`` sum of dc dc^T, metres²."""
+
+    cross: NDArray[np.float32] | None = None
+    """``(n_slopes, n_modes)`` sum of ds dc^T, metres."""
+
+    slope_power: float = 0.0
+    """Sum of |ds|²."""
+
+    n_effective: float = 0.0
+    """Frames in the sums, forgetting included."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PassiveEstimate:
+    """What ordinary telemetry says of the registration."""
+
+    alpha: Misregistration
+    sigma: NDArray[np.float64]
+    """``(4,)`` numeric units, never below ``BIAS_FLOOR``."""
+
+    gains: NDArray[np.float64]
+    """``(n_modes,)`` free gain of each mode against the model."""
+
+    step: NDArray[np.float64]
+    """``(4,)`` distance from the linearisation."""
+
+
+def accumulate(state: Passive, block: FrameBlock) -> Passive:
+    """Add a block of frames; no difference spans two blocks."""
+    if block.n_frames < 2:
+        return state
+    commands = np.diff(block.commands_m[:, : state.n_modes], axis=0)
+    slopes = np.diff(block.slopes, axis=0)
+    n = len(commands)
+    fade = float(np.exp(-n / state.memory_frames))
+    power, cross = commands.T @ commands, slopes.T @ commands
+    if state.command_power is not None and state.cross is not None:
+        power += np.float32(fade) * state.command_power
+        cross += np.float32(fade) * state.cross
+    return replace(
+        state,
+        command_power=power,
+        cross=cross,
+        slope_power=fade * state.slope_power + float(np.vdot(slopes, slopes)),
+        n_effective=fade * state.n_effective + n,
+    )
+
+
+def interaction_matrix(state: Passive) -> Array | None:
+    """Return the noisy interaction matrix ``(n_slopes, n_modes)``, or None when too young."""
+    if state.command_power is None or state.cross is None:
+        return None
+    if state.n_effective < MIN_FRAMES_PER_MODE * state.n_modes:
+        return None
+    power = state.command_power.astype(np.float64)
+    power += np.diag(_RIDGE * np.diag(power))
+    return np.asarray(np.linalg.solve(power, state.cross.T.astype(np.float64)).T)
+
+
+def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
+    """Fit α and a free gain per mode to the noisy matrix; None when too few frames came.
+
+    Variable projection (Kaufman 1975): ``g_j = D_j.Y_j / D_j.D_j``,
+    ``J_jk = g_j (I - P_j) dD_j/dα_k``, each mode weighted by its noise.
+    """
+    measured = interaction_matrix(state)
+    if measured is None:
+        return None
+    weight = _column_weights(state, measured)
+    modes = slice(0, state.n_modes)
+    matrix = linearisation.matrix[:, modes].astype(np.float64)
+    norm = np.einsum("sm,sm->m", matrix, matrix)
+    gains = np.einsum("sm,sm->m", matrix, measured) / norm
+    residual = measured - gains * matrix
+    jacobian = []
+    for derivative in linearisation.derivatives[:, :, modes].astype(np.float64):
+        along = np.einsum("sm,sm->m", matrix, derivative) / norm
+        jacobian.append(gains * (derivative - along * matrix))
+    flat = np.array([(j * np.sqrt(weight)).ravel() for j in jacobian])
+    target = (residual * np.sqrt(weight)).ravel()
+    normal = flat @ flat.T
+    step = np.linalg.solve(normal, flat @ target)
+    left = target - step @ flat
+    scatter = np.linalg.inv(normal) * (left @ left) / (left.size - state.n_modes - 4)
+    return PassiveEstimate(
+        alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
+        sigma=np.sqrt(np.diag(scatter) + BIAS_FLOOR**2),
+        gains=gains,
+        step=step,
+    )
+
+
+def _column_weights(state: Passive, measured: Array) -> Array:
+    """Return ``(n_modes,)`` inverse noise variance of each column of the noisy matrix, scaled.
+
+    The residual slopes are as noisy for every column, so a column's noise is what the inverse of
+    the command covariance makes of it.
+    """
+    power = np.asarray(state.command_power, dtype=np.float64)
+    power = power + np.diag(_RIDGE * np.diag(power))
+    noise = np.diag(np.linalg.inv(power))
+    scale = np.mean(np.einsum("sm,sm->m", measured, measured)) * noise
+    return np.asarray(1.0 / scale)

@@ -32,8 +32,9 @@ from service.wire.commands import (
     encode_command,
     encode_reply,
 )
-from service.wire.fields import VERSION
+from service.wire.fields import MESSAGE_LIMIT, VERSION
 from service.wire.frames import (
+    ATTACHMENT_LIMIT,
     BATCH_LIMIT,
     FRAMES_PER_BATCH,
     FrameBatch,
@@ -41,7 +42,7 @@ from service.wire.frames import (
     decode_frames,
     encode_frames,
 )
-from service.wire.keys import Encodings, Keys, Role, checked_id
+from service.wire.keys import Encodings, Keys, Role, checked_id, chunk_index
 from service.wire.manifests import (
     Manifest,
     MeasuredManifest,
@@ -68,9 +69,11 @@ from service.wire.status import (
 )
 
 __all__ = [
+    "ATTACHMENT_LIMIT",
     "BATCH_LIMIT",
     "CHUNK_LIMIT",
     "FRAMES_PER_BATCH",
+    "MESSAGE_LIMIT",
     "VERSION",
     "AckState",
     "Acknowledgement",
@@ -99,6 +102,7 @@ __all__ = [
     "Status",
     "checked_id",
     "checksum",
+    "chunk_index",
     "command_id",
     "command_kind",
     "decode_acknowledgement",

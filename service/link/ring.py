@@ -1,0 +1,194 @@
+"""The last seconds of one session's telemetry, each frame in its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.frames import FrameBlock
+from service.wire import FrameBatch, FrameHeader
+
+MISSING: Final = 0
+HELD: Final = 1
+VOID: Final = 2
+
+
+@dataclass(slots=True)
+class FrameCounts:
+    """What has become of the frames of all sessions so far."""
+
+    received: int = 0
+    """Frames stored, recovered ones included."""
+
+    lost: int = 0
+    """Sequence numbers that have not come (yet): a recovered frame is taken off again."""
+
+    recovered: int = 0
+    """Frames that came after later ones and still found their place."""
+
+    duplicate: int = 0
+    late: int = 0
+    """Frames that came when their place had been passed; they stay among the lost."""
+
+    nonfinite: int = 0
+    overwritten: int = 0
+    """Frames nobody drained in time, or that a new session made void."""
+
+
+class FrameRing:
+    """Frames by sequence number modulo the capacity; not thread-safe.
+
+    The reader's cursor and the head (one past the newest frame) bound what is undelivered.
+    A place between them is held, missing (it may still come) or void (it came, with a number
+    that is not finite).
+    """
+
+    def __init__(self, header: FrameHeader, capacity: int, counts: FrameCounts) -> None:
+        """Allocate the ring.
+
+        Parameters
+        ----------
+        header
+            Of the first batch: gives session, sizes and the first sequence number.
+        capacity
+            Frames kept.
+        counts
+            Where to count; outlives the ring.
+        """
+        self.session = header.session
+        self.n_slopes = header.n_slopes
+        self.n_modes = header.n_modes
+        self._counts = counts
+        self._capacity = capacity
+        self._cursor = self._head = header.seq0
+        self._slopes = np.empty((capacity, header.n_slopes), np.float32)
+        self._commands = np.empty((capacity, header.n_modes), np.float32)
+        self._dither = np.empty((capacity, header.n_modes), np.float32)
+        self._state = np.zeros(capacity, np.int8)
+        self._seq = np.full(capacity, -1, np.int64)
+        self._t_ns = np.zeros(capacity, np.int64)
+        self._dt_ns = np.zeros(capacity, np.int64)
+        self._has_dither = np.zeros(capacity, np.bool_)
+        self._cm_id = np.full(capacity, None, object)
+        self._noticed_s = np.zeros(capacity)
+
+    def fits(self, header: FrameHeader) -> bool:
+        """Return whether these frames belong here."""
+        sizes = (self.n_slopes, self.n_modes)
+        return self.session == header.session and sizes == (header.n_slopes, header.n_modes)
+
+    @property
+    def undelivered(self) -> int:
+        """Frames held that nobody has drained."""
+        slots = np.arange(self._cursor, self._head) % self._capacity
+        return int(np.count_nonzero(self._state[slots] == HELD))
+
+    def store(self, batch: FrameBatch, now_s: float) -> None:
+        """Put the frames of a batch in their places.
+
+        The first of two frames with the same number wins; a frame that is not finite leaves a
+        place that nothing will fill.
+        """
+        header, counts = batch.header, self._counts
+        seq = np.arange(header.seq0, header.seq0 + header.n)
+        older = int(np.count_nonzero(seq < self._head))
+        self._advance(header.seq0 + header.n, now_s)
+        slots = seq % self._capacity
+        here = self._seq[slots] == seq
+        free = here & (self._state[slots] == MISSING) & (seq >= self._cursor)
+        duplicate = int(np.count_nonzero(here & (self._state[slots] != MISSING)))
+        counts.duplicate += duplicate
+        counts.late += header.n - duplicate - int(np.count_nonzero(free))
+        counts.recovered += int(np.count_nonzero(free[:older]))
+        self._fill(batch, np.flatnonzero(free), slots[free])
+
+    def take(self, now_s: float, patience_s: float, limit: int) -> list[FrameBlock]:
+        """Return copies of at most ``limit`` frames that are due, and pass them.
+
+        Frames behind a missing one are held back until it comes or ``patience_s`` have gone by
+        since it was missed. A hole, a clock step of more than half a period, another
+        reconstructor, period or kind of row begins a new block.
+        """
+        slots = np.arange(self._cursor, min(self._head, self._cursor + limit)) % self._capacity
+        waiting = (self._state[slots] == MISSING) & (now_s - self._noticed_s[slots] < patience_s)
+        if waiting.any():
+            slots = slots[: int(np.argmax(waiting))]
+        blocks = [
+            self._block(slots[start:stop])
+            for start, stop in self._runs(slots)
+            if self._state[slots[start]] == HELD
+        ]
+        self._cursor += len(slots)
+        return blocks
+
+    def due(self, now_s: float, patience_s: float) -> bool:
+        """Return whether the next place can be passed now."""
+        if self._cursor == self._head:
+            return False
+        slot = self._cursor % self._capacity
+        waited_s = now_s - float(self._noticed_s[slot])
+        return self._state[slot] != MISSING or waited_s >= patience_s
+
+    def _advance(self, head: int, now_s: float) -> None:
+        """Move the head, making places that are missing until they are filled."""
+        if head <= self._head:
+            return
+        cursor = max(self._cursor, head - self._capacity)
+        passed = np.arange(self._cursor, min(cursor, self._head)) % self._capacity
+        self._counts.overwritten += int(np.count_nonzero(self._state[passed] == HELD))
+        self._counts.lost += head - self._head
+        self._cursor = cursor
+        seq = np.arange(max(self._head, head - self._capacity), head)
+        slots = seq % self._capacity
+        self._seq[slots] = seq
+        self._state[slots] = MISSING
+        self._noticed_s[slots] = now_s
+        self._head = head
+
+    def _fill(self, batch: FrameBatch, rows: NDArray[np.intp], slots: NDArray[np.int64]) -> None:
+        header = batch.header
+        finite = np.isfinite(batch.rows[rows]).all(axis=1)
+        self._state[slots] = np.where(finite, HELD, VOID)
+        self._counts.lost -= len(rows)
+        self._counts.nonfinite += int(np.count_nonzero(~finite))
+        self._counts.received += int(np.count_nonzero(finite))
+        self._slopes[slots] = batch.slopes[rows]
+        self._commands[slots] = batch.commands_m[rows]
+        dither = batch.dither_m
+        if dither is not None:
+            self._dither[slots] = dither[rows]
+        self._has_dither[slots] = header.dither
+        self._t_ns[slots] = header.t0_ns + rows * header.dt_ns
+        self._dt_ns[slots] = header.dt_ns
+        self._cm_id[slots] = header.cm_id
+
+    def _runs(self, slots: NDArray[np.int64]) -> list[tuple[int, int]]:
+        """Return the bounds of rows that may share a block; runs of missing rows are among them."""
+        if not len(slots):
+            return []
+        held = self._state[slots] == HELD
+        t_ns, dt_ns = self._t_ns[slots], self._dt_ns[slots]
+        cm_id, has_dither = self._cm_id[slots], self._has_dither[slots]
+        step = 2 * np.abs(np.diff(t_ns) - dt_ns[:-1]) > dt_ns[:-1]
+        changed = (dt_ns[1:] != dt_ns[:-1]) | (has_dither[1:] != has_dither[:-1])
+        other_matrix = (cm_id[1:] != cm_id[:-1]).astype(np.bool_)
+        cut = ~(held[1:] & held[:-1]) | step | changed | other_matrix
+        bounds = [0, *(np.flatnonzero(cut) + 1).tolist(), len(slots)]
+        return list(pairwise(bounds))
+
+    def _block(self, slots: NDArray[np.int64]) -> FrameBlock:
+        first = slots[0]
+        return FrameBlock(
+            session=self.session,
+            first_seq=int(self._seq[first]),
+            t0_ns_utc=int(self._t_ns[first]),
+            dt_ns=int(self._dt_ns[first]),
+            slopes=self._slopes[slots],
+            commands_m=self._commands[slots],
+            dither_m=self._dither[slots] if self._has_dither[first] else None,
+            cm_id=self._cm_id[first],
+        )

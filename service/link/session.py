@@ -1,0 +1,191 @@
+"""The only module that touches zenoh: how pyrcal opens, subscribes, serves, asks and puts.
+
+The advanced publisher and subscriber are marked unstable by zenoh; their version is pinned to the
+minor and their use is confined to this page.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import zenoh
+import zenoh.ext
+
+from service.errors import LinkError, WireError
+from service.link.endpoint import Endpoint
+
+HISTORY_S = 0.5
+"""Telemetry asked for when the service comes late: asking for all of an RTC's cache stalled its
+sender for seconds."""
+
+RETRY = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
+"""Back-off of a client that lost its router; zenoh's own is 3 s at the first loss."""
+
+
+def open_session(endpoint: Endpoint) -> zenoh.Session:
+    """Return an open session: the embedded router, or a client of other routers.
+
+    Raises
+    ------
+    LinkError
+        If the port is busy or no router answers.
+    """
+    config = zenoh.Config()
+    client = bool(endpoint.connect)
+    settings: dict[str, object] = {
+        "mode": "client" if client else "router",
+        "listen/endpoints": [] if client else [endpoint.listen],
+        "connect/endpoints": list(endpoint.connect),
+        "connect/retry": RETRY,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "timestamping/enabled": True,
+        "transport/link/tx/lease": round(1000 * endpoint.lease_s),
+        "transport/shared_memory/enabled": False,
+    }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise LinkError(_complaint(endpoint, str(error))) from error
+
+
+def _complaint(endpoint: Endpoint, text: str) -> str:
+    if endpoint.connect:
+        return f"no zenoh router answers at {', '.join(endpoint.connect)}: {text:.160}"
+    if "already in use" in text:
+        return (
+            f"cannot listen on {endpoint.listen}: the address is already in use; stop the other "
+            "program (another pyrcal?) or set another listen endpoint"
+        )
+    return f"cannot listen on {endpoint.listen}: {text:.160}"
+
+
+def subscribe_frames(
+    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None]
+) -> object:
+    """Call ``callback``, on zenoh's own thread, for each batch; missed ones are recovered."""
+    return zenoh.ext.declare_advanced_subscriber(
+        session,
+        key,
+        zenoh.handlers.Callback(callback, indirect=False),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_age=HISTORY_S),
+        recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+    )
+
+
+def subscribe(session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None]) -> object:
+    """Call ``callback``, on a thread of its own, for each message."""
+    return session.declare_subscriber(key, callback)
+
+
+def watch(session: zenoh.Session, key: str, callback: Callable[[bool], None]) -> object:
+    """Call ``callback`` with whether the liveliness token is there, now and at each change."""
+
+    def changed(sample: zenoh.Sample) -> None:
+        callback(sample.kind is zenoh.SampleKind.PUT)
+
+    return session.liveliness().declare_subscriber(key, changed, history=True)
+
+
+def serve(session: zenoh.Session, key: str, callback: Callable[[zenoh.Query], None]) -> object:
+    """Call ``callback``, on a thread of its own, for each query."""
+    return session.declare_queryable(key, callback, complete=True)
+
+
+def announce(session: zenoh.Session, key: str) -> object:
+    """Hold a liveliness token until the session closes."""
+    return session.liveliness().declare_token(key)
+
+
+def last_value(session: zenoh.Session, key: str) -> zenoh.ext.AdvancedPublisher:
+    """Return a publisher whose last message a late subscriber still gets."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        congestion_control=zenoh.CongestionControl.DROP,
+        cache=zenoh.ext.CacheConfig(1),
+    )
+
+
+def put(session: zenoh.Session, key: str, data: bytes, encoding: str, *, urgent: bool) -> None:
+    """Send what must arrive: waits while the link is full.
+
+    Raises
+    ------
+    LinkError
+        If the session is closed.
+    """
+    priority = zenoh.Priority.DATA_HIGH if urgent else zenoh.Priority.DATA_LOW
+    try:
+        session.put(
+            key,
+            data,
+            encoding=encoding,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=priority,
+        )
+    except zenoh.ZError as error:
+        raise LinkError(f"cannot send on {key}: {error!s:.160}") from error
+
+
+def ask(
+    session: zenoh.Session,
+    selector: str,
+    timeout_s: float,
+    payload: bytes | None = None,
+    encoding: str | None = None,
+) -> bytes | None:
+    """Return the first answer to a query, None when there is none in time.
+
+    Raises
+    ------
+    LinkError
+        If the answer is an error, or the session is closed.
+    """
+    try:
+        replies = session.get(
+            selector,
+            payload=payload,
+            encoding=encoding,
+            timeout=timeout_s,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+            text = (
+                ""
+                if reply.err is None
+                else reply.err.payload.to_bytes()[:160].decode(errors="replace")
+            )
+            if text == "Timeout":
+                return None
+            raise LinkError(f"{selector} was refused: {text}")
+    except zenoh.ZError as error:
+        raise LinkError(f"cannot ask {selector}: {error!s:.160}") from error
+    return None
+
+
+def bytes_of(data: zenoh.ZBytes, limit: int, what: str) -> bytes:
+    """Return the bytes of a message.
+
+    Raises
+    ------
+    WireError
+        If it is longer than ``limit``: then it is not read.
+    """
+    if len(data) > limit:
+        raise WireError(f"range: {what} has {len(data)} bytes, expected at most {limit}")
+    return data.to_bytes()
+
+
+def latency_s(session: zenoh.Session, sample: zenoh.Sample, now_ns: int) -> float | None:
+    """Return put-to-now of a message its publisher stamped; a router's own stamp says nothing."""
+    stamp = sample.timestamp
+    if stamp is None or str(stamp.get_id()) == str(session.zid()):
+        return None
+    return (now_ns - stamp.get_time_as_ntp64().as_nanos()) * 1e-9

@@ -1,0 +1,398 @@
+"""The link to the RTC: telemetry in, reconstructors and commands out, over zenoh.
+
+Frames walk one way: zenoh's thread checks them into a bounded ring, ``drain`` hands out copies.
+Everything else that happens waits as an event. Nothing here decides anything: what an event means
+is the tracker's business.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Self, TypeVar
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from service.errors import LinkError, UnknownId, WireError
+from service.estimation.frames import FrameBlock
+from service.link import session as link
+from service.link.endpoint import Endpoint
+from service.link.events import LinkEvent
+from service.link.intake import Intake
+from service.link.measured import MeasuredIntake
+from service.link.outbox import Offer, Outbox
+from service.link.statistics import LinkStatistics
+from service.wire import (
+    ATTACHMENT_LIMIT,
+    BATCH_LIMIT,
+    CHUNK_LIMIT,
+    MESSAGE_LIMIT,
+    AckState,
+    AlarmMessage,
+    ChunkAssembler,
+    Command,
+    Encodings,
+    Keys,
+    Manifest,
+    Reply,
+    Role,
+    StateMessage,
+    chunk_index,
+    command_kind,
+    decode_acknowledgement,
+    decode_manifest,
+    decode_reply,
+    encode_alarm,
+    encode_command,
+    encode_manifest,
+    encode_state,
+    layout_of,
+    split,
+)
+
+if TYPE_CHECKING:
+    import zenoh
+    import zenoh.ext
+
+__all__ = ["Bridge", "Endpoint"]
+
+ABSENT_PAUSE_S: Final = 0.3
+"""Before a query is repeated that nobody was there to answer."""
+
+MATRIX_TIMEOUT_S: Final = 2.0
+"""For the RTC to answer with a manifest or a part of its matrix."""
+
+_T = TypeVar("_T")
+
+
+class Bridge:
+    """One system's link; ``open`` and ``close`` it, or use it as a context manager.
+
+    Every method may be called from any thread. The asynchronous ones wait off the event loop.
+    """
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self._endpoint = endpoint
+        self._keys = Keys(endpoint.system)
+        self._log = structlog.get_logger().bind(system=endpoint.system)
+        self._intake = Intake(endpoint)
+        self._measured = MeasuredIntake(self._keys)
+        self._outbox = Outbox(endpoint.offer_s)
+        self._session: zenoh.Session | None = None
+        self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
+
+    def __enter__(self) -> Self:
+        """Open the link."""
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the link."""
+        self.close()
+
+    def open(self) -> None:
+        """Open the zenoh session and say that the service is there.
+
+        The queryables are declared before the liveliness token, so that an RTC that sees the token
+        can ask.
+
+        Raises
+        ------
+        LinkError
+            If the port is busy, no router answers, or the link is open already.
+        """
+        if self._session is not None:
+            raise LinkError(f"the link of {self._endpoint.system} is open already")
+        self._session = session = link.open_session(self._endpoint)
+        try:
+            self._declare(session)
+        except BaseException:
+            self.close()
+            raise
+        self._log.info("link.opened", listen=self._endpoint.listen, connect=self._endpoint.connect)
+
+    def close(self) -> None:
+        """Leave the network; the process can exit. Closing twice does nothing."""
+        session, self._session = self._session, None
+        self._publishers.clear()
+        self._intake.set_wakeup(None)
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+            self._log.info("link.closed")
+
+    def expect(self, basis_id: str | None, config_id: str | None) -> None:
+        """Refuse frames of any other basis or sensor configuration; None: adopt the first seen."""
+        self._intake.expect(basis_id, config_id)
+
+    def set_wakeup(self, callback: Callable[[], object] | None) -> None:
+        """Call ``callback`` from zenoh's threads when something new has come.
+
+        It rings once until the next :meth:`drain` or :meth:`events`; give it something like
+        ``lambda: loop.call_soon_threadsafe(event.set)``. Frames held back for the sake of a hole
+        ring no bell when their time is up: look at least a few times a second.
+        """
+        self._intake.set_wakeup(callback)
+
+    def drain(self) -> list[FrameBlock]:
+        """Return the frames that have come since the last call, as copies, in order.
+
+        Each block is contiguous and of one reconstructor. Frames behind a hole are held back for
+        as long as the hole may still be filled.
+        """
+        return self._intake.drain()
+
+    def events(self) -> list[LinkEvent]:
+        """Return what else has happened since the last call, oldest first."""
+        return self._intake.events()
+
+    def statistics(self) -> LinkStatistics:
+        """Return all counters of the link."""
+        return self._intake.statistics()
+
+    def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+        """Let an RTC ask for a reconstructor without sending it.
+
+        Raises
+        ------
+        WireError
+            If the manifest does not describe the matrix, or its id names another one.
+        """
+        self._prepare(manifest, matrix)
+
+    def set_current(self, matrix_id: str | None) -> None:
+        """Say which offer a late RTC should use; None: none.
+
+        An acknowledgement that one was applied does the same.
+
+        Raises
+        ------
+        UnknownId
+            If it is not on offer.
+        """
+        self._outbox.set_current(matrix_id)
+
+    async def publish(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+        """Send a reconstructor: its parts, then the commit that orders staging and swap.
+
+        Parameters
+        ----------
+        manifest
+            With the layout of the matrix in parts of the endpoint's ``chunk_bytes``.
+        matrix
+            ``(n_controlled, n_slopes)``, metres per slope; the loop gain is not in it.
+
+        Raises
+        ------
+        WireError
+            If the manifest does not describe the matrix, or its id names another one.
+        LinkError
+            If the link is not open.
+        """
+        await asyncio.to_thread(self._publish, manifest, matrix)
+
+    async def command(self, command: Command) -> Reply:
+        """Send a command and return the RTC's answer, accepted or not.
+
+        Raises
+        ------
+        WireError
+            If the command breaks the contract.
+        LinkError
+            If the RTC does not answer, even when asked again with the same id: whether it has
+            carried the command out is unknown.
+        """
+        return await asyncio.to_thread(self._command, command)
+
+    async def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
+        """Return the reconstructor the RTC uses, checked against its manifest.
+
+        Raises
+        ------
+        WireError
+            If what comes breaks the contract or the checksum differs.
+        LinkError
+            If the RTC does not answer or has none.
+        """
+        return await asyncio.to_thread(self._fetch_applied)
+
+    def publish_state(self, message: StateMessage) -> None:
+        """Tell whoever listens what the service knows; dropped while the network is slow."""
+        self._tell(self._keys.state, encode_state(message), Encodings.STATE)
+
+    def publish_alarm(self, message: AlarmMessage) -> None:
+        """Tell whoever listens that an alarm came or went; dropped while the network is slow."""
+        self._tell(self._keys.alarm, encode_alarm(message), Encodings.ALARM)
+
+    def _declare(self, session: zenoh.Session) -> None:
+        keys = self._keys
+        for key in (keys.state, keys.alarm):
+            self._publishers[key] = link.last_value(session, key)
+        link.serve(session, keys.all_matrices, self._answer)
+        link.announce(session, keys.alive(Role.SERVICE))
+        link.subscribe(session, keys.acknowledgement, self._guarded("ack", self._on_ack))
+        link.subscribe(session, keys.status, self._guarded("status", self._on_status))
+        link.subscribe(session, keys.all_measured, self._guarded("im", self._on_measured))
+        link.watch(session, keys.alive(Role.RTC), self._guarded("alive", self._on_alive))
+        link.subscribe_frames(session, keys.frames, self._guarded("frames", self._on_frames))
+
+    def _guarded(self, kind: str, take: Callable[[_T], None]) -> Callable[[_T], None]:
+        """Return a callback that lets nothing escape into zenoh's thread unseen."""
+
+        def callback(item: _T) -> None:
+            try:
+                take(item)
+            except WireError as error:
+                self._intake.malformed(kind, error)
+            except Exception:  # noqa: BLE001  zenoh would swallow it: counted and logged here
+                if self._intake.failed(kind):
+                    self._log.exception("link.callback_failed", kind=kind)
+
+        return callback
+
+    def _on_frames(self, sample: zenoh.Sample) -> None:
+        session = self._session
+        payload, attachment = sample.payload, sample.attachment
+        if session is None:
+            return
+        self._intake.frames(
+            link.bytes_of(payload, BATCH_LIMIT, "a frame batch"),
+            None
+            if attachment is None
+            else link.bytes_of(attachment, ATTACHMENT_LIMIT, "an attachment"),
+            recoverable=sample.source_info is not None,
+            latency_s=link.latency_s(session, sample, time.time_ns()),
+        )
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        self._intake.status(link.bytes_of(sample.payload, MESSAGE_LIMIT, "a status"))
+
+    def _on_ack(self, sample: zenoh.Sample) -> None:
+        data = link.bytes_of(sample.payload, MESSAGE_LIMIT, "an acknowledgement")
+        acknowledgement = decode_acknowledgement(data)
+        known = self._outbox.knows(acknowledgement.id)
+        if acknowledgement.state is AckState.APPLIED:
+            self._outbox.adopt(acknowledgement.id)
+        self._intake.acknowledgement(acknowledgement, known=known)
+
+    def _on_measured(self, sample: zenoh.Sample) -> None:
+        data = link.bytes_of(sample.payload, CHUNK_LIMIT, "a measured matrix")
+        event = self._measured.take(str(sample.key_expr), data)
+        if event is not None:
+            self._intake.event(event)
+
+    def _on_alive(self, alive: bool) -> None:
+        self._intake.liveliness(alive=alive)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        """Answer a query for a reconstructor; a text says why there is none."""
+        with query:
+            key = str(query.key_expr)
+            part = query.parameters.get("chunk")
+            try:
+                if key == self._keys.current:
+                    data, encoding = self._outbox.current_commit(), Encodings.COMMIT
+                else:
+                    index = None if part is None else chunk_index(part, "a query")
+                    data = self._outbox.answer(
+                        self._keys.matrix_id_of(key), index, time.monotonic()
+                    )
+                    encoding = Encodings.COMMIT if index is None else Encodings.BYTES
+            except (UnknownId, WireError) as error:
+                query.reply_err(str(error).encode())
+            else:
+                query.reply(key, data, encoding=encoding)
+
+    def _prepare(self, manifest: Manifest, matrix: NDArray[np.float32]) -> Offer:
+        layout = layout_of(matrix, manifest.layout.chunk_bytes)
+        if layout != manifest.layout:
+            raise WireError(f"range: manifest {manifest.id} says {manifest.layout}, found {layout}")
+        if manifest.system != self._endpoint.system:
+            raise WireError(
+                f"id: manifest {manifest.id} is of system {manifest.system}, "
+                f"expected {self._endpoint.system}"
+            )
+        offer = Offer(
+            manifest=manifest,
+            commit=encode_manifest(manifest),
+            parts=tuple(split(matrix, layout.chunk_bytes)),
+            offered_s=time.monotonic(),
+        )
+        self._outbox.add(offer)
+        return offer
+
+    def _publish(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+        session = self._opened()
+        offer = self._prepare(manifest, matrix)
+        for index, part in enumerate(offer.parts):
+            key = self._keys.chunk(manifest.id, index)
+            link.put(session, key, part, Encodings.BYTES, urgent=False)
+        key = self._keys.commit(manifest.id)
+        link.put(session, key, offer.commit, Encodings.COMMIT, urgent=True)
+        self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
+
+    def _command(self, command: Command) -> Reply:
+        session = self._opened()
+        payload = encode_command(command)
+        kind = command_kind(command)
+        for _ in range(self._endpoint.command_attempts):
+            answer = link.ask(
+                session,
+                self._keys.command(kind),
+                self._endpoint.command_timeout_s,
+                payload,
+                Encodings.COMMAND,
+            )
+            if answer is not None:
+                return self._reply(command, answer)
+            time.sleep(ABSENT_PAUSE_S)
+        raise LinkError(
+            f"no answer from the RTC to {kind} command {command.id} after "
+            f"{self._endpoint.command_attempts} attempts: whether it was carried out is unknown"
+        )
+
+    def _reply(self, command: Command, answer: bytes) -> Reply:
+        try:
+            reply = decode_reply(answer)
+        except WireError as error:
+            self._intake.malformed("reply", error)
+            raise LinkError(
+                f"the RTC's reply to command {command.id} is unusable: {error}"
+            ) from error
+        if reply.id not in {None, command.id}:
+            raise LinkError(f"the RTC answered command {command.id} with a reply to {reply.id}")
+        return reply
+
+    def _fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
+        session = self._opened()
+        manifest = decode_manifest(self._asked(session, self._keys.applied))
+        assembler = ChunkAssembler()
+        assembler.announce(manifest.layout)
+        for index in range(manifest.layout.n_chunks):
+            assembler.add(index, self._asked(session, f"{self._keys.applied}?chunk={index}"))
+        return manifest, assembler.matrix()
+
+    def _asked(self, session: zenoh.Session, selector: str) -> bytes:
+        answer = link.ask(session, selector, MATRIX_TIMEOUT_S)
+        if answer is None:
+            raise LinkError(f"no answer from the RTC on {selector} within {MATRIX_TIMEOUT_S} s")
+        return answer
+
+    def _tell(self, key: str, data: bytes, encoding: str) -> None:
+        publisher = self._publishers.get(key)
+        if publisher is None:
+            raise LinkError(f"cannot send on {key}: the link is not open")
+        publisher.put(data, encoding=encoding)
+
+    def _opened(self) -> zenoh.Session:
+        if self._session is None:
+            raise LinkError(f"the link of {self._endpoint.system} is not open")
+        return self._session

@@ -1,0 +1,636 @@
+"""The bridge over real zenoh on loopback, against a fake RTC."""
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.errors import LinkError, UnknownId, WireError
+from service.link.events import (
+    AcknowledgementReceived,
+    BasisMismatch,
+    IdsAdopted,
+    MalformedMessage,
+    MeasuredMatrix,
+    RtcAppeared,
+    RtcVanished,
+    SecondRtc,
+    SessionChanged,
+    StatusReceived,
+)
+from service.rtc_bridge import Bridge, Endpoint
+from service.wire import (
+    AckState,
+    AlarmMessage,
+    DitherAction,
+    DitherKind,
+    DitherRequest,
+    LoopRequest,
+    Manifest,
+    MeasuredManifest,
+    Pattern,
+    StateMessage,
+    decode_alarm,
+    decode_state,
+    layout_of,
+)
+from tests.system.fake_rtc import FakeRtc
+
+pytestmark = pytest.mark.system
+
+ROOT = Path(__file__).parents[2]
+SYSTEM = "bench"
+
+
+@pytest.fixture
+def endpoint():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    return Endpoint(system=SYSTEM, listen=f"tcp/127.0.0.1:{port}", chunk_bytes=64)
+
+
+@pytest.fixture
+def bridge(endpoint):
+    with Bridge(endpoint) as bridge:
+        yield bridge
+
+
+@pytest.fixture
+def rtc(bridge, endpoint):
+    with FakeRtc(endpoint.listen) as rtc:
+        yield rtc
+
+
+@contextmanager
+def rtc_process(endpoint, session, n_slopes=6, n_modes=4, rate_hz=1000, per_batch=10):
+    arguments = (endpoint.listen, SYSTEM, session, n_slopes, n_modes, rate_hz, per_batch)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.system.fake_rtc", *map(str, arguments)], cwd=ROOT
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+def wait_until(condition, timeout_s=5.0):
+    """Return what the condition returns once it is true."""
+    end = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+    return found
+
+
+class Seen:
+    """Events collected until the one that is waited for has come."""
+
+    def __init__(self, bridge):
+        self.bridge = bridge
+        self.events = []
+
+    def first(self, kind, timeout_s=5.0, **values):
+        def look():
+            self.events += self.bridge.events()
+            return [
+                e
+                for e in self.events
+                if isinstance(e, kind) and all(getattr(e, k) == v for k, v in values.items())
+            ]
+
+        return wait_until(look, timeout_s)[0]
+
+    def count(self, kind):
+        self.events += self.bridge.events()
+        return sum(isinstance(e, kind) for e in self.events)
+
+
+def drained(bridge, n_frames, timeout_s=5.0):
+    """Return the blocks of the next ``n_frames`` frames."""
+    blocks = []
+
+    def look():
+        blocks.extend(bridge.drain())
+        return sum(b.n_frames for b in blocks) >= n_frames
+
+    wait_until(look, timeout_s)
+    return blocks
+
+
+def sequence(blocks):
+    return np.concatenate([b.first_seq + np.arange(b.n_frames) for b in blocks]).tolist()
+
+
+def reconstructor(rtc, name="r-1", seed=0):
+    matrix = np.random.default_rng(seed).standard_normal((8, rtc.n_slopes)).astype(np.float32)
+    manifest = Manifest(
+        id=name,
+        layout=layout_of(matrix, 64),
+        alpha={
+            "shift_x_subap": 0.1,
+            "shift_y_subap": 0.0,
+            "rotation_deg": 0.2,
+            "magnification": 1.0,
+        },
+        sigma=None,
+        im_id=None,
+        parent=None,
+        basis_id=rtc.basis_id,
+        config_id=rtc.config_id,
+        system=SYSTEM,
+        created_ns=1,
+    )
+    return manifest, matrix
+
+
+# ---------------------------------------------------------------- telemetry
+
+
+def test_frames_arrive_in_order_with_their_own_values_and_times(bridge, rtc):
+    for k in range(5):
+        rtc.send(100 + 10 * k, dither=True)
+    blocks = drained(bridge, 50)
+    assert sequence(blocks) == list(range(100, 150))
+    block = blocks[-1]
+    last = block.first_seq + block.n_frames - 1
+    header = rtc.header(last)
+    assert block.slopes[-1].tolist() == [last] * rtc.n_slopes
+    assert block.commands_m[-1].tolist() == [last] * rtc.n_modes
+    assert block.dither_m[-1].tolist() == [last] * rtc.n_modes
+    assert block.t0_ns_utc + (block.n_frames - 1) * block.dt_ns == header.t0_ns
+    assert (block.session, block.cm_id) == ("s1", None)
+    statistics = bridge.statistics()
+    assert (statistics.frames_received, statistics.frames_lost) == (50, 0)
+    assert statistics.batches_received == 5
+    assert statistics.frame_age_s < 5.0
+
+
+def test_a_flao_loop_at_1_khz_loses_nothing_and_is_read_within_a_millisecond(endpoint, capsys):
+    with (
+        Bridge(endpoint) as bridge,
+        rtc_process(endpoint, "flao", n_slopes=1384, n_modes=594),
+    ):
+        wait_until(lambda: bridge.statistics().frames_received, 20.0)
+        blocks = []
+        end = time.monotonic() + 5.0
+        while time.monotonic() < end:
+            blocks += bridge.drain()
+            time.sleep(0.02)
+        statistics = bridge.statistics()
+    seq = sequence(blocks)
+    assert seq == list(range(seq[0], seq[0] + len(seq)))
+    assert np.concatenate([b.slopes[:, 0] for b in blocks]).tolist() == seq
+    assert len(seq) > 4000
+    assert (statistics.frames_lost, statistics.frames_overwritten) == (0, 0)
+    with capsys.disabled():
+        print(f" p50 {1e3 * statistics.latency_p50_s:.3f} ms, {len(seq)} frames", end="")  # noqa: T201
+    assert statistics.latency_p50_s < 1e-3
+
+
+def test_a_missing_batch_is_lost_until_it_comes_late_and_finds_its_place(bridge, rtc):
+    rtc.send(0)
+    rtc.send(20)
+    wait_until(lambda: bridge.statistics().frames_lost == 10)
+    assert sequence(drained(bridge, 10)) == list(range(10))
+    assert bridge.drain() == []
+    rtc.send(10)
+    (block,) = drained(bridge, 20)
+    assert (block.first_seq, block.n_frames) == (10, 20)
+    statistics = bridge.statistics()
+    assert (statistics.frames_lost, statistics.frames_recovered) == (0, 10)
+
+
+def test_a_hole_that_nothing_fills_holds_frames_back_for_half_a_second_only(bridge, rtc):
+    rtc.send(0)
+    rtc.send(20)
+    begin = time.monotonic()
+    blocks = drained(bridge, 20)
+    assert 0.3 < time.monotonic() - begin < 1.5
+    assert [(b.first_seq, b.n_frames) for b in blocks] == [(0, 10), (20, 10)]
+    rtc.send(10)
+    wait_until(lambda: bridge.statistics().frames_late == 10)
+    assert bridge.statistics().frames_lost == 10
+
+
+def test_without_a_publisher_that_remembers_a_hole_is_given_up_at_once(bridge, rtc):
+    rtc.send(0, plain=True)
+    rtc.send(20, plain=True)
+    begin = time.monotonic()
+    drained(bridge, 20)
+    assert time.monotonic() - begin < 0.3
+
+
+def test_the_first_of_two_equal_frames_wins(bridge, rtc):
+    rtc.send(0)
+    rtc.send(5, rows=np.full((10, 10), 99.0, np.float32))
+    blocks = drained(bridge, 15)
+    assert sequence(blocks) == list(range(15))
+    slopes = np.concatenate([b.slopes[:, 0] for b in blocks])
+    assert slopes.tolist() == [*range(10), *([99.0] * 5)]
+    assert bridge.statistics().frames_duplicate == 5
+
+
+def test_a_frame_that_is_not_finite_costs_itself_only(bridge, rtc):
+    rows = rtc.rows(rtc.header(0))
+    rows[3, 2], rows[7, -1] = np.nan, np.inf
+    rtc.send(0, rows=rows)
+    blocks = drained(bridge, 8)
+    assert [(b.first_seq, b.n_frames) for b in blocks] == [(0, 3), (4, 3), (8, 2)]
+    statistics = bridge.statistics()
+    assert (statistics.frames_nonfinite, statistics.frames_lost) == (2, 0)
+
+
+def test_malformed_batches_are_counted_reported_once_and_survived(bridge, rtc):
+    seen = Seen(bridge)
+    payload = rtc.rows(rtc.header(0)).tobytes()
+    for attachment in (None, b"", b"\xc1", b"\x81\xa1v\x02", b"x" * 5000):
+        rtc.send_raw(payload, attachment)
+    rtc.send(0)
+    header = rtc.header(10)
+    rtc.send_raw(payload[:-4], attachment=_attachment(header))
+    rtc.send_raw(b"\0" * 4_000_004, attachment=_attachment(header))
+    rtc.send(10)
+    assert sequence(drained(bridge, 20)) == list(range(20))
+    wait_until(lambda: bridge.statistics().messages_malformed.get("frames") == 7)
+    assert seen.first(MalformedMessage).kind == "frames"
+    assert seen.count(MalformedMessage) == 1
+    assert bridge.statistics().callback_errors == 0
+
+
+def _attachment(header):
+    from service.wire.fields import pack
+
+    return pack(header)
+
+
+def test_frames_of_another_basis_or_configuration_are_refused(bridge, rtc):
+    bridge.expect("kl-1", "mask-1")
+    seen = Seen(bridge)
+    rtc.send(0)
+    rtc.send(10, basis_id="kl-2")
+    rtc.send(20, config_id="mask-2")
+    rtc.send(30)
+    blocks = drained(bridge, 20)
+    assert sequence(blocks) == [*range(10), *range(30, 40)]
+    assert bridge.statistics().frames_refused == {"basis": 10, "config": 10}
+    mismatch = seen.first(BasisMismatch)
+    assert (mismatch.expected, mismatch.found) == (("kl-1", "mask-1"), ("kl-2", "mask-1"))
+
+
+def test_the_first_basis_seen_is_adopted_when_none_is_pinned(bridge, rtc):
+    seen = Seen(bridge)
+    rtc.send(0)
+    adopted = seen.first(IdsAdopted)
+    assert (adopted.basis_id, adopted.config_id) == ("kl-1", "mask-1")
+    rtc.send(10, basis_id="kl-2")
+    wait_until(lambda: bridge.statistics().frames_refused == {"basis": 10})
+
+
+def test_frames_of_another_system_are_not_heard(bridge, rtc, endpoint):
+    with FakeRtc(endpoint.listen, system="other") as other:
+        other.send(0)
+        rtc.send(0)
+        drained(bridge, 10)
+        time.sleep(0.2)
+    assert bridge.statistics().frames_received == 10
+
+
+def test_another_reconstructor_a_clock_step_and_a_dither_begin_new_blocks(bridge, rtc):
+    rtc.send(0)
+    rtc.send(10, cm_id="r-2")
+    late = rtc.header(20).t0_ns + 600_000
+    rtc.send(20, cm_id="r-2", t0_ns=late)
+    rtc.send(30, cm_id="r-2", dither=True)
+    blocks = wait_until(lambda: _whole(bridge, 40))
+    assert [(b.first_seq, b.cm_id) for b in blocks] == [
+        (0, None),
+        (10, "r-2"),
+        (20, "r-2"),
+        (30, "r-2"),
+    ]
+    assert [b.dither_m is None for b in blocks] == [True, True, True, False]
+
+
+def _whole(bridge, n_frames):
+    """Drain only once everything is there, so that blocks end where they must and nowhere else."""
+    return bridge.drain() if bridge.statistics().frames_received >= n_frames else None
+
+
+def test_frames_nobody_drains_are_overwritten_oldest_first_and_counted(endpoint):
+    small = Endpoint(system=SYSTEM, listen=endpoint.listen, ring_seconds=0.2)
+    with Bridge(small) as bridge, FakeRtc(endpoint.listen) as rtc:
+        for k in range(30):
+            rtc.send(10 * k)
+        wait_until(lambda: bridge.statistics().frames_received == 300)
+        assert sequence(bridge.drain()) == list(range(100, 300))
+        assert bridge.statistics().frames_overwritten == 100
+        assert bridge.statistics().frames_lost == 0
+
+
+def test_the_consumer_is_woken_once_until_it_looks(bridge, rtc):
+    rings = []
+    bridge.set_wakeup(lambda: rings.append(1))
+    rtc.send(0)
+    rtc.send(10)
+    wait_until(lambda: bridge.statistics().frames_received == 20)
+    assert len(rings) == 1
+    bridge.drain()
+    rtc.send(20)
+    wait_until(lambda: len(rings) == 2)
+
+
+def test_a_fault_in_the_consumers_bell_is_counted_and_ingest_goes_on(bridge, rtc):
+    bridge.set_wakeup(lambda: 1 / 0)
+    rtc.send(0)
+    rtc.send(10)
+    assert sequence(drained(bridge, 20)) == list(range(20))
+    assert bridge.statistics().callback_errors >= 1
+
+
+# ---------------------------------------------------------------- sessions and liveliness
+
+
+def test_a_restarted_rtc_is_a_new_session_counting_from_zero(bridge, endpoint):
+    seen = Seen(bridge)
+    with FakeRtc(endpoint.listen, session="one") as rtc:
+        rtc.send(5000)
+        seen.first(RtcAppeared)
+        seen.first(SessionChanged, old=None, new="one")
+        drained(bridge, 10)
+    seen.first(RtcVanished)
+    with FakeRtc(endpoint.listen, session="two") as rtc:
+        rtc.send(0)
+        seen.first(SessionChanged, old="one", new="two")
+        (block,) = drained(bridge, 10)
+    assert (block.session, block.first_seq) == ("two", 0)
+    assert bridge.statistics().frames_lost == 0
+
+
+def test_a_killed_rtc_vanishes_within_the_lease(bridge, endpoint):
+    seen = Seen(bridge)
+    with rtc_process(endpoint, "doomed") as process:
+        seen.first(RtcAppeared, 20.0)
+        assert bridge.statistics().rtc_alive
+        process.kill()
+        seen.first(RtcVanished, 4.0)
+    assert not bridge.statistics().rtc_alive
+
+
+def test_interleaved_sessions_are_a_second_rtc(bridge, rtc, endpoint):
+    seen = Seen(bridge)
+    with FakeRtc(endpoint.listen, session="s2") as other:
+        rtc.send(0)
+        wait_until(lambda: bridge.statistics().session == "s1")
+        other.send(0)
+        wait_until(lambda: bridge.statistics().session == "s2")
+        for k in range(1, 16):
+            rtc.send(10 * k)
+            other.send(10 * k)
+            time.sleep(0.1)
+    event = seen.first(SecondRtc)
+    assert (event.current, event.other) == ("s2", "s1")
+    assert bridge.statistics().frames_refused == {"session": 150}
+    assert {b.session for b in bridge.drain()} == {"s2"}
+
+
+def test_a_status_is_reported_and_a_bad_one_counted(bridge, rtc):
+    seen = Seen(bridge)
+    rtc.send_bytes(rtc.keys.status, b"\x80")
+    rtc.send_bytes(rtc.keys.status, b"x" * 70_000)
+    rtc.send_status(seq=42, magnitude=None)
+    assert seen.first(StatusReceived).status == rtc.status(seq=42, magnitude=None)
+    assert bridge.statistics().messages_malformed == {"status": 2}
+    assert "missing: key 'v'" in seen.first(MalformedMessage).text
+
+
+# ---------------------------------------------------------------- reconstructors
+
+
+async def test_a_published_reconstructor_is_staged_applied_and_acknowledged(bridge, rtc):
+    manifest, matrix = reconstructor(rtc)
+    seen = Seen(bridge)
+    await bridge.publish(manifest, matrix)
+    states = []
+    while AckState.APPLIED not in states:
+        event = await asyncio.to_thread(seen.first, AcknowledgementReceived)
+        seen.events.remove(event)
+        assert event.known
+        assert event.acknowledgement.sha256 == manifest.layout.sha256
+        states.append(event.acknowledgement.state)
+    assert states == [AckState.STAGED, AckState.APPLIED]
+    assert np.array_equal(rtc.applied["matrix"], matrix)
+    assert bridge.statistics().acknowledgements_unknown == 0
+
+
+async def test_a_late_rtc_fetches_the_current_reconstructor_part_by_part(bridge, endpoint, rtc):
+    manifest, matrix = reconstructor(rtc)
+    bridge.offer(manifest, matrix)
+    assert rtc.fetch(rtc.keys.current) == "nothing to offer"
+    bridge.set_current(manifest.id)
+    with FakeRtc(endpoint.listen, session="late") as late:
+        fetched, received = late.fetch_current()
+    assert fetched == manifest
+    assert np.array_equal(received, matrix)
+    assert manifest.layout.n_chunks == 3
+
+
+def test_a_query_for_what_is_not_there_is_answered_with_a_text(bridge, rtc):
+    manifest, matrix = reconstructor(rtc)
+    bridge.offer(manifest, matrix)
+    key = rtc.keys.matrix(manifest.id)
+    assert rtc.fetch(rtc.keys.matrix("unknown")) == "reconstructor unknown is not on offer"
+    assert rtc.fetch(f"{key}?chunk=3") == "chunk 3 of r-1: there are 3"
+    assert rtc.fetch(f"{key}?chunk=-1").startswith("range: chunk '-1'")
+    assert rtc.fetch(rtc.keys.acknowledgement).startswith("id: 'ack'")
+
+
+def test_an_applied_reconstructor_becomes_the_current_one(bridge, rtc):
+    manifest, matrix = reconstructor(rtc)
+    asyncio.run(bridge.publish(manifest, matrix))
+    Seen(bridge).first(AcknowledgementReceived)
+    wait_until(lambda: rtc.fetch(rtc.keys.current) != "nothing to offer")
+    fetched, _ = rtc.fetch_current()
+    assert fetched.id == manifest.id
+
+
+async def test_an_id_is_never_reused_for_another_matrix(bridge, rtc):
+    await bridge.publish(*reconstructor(rtc, seed=0))
+    with pytest.raises(WireError, match="r-1 already names a matrix"):
+        await bridge.publish(*reconstructor(rtc, seed=1))
+
+
+async def test_a_manifest_that_does_not_describe_its_matrix_is_not_sent(bridge, rtc):
+    manifest, matrix = reconstructor(rtc)
+    with pytest.raises(WireError, match="manifest r-1 says"):
+        await bridge.publish(manifest, matrix + 1)
+
+
+def test_only_what_is_on_offer_can_be_current(bridge):
+    with pytest.raises(UnknownId, match="r-9 is not on offer"):
+        bridge.set_current("r-9")
+
+
+def test_an_acknowledgement_for_an_unknown_id_is_counted_and_reported(bridge, rtc):
+    rtc.acknowledge("stranger", "0" * 64, AckState.APPLIED, frame_seq=3)
+    event = Seen(bridge).first(AcknowledgementReceived)
+    assert not event.known
+    assert event.acknowledgement.frame_seq == 3
+    assert bridge.statistics().acknowledgements_unknown == 1
+
+
+async def test_the_matrix_in_use_is_fetched_from_the_rtc(bridge, rtc):
+    with pytest.raises(LinkError, match="no matrix in use"):
+        await bridge.fetch_applied()
+    manifest, matrix = reconstructor(rtc)
+    rtc.applied = {"manifest": manifest, "matrix": matrix}
+    fetched, received = await bridge.fetch_applied()
+    assert fetched == manifest
+    assert np.array_equal(received, matrix)
+
+
+def measured(rtc, matrix, **changes):
+    values = {
+        "id": "im-1",
+        "layout": layout_of(matrix, 64),
+        "reason": None,
+        "modes": tuple(range(matrix.shape[1])),
+        "amplitude_m": (1e-9,) * matrix.shape[1],
+        "n_average": 4,
+        "pattern": Pattern.PUSH_PULL_MODAL,
+        "double_pass": False,
+        "session": rtc.session,
+        "basis_id": rtc.basis_id,
+        "config_id": rtc.config_id,
+        "system": SYSTEM,
+        "created_ns": 5,
+    }
+    return MeasuredManifest(**(values | changes))
+
+
+def test_a_measured_matrix_is_put_together(bridge, rtc):
+    matrix = np.arange(24, dtype=np.float32).reshape(6, 4)
+    manifest = measured(rtc, matrix)
+    rtc.send_measured(manifest, matrix)
+    event = Seen(bridge).first(MeasuredMatrix)
+    assert event.manifest == manifest
+    assert np.array_equal(event.matrix, matrix)
+
+
+def test_a_measured_matrix_with_a_wrong_checksum_is_refused_and_the_next_one_taken(bridge, rtc):
+    matrix = np.arange(24, dtype=np.float32).reshape(6, 4)
+    seen = Seen(bridge)
+    rtc.send_measured(measured(rtc, matrix, layout=layout_of(matrix + 1, 64)), matrix)
+    assert "sha256" in seen.first(MalformedMessage, kind="im").text
+    rtc.send_measured(measured(rtc, matrix), matrix)
+    assert np.array_equal(seen.first(MeasuredMatrix).matrix, matrix)
+
+
+# ---------------------------------------------------------------- commands and messages
+
+
+async def test_a_command_is_answered_and_carried_out(bridge, rtc):
+    request = DitherRequest(
+        id="d-1",
+        action=DitherAction.START,
+        kind=DitherKind.SINE,
+        modes=(3, 2),
+        amplitude_m=(5e-9, 5e-9),
+        frequency_hz=(250.0, 240.0),
+        duration_s=5.0,
+    )
+    reply = await bridge.command(request)
+    assert (reply.accepted, reply.start_seq) == (True, 77)
+    assert rtc.commands == [request]
+
+
+async def test_a_command_without_an_answer_is_repeated_with_the_same_id(bridge, rtc):
+    rtc.silent = 1
+    reply = await bridge.command(LoopRequest(id="l-1", leak=0.98))
+    assert reply.accepted
+    assert [c.id for c in rtc.commands] == ["l-1"]
+
+
+async def test_no_rtc_at_all_is_a_link_error_within_seconds(bridge):
+    begin = time.monotonic()
+    with pytest.raises(LinkError, match="no answer from the RTC to loop command l-1 after 3"):
+        await bridge.command(LoopRequest(id="l-1", leak=0.98))
+    assert time.monotonic() - begin < 3.0
+
+
+def test_state_and_alarm_reach_a_listener_and_the_last_one_a_late_one(bridge, rtc):
+    state = StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use="r-1")
+    alarm = AlarmMessage(system=SYSTEM, t_ns=2, name="rtc.vanished", active=True, text="gone")
+    heard = {}
+    rtc.zenoh.declare_subscriber(
+        f"{rtc.keys.root}/*", lambda s: heard.update({str(s.key_expr): s.payload.to_bytes()})
+    )
+
+    def told():
+        bridge.publish_state(state)
+        bridge.publish_alarm(alarm)
+        return len(heard) == 2
+
+    wait_until(told)
+    assert decode_state(heard[rtc.keys.state]) == state
+    assert decode_alarm(heard[rtc.keys.alarm]) == alarm
+
+
+# ---------------------------------------------------------------- opening and closing
+
+
+def test_a_busy_port_is_one_clear_line(bridge, endpoint):
+    with pytest.raises(LinkError) as refusal:
+        Bridge(endpoint).open()
+    text = str(refusal.value)
+    assert endpoint.listen in text
+    assert "already in use" in text
+    assert "\n" not in text
+
+
+def test_a_missing_router_is_one_clear_line(endpoint):
+    client = Endpoint(system=SYSTEM, connect=(endpoint.listen,))
+    with pytest.raises(LinkError, match="no zenoh router answers at tcp/127.0.0.1"):
+        Bridge(client).open()
+
+
+def test_the_service_can_be_a_client_of_another_router(bridge, endpoint, rtc):
+    with Bridge(Endpoint(system=SYSTEM, connect=(endpoint.listen,))) as client:
+        seen = Seen(client)
+        seen.first(RtcAppeared)
+        rtc.send(0)
+        assert sequence(drained(client, 10)) == list(range(10))
+
+
+def test_nothing_works_before_open_and_closing_twice_is_fine(endpoint):
+    bridge = Bridge(endpoint)
+    with pytest.raises(LinkError, match="not open"):
+        asyncio.run(bridge.fetch_applied())
+    assert bridge.drain() == []
+    bridge.open()
+    with pytest.raises(LinkError, match="open already"):
+        bridge.open()
+    bridge.close()
+    bridge.close()
+    with Bridge(endpoint):
+        pass
+
+
+def test_a_process_that_closes_its_bridge_exits(endpoint):
+    program = (
+        "from service.rtc_bridge import Bridge, Endpoint\n"
+        f"bridge = Bridge(Endpoint(system='bench', listen={endpoint.listen!r}))\n"
+        "bridge.open()\n"
+        "bridge.close()\n"
+    )
+    subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, check=True, timeout=20, env=os.environ
+    )

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from service.config.strict import Id, Table, Tuple, in_file, nearest, read_toml, validated
 from service.errors import ConfigurationError
 from service.state import Mode
+from service.wire import CHUNK_LIMIT
 
 PREFIX = "PYRCAL_"
 """Of the environment variables: ``PYRCAL_<SECTION>__<KEY>``, like ``PYRCAL_API__PORT``."""
@@ -45,7 +46,7 @@ class ZenohTable(Table):
     connect: Tuple[str] = ()
     """Endpoints of an observatory's own routers; not empty: no router is embedded."""
 
-    chunk_bytes: int = Field(default=4_000_000, ge=1024, le=4_000_000)
+    chunk_bytes: int = Field(default=4_000_000, ge=1024, le=CHUNK_LIMIT)
     """Size of a reconstructor's chunks; a default build of zenoh-pico drops more than 4 KB."""
 
 

@@ -1,0 +1,14 @@
+"""Products and their history: immutable HDF5 files, an SQLite index and audit trail.
+
+::
+
+    <directory>/
+      reconstructors/<id>.h5   one reconstructor each, written once, complete or absent
+      index.sqlite             where each is on its way, and who did what, when
+      lock                     held while a service uses the directory
+"""
+
+from service.archive.archive import Archive
+from service.archive.index import AuditEntry
+
+__all__ = ["Archive", "AuditEntry"]

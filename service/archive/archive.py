@@ -1,0 +1,197 @@
+"""The archive as the rest of the service sees it."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.archive.index import AuditEntry, Index
+from service.archive.product import Provenance, read_matrix, read_product, write_product
+from service.errors import ArchiveError, UnknownId
+from service.state import ReconstructorRecord
+from service.wire import checked_id, checksum
+
+
+class Archive:
+    """Reconstructors, their states and the audit trail, below one directory.
+
+    A call returns when what it wrote is on the disk, so a service killed at any moment finds after
+    its restart everything it was told is stored, and nothing half-written. Calls may come from
+    any thread and are carried out one at a time; a call waits for the disk (tens of milliseconds
+    for a FLAO matrix), so it does not belong on an event loop that serves others.
+
+    Parameters
+    ----------
+    directory
+        Made by :meth:`open` where it does not exist.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._products = directory / "reconstructors"
+        self._index = Index(directory / "index.sqlite")
+        self._lock: IO[str] | None = None
+
+    def __enter__(self) -> Self:
+        """Use an archive that is open; it is closed at the end."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def open(self) -> tuple[str, ...]:
+        """Make the directory, open the index and bring it up to date with the products.
+
+        A product that was complete but not yet in the index when the service was killed is taken
+        in now; what was half-written is removed.
+
+        Returns
+        -------
+        One line for each damaged product; the others are not affected.
+
+        Raises
+        ------
+        ArchiveError
+            If the directory cannot be written, is in use by another service, or the index is
+            damaged.
+        """
+        try:
+            self._products.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(self._directory / "lock")
+            for leftover in self._products.glob("*.part"):
+                leftover.unlink()
+        except OSError as error:
+            self.close()
+            raise ArchiveError(f"{self._directory}: cannot be used: {error}") from error
+        try:
+            self._index.open()
+            return self._adopt()
+        except ArchiveError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the index and let another service use the directory."""
+        self._index.close()
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def store(
+        self,
+        record: ReconstructorRecord,
+        matrix: NDArray[np.float32],
+        covariance: NDArray[np.float64] | None,
+        provenance: Mapping[str, Provenance],
+    ) -> None:
+        """Write a reconstructor for good.
+
+        Parameters
+        ----------
+        record
+            What is known of it; its ``sha256``, where given, must be the matrix'.
+        matrix
+            ``(n_modes, n_slopes)``, metres per slope.
+        covariance
+            ``(4, 4)`` of its registration, floor included, numeric units (rotation in radians);
+            None: not known.
+        provenance
+            What it was made from (instrument, software version, session...): attributes of the
+            file's group ``provenance``.
+
+        Raises
+        ------
+        ArchiveError
+            If the id is taken, the matrix is not what the record says, or the disk refuses.
+        WireError
+            If the id is not one.
+        """
+        checked_id(record.id, "a reconstructor to be stored")
+        if matrix.ndim != 2 or matrix.shape[0] != record.n_modes:
+            raise ArchiveError(
+                f"reconstructor {record.id}: found a matrix of shape {matrix.shape}, "
+                f"expected ({record.n_modes}, n_slopes)"
+            )
+        if not np.isfinite(matrix).all():
+            raise ArchiveError(f"reconstructor {record.id}: not all of its numbers are finite")
+        sha256 = checksum(matrix)
+        if record.sha256 not in {"", sha256}:
+            raise ArchiveError(
+                f"reconstructor {record.id}: found a matrix of checksum {sha256}, "
+                f"expected {record.sha256} of its record"
+            )
+        path = self._path(record.id)
+        if path.exists():
+            raise ArchiveError(f"reconstructor {record.id}: already stored, ids are never reused")
+        write_product(path, record, matrix, covariance, provenance)
+        self._index.add(record, sha256)
+
+    def matrix(self, matrix_id: str) -> NDArray[np.float32]:
+        """Return a reconstructor, ``(n_modes, n_slopes)``, its checksum verified.
+
+        Raises
+        ------
+        UnknownId
+            If no such reconstructor was ever stored here.
+        ArchiveError
+            If its file is missing, damaged, or holds other numbers than were stored.
+        """
+        sha256 = self._index.product_sha256(matrix_id)
+        if sha256 is None:
+            raise UnknownId(f"reconstructor {matrix_id}: no such matrix in the archive")
+        matrix = read_matrix(self._path(matrix_id))
+        found = checksum(matrix)
+        if found != sha256:
+            raise ArchiveError(
+                f"{self._path(matrix_id)}: damaged: found checksum {found}, expected {sha256}"
+            )
+        return matrix
+
+    def update(self, record: ReconstructorRecord) -> None:
+        """Remember where a reconstructor is now, one that is not stored here (the RTC's) too."""
+        self._index.update(record)
+
+    def records(self) -> tuple[ReconstructorRecord, ...]:
+        """Return what is known of every reconstructor, oldest first."""
+        return self._index.records()
+
+    def audit(self, t_ns_utc: int, who: str, name: str, text: str) -> None:
+        """Add to the audit trail, which only ever grows."""
+        self._index.audit(AuditEntry(t_ns_utc=t_ns_utc, who=who, name=name, text=text))
+
+    def audit_trail(self, limit: int = 100) -> tuple[AuditEntry, ...]:
+        """Return the last ``limit`` entries of the audit trail, oldest first."""
+        return self._index.audit_trail(limit)
+
+    def _path(self, matrix_id: str) -> Path:
+        return self._products / f"{matrix_id}.h5"
+
+    def _adopt(self) -> tuple[str, ...]:
+        known = self._index.stored_ids()
+        damaged = []
+        for path in sorted(self._products.glob("*.h5")):
+            if path.stem in known:
+                continue
+            try:
+                record, matrix = read_product(path)
+            except ArchiveError as error:
+                damaged.append(str(error))
+                continue
+            self._index.add(record, checksum(matrix))
+        return tuple(damaged)
+
+
+def _locked(path: Path) -> IO[str]:
+    file = path.open("a")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        raise ArchiveError(f"{path.parent}: in use by another service") from None
+    return file

@@ -1,0 +1,198 @@
+"""Where each reconstructor is on its way, and who did what, when: SQLite."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.archive.records import record_from_json, record_to_json
+from service.errors import ArchiveError
+from service.state import ReconstructorRecord
+
+_SCHEMA_VERSION = 1
+
+_SCHEMA = f"""
+BEGIN;
+CREATE TABLE reconstructor (
+    id TEXT PRIMARY KEY,
+    created_ns_utc INTEGER NOT NULL,
+    record TEXT NOT NULL,
+    product_sha256 TEXT
+);
+CREATE TABLE audit (
+    t_ns_utc INTEGER NOT NULL,
+    who TEXT NOT NULL,
+    name TEXT NOT NULL,
+    text TEXT NOT NULL
+);
+CREATE TRIGGER audit_keeps_its_entries BEFORE DELETE ON audit
+    BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
+CREATE TRIGGER audit_keeps_its_words BEFORE UPDATE ON audit
+    BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
+PRAGMA user_version = {_SCHEMA_VERSION};
+COMMIT;
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AuditEntry:
+    """One line of the audit trail."""
+
+    t_ns_utc: int
+    """When, nanoseconds since the Unix epoch."""
+
+    who: str
+    """An operator, the service or the RTC."""
+
+    name: str
+    """Machine-readable, like ``reconstructor.applied``."""
+
+    text: str
+    """What happened."""
+
+
+class Index:
+    """The SQLite file; each call is one transaction, on the disk when it returns.
+
+    One connection behind a lock: calls may come from any thread and queue up.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self._connection: sqlite3.Connection | None = None
+
+    def open(self) -> None:
+        """Open the file, or make it.
+
+        Raises
+        ------
+        ArchiveError
+            If it is damaged, of another version, or cannot be written.
+        """
+        try:
+            self._connection = sqlite3.connect(
+                self._path, isolation_level=None, check_same_thread=False
+            )
+            with self._use() as connection:
+                connection.execute("PRAGMA journal_mode = WAL")
+                connection.execute("PRAGMA synchronous = FULL")
+                version = connection.execute("PRAGMA user_version").fetchone()[0]
+                if version == 0:
+                    connection.executescript(_SCHEMA)
+                elif version != _SCHEMA_VERSION:
+                    raise ArchiveError(
+                        f"{self._path}: found version {version}, expected {_SCHEMA_VERSION}"
+                    )
+        except sqlite3.OperationalError as error:
+            raise ArchiveError(f"{self._path}: cannot be opened: {error}") from error
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            if self._connection is not None:
+                self._connection.close()
+                self._connection = None
+
+    def add(self, record: ReconstructorRecord, sha256: str) -> None:
+        """Enter a reconstructor whose product is on the disk.
+
+        Raises
+        ------
+        ArchiveError
+            If one of this id is already there.
+        """
+        with self._use() as connection:
+            done = connection.execute(
+                "INSERT INTO reconstructor VALUES (?, ?, ?, ?) ON CONFLICT (id) DO UPDATE SET"
+                " record = excluded.record, product_sha256 = excluded.product_sha256"
+                " WHERE product_sha256 IS NULL",
+                (record.id, record.created_ns_utc, record_to_json(record), sha256),
+            )
+        if done.rowcount == 0:
+            raise ArchiveError(f"reconstructor {record.id}: already stored, ids are never reused")
+
+    def update(self, record: ReconstructorRecord) -> None:
+        """Replace what is known of a reconstructor, or enter one that has no product here."""
+        with self._use() as connection:
+            connection.execute(
+                "INSERT INTO reconstructor VALUES (?, ?, ?, NULL)"
+                " ON CONFLICT (id) DO UPDATE SET record = excluded.record",
+                (record.id, record.created_ns_utc, record_to_json(record)),
+            )
+
+    def product_sha256(self, matrix_id: str) -> str | None:
+        """Return the checksum of a stored reconstructor, None where none is stored."""
+        with self._use() as connection:
+            row = connection.execute(
+                "SELECT product_sha256 FROM reconstructor WHERE id = ?", (matrix_id,)
+            ).fetchone()
+        return None if row is None else row[0]
+
+    def stored_ids(self) -> frozenset[str]:
+        """Return the ids that have a product."""
+        with self._use() as connection:
+            rows = connection.execute(
+                "SELECT id FROM reconstructor WHERE product_sha256 IS NOT NULL"
+            ).fetchall()
+        return frozenset(row[0] for row in rows)
+
+    def records(self) -> tuple[ReconstructorRecord, ...]:
+        """Return every reconstructor, oldest first.
+
+        Raises
+        ------
+        ArchiveError
+            If one was written by a version that this one does not understand.
+        """
+        with self._use() as connection:
+            rows = connection.execute(
+                "SELECT id, record FROM reconstructor ORDER BY created_ns_utc, rowid"
+            ).fetchall()
+        return tuple(self._record(*row) for row in rows)
+
+    def audit(self, entry: AuditEntry) -> None:
+        """Add an entry."""
+        with self._use() as connection:
+            connection.execute(
+                "INSERT INTO audit VALUES (?, ?, ?, ?)",
+                (entry.t_ns_utc, entry.who, entry.name, entry.text),
+            )
+
+    def audit_trail(self, limit: int) -> tuple[AuditEntry, ...]:
+        """Return the last ``limit`` entries, oldest first."""
+        with self._use() as connection:
+            rows = connection.execute(
+                "SELECT t_ns_utc, who, name, text FROM audit ORDER BY rowid DESC LIMIT ?", (limit,)
+            ).fetchall()
+        return tuple(
+            AuditEntry(t_ns_utc=t, who=who, name=name, text=text)
+            for t, who, name, text in reversed(rows)
+        )
+
+    def _record(self, matrix_id: str, text: str) -> ReconstructorRecord:
+        try:
+            return record_from_json(text)
+        except (ValueError, KeyError, TypeError) as error:
+            raise ArchiveError(
+                f"{self._path}: record of reconstructor {matrix_id} not understood: {error!r}"
+            ) from error
+
+    @contextmanager
+    def _use(self) -> Iterator[sqlite3.Connection]:
+        with self._lock:
+            if self._connection is None:
+                raise ArchiveError(f"{self._path}: not open")
+            try:
+                yield self._connection
+            except sqlite3.OperationalError as error:
+                raise ArchiveError(f"{self._path}: cannot be used: {error}") from error
+            except sqlite3.DatabaseError as error:
+                raise ArchiveError(
+                    f"{self._path}: damaged ({error}): move it away; the next start makes a new "
+                    "one from the products, the audit trail stays in the old one"
+                ) from error

@@ -1,0 +1,51 @@
+"""``ReconstructorRecord`` <-> JSON, with boundary units and names."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.gate import GateVerdict
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.state import MatrixState, ReconstructorRecord
+
+
+def record_to_json(record: ReconstructorRecord) -> str:
+    """Return the record as JSON; a pole radius may be ``Infinity``, as Python writes it."""
+    values: dict[str, Any] = {f.name: getattr(record, f.name) for f in fields(record)}
+    if record.alpha is not None:
+        values["alpha"] = record.alpha.to_boundary()
+    if record.sigma is not None:
+        sigma = record.sigma * BOUNDARY_SCALE
+        values["sigma"] = dict(zip(PARAMETERS, sigma.tolist(), strict=True))
+    if record.gate is not None:
+        values["gate"] = asdict(record.gate)
+    return json.dumps(values)
+
+
+def record_from_json(text: str) -> ReconstructorRecord:
+    """Return the record that :func:`record_to_json` wrote.
+
+    Raises
+    ------
+    ValueError, KeyError, TypeError
+        If the text is something else.
+    """
+    values = json.loads(text)
+    record = ReconstructorRecord(**{**values, "state": MatrixState(values["state"])})
+    alpha, sigma, gate = values["alpha"], values["sigma"], values["gate"]
+    return replace(
+        record,
+        alpha=None if alpha is None else Misregistration.from_boundary(alpha),
+        sigma=None if sigma is None else _numeric(sigma),
+        gate=None if gate is None else GateVerdict(**gate),
+    )
+
+
+def _numeric(sigma: dict[str, float]) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = np.array([sigma[name] for name in PARAMETERS]) / BOUNDARY_SCALE
+    return values

@@ -1,0 +1,421 @@
+"""Products that outlive the service: real files, a real index, real processes killed on the way."""
+
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from service.archive import Archive, AuditEntry
+from service.control.gate import GateVerdict
+from service.errors import ArchiveError, UnknownId, WireError
+from service.model.misregistration import Misregistration
+from service.state import MatrixState, ReconstructorRecord
+from service.wire import checksum
+
+MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4)
+VERDICT = GateVerdict(
+    accepted=False,
+    worst_pole_radius=float("inf"),
+    aligned_pole_radius=0.7,
+    bound=0.95,
+    n_points=9,
+    reason="unstable at +3 sigma: measure longer",
+)
+
+
+def record_of(matrix_id="cm-1", **changes) -> ReconstructorRecord:
+    record = ReconstructorRecord(
+        id=matrix_id,
+        state=MatrixState.PROPOSED,
+        n_modes=3,
+        created_ns_utc=1_000,
+        alpha=Misregistration(shift_x_subap=0.2, rotation_rad=np.deg2rad(0.3), magnification=1.01),
+        sigma=np.array([0.01, 0.02, np.deg2rad(0.03), 0.004]),
+        parent="cm-0",
+        condition_number=8.4,
+        gate=VERDICT,
+        reason="waits for an operator",
+    )
+    return replace(record, **changes)
+
+
+def assert_same(found: ReconstructorRecord, expected: ReconstructorRecord) -> None:
+    if expected.alpha is None:
+        assert found.alpha is found.sigma is None
+    else:
+        np.testing.assert_allclose(found.alpha.vector, expected.alpha.vector, rtol=1e-14)
+        np.testing.assert_allclose(found.sigma, expected.sigma, rtol=1e-14)
+    for name in set(ReconstructorRecord.__slots__) - {"alpha", "sigma"}:
+        assert getattr(found, name) == getattr(expected, name), name
+
+
+@pytest.fixture
+def archive(tmp_path):
+    archive = Archive(tmp_path / "data" / "var")
+    archive.open()
+    with archive:
+        yield archive
+
+
+def product(archive, matrix_id="cm-1"):
+    return archive._products / f"{matrix_id}.h5"
+
+
+def damage(path):
+    path.chmod(0o644)
+    data = bytearray(path.read_bytes())
+    place = data.find(MATRIX.tobytes())
+    data[place : place + 4] = b"\x00\x00\x80\x3f"
+    path.write_bytes(data)
+
+
+def test_making_an_archive_touches_nothing(tmp_path):
+    Archive(tmp_path / "var")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_archive_that_is_not_open_says_so(tmp_path):
+    with pytest.raises(ArchiveError, match="not open"):
+        Archive(tmp_path / "var").records()
+
+
+def test_a_stored_matrix_comes_back_bit_for_bit(archive):
+    matrix = np.random.default_rng(1).normal(size=(3, 50)).astype(np.float32)
+    archive.store(record_of(), np.asfortranarray(matrix), np.eye(4), {})
+    found = archive.matrix("cm-1")
+    assert found.dtype == np.float32
+    assert found.tobytes() == matrix.tobytes()
+
+
+def test_records_come_back_after_a_restart_oldest_first(tmp_path):
+    newer, older = record_of("b", created_ns_utc=2), record_of("a", created_ns_utc=1)
+    for record in (newer, older):
+        archive = Archive(tmp_path)
+        archive.open()
+        with archive:
+            archive.store(record, MATRIX, None, {})
+    archive = Archive(tmp_path)
+    assert archive.open() == ()
+    with archive:
+        found = archive.records()
+        assert [r.id for r in found] == ["a", "b"]
+        assert_same(found[0], older)
+        np.testing.assert_array_equal(archive.matrix("b"), MATRIX)
+
+
+def test_a_record_without_registration_or_verdict_comes_back_as_it_was(archive):
+    bare = ReconstructorRecord(id="rtc-7", state=MatrixState.APPLIED, n_modes=400, created_ns_utc=5)
+    archive.update(bare)
+    assert_same(archive.records()[0], bare)
+
+
+def test_an_update_changes_the_index_but_not_the_product(archive):
+    archive.store(record_of(), MATRIX, None, {})
+    before = product(archive).read_bytes()
+    applied = record_of(state=MatrixState.APPLIED, applied_frame_seq=77, published_ns_utc=5)
+    archive.update(applied)
+    assert_same(archive.records()[0], applied)
+    assert product(archive).read_bytes() == before
+    np.testing.assert_array_equal(archive.matrix("cm-1"), MATRIX)
+
+
+def test_the_file_says_what_it_is_with_units_in_its_names(archive):
+    covariance = np.diag([1e-4, 4e-4, np.deg2rad(0.03) ** 2, 1e-6])
+    archive.store(record_of(), MATRIX, covariance, {"instrument": "flao-lbt", "n_frames": 5000})
+    with h5py.File(product(archive)) as file:
+        assert file["reconstructor"].shape == (3, 4)
+        assert file["reconstructor"].dtype == np.dtype("<f4")
+        attributes = file.attrs
+        assert attributes["id"] == "cm-1"
+        assert attributes["parent"] == "cm-0"
+        assert attributes["shift_x_subap"] == 0.2
+        assert attributes["rotation_deg"] == pytest.approx(0.3)
+        assert attributes["sigma_rotation_deg"] == pytest.approx(0.03)
+        assert attributes["sha256"] == checksum(MATRIX)
+        assert attributes["software_version"]
+        assert file["covariance"][2, 2] == pytest.approx(0.03**2)
+        assert list(file["covariance"].attrs["parameters"])[2] == "rotation_deg"
+        assert dict(file["provenance"].attrs) == {"instrument": "flao-lbt", "n_frames": 5000}
+
+
+def test_an_id_is_never_reused(archive):
+    archive.store(record_of(), MATRIX, None, {})
+    with pytest.raises(ArchiveError, match="cm-1: already stored, ids are never reused"):
+        archive.store(record_of(), MATRIX + 1, None, {})
+    np.testing.assert_array_equal(archive.matrix("cm-1"), MATRIX)
+
+
+def test_a_record_may_be_known_before_its_matrix_is_stored(archive):
+    archive.update(record_of(state=MatrixState.REFUSED))
+    archive.store(record_of(), MATRIX, None, {})
+    assert [r.state for r in archive.records()] == [MatrixState.PROPOSED]
+    np.testing.assert_array_equal(archive.matrix("cm-1"), MATRIX)
+
+
+@pytest.mark.parametrize(
+    ("record", "matrix", "expected"),
+    [
+        (record_of(n_modes=5), MATRIX, r"found a matrix of shape \(3, 4\), expected \(5, n_slopes"),
+        (record_of(), MATRIX[0], r"shape \(4,\)"),
+        (record_of(), np.full((3, 4), np.nan, np.float32), "finite"),
+        (record_of(sha256="0" * 64), MATRIX, f"expected {'0' * 64}"),
+    ],
+)
+def test_a_matrix_that_is_not_what_its_record_says_is_not_stored(archive, record, matrix, expected):
+    with pytest.raises(ArchiveError, match=expected):
+        archive.store(record, matrix, None, {})
+    assert archive.records() == ()
+    assert list(product(archive).parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("matrix_id", ["../escape", "a/b", "", "current"])
+def test_an_id_that_is_no_id_never_becomes_a_file_name(archive, matrix_id):
+    with pytest.raises(WireError):
+        archive.store(record_of(matrix_id), MATRIX, None, {})
+
+
+@pytest.mark.parametrize("matrix_id", ["nobody", "../index", "rtc-7"])
+def test_a_matrix_that_was_never_stored_is_unknown(archive, matrix_id):
+    archive.update(record_of("rtc-7"))
+    with pytest.raises(UnknownId, match=f"{matrix_id}: no such matrix in the archive"):
+        archive.matrix(matrix_id)
+
+
+# --- damage
+
+
+def test_a_changed_byte_is_found_by_the_checksum_and_the_rest_goes_on(archive):
+    archive.store(record_of("bad"), MATRIX, None, {})
+    archive.store(record_of("good"), MATRIX, None, {})
+    damage(product(archive, "bad"))
+    with pytest.raises(ArchiveError, match=r"bad\.h5: damaged: found checksum"):
+        archive.matrix("bad")
+    np.testing.assert_array_equal(archive.matrix("good"), MATRIX)
+
+
+@pytest.mark.parametrize("keep", [0, 100, 2000])
+def test_a_truncated_file_is_named(archive, keep):
+    archive.store(record_of(), MATRIX, None, {})
+    path = product(archive)
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(ArchiveError, match=r"cm-1\.h5: damaged"):
+        archive.matrix("cm-1")
+
+
+def test_a_missing_file_is_named(archive):
+    archive.store(record_of(), MATRIX, None, {})
+    product(archive).unlink()
+    with pytest.raises(ArchiveError, match=r"cm-1\.h5: missing, although it was stored"):
+        archive.matrix("cm-1")
+
+
+def test_a_lost_index_is_made_anew_from_the_sound_products(tmp_path):
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        for name in ("a", "b", "c", "d"):
+            archive.store(record_of(name), MATRIX, None, {})
+        damage(product(archive, "a"))
+        product(archive, "b").rename(product(archive, "z"))
+        product(archive, "c").chmod(0o644)
+        product(archive, "c").write_bytes(b"not HDF5")
+    for leftover in tmp_path.glob("index.sqlite*"):
+        leftover.unlink()
+    damaged = archive.open()
+    with archive:
+        assert [r.id for r in archive.records()] == ["d"]
+        np.testing.assert_array_equal(archive.matrix("d"), MATRIX)
+    assert len(damaged) == 3
+    assert "a.h5: damaged: found checksum" in damaged[0]
+    assert "c.h5: damaged" in damaged[1]
+    assert "z.h5: found reconstructor b in it, expected z" in damaged[2]
+
+
+def test_a_damaged_index_is_refused_with_what_to_do(tmp_path):
+    (tmp_path / "index.sqlite").write_bytes(b"no database at all, but long enough to look" * 50)
+    with pytest.raises(ArchiveError, match=r"index\.sqlite: damaged .*move it away"):
+        Archive(tmp_path).open()
+
+
+def test_an_index_of_a_later_version_is_refused(tmp_path):
+    connection = sqlite3.connect(tmp_path / "index.sqlite")
+    connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(ArchiveError, match="found version 99, expected 1"):
+        Archive(tmp_path).open()
+
+
+def test_a_record_of_another_version_is_named(archive):
+    archive.update(record_of())
+    archive._index._connection.execute("UPDATE reconstructor SET record = '{\"colour\": 1}'")
+    with pytest.raises(ArchiveError, match="record of reconstructor cm-1 not understood"):
+        archive.records()
+
+
+def test_a_directory_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "var").write_text("a file")
+    with pytest.raises(ArchiveError, match="var: cannot be used"):
+        Archive(tmp_path / "var").open()
+
+
+def test_an_index_that_cannot_be_opened_is_named(tmp_path):
+    (tmp_path / "index.sqlite").mkdir()
+    with pytest.raises(ArchiveError, match=r"index\.sqlite: cannot be opened"):
+        Archive(tmp_path).open()
+
+
+def test_two_services_cannot_share_a_directory(archive):
+    second = Archive(archive._directory)
+    with pytest.raises(ArchiveError, match="in use by another service"):
+        second.open()
+    archive.close()
+    second.open()
+    second.close()
+
+
+# --- audit trail
+
+
+def test_the_audit_trail_keeps_the_last_entries_oldest_first(archive):
+    for i in range(5):
+        archive.audit(i, "operator", "mode.set", f"entry {i}")
+    assert archive.audit_trail(2) == (
+        AuditEntry(t_ns_utc=3, who="operator", name="mode.set", text="entry 3"),
+        AuditEntry(t_ns_utc=4, who="operator", name="mode.set", text="entry 4"),
+    )
+    assert len(archive.audit_trail()) == 5
+
+
+@pytest.mark.parametrize("statement", ["DELETE FROM audit", "UPDATE audit SET who = 'nobody'"])
+def test_the_audit_trail_only_grows(archive, statement):
+    archive.audit(1, "operator", "mode.set", "auto")
+    with pytest.raises(sqlite3.IntegrityError, match="only grows"):
+        archive._index._connection.execute(statement)
+    assert len(archive.audit_trail()) == 1
+
+
+def test_calls_from_several_threads_queue_up(archive):
+    def work(k):
+        archive.store(record_of(f"cm-{k}"), MATRIX + k, None, {})
+        archive.audit(k, "service", "stored", f"cm-{k}")
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(archive.records()) == len(archive.audit_trail()) == 8
+    for k in range(8):
+        np.testing.assert_array_equal(archive.matrix(f"cm-{k}"), MATRIX + k)
+
+
+# --- a service that dies
+
+WRITER = """
+import sys
+from pathlib import Path
+import numpy as np
+from service.archive import Archive
+from service.state import MatrixState, ReconstructorRecord
+
+archive = Archive(Path(sys.argv[1]))
+archive.open()
+matrix = np.random.default_rng(1).normal(size=(400, 1384)).astype(np.float32)
+for k in range(100_000):
+    record = ReconstructorRecord(
+        id=f"cm-{k:06d}", state=MatrixState.PROPOSED, n_modes=400, created_ns_utc=k
+    )
+    archive.store(record, matrix, None, {})
+    archive.audit(k, "service", "stored", record.id)
+    print(record.id, flush=True)
+"""
+
+
+def start_writer(directory, before=""):
+    told = (directory / "told.txt").open("w")
+    complaint = (directory / "complaint.txt").open("w")
+    with told, complaint:
+        return subprocess.Popen(
+            [sys.executable, "-c", before + WRITER, str(directory / "var")],
+            stdout=told,
+            stderr=complaint,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+
+
+def assert_nothing_told_is_lost(directory):
+    told = (directory / "told.txt").read_text().split()
+    archive = Archive(directory / "var")
+    assert archive.open() == ()
+    with archive:
+        found = [record.id for record in archive.records()]
+        assert told == found[: len(told)]
+        assert len(found) <= len(told) + 1
+        for matrix_id in found:
+            assert archive.matrix(matrix_id).shape == (400, 1384)
+        assert {path.stem for path in product(archive).parent.iterdir()} == set(found)
+        return found
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_service_killed_while_it_writes_loses_nothing_it_was_told_is_stored(tmp_path, seed):
+    writer = start_writer(tmp_path)
+    deadline = time.monotonic() + 20
+    while (tmp_path / "told.txt").read_text().count("\n") < 2:
+        assert time.monotonic() < deadline, (tmp_path / "complaint.txt").read_text()
+        time.sleep(0.01)
+    time.sleep(random.Random(seed).uniform(0.0, 0.05))
+    writer.send_signal(signal.SIGKILL)
+    writer.wait(timeout=20)
+    assert len(assert_nothing_told_is_lost(tmp_path)) >= 2
+
+
+DIE = "import os, signal\ndie = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
+
+
+@pytest.mark.parametrize(
+    ("death", "found"),
+    [
+        ("import service.archive.product as p; p._flush = die\n", []),
+        ("import service.archive.index as i; i.Index.add = die\n", ["cm-000000"]),
+        ("import service.archive.index as i; i.Index.audit = die\n", ["cm-000000"]),
+    ],
+    ids=["before the file has its name", "before the index", "before the audit trail"],
+)
+def test_a_service_killed_between_two_steps_finds_all_or_nothing(tmp_path, death, found):
+    writer = start_writer(tmp_path, before=DIE + death)
+    assert writer.wait(timeout=20) == -signal.SIGKILL
+    assert assert_nothing_told_is_lost(tmp_path) == found
+
+
+def test_a_product_that_did_not_reach_the_index_is_taken_in_at_the_next_start(tmp_path):
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        archive.store(record_of(), MATRIX, None, {})
+        archive._index._connection.execute("DELETE FROM reconstructor")
+        (product(archive).parent / "cm-2.h5.part").write_bytes(b"half")
+    assert archive.open() == ()
+    with archive:
+        assert_same(archive.records()[0], record_of())
+        assert os.listdir(product(archive).parent) == ["cm-1.h5"]
+
+
+def test_a_disk_that_refuses_leaves_nothing_behind(tmp_path):
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
+    writer = start_writer(tmp_path, before=limit)
+    assert writer.wait(timeout=20) == 1
+    complaint = (tmp_path / "complaint.txt").read_text()
+    assert "ArchiveError" in complaint
+    assert "cm-000000.h5: cannot be written" in complaint
+    assert assert_nothing_told_is_lost(tmp_path) == []

@@ -8,7 +8,7 @@
     ├── WireError            bytes from the RTC that break the contract
     ├── LinkError            the zenoh session cannot be opened or an RTC does not answer
     ├── CommandError         an operator's request that cannot be carried out now
-    │   └── UnknownId        a reconstructor, session or product nobody has heard of
+    │   └── UnknownIdError      a reconstructor, session or product nobody has heard of
     └── ArchiveError         a product that cannot be written, read, or fails its checksum
 
 Expected outcomes (a rejected fit, a refused reconstructor, too few frames) are values, not
@@ -40,9 +40,12 @@ class CommandError(PyrcalError):
     """An operator's request cannot be carried out in the present state."""
 
 
-class UnknownId(CommandError):
+class UnknownIdError(CommandError):
     """The id names nothing this service knows."""
 
 
 class ArchiveError(PyrcalError):
     """A product cannot be written or read, or its checksum does not match."""
+
+
+UnknownId = UnknownIdError

@@ -187,6 +187,9 @@ class RtcView:
     magnitude: float | None
     max_dither_m: float
     max_dither_modes: int
+    dither_id: str | None
+    """The dither now running; None: none."""
+
     t_ns_utc: int
     """The RTC's own timestamp of this status."""
 
@@ -205,8 +208,8 @@ class DitherView:
     start_seq: int | None
     """First frame that contains it; None until the RTC has accepted."""
 
-    dt_ns: int
-    """Frame period it was planned for."""
+    asked_ns_utc: int
+    """When the service asked for it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -280,6 +283,20 @@ class TrackerState:
     """Pinned or adopted; frames of another configuration are refused."""
 
     dither: DitherView | None = None
+    """Requested or running; None: none, and a new one may be asked for."""
+
+    dither_stopped: bool = False
+    """An operator stopped it: the service does not start another by itself."""
+
+    making_since_ns_utc: int | None = None
+    """When the reconstructor now being computed was asked for; None: none is."""
+
+    judged_ns_utc: int | None = None
+    """When ``margin`` was last asked for."""
+
+    retry_ns_utc: int = 0
+    """Nothing is asked of the RTC or computed by itself before this time."""
+
     watchdog: Watchdog | None = None
     alarms: tuple[Alarm, ...] = ()
     log: tuple[LogEntry, ...] = ()

@@ -1,73 +1,91 @@
-"""How one event changes what the service knows, and what is to be done about it."""
+"""How one event changes what the service knows, and what is then to be done.
+
+``step`` is a function of state, event and time alone: no clock, no files, no link. A recorded
+night therefore replays exactly, and every reaction of the service can be tested as a value.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from service import events as ev
+from service.events import Command, Event
+from service.reactions.journal import with_alarm, without_alarm
+from service.reactions.matrices import (
+    Step,
+    on_acknowledgement,
+    on_fetched,
+    on_margin,
+    on_matrix,
+)
+from service.reactions.operator import on_command
+from service.reactions.policy import Policy, decide
+from service.reactions.rtc import (
+    on_dither,
+    on_failure,
+    on_new_session,
+    on_status,
+    on_tick,
+    on_vanished,
+)
+from service.reactions.windows import on_watchdog, on_window, refuse_window
+from service.state import TrackerState
 
-from service.state import Mode
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetMode:
-    """An operator chooses how much the service may do by itself."""
-
-    mode: Mode
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Refit:
-    """Compute a reconstructor for the current α now; it still passes the gate and the mode."""
-
-    n_modes: int | None = None
-    """Modes to control; None: as many as now."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StartDither:
-    """Start a sinusoidal dither; None: the service's own choice."""
-
-    modes: tuple[int, ...] | None = None
-    """0-based basis indices."""
-
-    amplitude_m: float | None = None
-    """RMS of each mode, metres OPD."""
-
-    frequency_hz: tuple[float, ...] | None = None
-    """One for each mode."""
-
-    duration_s: float | None = None
+__all__ = ["Command", "Event", "Policy", "step"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StopDither:
-    """Stop the dither and do not start another until told to."""
+def step(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
+    """Return the next state and what is to be done.
+
+    Raises
+    ------
+    CommandError
+        If an operator's command cannot be carried out in this state; the state stands.
+    UnknownIdError
+        If it names a reconstructor nobody has heard of.
+    """
+    state, effects = _react(state, event, policy, now_ns)
+    state, more = decide(state, policy, now_ns)
+    return state, (*effects, *more)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Approve:
-    """Publish a proposed reconstructor."""
+def _react(  # noqa: C901 - one line for each event
+    state: TrackerState, event: Event, policy: Policy, now_ns: int
+) -> Step:
+    match event:
+        case ev.Tick():
+            return on_tick(state, now_ns), ()
+        case ev.StatusSeen(rtc=rtc):
+            return on_status(state, rtc, now_ns), ()
+        case ev.SessionStarted(session=session):
+            return on_new_session(state, session, now_ns), ()
+        case ev.RtcVanished():
+            return on_vanished(state, now_ns), ()
+        case ev.Trouble(name=name, text=text, over=over):
+            if over:
+                return without_alarm(state, name, now_ns), ()
+            return with_alarm(state, name, text, now_ns), ()
+        case ev.WindowFitted(estimate=estimate):
+            return on_window(state, estimate, policy, now_ns), ()
+        case ev.WindowLost(refused=refused):
+            return refuse_window(state, refused.reason, now_ns), ()
+        case ev.Watched():
+            return on_watchdog(state, event, now_ns), ()
+        case _:
+            return _react_to_matrices(state, event, policy, now_ns)
 
-    id: str
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reject:
-    """Discard a proposed reconstructor."""
-
-    id: str
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Publish:
-    """Send a known reconstructor again, under a new id, after it has passed the gate anew."""
-
-    id: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rollback:
-    """Go back to the reconstructor that was in use before the present one."""
-
-
-Command = SetMode | Refit | StartDither | StopDither | Approve | Reject | Publish | Rollback
+def _react_to_matrices(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
+    match event:
+        case ev.MatrixMade(record=record, wanted=wanted):
+            return on_matrix(state, record, wanted=wanted, now_ns=now_ns)
+        case ev.MatrixFetched(record=record):
+            return on_fetched(state, record, now_ns), ()
+        case ev.MarginJudged(id=matrix_id, verdict=verdict):
+            return on_margin(state, matrix_id, verdict, now_ns), ()
+        case ev.Acknowledged():
+            return on_acknowledgement(state, event, now_ns), ()
+        case ev.DitherAnswered():
+            return on_dither(state, event, now_ns), ()
+        case ev.JobFailed(effect=effect, text=text):
+            return on_failure(state, effect, text, now_ns), ()
+        case _:
+            return on_command(state, event, policy, now_ns)

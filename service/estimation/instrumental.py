@@ -23,7 +23,7 @@ N_STEPS = 5
 """Gauss-Newton steps inside one linearisation: gains and α are multiplied with one another."""
 
 MAX_LAG_FRAMES = 0.2
-"""A larger lag between slopes and commands means the columns are not aligned as the wire demands."""
+"""A larger lag between slopes and commands: the columns are not aligned as the wire demands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -64,7 +64,7 @@ class LockInPlan:
         periods = lines * self.n_frames / self.frame_rate_hz
         if np.abs(periods - np.round(periods)).max() > 1e-6:
             raise ModelError(
-                f"lock-in: {self.n_frames} frames cut a period; expected whole periods of {lines} Hz"
+                f"lock-in: {self.n_frames} frames cut a period of {lines} Hz; expected whole ones"
             )
         gaps = np.diff(np.sort(lines)) * self.n_frames / self.frame_rate_hz
         if gaps.size and gaps.min() < 4:
@@ -214,8 +214,8 @@ def _add(plan: LockInPlan, window: _Window, block: FrameBlock, rows: slice) -> _
     turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, index)
     phasors = (hann * np.exp(-2j * np.pi * turns)).astype(np.complex64)
     lines = phasors.reshape(*plan.bins_hz.shape, n_rows)[:, 0]
-    dither = block.dither_m
-    assert_dither = dither[rows] if dither is not None else np.zeros((n_rows, 1), np.float32)
+    # _why_broken lets no block without dither columns come this far
+    dither = block.commands_m[:0] if block.dither_m is None else block.dither_m
     shape = plan.bins_hz.shape
     return replace(
         window,
@@ -224,7 +224,7 @@ def _add(plan: LockInPlan, window: _Window, block: FrameBlock, rows: slice) -> _
         next_t_ns=block.t0_ns_utc + rows.stop * block.dt_ns,
         slopes=window.slopes + _project(phasors, block.slopes[rows]).reshape(*shape, -1),
         commands=window.commands + _project(phasors, block.commands_m[rows]).reshape(*shape, -1),
-        dither=window.dither + _project(lines, assert_dither),
+        dither=window.dither + _project(lines, dither[rows]),
     )
 
 

@@ -21,7 +21,7 @@ from service.model.misregistration import Misregistration
 Array = NDArray[Any]
 
 BIAS_FLOOR = np.array([0.10, 0.10, np.deg2rad(0.05), 0.001])
-"""1 σ nobody may go below without a dither: wind bias for the shifts, measured bias for the rest."""
+"""1 σ nobody may go below without a dither: the wind's bias of the shifts, measured otherwise."""
 
 MIN_FRAMES_PER_MODE = 5
 """Fewer effective frames leave the command covariance too noisy to invert."""

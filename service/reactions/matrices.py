@@ -1,0 +1,111 @@
+"""A reconstructor's way: made, judged, sent, acknowledged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service import events as ev
+from service.control.gate import GateVerdict
+from service.errors import CommandError
+from service.events import Effect
+from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.shelf import (
+    known_record,
+    with_changed,
+    with_in_use,
+    with_record,
+    with_state,
+)
+from service.state import Level, MatrixState, Mode, ReconstructorRecord, RtcView, TrackerState
+
+Step = tuple[TrackerState, tuple[Effect, ...]]
+
+
+def on_matrix(
+    state: TrackerState, record: ReconstructorRecord, *, wanted: bool, now_ns: int
+) -> Step:
+    """Shelve a new reconstructor; send it if it passed the gate and nobody need approve."""
+    state = replace(state, making_since_ns_utc=None)
+    for older in state.reconstructors:
+        if older.state is MatrixState.PROPOSED:
+            state = with_state(state, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
+    state = with_record(state, record)
+    verdict = record.gate.reason if record.gate is not None else "not judged: α is unknown"
+    if record.state is MatrixState.REFUSED:
+        text = f"{record.id}: {verdict}"
+        return logged(state, "reconstructor.refused", text, now_ns, Level.WARNING), ()
+    state = logged(
+        state, "reconstructor.made", f"{record.id}, {record.n_modes} modes, {verdict}", now_ns
+    )
+    if wanted or state.mode is Mode.AUTO:
+        return send(state, record.id, now_ns)
+    return state, ()
+
+
+def send(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
+    """Mark a reconstructor as published and ask for it to be sent.
+
+    Raises
+    ------
+    CommandError
+        If no RTC is there.
+    """
+    record, rtc = known_record(state, matrix_id), state.rtc
+    if rtc is None:
+        raise CommandError(f"{matrix_id} cannot be sent: no RTC is there")
+    state = with_changed(
+        state, replace(record, state=MatrixState.PUBLISHED, published_ns_utc=now_ns, reason="")
+    )
+    state = logged(state, "reconstructor.published", f"{matrix_id} sent to the RTC", now_ns)
+    gains = None
+    if record.n_modes != rtc.n_controlled:
+        gains = extended_gains(rtc, record.n_modes)
+    return state, (ev.SendMatrix(id=matrix_id, n_modes=record.n_modes, gains=gains),)
+
+
+def extended_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:
+    """Return gains for ``n_modes`` controlled modes: those in force, the last one for new modes."""
+    last = rtc.gains[rtc.n_controlled - 1]
+    kept = rtc.gains[: min(rtc.n_controlled, n_modes)]
+    return (*kept, *(last,) * (n_modes - len(kept)), *(0.0,) * (rtc.n_modes - n_modes))
+
+
+def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int) -> TrackerState:
+    """Fold the RTC's answer to a reconstructor back in; a late one is accepted."""
+    record = state.reconstructor(event.id)
+    if record is None:
+        text = f"an acknowledgement for {event.id}, which this service never sent"
+        return logged(state, "acknowledgement.unknown", text, now_ns, Level.WARNING)
+    if event.state is MatrixState.STAGED and record.state is not MatrixState.PUBLISHED:
+        return state
+    if event.state is MatrixState.APPLIED:
+        record = replace(record, applied_frame_seq=event.frame_seq, reason=event.reason)
+        state = with_in_use(with_changed(state, record), event.id)
+        state = without_alarm(state, "no-acknowledgement", now_ns)
+        state = replace(state, margin=record.gate, judged_ns_utc=now_ns)
+        text = f"{event.id} applied from frame {event.frame_seq}"
+        return logged(state, "reconstructor.applied", text, now_ns)
+    state = with_state(state, event.id, event.state, event.reason)
+    if event.state is MatrixState.REJECTED:
+        text = f"the RTC rejected {event.id}: {event.reason}"
+        return logged(state, "reconstructor.rejected", text, now_ns, Level.WARNING)
+    return state
+
+
+def on_fetched(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> TrackerState:
+    """Shelve the matrix the RTC uses, which the service did not make."""
+    state = with_in_use(with_record(state, record), record.id)
+    text = f"the RTC uses {record.id}, {record.n_modes} modes"
+    return logged(state, "reconstructor.adopted", text, now_ns)
+
+
+def on_margin(
+    state: TrackerState, matrix_id: str, verdict: GateVerdict, now_ns: int
+) -> TrackerState:
+    """Note the margin of the matrix in use; raise an alarm when it is short."""
+    if matrix_id != state.in_use:
+        return state
+    state = replace(state, margin=verdict)
+    if verdict.accepted:
+        return without_alarm(state, "margin", now_ns)
+    return with_alarm(state, "margin", f"{matrix_id}: {verdict.reason}", now_ns)

@@ -1,0 +1,114 @@
+"""What an operator asks for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service import events as ev
+from service.errors import CommandError
+from service.events import Event
+from service.reactions.journal import logged
+from service.reactions.matrices import Step, send
+from service.reactions.policy import Policy, plan_dither
+from service.reactions.shelf import known_record, with_state
+from service.state import MatrixState, Mode, TrackerState
+
+
+def on_command(  # noqa: C901 - one line for each command
+    state: TrackerState, event: Event, policy: Policy, now_ns: int
+) -> Step:
+    """Carry out an operator's command, or say why it cannot be.
+
+    Raises
+    ------
+    CommandError
+        If it makes no sense in this state.
+    """
+    match event:
+        case ev.SetMode(mode=mode):
+            return logged(replace(state, mode=mode), "mode", f"mode is {mode}", now_ns), ()
+        case ev.StopDither():
+            state = replace(state, dither=None, dither_stopped=True)
+            return logged(state, "dither.stopped", "by the operator", now_ns), (ev.AskNoDither(),)
+        case ev.StartDither():
+            return _start_dither(state, event, policy, now_ns)
+        case ev.Refit(n_modes=n_modes):
+            return _refit(state, n_modes, now_ns)
+        case ev.Approve(id=matrix_id):
+            _proposed(state, matrix_id)
+            return send(state, matrix_id, now_ns)
+        case ev.Reject(id=matrix_id, reason=reason):
+            _proposed(state, matrix_id)
+            state = with_state(state, matrix_id, MatrixState.DISCARDED, reason or "by the operator")
+            return logged(state, "reconstructor.discarded", matrix_id, now_ns), ()
+        case ev.Publish(id=matrix_id):
+            known_record(state, matrix_id)
+            return _copy(state, matrix_id, f"the operator publishes {matrix_id} again", now_ns)
+        case ev.Rollback():
+            return _rollback(state, now_ns)
+        case _:
+            raise TypeError(f"an event the tracker does not know: {event!r}")
+
+
+def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, now_ns: int) -> Step:
+    rtc = state.rtc
+    if rtc is None or rtc.loop == "open":
+        raise CommandError("a dither needs an RTC with its loop closed")
+    if state.dither is not None:
+        raise CommandError(f"{state.dither.id} is running: stop it first")
+    dither = plan_dither(
+        rtc,
+        policy,
+        now_ns,
+        modes=event.modes,
+        amplitude_m=event.amplitude_m,
+        frequency_hz=event.frequency_hz,
+        duration_s=event.duration_s,
+    )
+    if len(dither.modes) != len(dither.frequency_hz):
+        raise CommandError(
+            f"dither: found {len(dither.frequency_hz)} frequencies for {len(dither.modes)} modes; "
+            "expected one for each"
+        )
+    state = replace(state, dither=dither, dither_stopped=False)
+    return logged(state, "dither.asked", f"modes {dither.modes}", now_ns), (
+        ev.AskDither(dither=dither),
+    )
+
+
+def _refit(state: TrackerState, n_modes: int | None, now_ns: int) -> Step:
+    if state.rtc is None:
+        raise CommandError("refit: no RTC is there")
+    if state.registration is None:
+        raise CommandError("refit: α is not known yet; start a dither and wait for a window")
+    if state.making_since_ns_utc is not None:
+        raise CommandError("refit: a reconstructor is being computed; wait for it")
+    wanted = n_modes or state.rtc.n_controlled
+    if not 0 < wanted <= state.rtc.n_modes:
+        raise CommandError(f"refit: found {wanted} modes; expected 1 to {state.rtc.n_modes}")
+    state = replace(state, making_since_ns_utc=now_ns)
+    return state, (ev.MakeMatrix(n_modes=wanted, why="the operator asked"),)
+
+
+def _copy(state: TrackerState, source: str, why: str, now_ns: int) -> Step:
+    """Offer an earlier matrix again; hold, or the service would replace it at once."""
+    if state.making_since_ns_utc is not None:
+        raise CommandError("a reconstructor is being computed; wait for it")
+    if state.rtc is None:
+        raise CommandError("no RTC is there")
+    state = replace(state, mode=Mode.HOLD, making_since_ns_utc=now_ns)
+    state = logged(state, "mode", f"hold: {why}", now_ns)
+    return state, (ev.CopyMatrix(source=source, why=why),)
+
+
+def _rollback(state: TrackerState, now_ns: int) -> Step:
+    earlier = [r.id for r in state.reconstructors if r.state is MatrixState.SUPERSEDED]
+    if not earlier:
+        raise CommandError("rollback: no earlier reconstructor has been in use")
+    return _copy(state, earlier[-1], f"the operator goes back to {earlier[-1]}", now_ns)
+
+
+def _proposed(state: TrackerState, matrix_id: str) -> None:
+    record = known_record(state, matrix_id)
+    if record.state is not MatrixState.PROPOSED:
+        raise CommandError(f"{matrix_id} is {record.state}, not proposed")

@@ -1,0 +1,116 @@
+"""What the RTC says, does not say, and what fails on the way to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service import events as ev
+from service.events import Effect
+from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.policy import SECOND_NS
+from service.reactions.shelf import with_in_use, with_state
+from service.state import Level, MatrixState, RtcView, TrackerState
+
+ACKNOWLEDGE_WITHIN_S = 3.0
+"""An RTC applies within 2 s of the commit, or it has failed."""
+
+COMPUTE_WITHIN_S = 60.0
+"""A reconstructor that takes longer was lost with its worker."""
+
+
+def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
+    """Give up what has been waited for too long."""
+    for record in state.reconstructors:
+        waiting = record.state in {MatrixState.PUBLISHED, MatrixState.STAGED}
+        sent_ns = record.published_ns_utc or now_ns
+        if waiting and now_ns - sent_ns > ACKNOWLEDGE_WITHIN_S * SECOND_NS:
+            text = (
+                f"{record.id} was not applied within {ACKNOWLEDGE_WITHIN_S:.0f} s; the RTC keeps "
+                "the old one: look at the RTC's log, then publish again"
+            )
+            state = with_state(state, record.id, MatrixState.FAILED, text)
+            state = with_alarm(state, "no-acknowledgement", text, now_ns)
+    since_ns = state.making_since_ns_utc
+    if since_ns is not None and now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
+        state = replace(state, making_since_ns_utc=None)
+        text = f"no reconstructor came within {COMPUTE_WITHIN_S:.0f} s"
+        state = logged(state, "reconstructor.lost", text, now_ns, Level.WARNING)
+    return state
+
+
+def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
+    """Take over what the RTC says of itself."""
+    state = without_alarm(state, "rtc-vanished", now_ns)
+    state = replace(
+        state,
+        rtc=rtc,
+        basis_id=state.basis_id or rtc.basis_id,
+        config_id=state.config_id or rtc.config_id,
+    )
+    if rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None:
+        state = with_in_use(state, rtc.cm_id)
+    if rtc.loop == "open":
+        state = with_alarm(state, "loop-open", "the loop is open: close it to calibrate", now_ns)
+    else:
+        state = without_alarm(state, "loop-open", now_ns)
+    dither = state.dither
+    if dither is None or dither.start_seq is None or rtc.dither_id == dither.id:
+        return state
+    # a status on its way when the dither was accepted does not know it yet
+    if now_ns - dither.asked_ns_utc > 2 * SECOND_NS:
+        state = replace(state, dither=None)
+        state = logged(state, "dither.ended", f"{dither.id} has ended", now_ns)
+    return state
+
+
+def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerState:
+    """Void what belonged to the old session; α is the telescope's and stays, to be confirmed."""
+    for record in state.reconstructors:
+        if record.state in {MatrixState.PUBLISHED, MatrixState.STAGED}:
+            state = with_state(state, record.id, MatrixState.FAILED, "the RTC restarted")
+    registration = state.registration
+    state = replace(
+        state,
+        rtc=None,
+        dither=None,
+        in_use=None,
+        margin=None,
+        judged_ns_utc=None,
+        retry_ns_utc=0,
+        registration=registration and replace(registration, n_windows=0),
+    )
+    return logged(state, "rtc.session", f"the RTC started session {session}", now_ns)
+
+
+def on_dither(state: TrackerState, event: ev.DitherAnswered, now_ns: int) -> TrackerState:
+    """Note when the dither starts, or why it does not."""
+    if state.dither is None or state.dither.id != event.id:
+        return state
+    if event.accepted:
+        state = replace(state, dither=replace(state.dither, start_seq=event.start_seq))
+        text = f"{event.id} starts at frame {event.start_seq}"
+        return logged(without_alarm(state, "dither", now_ns), "dither.started", text, now_ns)
+    state = replace(state, dither=None, retry_ns_utc=now_ns + 10 * SECOND_NS)
+    return with_alarm(state, "dither", f"the RTC refused the dither: {event.reason}", now_ns)
+
+
+def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> TrackerState:
+    """Undo the memory of having asked, so that it can be asked again later."""
+    later = now_ns + 5 * SECOND_NS
+    match effect:
+        case ev.MakeMatrix() | ev.CopyMatrix():
+            state = replace(state, making_since_ns_utc=None, retry_ns_utc=later)
+        case ev.AskDither():
+            state = replace(state, dither=None, retry_ns_utc=later)
+        case ev.SendMatrix(id=matrix_id):
+            state = with_state(state, matrix_id, MatrixState.FAILED, text)
+        case _:
+            state = replace(state, retry_ns_utc=later)
+    return logged(state, "job.failed", text, now_ns, Level.WARNING)
+
+
+def on_vanished(state: TrackerState, now_ns: int) -> TrackerState:
+    """Forget what belonged to the RTC, and nothing else."""
+    state = replace(state, rtc=None, dither=None)
+    text = "the RTC vanished; α and every reconstructor are kept: restart the RTC"
+    return with_alarm(state, "rtc-vanished", text, now_ns)

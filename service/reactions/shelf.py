@@ -1,0 +1,53 @@
+"""The shelf of reconstructors inside the state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service.errors import UnknownIdError
+from service.state import MatrixState, ReconstructorRecord, TrackerState
+
+RECONSTRUCTORS_KEPT = 200
+
+
+def with_record(state: TrackerState, record: ReconstructorRecord) -> TrackerState:
+    """Return the state with one more reconstructor."""
+    return replace(state, reconstructors=(*state.reconstructors, record)[-RECONSTRUCTORS_KEPT:])
+
+
+def with_changed(state: TrackerState, record: ReconstructorRecord) -> TrackerState:
+    """Return the state with the record of the same id replaced."""
+    return replace(
+        state,
+        reconstructors=tuple(record if r.id == record.id else r for r in state.reconstructors),
+    )
+
+
+def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
+    """Return the record of this id.
+
+    Raises
+    ------
+    UnknownIdError
+        If there is none.
+    """
+    record = state.reconstructor(matrix_id)
+    if record is None:
+        raise UnknownIdError(f"no reconstructor {matrix_id}")
+    return record
+
+
+def with_state(state: TrackerState, matrix_id: str, to: MatrixState, reason: str) -> TrackerState:
+    """Return the state with one reconstructor further on its way."""
+    return with_changed(state, replace(known_record(state, matrix_id), state=to, reason=reason))
+
+
+def with_in_use(state: TrackerState, matrix_id: str) -> TrackerState:
+    """Mark one reconstructor as applied; whichever was, has been superseded."""
+    if state.in_use == matrix_id and known_record(state, matrix_id).state is MatrixState.APPLIED:
+        return state
+    for record in state.reconstructors:
+        if record.id != matrix_id and record.state is MatrixState.APPLIED:
+            state = with_state(state, record.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
+    state = with_state(state, matrix_id, MatrixState.APPLIED, known_record(state, matrix_id).reason)
+    return replace(state, in_use=matrix_id, margin=None, judged_ns_utc=None)

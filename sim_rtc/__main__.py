@@ -1,0 +1,147 @@
+"""``python -m sim_rtc``: the simulated RTC as a process of its own."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from types import FrameType
+
+import structlog
+from threadpoolctl import threadpool_limits
+
+from service.config import load_instrument
+from service.errors import ConfigurationError
+from sim_rtc.assembly import Telescope, build_telescope
+from sim_rtc.clock import FrameClock, Pace
+from sim_rtc.computer import Batch, RealTimeComputer
+from sim_rtc.feed import BATCH_FRAMES, Ahead
+from sim_rtc.link import Link
+from sim_rtc.options import Options, parse_options
+from sim_rtc.truth import TruthRecorder
+
+_REPORT_PERIOD_S = 10.0
+_log = structlog.get_logger("sim_rtc")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the simulated RTC until its time is up or it is told to stop; return the exit status."""
+    options = parse_options(arguments)
+    _configure_log(quiet=options.quiet)
+    stopped = threading.Event()
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        stopped.set()
+
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, stop)
+    try:
+        instrument = load_instrument(options.instrument)
+        # Nested threading makes small products slower, and the service needs the other core.
+        with threadpool_limits(1):
+            telescope = build_telescope(options, instrument)
+            run(telescope, options, stopped)
+    except ConfigurationError as error:
+        print(f"sim_rtc: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def run(telescope: Telescope, options: Options, stopped: threading.Event) -> None:
+    """Run the loop in this thread until ``stopped`` or the time is up."""
+    batch_s = BATCH_FRAMES / options.frame_rate_hz / options.speed if options.speed else 0.0
+    pace = Pace(batch_s=batch_s)
+    with ExitStack() as stack:
+        ahead = stack.enter_context(Ahead(telescope.feed.blocks()))
+        computer = telescope.computer(iter(ahead))
+        computer.prepare()
+        clock = FrameClock(start_ns_utc=time.time_ns(), dt_ns=round(1e9 / options.frame_rate_hz))
+        link = stack.enter_context(
+            Link(
+                computer,
+                endpoint=options.connect,
+                clock=clock,
+                detector=telescope.detector,
+                magnitude=options.magnitude,
+            )
+        )
+        truth = None
+        if options.truth is not None:
+            recorder = TruthRecorder(options.truth, weights=telescope.weights, clock=clock)
+            truth = stack.enter_context(recorder)
+        last_batch = float("inf")
+        if options.seconds is not None:
+            last_batch = round(options.seconds * options.frame_rate_hz / BATCH_FRAMES)
+        watch = Watch(computer, pace)
+        n_batches = 0
+        _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.snapshot().session)
+        while not stopped.is_set() and n_batches < last_batch:
+            pace.wait(stopped)
+            batch = computer.next_batch()
+            link.offer(batch)
+            if truth is not None:
+                truth.offer(batch, pace.late_batches * BATCH_FRAMES)
+            pace.done()
+            watch.look(batch)
+            n_batches += 1
+        watch.report()
+
+
+class Watch:
+    """Tells the log, at most every few seconds, how the loop is doing."""
+
+    def __init__(self, computer: RealTimeComputer, pace: Pace) -> None:
+        self._computer = computer
+        self._pace = pace
+        self._since_s = time.monotonic()
+        self._cpu_s = time.process_time()
+        self._seq = 0
+        self._clipped = 0
+        self._late = 0
+
+    def look(self, batch: Batch) -> None:
+        """Take note of a batch."""
+        self._clipped += batch.n_clipped
+        self._seq = batch.seq0 + len(batch.slopes)
+        if time.monotonic() - self._since_s >= _REPORT_PERIOD_S:
+            self.report()
+
+    def report(self) -> None:
+        """Log what has happened since the last report."""
+        now_s, cpu_s = time.monotonic(), time.process_time()
+        late = self._pace.late_batches - self._late
+        _log.info(
+            "loop.report",
+            frames=self._seq,
+            cm_id=self._computer.snapshot().reconstructor.manifest.id,
+            cpu_per_second=round((cpu_s - self._cpu_s) / max(now_s - self._since_s, 1e-9), 3),
+            overrun_frames=late * BATCH_FRAMES,
+        )
+        if self._clipped:
+            _log.warning("loop.clipped", commands=self._clipped, text="the loop may diverge")
+        if late:
+            _log.warning("loop.late", frames=late * BATCH_FRAMES, behind_s=self._pace.behind_s)
+        self._since_s, self._cpu_s, self._clipped = now_s, cpu_s, 0
+        self._late = self._pace.late_batches
+
+
+def _configure_log(*, quiet: bool) -> None:
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.KeyValueRenderer(key_order=["timestamp", "level", "event"]),
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(
+            logging.WARNING if quiet else logging.INFO
+        ),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

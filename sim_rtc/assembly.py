@@ -1,0 +1,161 @@
+"""Puts a simulated RTC together from its options; takes a few seconds."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ConfigurationError
+from service.model.instrument import Instrument, KarhunenLoeve
+from service.model.interaction import InteractionModel
+from service.model.misregistration import Misregistration
+from service.model.modes import ModalBasis, karhunen_loeve_basis
+from service.wire import CHUNK_LIMIT, Manifest, layout_of
+from sim_rtc.atmosphere import fried_parameter_m, frozen_layers
+from sim_rtc.computer import Identity, LoopSettings, RealTimeComputer
+from sim_rtc.detector import Detector
+from sim_rtc.dither import DitherLimits
+from sim_rtc.feed import OpenLoopBlock, OpenLoopFeed
+from sim_rtc.motion import MovingOptics, background_executor
+from sim_rtc.options import Options
+from sim_rtc.plant import LinearPlant
+from sim_rtc.reconstructors import Reconstructor, truncated_inverse
+from sim_rtc.schedule import Schedule, random_registration
+
+STROKE_M = 10e-6
+"""Largest command of one mode, metres RMS OPD: seven times the tilt of median seeing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Telescope:
+    """Everything but the computer: what feeds it and what is known of it beforehand."""
+
+    feed: OpenLoopFeed
+    optics: MovingOptics
+    detector: Detector
+    identity: Identity
+    reconstructor: Reconstructor
+    """In use at the start: for a perfect registration, by the nominal model."""
+
+    settings: LoopSettings
+    weights: NDArray[np.float64]
+    """``(n_points,)`` share of the pupil's area at each point of the plant."""
+
+    def computer(self, blocks: Iterator[OpenLoopBlock]) -> RealTimeComputer:
+        """Return a computer that runs on these blocks of the feed."""
+        return RealTimeComputer(
+            blocks,
+            identity=self.identity,
+            settings=self.settings,
+            reconstructor=self.reconstructor,
+            optics=self.optics.at(0.0),
+            stroke_m=STROKE_M,
+            limits=DitherLimits(most_modes=len(self.settings.gains)),
+        )
+
+
+def build_telescope(options: Options, instrument: Instrument) -> Telescope:
+    """Return the telescope of these options.
+
+    Raises
+    ------
+    ConfigurationError
+        If more modes are to be controlled than the instrument has.
+    """
+    n_modes = instrument.modes.n_modes
+    if options.n_controlled > n_modes:
+        raise ConfigurationError(
+            f"--n-controlled: found {options.n_controlled}; {instrument.name} has {n_modes} modes"
+        )
+    plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
+    basis = karhunen_loeve_basis(instrument)
+    plant = LinearPlant(instrument, basis, rng=plant_rng)
+    schedule = Schedule(
+        start=options.alpha or random_registration(alpha_rng),
+        drift=options.drift,
+        jumps=options.jumps,
+    )
+    optics = MovingOptics(plant, schedule, background_executor())
+    detector = Detector(
+        instrument,
+        images=optics.start().images,
+        valid=plant.valid,
+        magnitude=options.magnitude,
+        frame_rate_hz=options.frame_rate_hz,
+    )
+    layers = frozen_layers(
+        options.layers,
+        points_m=plant.points_m,
+        pitch_m=plant.pitch_m,
+        turbulence=KarhunenLoeve(
+            r0_m=fried_parameter_m(options.seeing_arcsec), outer_scale_m=options.outer_scale_m
+        ),
+        rng=sky_rng,
+    )
+    identity = identity_of(instrument, plant.valid)
+    return Telescope(
+        feed=OpenLoopFeed(
+            layers=layers,
+            optics=optics,
+            detector=detector,
+            frame_rate_hz=options.frame_rate_hz,
+            jump_times_s=tuple(jump.time_s for jump in options.jumps),
+            rng=noise_rng,
+        ),
+        optics=optics,
+        detector=detector,
+        identity=identity,
+        reconstructor=initial_reconstructor(instrument, basis, identity, options.n_controlled),
+        settings=LoopSettings(
+            frame_rate_hz=options.frame_rate_hz,
+            delay_frames=options.delay_frames,
+            gains=(options.gain,) * n_modes,
+            leak=options.leak,
+            n_controlled_next=options.n_controlled,
+        ),
+        weights=plant.weights,
+    )
+
+
+def initial_reconstructor(
+    instrument: Instrument, basis: ModalBasis, identity: Identity, n_controlled: int
+) -> Reconstructor:
+    """Return what an observatory has before any flexure: the nominal model's inverse at α = 0."""
+    aligned = Misregistration()
+    interaction = InteractionModel(instrument, basis).interaction_matrix(aligned)
+    matrix = truncated_inverse(interaction[:, :n_controlled])
+    layout = layout_of(matrix, CHUNK_LIMIT)
+    manifest = Manifest(
+        id=f"initial-{n_controlled}-{layout.sha256[:8]}",
+        layout=layout,
+        alpha=aligned.to_boundary(),
+        sigma=None,
+        im_id=None,
+        parent=None,
+        basis_id=identity.basis_id,
+        config_id=identity.config_id,
+        system=identity.system,
+        created_ns=time.time_ns(),
+    )
+    return Reconstructor(manifest=manifest, matrix=matrix)
+
+
+def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:
+    """Return the names of basis and sensor configuration: they change when either does."""
+    mirror, wfs = instrument.mirror, instrument.wfs
+    basis = hashlib.sha256(np.round(mirror.positions_m, 6).tobytes())
+    basis.update(repr((mirror.influence, mirror.coupling, instrument.modes)).encode())
+    sensor = hashlib.sha256(np.packbits(valid).tobytes())
+    sensor.update(
+        repr((wfs.wavelength_m, wfs.modulation_lambda_over_d, wfs.pupil_separation_subap)).encode()
+    )
+    return Identity(
+        system=instrument.name,
+        basis_id=f"kl-{instrument.modes.n_modes}-{basis.hexdigest()[:8]}",
+        config_id=f"pyramid-{wfs.n_subapertures}-{sensor.hexdigest()[:8]}",
+    )

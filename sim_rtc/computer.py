@@ -1,0 +1,381 @@
+"""The real-time computer itself: one batch of frames after the other, and what may change between.
+
+Everything that may change (matrix, gains, dither, loop state) changes between two batches, under
+one lock, so a batch has one reconstructor and one session, and no frame is ever skipped.
+"""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.wire import (
+    Command,
+    DitherAction,
+    DitherRequest,
+    DitherStatus,
+    Loop,
+    LoopRequest,
+    MeasureRequest,
+    Reply,
+)
+from sim_rtc.dither import Dither, DitherLimits, refusal
+from sim_rtc.feed import BATCH_FRAMES, OpenLoopBlock
+from sim_rtc.loop import LoopTerms, ModalLoop
+from sim_rtc.plant import Optics
+from sim_rtc.reconstructors import Reconstructor, Terms
+
+Array32 = NDArray[np.float32]
+
+_LEAD_BATCHES = 1
+"""Whole batches between a command's acceptance and the first frame that contains it."""
+
+_LARGEST_GAIN = 2.0
+_REMEMBERED_S = 600.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopSettings:
+    """How the loop is run; replaced as a whole."""
+
+    frame_rate_hz: float
+    delay_frames: int
+    """Frames from an exposure to the first command that answers it."""
+
+    gains: tuple[float, ...]
+    """One per mode of the basis; the controlled ones are used."""
+
+    leak: float
+    """Per frame; 1 forgets nothing."""
+
+    closed: bool = True
+    n_controlled_next: int
+    """What a command has asked for; takes effect with the next matrix of that many rows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Identity:
+    """Names the telemetry carries."""
+
+    system: str
+    basis_id: str
+    config_id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Batch:
+    """One batch of frames as it leaves the loop, and what only the simulator knows of it."""
+
+    session: str
+    seq0: int
+    slopes: Array32
+    """``(n_frames, n_slopes)``."""
+
+    commands_m: Array32
+    """``(n_frames, n_modes)``, dither included, after clipping."""
+
+    dither_m: Array32 | None
+    """``(n_frames, n_modes)``; None without dither."""
+
+    cm_id: str
+    """The matrix that multiplied these slopes."""
+
+    n_clipped: int
+    """Commands that met the stroke limit."""
+
+    closed: bool
+    n_controlled: int
+    optics: Optics
+    """The truth: never on the wire."""
+
+    phase_m: Array32
+    """``(n_points,)`` turbulence OPD during the first frame: never on the wire."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Snapshot:
+    """What the computer says about itself."""
+
+    session: str
+    seq: int
+    """Last frame processed; -1 before the first."""
+
+    settings: LoopSettings
+    loop: Loop
+    gains: tuple[float, ...]
+    """One per mode, 0 where uncontrolled."""
+
+    reconstructor: Reconstructor
+    dither: DitherStatus | None
+    limits: DitherLimits
+    images: NDArray[np.float64]
+    """``(2, n, 2, n)`` share of the light in every pixel."""
+
+
+class RealTimeComputer:
+    """The loop over a feed of open-loop blocks.
+
+    ``next_batch`` is for one thread, everything else for any.
+    """
+
+    def __init__(
+        self,
+        blocks: Iterator[OpenLoopBlock],
+        *,
+        identity: Identity,
+        settings: LoopSettings,
+        reconstructor: Reconstructor,
+        optics: Optics,
+        stroke_m: float,
+        limits: DitherLimits,
+    ) -> None:
+        self._blocks = blocks
+        self.identity = identity
+        self._settings = settings
+        self._limits = limits
+        self._n_slopes, self._n_modes = optics.slopes_per_command.shape
+        self._loop = ModalLoop(
+            n_modes=self._n_modes, delay_frames=settings.delay_frames, stroke_m=stroke_m
+        )
+        self._lock = threading.Lock()
+        self._session = new_session()
+        self._seq = 0
+        self._active = reconstructor
+        self._staged: deque[Reconstructor] = deque()
+        self._swaps: deque[tuple[str, int]] = deque(maxlen=16)
+        self._dither: Dither | None = None
+        self._terms: LoopTerms | None = None
+        self._block: OpenLoopBlock | None = None
+        self._row = 0
+        self._optics = optics
+
+    def prepare(self) -> None:
+        """Wait for the first frames of the feed, so that the first batch does not."""
+        self._block, self._row = next(self._blocks), 0
+
+    def next_batch(self) -> Batch:
+        """Process the next frames, whatever the clock says."""
+        block, row = self._next_rows()
+        with self._lock:
+            self._swap()
+            self._optics = block.optics
+            terms = self._current_terms(block.optics)
+            dither_m = self._next_dither()
+            result = self._loop.run(block.slopes[row : row + BATCH_FRAMES], terms, dither_m)
+            batch = Batch(
+                session=self._session,
+                seq0=self._seq,
+                slopes=result.slopes,
+                commands_m=result.commands_m,
+                dither_m=dither_m,
+                cm_id=self._active.manifest.id,
+                n_clipped=result.n_clipped,
+                closed=self._settings.closed,
+                n_controlled=len(terms.gains),
+                optics=block.optics,
+                phase_m=block.phases_m[row // BATCH_FRAMES],
+            )
+            self._seq += BATCH_FRAMES
+            return batch
+
+    def stage(self, reconstructor: Reconstructor) -> None:
+        """Take a checked matrix; it is swapped in before the next batch."""
+        with self._lock:
+            self._staged.append(reconstructor)
+
+    def take_swaps(self) -> list[tuple[str, int]]:
+        """Return ids and first frames of the matrices swapped in since the last call."""
+        with self._lock:
+            swaps = list(self._swaps)
+            self._swaps.clear()
+        return swaps
+
+    def terms(self) -> Terms:
+        """Return what a new reconstructor must fit at present."""
+        with self._lock:
+            rows = {self._settings.n_controlled_next: None, len(self._active.matrix): None}
+        return Terms(
+            n_slopes=self._n_slopes,
+            n_controlled=tuple(rows),
+            basis_id=self.identity.basis_id,
+            config_id=self.identity.config_id,
+            system=self.identity.system,
+        )
+
+    @property
+    def largest_matrix_bytes(self) -> int:
+        """Bytes of a matrix for all modes."""
+        return int(4 * self._n_modes * self._n_slopes)
+
+    def snapshot(self) -> Snapshot:
+        """Return what a status message tells."""
+        with self._lock:
+            dither = self._dither
+            return Snapshot(
+                session=self._session,
+                seq=max(self._seq - 1, 0),
+                settings=self._settings,
+                loop=self._loop_state(),
+                gains=self._effective_gains(),
+                reconstructor=self._active,
+                dither=None
+                if dither is None
+                else DitherStatus(request=dither.request, start_seq=dither.start_seq),
+                limits=self._limits,
+                images=self._optics.images,
+            )
+
+    def execute(self, command: Command) -> Reply:
+        """Carry out a command, or say why not."""
+        match command:
+            case DitherRequest(action=DitherAction.STOP):
+                return self._stop_dither(command)
+            case DitherRequest():
+                return self._start_dither(command)
+            case LoopRequest():
+                return self._change_loop(command)
+            case MeasureRequest():
+                reason = f"unsupported: this RTC does not measure matrices ({command.pattern})"
+                return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
+
+    def _next_rows(self) -> tuple[OpenLoopBlock, int]:
+        if self._block is None or self._row >= len(self._block.slopes):
+            self._block, self._row = next(self._blocks), 0
+        row = self._row
+        self._row += BATCH_FRAMES
+        return self._block, row
+
+    def _swap(self) -> None:
+        if not self._staged:
+            return
+        fewer = len(self._staged[0].matrix) < len(self._active.matrix)
+        self._active = self._staged.popleft()
+        if fewer:
+            self._loop.release(len(self._active.matrix))
+        self._terms = None
+        self._swaps.append((self._active.manifest.id, self._seq))
+
+    def _current_terms(self, optics: Optics) -> LoopTerms:
+        matrix = self._active.matrix
+        if self._terms is None or self._terms.slopes_per_command is not optics.slopes_per_command:
+            self._terms = LoopTerms(
+                reconstructor=matrix,
+                slopes_per_command=optics.slopes_per_command,
+                modal_response=matrix @ optics.slopes_per_command,
+                gains=np.array(self._effective_gains()[: len(matrix)], dtype=np.float32),
+                leak=self._settings.leak,
+            )
+        return self._terms
+
+    def _next_dither(self) -> Array32 | None:
+        dither = self._dither
+        if dither is None:
+            return None
+        commands = dither.commands(self._seq, BATCH_FRAMES)
+        if self._seq + BATCH_FRAMES >= dither.stop_seq:
+            self._dither = None
+        return commands
+
+    def _effective_gains(self) -> tuple[float, ...]:
+        n_controlled = len(self._active.matrix) if self._settings.closed else 0
+        unused = (0.0,) * int(self._n_modes - n_controlled)
+        return self._settings.gains[:n_controlled] + unused
+
+    def _loop_state(self) -> Loop:
+        if not self._settings.closed:
+            return Loop.OPEN
+        controlled = self._settings.gains[: len(self._active.matrix)]
+        return Loop.CLOSED if all(controlled) else Loop.PARTIAL
+
+    def _start_dither(self, request: DitherRequest) -> Reply:
+        rate_hz = self._settings.frame_rate_hz
+        reason = refusal(request, self._limits, n_modes=self._n_modes, frame_rate_hz=rate_hz)
+        if reason:
+            return Reply(id=request.id, accepted=False, reason=reason, start_seq=None)
+        with self._lock:
+            if self._dither is not None:
+                reason = f"busy: dither {self._dither.request.id} is on until frame "
+                reason += f"{self._dither.stop_seq}; stop it first"
+                return Reply(id=request.id, accepted=False, reason=reason, start_seq=None)
+            start_seq = self._seq + _LEAD_BATCHES * BATCH_FRAMES
+            self._dither = Dither(
+                request, start_seq=start_seq, n_modes=self._n_modes, frame_rate_hz=rate_hz
+            )
+        return Reply(id=request.id, accepted=True, reason="", start_seq=start_seq)
+
+    def _stop_dither(self, request: DitherRequest) -> Reply:
+        with self._lock:
+            self._dither = None
+            return Reply(id=request.id, accepted=True, reason="", start_seq=self._seq)
+
+    def _change_loop(self, request: LoopRequest) -> Reply:
+        reason = self._loop_refusal(request)
+        if reason:
+            return Reply(id=request.id, accepted=False, reason=reason, start_seq=None)
+        with self._lock:
+            was_closed, old = self._settings.closed, self._settings
+            self._settings = replace(
+                old,
+                closed=was_closed if request.loop is None else request.loop is not Loop.OPEN,
+                gains=old.gains if request.gains is None else request.gains,
+                leak=old.leak if request.leak is None else request.leak,
+                n_controlled_next=request.n_controlled or old.n_controlled_next,
+            )
+            self._terms = None
+            if was_closed and not self._settings.closed:
+                self._start_over()
+            return Reply(id=request.id, accepted=True, reason="", start_seq=self._seq)
+
+    def _loop_refusal(self, request: LoopRequest) -> str:
+        gains = request.gains
+        if gains is not None and len(gains) != self._n_modes:
+            return f"range: {len(gains)} gains, expected {self._n_modes}"
+        if gains is not None and max(gains) > _LARGEST_GAIN:
+            return f"range: gain {max(gains):g}, expected at most {_LARGEST_GAIN:g}"
+        if request.n_controlled is not None and not 1 <= request.n_controlled <= self._n_modes:
+            return f"range: n_controlled {request.n_controlled}, expected 1 to {self._n_modes}"
+        if request.loop is Loop.PARTIAL:
+            return "unsupported: loop 'partial', ask for 'closed' with some gains 0"
+        return ""
+
+    def _start_over(self) -> None:
+        """Zero the integrator, which by the wire's rules begins a new session."""
+        self._loop.reset()
+        self._session = new_session()
+        self._staged.clear()
+        self._dither = None
+
+
+class CommandDesk:
+    """Carries out each command once: the same id gets the same reply for ten minutes."""
+
+    def __init__(self, computer: RealTimeComputer) -> None:
+        self._computer = computer
+        self._lock = threading.Lock()
+        self._replies: dict[str, tuple[float, Command, Reply]] = {}
+
+    def handle(self, command: Command, now_s: float) -> Reply:
+        """Return the reply; ``now_s`` is any clock that never goes back."""
+        with self._lock:
+            for known in [k for k, (t, _, _) in self._replies.items() if now_s - t > _REMEMBERED_S]:
+                del self._replies[known]
+            if command.id in self._replies:
+                _, earlier, reply = self._replies[command.id]
+                if earlier == command:
+                    return reply
+                reason = f"id: {command.id} was used for another command, expected a new id"
+                return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
+            reply = self._computer.execute(command)
+            self._replies[command.id] = (now_s, command, reply)
+            return reply
+
+
+def new_session() -> str:
+    """Return a name no other session has."""
+    return uuid.uuid4().hex[:16]

@@ -1,0 +1,80 @@
+"""The detector: how many photons a star gives, and what their noise does to the slopes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.instrument import Instrument
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Camera:
+    """Band, throughput and read noise of the sensor's detector."""
+
+    zero_point_photons: float = 2.1e10
+    """Photons per second and square metre above the atmosphere from a star of R = 0.
+
+    7.0e6 photons per second, square metre and nanometre in Johnson R (Bessell 1979), over the
+    300 nm of the sensor's band, 600 to 900 nm.
+    """
+
+    throughput: float = 0.25
+    """Atmosphere, telescope, sensor optics and quantum efficiency together, 0..1."""
+
+    read_noise_electrons: float = 4.0
+    """RMS per pixel and read; a subaperture is one pixel in each of the four images."""
+
+
+class Detector:
+    """Photon and read noise of the slopes, as Gaussian noise per subaperture from its own flux."""
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        *,
+        images: Array,
+        valid: NDArray[np.bool_],
+        magnitude: float,
+        frame_rate_hz: float,
+        camera: Camera | None = None,
+    ) -> None:
+        """Take the share of the light in each pixel, ``images`` ``(2, n, 2, n)``, at the start."""
+        camera = camera or Camera()
+        area_m2 = np.pi / 4 * instrument.diameter_m**2 * (1 - instrument.obscuration_ratio**2)
+        self.electrons_per_frame: float = float(
+            camera.zero_point_photons
+            * 10 ** (-0.4 * magnitude)
+            * camera.throughput
+            * area_m2
+            / frame_rate_hz
+        )
+        """Detected in all four images together."""
+        own = images.sum(axis=(0, 2))[valid] * self.electrons_per_frame
+        variance = (own + 4 * camera.read_noise_electrons**2) / own.mean() ** 2
+        self.sigma: Array32 = np.sqrt(np.tile(variance, 2)).astype(np.float32)
+        """``(n_slopes,)`` 1 σ of a slope in one frame."""
+
+    def counts(self, images: Array) -> Array32:
+        """Return ``(4, n, n)`` electrons per frame of these images ``(2, n, 2, n)``.
+
+        In row-major order of the images' place on the detector.
+        """
+        n = images.shape[1]
+        electrons = images * self.electrons_per_frame
+        return electrons.transpose(0, 2, 1, 3).reshape(4, n, n).astype(np.float32)
+
+    def noise(self, n_frames: int, rng: np.random.Generator) -> Array32:
+        """Return slope noise ``(n_frames, n_slopes)``.
+
+        The x and y slopes of a subaperture use the same four pixels with signs that make their
+        noise uncorrelated.
+        """
+        noise = rng.standard_normal((n_frames, len(self.sigma)), dtype=np.float32)
+        noise *= self.sigma
+        return noise

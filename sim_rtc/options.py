@@ -1,0 +1,286 @@
+"""The command line of the simulated RTC, read like the manual of an instrument."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+from typing_extensions import override
+
+from service.model.misregistration import Misregistration
+from sim_rtc import arguments
+from sim_rtc.atmosphere import Layer
+from sim_rtc.schedule import Drift, Jump
+
+_MOST_LAYERS = 3
+_DEFAULT_WIND = Layer(fraction=1.0, speed_m_s=12.0, direction_deg=35.0)
+
+_DESCRIPTION = """\
+Simulated real-time computer of an adaptive telescope with a pyramid sensor. It closes the loop on
+frozen-flow turbulence at the frame rate, in real time, publishes telemetry over zenoh, and takes
+dithers, loop commands and reconstructors, as the service's wire contract says. Its mirror is
+mis-registered on the sensor by an amount that it tells nobody on the wire.
+"""
+
+_EPILOG = """\
+registration
+  X,Y in subapertures, rotation in degrees from +x towards +y, magnification as a ratio. A jump
+  T:dx,dy,drot_deg,dmag happens at T seconds of loop time, at the next batch of 10 frames; its
+  optics take a few seconds to compute, so a jump in the first seconds comes late. A drift moves in
+  linear steps of 2 s between exact optics 20 s apart.
+
+light
+  A star of R = 0 gives 2.1e10 photons per second and square metre in the band (600 to 900 nm); a
+  quarter of them are detected; read noise is 4 electrons RMS per pixel.
+
+truth file
+  One JSON object a line, twice a second: registration, wavefront error (RMS and peak, nm) over the
+  pupil, matrix in use; and one for each reconstructor swap with the peaks one second before and
+  after it.
+
+examples
+  python -m sim_rtc --alpha 0.12,-0.08,0.2,1.003 --truth truth.jsonl
+  python -m sim_rtc --seed 7 --mag 10 --jump 30:0.2,0,0,0 --seconds 60
+
+exit status
+  0 it ended as asked (time is up, SIGINT, SIGTERM); 2 an option that cannot be.
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """What the command line asked for, each value possible by itself."""
+
+    connect: str
+    """zenoh endpoint of the service's router."""
+
+    instrument: str
+    """Name of a packaged instrument, or path of an instrument file."""
+
+    alpha: Misregistration | None
+    """True registration at the start; None: drawn at random."""
+
+    magnitude: float
+    seed: int | None
+    """Of everything random; None: different every time."""
+
+    seeing_arcsec: float
+    outer_scale_m: float
+    layers: tuple[Layer, ...]
+    gain: float
+    leak: float
+    delay_frames: int
+    n_controlled: int
+    frame_rate_hz: float
+    plant: str
+    truth: Path | None
+    jumps: tuple[Jump, ...]
+    drift: Drift
+    seconds: float | None
+    """Loop time after which to stop; None: never."""
+
+    speed: float
+    """Loop time over wall-clock time; 0: as fast as it goes."""
+
+    quiet: bool
+
+
+def parse_options(given: Sequence[str] | None = None) -> Options:
+    """Return the options; an impossible one ends the program with one line and status 2."""
+    parser = _parser()
+    found = parser.parse_args(_joined(sys.argv[1:] if given is None else given))
+    if found.wind is not None and len(found.wind) > _MOST_LAYERS:
+        parser.error(f"--wind: found {len(found.wind)} layers; expected at most {_MOST_LAYERS}")
+    return Options(
+        connect=found.connect,
+        instrument=found.instrument,
+        alpha=found.alpha,
+        magnitude=found.mag,
+        seed=found.seed,
+        seeing_arcsec=found.seeing,
+        outer_scale_m=found.outer_scale,
+        layers=tuple(found.wind or (_DEFAULT_WIND,)),
+        gain=found.gain,
+        leak=found.leak,
+        delay_frames=found.delay,
+        n_controlled=found.n_controlled,
+        frame_rate_hz=found.rate,
+        plant=found.plant,
+        truth=found.truth,
+        jumps=tuple(found.jump or ()),
+        drift=found.drift,
+        seconds=found.seconds,
+        speed=found.speed,
+        quiet=found.quiet,
+    )
+
+
+def _joined(given: Sequence[str]) -> list[str]:
+    """Tie values that begin with a minus sign to their option: argparse takes them for options."""
+    joined: list[str] = []
+    for argument in given:
+        if joined and joined[-1].startswith("--") and re.match(r"-[\d.]", argument):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage that would push it off the screen."""
+
+    @override
+    def error(self, message: str) -> NoReturn:
+        """End the program with status 2."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="sim_rtc",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    _add_instrument(parser.add_argument_group("instrument and truth"))
+    _add_sky(parser.add_argument_group("star and sky"))
+    _add_loop(parser.add_argument_group("loop"))
+    _add_run(parser.add_argument_group("run"))
+    return parser
+
+
+def _add_instrument(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--instrument",
+        default="flao-lbt",
+        metavar="NAME|FILE",
+        help="packaged instrument or instrument file (default: %(default)s)",
+    )
+    group.add_argument(
+        "--plant",
+        choices=["linear"],
+        default="linear",
+        help="model of the telescope (default: %(default)s)",
+    )
+    group.add_argument(
+        "--alpha",
+        type=arguments.alpha,
+        metavar="X,Y,ROT_DEG,MAG",
+        help="true registration (default: at random, |shift| <= 0.2, 0.3 deg, 0.5 %%)",
+    )
+    group.add_argument(
+        "--jump",
+        type=arguments.jump,
+        action="append",
+        metavar="T:DX,DY,DROT_DEG,DMAG",
+        help="sudden change of the registration at T seconds; may be repeated",
+    )
+    group.add_argument(
+        "--drift",
+        type=arguments.drift,
+        default=Drift(),
+        metavar="DX,DY,DROT_DEG,DMAG",
+        help="steady change of the registration, per minute",
+    )
+    group.add_argument(
+        "--truth", type=Path, metavar="FILE", help="write the truth there (never on the wire)"
+    )
+
+
+def _add_sky(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--mag",
+        type=arguments.within(-5.0, 20.0),
+        default=8.0,
+        metavar="R",
+        help="magnitude of the guide star (default: %(default)s)",
+    )
+    group.add_argument(
+        "--seeing",
+        type=arguments.within(0.05, 5.0),
+        default=1.0,
+        metavar="ARCSEC",
+        help="seeing at 500 nm (default: %(default)s)",
+    )
+    group.add_argument(
+        "--outer-scale",
+        type=arguments.within(1.0, 1000.0),
+        default=25.0,
+        metavar="M",
+        help="outer scale of the turbulence (default: %(default)s)",
+    )
+    group.add_argument(
+        "--wind",
+        type=arguments.layer,
+        action="append",
+        metavar="SPEED,DIR_DEG[,SHARE]",
+        help=f"a layer: m/s, direction it moves to, share; up to {_MOST_LAYERS} (default: 12,35)",
+    )
+    group.add_argument("--seed", type=arguments.count(0), metavar="N", help="of everything random")
+
+
+def _add_loop(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--rate",
+        type=arguments.within(10.0, 4000.0),
+        default=1000.0,
+        metavar="HZ",
+        help="frame rate (default: %(default)s)",
+    )
+    group.add_argument(
+        "--gain",
+        type=arguments.within(0.0, 2.0),
+        default=0.4,
+        metavar="G",
+        help="integrator gain of every controlled mode (default: %(default)s)",
+    )
+    group.add_argument(
+        "--leak",
+        type=arguments.within(0.0, 1.0),
+        default=0.999,
+        metavar="L",
+        help="share of the command kept from frame to frame (default: %(default)s)",
+    )
+    group.add_argument(
+        "--delay",
+        type=arguments.count(1, 10),
+        default=2,
+        metavar="FRAMES",
+        help="from an exposure to the command that answers it (default: %(default)s)",
+    )
+    group.add_argument(
+        "--n-controlled",
+        type=arguments.count(1),
+        default=400,
+        metavar="N",
+        help="modes in the loop at the start (default: %(default)s)",
+    )
+
+
+def _add_run(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--connect",
+        default="tcp/127.0.0.1:7447",
+        metavar="ENDPOINT",
+        help="zenoh endpoint of the service (default: %(default)s); may come up later",
+    )
+    group.add_argument(
+        "--seconds",
+        type=arguments.within(0.01, 1e7),
+        metavar="S",
+        help="stop after this much loop time",
+    )
+    group.add_argument(
+        "--speed",
+        type=arguments.within(0.0, 100.0),
+        default=1.0,
+        metavar="X",
+        help="loop time over wall-clock time, 0: as fast as it goes (default: %(default)s)",
+    )
+    group.add_argument("--quiet", action="store_true", help="say only what is wrong")

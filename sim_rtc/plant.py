@@ -1,0 +1,225 @@
+"""The telescope the loop really has: finer, uneven, misaligned, and not the service's model.
+
+It is linear: the slopes are ``K_eff turbulence + D G command``. It differs from the service's
+model by its grid (q = 4), its quadrature and modulation points, uneven light, actuators that are
+not where the drawing puts them, and an optical gain for every mode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from service.model.instrument import Instrument, Mirror, Stop
+from service.model.interaction import (
+    instrument_pupil,
+    normalised_jacobian,
+    rotation,
+    valid_subapertures,
+)
+from service.model.mirror import mirror_surface
+from service.model.misregistration import Misregistration
+from service.model.modes import ModalBasis
+from service.model.pupil import PupilGrid
+from service.model.pyramid import PyramidOptics
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+_SAMPLING = 4
+_NODES = 4
+_MODULATION_POINTS = 32
+_RENDER_ROWS = 512
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Imperfections:
+    """How far the plant is from the drawing."""
+
+    unevenness: float = 0.10
+    """Largest departure of the illumination from its mean, ratio of the flux."""
+
+    position_error: float = 0.02
+    """RMS error of an actuator's position per axis, in actuator pitches."""
+
+    lowest_optical_gain: float = 0.6
+    """Optical gain of the first mode, 0..1."""
+
+    highest_optical_gain: float = 0.9
+    """Optical gain of the last mode, 0..1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Optics:
+    """What the telescope does to a wavefront at one registration."""
+
+    alpha: Misregistration
+    """Where the mirror truly lies on the sensor."""
+
+    slopes_per_phase: Array32
+    """``(n_slopes, n_points)`` slope per metre of turbulence OPD, optical gain included."""
+
+    slopes_per_command: Array32
+    """``(n_slopes, n_modes)`` slope per metre of command, optical gain included."""
+
+    opd_per_command: Array32
+    """``(n_points, n_modes)`` OPD at the plant's pupil points per metre of command."""
+
+    images: Array
+    """``(2, n, 2, n)`` share of the detected light: side, row along y, side, column along x."""
+
+    def towards(self, other: Optics, share: float) -> Optics:
+        """Return the optics part of the way to ``other``: linear, for small steps of a drift."""
+
+        def blend(a: Array32, b: Array32) -> Array32:
+            mixed = b - a
+            mixed *= np.float32(share)
+            mixed += a
+            return mixed
+
+        return Optics(
+            alpha=Misregistration.from_vector(
+                (1.0 - share) * self.alpha.vector + share * other.alpha.vector
+            ),
+            slopes_per_phase=blend(self.slopes_per_phase, other.slopes_per_phase),
+            slopes_per_command=blend(self.slopes_per_command, other.slopes_per_command),
+            opd_per_command=blend(self.opd_per_command, other.opd_per_command),
+            images=(1.0 - share) * self.images + share * other.images,
+        )
+
+
+class Plant(Protocol):
+    """A telescope whose slopes are linear in the phase at any one registration."""
+
+    @property
+    def points_m(self) -> Array:
+        """``(n_points, 2)`` where the phase is sampled in the pupil, metres."""
+
+    @property
+    def pitch_m(self) -> float:
+        """Distance between neighbouring points, metres."""
+
+    @property
+    def weights(self) -> Array:
+        """``(n_points,)`` share of the pupil's area at each point; sums to 1."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
+
+    def optics(self, alpha: Misregistration) -> Optics:
+        """Return the optics at ``alpha``; takes seconds."""
+
+
+class LinearPlant:
+    """A pyramid and a thin-plate mirror, each slightly unlike the service's model of them."""
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        basis: ModalBasis,
+        *,
+        rng: np.random.Generator,
+        imperfections: Imperfections | None = None,
+    ) -> None:
+        imperfections = imperfections or Imperfections()
+        self._instrument = instrument
+        pupil = instrument_pupil(instrument, _SAMPLING)
+        uneven_rng, position_rng = rng.spawn(2)
+        self._pyramid = PyramidOptics(
+            wfs=instrument.wfs,
+            pupil=_uneven(pupil, imperfections.unevenness, uneven_rng),
+            n_nodes=_NODES,
+            n_modulation=_MODULATION_POINTS,
+        )
+        mirror = _misplaced(instrument.mirror, imperfections.position_error, position_rng)
+        self._surface = mirror_surface(mirror, instrument.subaperture_m)
+        self._coefficients = self._surface.coefficients(basis.mode_to_actuator)
+        self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)
+        self._points = pupil.points
+        self.points_m: Array = pupil.points * instrument.subaperture_m
+        self.pitch_m: float = instrument.subaperture_m / _SAMPLING
+        self.weights: Array = pupil.weights
+        self.valid: NDArray[np.bool_] = valid_subapertures(instrument, self._pyramid)
+
+    def optics(self, alpha: Misregistration) -> Optics:
+        """Return the optics at ``alpha``: K at the shifted images, modes turned and scaled.
+
+        The optical gain acts on the part of the turbulence the mirror can reproduce exactly as it
+        acts on the mirror: ``K_eff = K + D (G - 1) P`` with P the projection of phase on modes.
+        """
+        shift = self._image_shift(alpha)
+        response = self._pyramid.response(self.valid, shift)
+        jacobian = normalised_jacobian(response, self.valid)
+        jacobian *= np.float32(2 * np.pi / self._instrument.wfs.wavelength_m)
+        modes = self._render(alpha)
+        matrix = jacobian @ modes
+        jacobian += (matrix * (self._gain - 1.0)) @ self._projection(modes)
+        return Optics(
+            alpha=alpha,
+            slopes_per_phase=jacobian,
+            slopes_per_command=matrix * self._gain,
+            opd_per_command=modes,
+            images=response.images / response.images.sum(),
+        )
+
+    def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
+        if self._instrument.stop is Stop.TELESCOPE:
+            return (0.0, 0.0)
+        return (alpha.shift_x_subap, alpha.shift_y_subap)
+
+    def _render(self, alpha: Misregistration) -> Array32:
+        points = self._points
+        if self._instrument.stop is Stop.TELESCOPE:
+            points = points - alpha.vector[:2]
+        on_mirror = points @ rotation(alpha.rotation_rad) / alpha.magnification
+        blocks = [
+            self._surface.basis(on_mirror[start : start + _RENDER_ROWS]) @ self._coefficients
+            for start in range(0, len(on_mirror), _RENDER_ROWS)
+        ]
+        return np.concatenate([block.astype(np.float32) for block in blocks])
+
+    def _projection(self, modes: Array32) -> Array32:
+        """Return ``(n_modes, n_points)``: least-squares modal content of a phase, by area."""
+        weighted = modes * self.weights[:, None].astype(np.float32)
+        gram = (modes.T @ weighted).astype(np.float64)
+        return np.asarray(cho_solve(cho_factor(gram), weighted.T.astype(np.float64)), np.float32)
+
+
+def optical_gain(n_modes: int, imperfections: Imperfections) -> Array32:
+    """Return the plant's optical gain per mode: a smooth rise from low to high order."""
+    progress = np.sqrt(np.arange(n_modes) / max(n_modes - 1, 1))
+    low, high = imperfections.lowest_optical_gain, imperfections.highest_optical_gain
+    return (low + (high - low) * progress).astype(np.float32)
+
+
+def _uneven(pupil: PupilGrid, unevenness: float, rng: np.random.Generator) -> PupilGrid:
+    """Return the pupil lit by a random smooth map: polynomials up to third order, mean kept."""
+    u = pupil.coordinates / np.abs(pupil.coordinates).max()
+    x, y = u[None, :], u[:, None]
+    powers = [(i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3]
+    departure = np.zeros_like(pupil.amplitude)
+    for (i, j), weight in zip(powers, rng.standard_normal(len(powers)), strict=True):
+        departure += weight * x**i * y**j
+    departure -= departure[pupil.lit] @ pupil.weights
+    departure *= unevenness / np.abs(departure[pupil.lit]).max()
+    flux = np.maximum(1.0 + np.where(pupil.lit, departure, 0.0), 0.0)
+    return replace(pupil, amplitude=pupil.amplitude * np.sqrt(flux))
+
+
+def _misplaced(mirror: Mirror, position_error: float, rng: np.random.Generator) -> Mirror:
+    """Return the mirror with random position errors that contain no shift, rotation or scale.
+
+    A common movement of all actuators would be a registration: the true α would be another one.
+    """
+    nominal = mirror.positions_m @ np.array([1.0, 1.0j])
+    error = rng.normal(0.0, position_error * mirror.pitch_m, (len(nominal), 2)) @ [1.0, 1.0j]
+    similarity = np.column_stack([np.ones_like(nominal), nominal])
+    coefficients, *_ = np.linalg.lstsq(similarity, error, rcond=None)
+    error -= similarity @ coefficients
+    moved = nominal + error
+    return replace(mirror, positions_m=np.column_stack([moved.real, moved.imag]))

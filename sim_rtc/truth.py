@@ -1,0 +1,168 @@
+"""The truth of a run, written beside it and never sent: registration and wavefront error."""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_rtc.clock import FrameClock
+from sim_rtc.computer import Batch
+
+_LINE_S = 0.5
+_SWAP_S = 1.0
+"""Stretch before and after a swap in which the largest wavefront error is sought."""
+
+_BACKLOG_BATCHES = 2000
+
+
+@dataclass(slots=True, kw_only=True)
+class _Swap:
+    """A reconstructor swap whose second half is still to come."""
+
+    seq: int
+    cm_id: str
+    frames_skipped: int
+    before_nm: float
+    after_nm: list[float] = field(default_factory=list)
+
+
+class WavefrontError:
+    """RMS of the residual wavefront over the pupil, piston removed."""
+
+    def __init__(self, weights: NDArray[np.float64]) -> None:
+        self._weights = weights.astype(np.float32)
+
+    def rms_nm(self, batches: list[Batch]) -> list[float]:
+        """Return the error during the first frame of each batch, nm; all share their optics."""
+        modes = batches[0].optics.opd_per_command
+        commands = np.array([batch.commands_m[0] for batch in batches])
+        residual = commands @ modes.T
+        residual += np.array([batch.phase_m for batch in batches])
+        residual -= (residual @ self._weights)[:, None]
+        return [float(rms) * 1e9 for rms in np.sqrt(residual**2 @ self._weights)]
+
+
+class TruthRecorder:
+    """Writes JSON lines in a thread of its own while its ``with`` block lasts."""
+
+    def __init__(self, path: Path, *, weights: NDArray[np.float64], clock: FrameClock) -> None:
+        self._path = path
+        self._error = WavefrontError(weights)
+        self._clock = clock
+        self._line_frames = round(_LINE_S * 1e9 / clock.dt_ns)
+        self._swap_frames = round(_SWAP_S * 1e9 / clock.dt_ns)
+        self._queue: queue.Queue[tuple[Batch, int] | None] = queue.Queue(_BACKLOG_BATCHES)
+        self._thread = threading.Thread(target=self._run, name="truth", daemon=True)
+        self._recent: deque[tuple[int, float]] = deque()
+        self._swaps: list[_Swap] = []
+        self._last: Batch | None = None
+
+    def __enter__(self) -> TruthRecorder:
+        self._file: TextIO = self._path.open("w", encoding="utf-8")
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._queue.put(None)
+        self._thread.join()
+        self._file.close()
+
+    def offer(self, batch: Batch, overrun_frames: int) -> None:
+        """Queue a batch; waits only if the recorder is minutes of work behind."""
+        self._queue.put((batch, overrun_frames))
+
+    def _run(self) -> None:
+        pending: list[Batch] = []
+        overruns = 0
+        while True:
+            item = self._queue.get()
+            if item is None:
+                break
+            batch, overruns = item
+            if pending and self._is_boundary(pending, batch):
+                self._write_interval(pending, overruns)
+                pending = []
+            pending.append(batch)
+        if pending:
+            self._write_interval(pending, overruns)
+
+    def _is_boundary(self, pending: list[Batch], batch: Batch) -> bool:
+        """Return whether ``batch`` begins a new line: time is up, or something else is true."""
+        first = pending[0]
+        return (
+            batch.seq0 - first.seq0 >= self._line_frames
+            or batch.optics is not first.optics
+            or batch.cm_id != first.cm_id
+            or batch.session != first.session
+        )
+
+    def _write_interval(self, batches: list[Batch], overruns: int) -> None:
+        errors_nm = self._error.rms_nm(batches)
+        first, last = batches[0], batches[-1]
+        self._note_swap(first)
+        for batch, error_nm in zip(batches, errors_nm, strict=True):
+            self._recent.append((batch.seq0, error_nm))
+            for swap in self._swaps:
+                if batch.seq0 < swap.seq + self._swap_frames:
+                    swap.after_nm.append(error_nm)
+        end_seq = last.seq0 + len(last.slopes) - 1
+        self._write(
+            {
+                "kind": "truth",
+                "t_ns_utc": self._clock.end_of_exposure_ns(end_seq),
+                "seq": end_seq,
+                **last.optics.alpha.to_boundary(),
+                "wavefront_error_nm": round(float(np.sqrt(np.mean(np.square(errors_nm)))), 3),
+                "wavefront_error_peak_nm": round(max(errors_nm), 3),
+                "cm_id": last.cm_id,
+                "n_controlled": last.n_controlled,
+                "loop": "closed" if last.closed else "open",
+                "dither_on": any(batch.dither_m is not None for batch in batches),
+                "clipped": sum(batch.n_clipped for batch in batches),
+                "overrun_frames": overruns,
+            }
+        )
+        self._finish_swaps(end_seq)
+        while self._recent and self._recent[0][0] < end_seq - self._swap_frames:
+            self._recent.popleft()
+        self._last = last
+
+    def _note_swap(self, first: Batch) -> None:
+        last = self._last
+        if last is None or last.cm_id == first.cm_id:
+            return
+        self._swaps.append(
+            _Swap(
+                seq=first.seq0,
+                cm_id=first.cm_id,
+                frames_skipped=first.seq0 - (last.seq0 + len(last.slopes)),
+                before_nm=max(error_nm for _, error_nm in self._recent),
+            )
+        )
+
+    def _finish_swaps(self, end_seq: int) -> None:
+        for swap in list(self._swaps):
+            if end_seq + 1 >= swap.seq + self._swap_frames:
+                self._swaps.remove(swap)
+                self._write(
+                    {
+                        "kind": "swap",
+                        "seq": swap.seq,
+                        "cm_id": swap.cm_id,
+                        "peak_before_nm": round(swap.before_nm, 3),
+                        "peak_after_nm": round(max(swap.after_nm), 3),
+                        "frames_skipped": swap.frames_skipped,
+                    }
+                )
+
+    def _write(self, record: dict[str, Any]) -> None:
+        self._file.write(json.dumps(record) + "\n")
+        self._file.flush()

@@ -17,7 +17,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from service.errors import LinkError, UnknownId, WireError
+from service.errors import LinkError, UnknownIdError, WireError
 from service.estimation.frames import FrameBlock
 from service.link import session as link
 from service.link.endpoint import Endpoint
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 __all__ = ["Bridge", "Endpoint"]
 
 ABSENT_PAUSE_S: Final = 0.3
-"""Before a query is repeated that nobody was there to answer."""
+"""Before a command is repeated: an RTC that is not there makes a query end at once."""
 
 MATRIX_TIMEOUT_S: Final = 2.0
 """For the RTC to answer with a manifest or a part of its matrix."""
@@ -175,7 +175,7 @@ class Bridge:
 
         Raises
         ------
-        UnknownId
+        UnknownIdError
             If it is not on offer.
         """
         self._outbox.set_current(matrix_id)
@@ -306,7 +306,7 @@ class Bridge:
                         self._keys.matrix_id_of(key), index, time.monotonic()
                     )
                     encoding = Encodings.COMMIT if index is None else Encodings.BYTES
-            except (UnknownId, WireError) as error:
+            except (UnknownIdError, WireError) as error:
                 query.reply_err(str(error).encode())
             else:
                 query.reply(key, data, encoding=encoding)
@@ -343,7 +343,9 @@ class Bridge:
         session = self._opened()
         payload = encode_command(command)
         kind = command_kind(command)
-        for _ in range(self._endpoint.command_attempts):
+        for attempt in range(self._endpoint.command_attempts):
+            if attempt:
+                time.sleep(ABSENT_PAUSE_S)
             answer = link.ask(
                 session,
                 self._keys.command(kind),
@@ -353,7 +355,6 @@ class Bridge:
             )
             if answer is not None:
                 return self._reply(command, answer)
-            time.sleep(ABSENT_PAUSE_S)
         raise LinkError(
             f"no answer from the RTC to {kind} command {command.id} after "
             f"{self._endpoint.command_attempts} attempts: whether it was carried out is unknown"

@@ -93,8 +93,8 @@ class Intake:
         payload: bytes,
         attachment: bytes | None,
         *,
-        recoverable: bool,
-        latency_s: float | None,
+        recoverable: bool = False,
+        latency_s: float | None = None,
     ) -> None:
         """Take a batch of telemetry.
 

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Final
 
-from service.errors import UnknownId, WireError
+from service.errors import UnknownIdError, WireError
 from service.wire import Manifest
 
 OFFERS: Final = 8
@@ -69,12 +69,12 @@ class Outbox:
 
         Raises
         ------
-        UnknownId
+        UnknownIdError
             If it is not on offer.
         """
         with self._lock:
             if matrix_id is not None and matrix_id not in self._offers:
-                raise UnknownId(f"reconstructor {matrix_id} is not on offer")
+                raise UnknownIdError(f"reconstructor {matrix_id} is not on offer")
             self._current = matrix_id
 
     def adopt(self, matrix_id: str) -> None:
@@ -88,12 +88,12 @@ class Outbox:
 
         Raises
         ------
-        UnknownId
+        UnknownIdError
             If there is nothing to offer.
         """
         with self._lock:
             if self._current is None:
-                raise UnknownId("nothing to offer")
+                raise UnknownIdError("nothing to offer")
             return self._offers[self._current].commit
 
     def answer(self, matrix_id: str, index: int | None, now_s: float) -> bytes:
@@ -101,18 +101,18 @@ class Outbox:
 
         Raises
         ------
-        UnknownId
+        UnknownIdError
             If the matrix is not on offer or has no such part.
         """
         with self._lock:
             self._forget(now_s)
             offer = self._offers.get(matrix_id)
         if offer is None:
-            raise UnknownId(f"reconstructor {matrix_id} is not on offer")
+            raise UnknownIdError(f"reconstructor {matrix_id} is not on offer")
         if index is None:
             return offer.commit
         if not 0 <= index < len(offer.parts):
-            raise UnknownId(f"chunk {index} of {matrix_id}: there are {len(offer.parts)}")
+            raise UnknownIdError(f"chunk {index} of {matrix_id}: there are {len(offer.parts)}")
         return offer.parts[index]
 
     def _forget(self, now_s: float) -> None:

@@ -173,7 +173,7 @@ class FrameRing:
         held = self._state[slots] == HELD
         t_ns, dt_ns = self._t_ns[slots], self._dt_ns[slots]
         cm_id, has_dither = self._cm_id[slots], self._has_dither[slots]
-        step = 2 * np.abs(np.diff(t_ns) - dt_ns[:-1]) > dt_ns[:-1]
+        step = np.abs(np.diff(t_ns) - dt_ns[:-1]) > 0.5 * dt_ns[:-1]
         changed = (dt_ns[1:] != dt_ns[:-1]) | (has_dither[1:] != has_dither[:-1])
         other_matrix = (cm_id[1:] != cm_id[:-1]).astype(np.bool_)
         cut = ~(held[1:] & held[:-1]) | step | changed | other_matrix

@@ -85,7 +85,7 @@ def watch(session: zenoh.Session, key: str, callback: Callable[[bool], None]) ->
     """Call ``callback`` with whether the liveliness token is there, now and at each change."""
 
     def changed(sample: zenoh.Sample) -> None:
-        callback(sample.kind is zenoh.SampleKind.PUT)
+        callback(sample.kind == zenoh.SampleKind.PUT)
 
     return session.liveliness().declare_subscriber(key, changed, history=True)
 

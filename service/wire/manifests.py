@@ -113,7 +113,7 @@ def decode_manifest(data: bytes) -> Manifest:
     return Manifest(
         id=message.identifier("id"),
         layout=_layout(message, first_chunks=1),
-        alpha=message.optional("alpha", lambda key: message.named_numbers(key, PARAMETERS)),
+        alpha=message.optional("alpha", lambda key: _alpha(message, key)),
         sigma=message.optional("sigma", lambda key: message.named_numbers(key, PARAMETERS)),
         im_id=message.optional("im_id", message.text),
         parent=message.optional("parent", message.text),
@@ -122,6 +122,12 @@ def decode_manifest(data: bytes) -> Manifest:
         system=message.identifier("system"),
         created_ns=message.integer("created_ns"),
     )
+
+
+def _alpha(message: Fields, key: str) -> dict[str, float]:
+    alpha = message.named_numbers(key, PARAMETERS)
+    message.child(key).number("magnification", above=0.0)
+    return alpha
 
 
 def encode_measured_manifest(manifest: MeasuredManifest) -> bytes:

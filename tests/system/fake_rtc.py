@@ -79,6 +79,7 @@ class FakeRtc:
         self.applied = {}
         self.commands = []
         self.silent = 0
+        self.held = []
         self.waiting = {}
         self.lock = threading.Lock()
         self.zenoh = client_session(endpoint)
@@ -260,11 +261,12 @@ class FakeRtc:
             query.reply(query.key_expr, data)
 
     def _on_command(self, kind, query):
+        if self.silent:
+            self.silent -= 1
+            self.held.append(query)  # the caller waits its whole timeout
+            return
         with query:
             data = query.payload.to_bytes()
-            if self.silent:
-                self.silent -= 1
-                return
             try:
                 command = decode_command(kind, data)
             except WireError as error:

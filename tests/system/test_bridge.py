@@ -1,7 +1,6 @@
 """The bridge over real zenoh on loopback, against a fake RTC."""
 
 import asyncio
-import os
 import socket
 import subprocess
 import sys
@@ -11,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zenoh.ext
 
-from service.errors import LinkError, UnknownId, WireError
+from service.errors import LinkError, UnknownIdError, WireError
 from service.link.events import (
     AcknowledgementReceived,
     BasisMismatch,
@@ -98,20 +98,20 @@ class Seen:
         self.bridge = bridge
         self.events = []
 
-    def first(self, kind, timeout_s=5.0, **values):
+    def first(self, event, timeout_s=5.0, **values):
         def look():
             self.events += self.bridge.events()
             return [
                 e
                 for e in self.events
-                if isinstance(e, kind) and all(getattr(e, k) == v for k, v in values.items())
+                if isinstance(e, event) and all(getattr(e, k) == v for k, v in values.items())
             ]
 
         return wait_until(look, timeout_s)[0]
 
-    def count(self, kind):
+    def count(self, event):
         self.events += self.bridge.events()
-        return sum(isinstance(e, kind) for e in self.events)
+        return sum(isinstance(e, event) for e in self.events)
 
 
 def drained(bridge, n_frames, timeout_s=5.0):
@@ -475,7 +475,7 @@ async def test_a_manifest_that_does_not_describe_its_matrix_is_not_sent(bridge, 
 
 
 def test_only_what_is_on_offer_can_be_current(bridge):
-    with pytest.raises(UnknownId, match="r-9 is not on offer"):
+    with pytest.raises(UnknownIdError, match="r-9 is not on offer"):
         bridge.set_current("r-9")
 
 
@@ -566,22 +566,19 @@ async def test_no_rtc_at_all_is_a_link_error_within_seconds(bridge):
     assert time.monotonic() - begin < 3.0
 
 
-def test_state_and_alarm_reach_a_listener_and_the_last_one_a_late_one(bridge, rtc):
+def test_state_and_alarm_reach_those_who_listen_and_those_who_come_late(bridge, rtc):
     state = StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use="r-1")
     alarm = AlarmMessage(system=SYSTEM, t_ns=2, name="rtc.vanished", active=True, text="gone")
-    heard = {}
-    rtc.zenoh.declare_subscriber(
-        f"{rtc.keys.root}/*", lambda s: heard.update({str(s.key_expr): s.payload.to_bytes()})
-    )
+    bridge.publish_state(state)
+    bridge.publish_alarm(alarm)
+    assert decode_state(_last_value(rtc, rtc.keys.state)) == state
+    assert decode_alarm(_last_value(rtc, rtc.keys.alarm)) == alarm
 
-    def told():
-        bridge.publish_state(state)
-        bridge.publish_alarm(alarm)
-        return len(heard) == 2
 
-    wait_until(told)
-    assert decode_state(heard[rtc.keys.state]) == state
-    assert decode_alarm(heard[rtc.keys.alarm]) == alarm
+def _last_value(rtc, key):
+    history = zenoh.ext.HistoryConfig(max_samples=1)
+    heard = zenoh.ext.declare_advanced_subscriber(rtc.zenoh, key, history=history)
+    return wait_until(heard.try_recv).payload.to_bytes()
 
 
 # ---------------------------------------------------------------- opening and closing
@@ -598,7 +595,7 @@ def test_a_busy_port_is_one_clear_line(bridge, endpoint):
 
 def test_a_missing_router_is_one_clear_line(endpoint):
     client = Endpoint(system=SYSTEM, connect=(endpoint.listen,))
-    with pytest.raises(LinkError, match="no zenoh router answers at tcp/127.0.0.1"):
+    with pytest.raises(LinkError, match="no zenoh router answers at tcp"):
         Bridge(client).open()
 
 
@@ -631,6 +628,4 @@ def test_a_process_that_closes_its_bridge_exits(endpoint):
         "bridge.open()\n"
         "bridge.close()\n"
     )
-    subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, check=True, timeout=20, env=os.environ
-    )
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=20)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.archive.index import AuditEntry, Index
 from service.archive.product import Provenance, read_matrix, read_product, write_product
-from service.errors import ArchiveError, UnknownId
+from service.errors import ArchiveError, UnknownIdError
 from service.state import ReconstructorRecord
 from service.wire import checked_id, checksum
 
@@ -137,14 +137,14 @@ class Archive:
 
         Raises
         ------
-        UnknownId
+        UnknownIdError
             If no such reconstructor was ever stored here.
         ArchiveError
             If its file is missing, damaged, or holds other numbers than were stored.
         """
         sha256 = self._index.product_sha256(matrix_id)
         if sha256 is None:
-            raise UnknownId(f"reconstructor {matrix_id}: no such matrix in the archive")
+            raise UnknownIdError(f"reconstructor {matrix_id}: no such matrix in the archive")
         matrix = read_matrix(self._path(matrix_id))
         found = checksum(matrix)
         if found != sha256:

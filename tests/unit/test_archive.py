@@ -16,7 +16,7 @@ import pytest
 
 from service.archive import Archive, AuditEntry
 from service.control.gate import GateVerdict
-from service.errors import ArchiveError, UnknownId, WireError
+from service.errors import ArchiveError, UnknownIdError, WireError
 from service.model.misregistration import Misregistration
 from service.state import MatrixState, ReconstructorRecord
 from service.wire import checksum
@@ -186,7 +186,7 @@ def test_an_id_that_is_no_id_never_becomes_a_file_name(archive, matrix_id):
 @pytest.mark.parametrize("matrix_id", ["nobody", "../index", "rtc-7"])
 def test_a_matrix_that_was_never_stored_is_unknown(archive, matrix_id):
     archive.update(record_of("rtc-7"))
-    with pytest.raises(UnknownId, match=f"{matrix_id}: no such matrix in the archive"):
+    with pytest.raises(UnknownIdError, match=f"{matrix_id}: no such matrix in the archive"):
         archive.matrix(matrix_id)
 
 

@@ -1,0 +1,45 @@
+"""The REST application: reads snapshots, hands commands on; no science."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI
+from fastapi.routing import APIRoute
+
+from service import __version__
+from service.routes import health, operating, problems, reading
+from service.routes.service import Link, Service, Snapshot
+
+__all__ = ["Link", "Service", "Snapshot", "create_app"]
+
+_DESCRIPTION = """
+Calibration service of an adaptive telescope with a pyramid wavefront sensor.
+
+Shifts are in subapertures, angles in degrees, magnification is a ratio; every number has its unit
+in its name. Times are nanoseconds since the Unix epoch, UTC. A number that is not known or not
+finite is `null`. Errors are `application/problem+json` (RFC 9457).
+"""
+
+
+def create_app(service: Service) -> FastAPI:
+    """Return the REST application of a service.
+
+    Swagger and ReDoc pages are left out: they load their scripts from the internet, which an
+    observatory's network need not reach. ``/openapi.json`` is there.
+    """
+    app = FastAPI(
+        title="pyrcal",
+        version=__version__,
+        description=_DESCRIPTION,
+        docs_url=None,
+        redoc_url=None,
+        generate_unique_id_function=_operation_id,
+    )
+    app.state.service = service
+    problems.install(app)
+    for router in (reading.router, operating.router, health.router):
+        app.include_router(router)
+    return app
+
+
+def _operation_id(route: APIRoute) -> str:
+    return route.name

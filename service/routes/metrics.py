@@ -1,0 +1,132 @@
+"""The snapshot as Prometheus metrics."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from service import __version__
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.routes.schemas import age_s
+from service.routes.service import Link, Snapshot
+from service.state import MatrixState, Mode, TrackerState
+
+_LINK_COUNTERS = {
+    "batches_received": "Telemetry batches taken in",
+    "frames_received": "Frames that could be used",
+    "frames_recovered": "Frames that came late and still found their place",
+    "frames_duplicate": "Frames that came again",
+    "frames_late": "Frames that came when their place had been passed",
+    "frames_nonfinite": "Frames dropped because a number in them was not finite",
+    "frames_overwritten": "Frames nobody drained in time, or that a new session made void",
+    "statuses_received": "Status messages of the RTC",
+    "acknowledgements_received": "Acknowledgements of reconstructors",
+    "acknowledgements_unknown": "Acknowledgements for an id that was never offered",
+    "events_dropped": "Events of the link that nobody took in time",
+    "callback_errors": "Faults of the service while it took a message in",
+}
+
+
+class SnapshotCollector(Collector):
+    """Reads one snapshot for each scrape.
+
+    Parameters
+    ----------
+    snapshot
+        Returns what is known now.
+    """
+
+    def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
+        self._snapshot = snapshot
+
+    # typing.override comes with Python 3.12
+    def collect(self) -> Iterator[Metric]:  # type: ignore[explicit-override]
+        """Yield every metric."""
+        snapshot = self._snapshot()
+        yield _labelled_gauge("build_info", "Version", "version", {__version__: 1})
+        yield _gauge("ready", "1 when the service can do its work", snapshot.ready)
+        uptime_s = (snapshot.now_ns - snapshot.started_ns) / 1e9
+        yield _gauge("uptime_seconds", "Since the service started", uptime_s)
+        yield from _of_link(snapshot.link)
+        yield from _of_registration(snapshot)
+        yield from _of_reconstructors(snapshot.tracker)
+        alarms = {alarm.name: 1 for alarm in snapshot.tracker.alarms}
+        yield _gauge("alarms", "Alarms that last", len(alarms))
+        yield _labelled_gauge("alarm", "1 for each alarm that lasts", "name", alarms)
+
+
+def _of_link(link: Link) -> Iterator[Metric]:
+    for name, text in _LINK_COUNTERS.items():
+        yield CounterMetricFamily(f"pyrcal_{name}", text, value=getattr(link, name))
+    yield _labelled_counter(
+        "frames_refused", "Frames not used, by reason", "reason", link.frames_refused
+    )
+    yield _labelled_counter(
+        "messages_malformed",
+        "Messages that broke the contract",
+        "kind",
+        link.messages_malformed,
+    )
+    lost = "Frames missing in the sequence; falls again when they are recovered"
+    yield _gauge("frames_lost", lost, link.frames_lost)
+    yield _gauge("rtc_alive", "1 while the RTC's liveliness token is there", link.rtc_alive)
+    yield _gauge("frame_age_seconds", "Since the last frame arrived", link.frame_age_s)
+    yield _gauge("latency_p50_seconds", "Median from put to callback", link.latency_p50_s)
+
+
+def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
+    tracker = snapshot.tracker
+    windows = {"accepted": tracker.windows_accepted, "refused": tracker.windows_refused}
+    yield _labelled_counter("windows", "Windows of telemetry, by verdict", "verdict", windows)
+    registration = tracker.registration
+    if registration is None:
+        return
+    yield from _four("alpha", "Registration", registration.alpha.vector)
+    yield from _four("alpha_sigma", "1 sigma, floor included", registration.sigma)
+    yield _gauge("alpha_age_seconds", "Age of the estimate", age_s(registration, snapshot))
+    gain = "Mean optical gain of the dithered modes"
+    yield _gauge("optical_gain_ratio", gain, registration.optical_gain)
+
+
+def _of_reconstructors(tracker: TrackerState) -> Iterator[Metric]:
+    states = Counter(record.state for record in tracker.reconstructors)
+    by_state = {str(state): states[state] for state in MatrixState}
+    yield _labelled_gauge("reconstructors", "Reconstructors remembered", "state", by_state)
+    modes = {str(mode): mode is tracker.mode for mode in Mode}
+    yield _labelled_gauge("mode", "1 for the mode of the service", "mode", modes)
+    if tracker.margin is None:
+        return
+    worst = tracker.margin.worst_pole_radius
+    yield _gauge("worst_pole_radius", "Of the reconstructor in use, 1 is unstable", worst)
+    yield _gauge("pole_radius_bound", "Largest radius that is accepted", tracker.margin.bound)
+    yield _gauge("stability_margin", "1 minus the worst pole radius", 1.0 - worst)
+
+
+def _four(prefix: str, text: str, vector: NDArray[np.float64]) -> Iterator[Metric]:
+    for name, value in zip(PARAMETERS, vector * BOUNDARY_SCALE, strict=True):
+        yield _gauge(f"{prefix}_{name}", f"{text}: {name}", float(value))
+
+
+def _gauge(name: str, text: str, value: float | None) -> Metric:
+    """Return a gauge; what is not known is NaN, as Prometheus has it."""
+    return GaugeMetricFamily(f"pyrcal_{name}", text, value=math.nan if value is None else value)
+
+
+def _labelled_gauge(name: str, text: str, label: str, values: Mapping[str, int]) -> Metric:
+    family = GaugeMetricFamily(f"pyrcal_{name}", text, labels=[label])
+    for key, value in values.items():
+        family.add_metric([key], value)
+    return family
+
+
+def _labelled_counter(name: str, text: str, label: str, values: Mapping[str, int]) -> Metric:
+    family = CounterMetricFamily(f"pyrcal_{name}", text, labels=[label])
+    for key, value in values.items():
+        family.add_metric([key], value)
+    return family

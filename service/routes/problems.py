@@ -1,0 +1,129 @@
+"""Errors as ``application/problem+json`` (RFC 9457), all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict
+from starlette.exceptions import HTTPException
+
+from service.errors import ArchiveError, CommandError, LinkError, PyrcalError, UnknownIdError
+
+MEDIA_TYPE = "application/problem+json"
+
+_OF_ERROR: dict[type[PyrcalError], tuple[HTTPStatus, str]] = {
+    UnknownIdError: (HTTPStatus.NOT_FOUND, "unknown-id"),
+    CommandError: (HTTPStatus.CONFLICT, "not-now"),
+    LinkError: (HTTPStatus.GATEWAY_TIMEOUT, "rtc-silent"),
+    ArchiveError: (HTTPStatus.INTERNAL_SERVER_ERROR, "archive"),
+    PyrcalError: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal"),
+}
+
+
+class Problem(BaseModel):
+    """An error: what went wrong and what to do about it."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    type: str
+    """``urn:pyrcal:problem:<kind>``; the kind is stable, a program may branch on it."""
+
+    title: str
+    """The HTTP status in words."""
+
+    status: int
+    """The HTTP status."""
+
+    detail: str
+    """What was found and what was expected."""
+
+    instance: str
+    """Path of the request."""
+
+
+def problem_response(description: str) -> dict[str, Any]:
+    """Return the OpenAPI description of an error response."""
+    return {
+        "description": description,
+        "content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}},
+    }
+
+
+Responses = dict[int | str, dict[str, Any]]
+"""OpenAPI descriptions by HTTP status."""
+
+INVALID: Responses = {422: problem_response("A parameter or a field of the body cannot be used")}
+UNKNOWN: Responses = {404: problem_response("No such thing")}
+COMMAND: Responses = {
+    409: problem_response("Cannot be carried out in the present state"),
+    504: problem_response("The RTC does not answer"),
+}
+
+
+def problem(
+    request: Request,
+    status: HTTPStatus,
+    kind: str,
+    detail: str,
+    headers: Mapping[str, str] | None = None,
+) -> JSONResponse:
+    """Return a problem of this ``kind``."""
+    body = Problem(
+        type=f"urn:pyrcal:problem:{kind}",
+        title=status.phrase,
+        status=status,
+        detail=detail,
+        instance=request.url.path,
+    )
+    return JSONResponse(
+        body.model_dump(), status_code=status, headers=headers, media_type=MEDIA_TYPE
+    )
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of ``app`` a problem."""
+    app.exception_handler(PyrcalError)(_known)
+    app.exception_handler(RequestValidationError)(_invalid)
+    app.exception_handler(HTTPException)(_http)
+    app.exception_handler(Exception)(_fault)
+
+
+async def _known(request: Request, error: PyrcalError) -> JSONResponse:
+    status, kind = next(_OF_ERROR[cls] for cls in type(error).__mro__ if cls in _OF_ERROR)
+    return problem(request, status, kind, str(error))
+
+
+async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+    detail = "; ".join(_line(e) for e in error.errors())
+    return problem(request, HTTPStatus.UNPROCESSABLE_ENTITY, "invalid", detail)
+
+
+def _line(error: Mapping[str, Any]) -> str:
+    where = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        return f"{where}: unknown"
+    if error["type"] == "missing":
+        return f"{where}: missing"
+    if error["type"] == "json_invalid":
+        return f"{where}: not JSON: {error['ctx']['error']}"
+    expected = error["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    return f"{where}: found {error['input']!r:.80}, expected {expected}"
+
+
+async def _http(request: Request, error: HTTPException) -> JSONResponse:
+    status = HTTPStatus(error.status_code)
+    detail = {
+        HTTPStatus.NOT_FOUND: f"there is nothing at {request.url.path}",
+        HTTPStatus.METHOD_NOT_ALLOWED: f"{request.method} is not possible at {request.url.path}",
+    }.get(status, error.detail)
+    return problem(request, status, "http", detail, error.headers)
+
+
+async def _fault(request: Request, _error: Exception) -> JSONResponse:
+    detail = "a fault of the service itself; its log says more"
+    return problem(request, HTTPStatus.INTERNAL_SERVER_ERROR, "internal", detail)

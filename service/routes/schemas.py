@@ -1,0 +1,384 @@
+"""What leaves over REST: every number carries its unit in its name; what is not finite is null."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.routes.service import Snapshot
+from service.state import Level, MatrixState, Mode, Registration
+
+
+def _finite_or_none(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+Number = Annotated[float | None, BeforeValidator(_finite_or_none)]
+"""A number, or null where there is none or it is not finite."""
+
+
+class View(BaseModel):
+    """A read-only picture of one of the service's records, made from its attributes."""
+
+    model_config = ConfigDict(frozen=True, from_attributes=True, use_attribute_docstrings=True)
+
+
+class FourView(View):
+    """The four parameters of a registration, or their 1 σ."""
+
+    shift_x_subap: Number
+    """Along sensor +x, subapertures."""
+
+    shift_y_subap: Number
+    """Along sensor +y, subapertures."""
+
+    rotation_deg: Number
+    """From sensor +x towards +y, degrees."""
+
+    magnification: Number
+    """Ratio; 1 is nominal."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _in_boundary_units(cls, value: Misregistration | NDArray[np.float64]) -> dict[str, float]:
+        if isinstance(value, Misregistration):
+            return value.to_boundary()
+        return dict(zip(PARAMETERS, (value * BOUNDARY_SCALE).tolist(), strict=True))
+
+
+class AlphaView(View):
+    """The current estimate of the registration."""
+
+    alpha: FourView
+    """The estimate."""
+
+    sigma: FourView
+    """1 σ, model-error floor included."""
+
+    floor: FourView
+    """1 σ of the model error alone, which no integration removes."""
+
+    covariance: list[list[Number]] = Field(min_length=4, max_length=4)
+    """4 x 4, floor included, in the units of the names and the order of ``parameters``."""
+
+    parameters: tuple[str, ...] = PARAMETERS
+    """Order of rows and columns of the covariance."""
+
+    t_ns_utc: int
+    """End of the last window that entered it, the RTC's clock."""
+
+    age_s: float
+    """Since then, seconds."""
+
+    n_windows: int
+    """Windows that entered it."""
+
+    optical_gain: Number
+    """Mean optical gain of the dithered modes, 0..1; null: not measured."""
+
+    @classmethod
+    def of(cls, registration: Registration, snapshot: Snapshot) -> AlphaView:
+        """Return the view of the registration at the time of the snapshot."""
+        covariance = registration.total_covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)
+        return cls.model_validate(
+            {
+                "alpha": registration.alpha,
+                "sigma": registration.sigma,
+                "floor": registration.floor,
+                "covariance": covariance.tolist(),
+                "t_ns_utc": registration.t_ns_utc,
+                "age_s": age_s(registration, snapshot),
+                "n_windows": registration.n_windows,
+                "optical_gain": registration.optical_gain,
+            }
+        )
+
+
+def age_s(registration: Registration, snapshot: Snapshot) -> float:
+    """Return the age of the estimate, seconds."""
+    arrival_ns = snapshot.estimate_arrival_ns
+    then_ns = registration.t_ns_utc if arrival_ns is None else arrival_ns
+    return (snapshot.now_ns - then_ns) / 1e9
+
+
+class HistoryEntryView(View):
+    """One window's own estimate and the filtered one after it."""
+
+    t_ns_utc: int
+    """End of the window."""
+
+    measured: FourView
+    """What this window alone says."""
+
+    measured_sigma: FourView
+    """1 σ of it."""
+
+    filtered: FourView
+    """The estimate after it."""
+
+    filtered_sigma: FourView
+    """1 σ of it, floor included."""
+
+    innovation: Number
+    """Normalised innovation squared (4 degrees of freedom)."""
+
+
+class HistoryView(View):
+    """The estimates of the last windows."""
+
+    entries: tuple[HistoryEntryView, ...]
+    """Oldest first."""
+
+
+class VerdictView(View):
+    """The stability gate's verdict, over everything α may be."""
+
+    accepted: bool
+    """Whether every pole stays within the bound."""
+
+    worst_pole_radius: Number
+    """Largest closed-loop pole radius; 1 is the edge of stability, null: not finite."""
+
+    aligned_pole_radius: Number
+    """The same for a perfect reconstructor at these gains."""
+
+    bound: Number
+    """Largest radius that is accepted."""
+
+    n_points: int
+    """Registrations tried."""
+
+    reason: str
+    """What to know, and to do when it was refused."""
+
+
+class ReconstructorView(View):
+    """One reconstructor."""
+
+    id: str
+    """Never reused."""
+
+    state: MatrixState
+    """Where it is on its way to the RTC."""
+
+    n_modes: int
+    """Modes it commands."""
+
+    created_ns_utc: int
+    """When it was computed."""
+
+    alpha: FourView | None
+    """The registration it was computed for; null: not made by this service."""
+
+    sigma: FourView | None
+    """1 σ of that registration."""
+
+    parent: str | None
+    """The one in use when it was computed, or the one a rollback copies."""
+
+    sha256: str
+    """Of the matrix as it travels (``format=raw``)."""
+
+    condition_number: Number
+    """Of the interaction matrix it inverts."""
+
+    gate: VerdictView | None
+    """The stability gate's verdict."""
+
+    reason: str
+    """Why it is in this state."""
+
+    published_ns_utc: int | None
+    """When it was sent."""
+
+    applied_frame_seq: int | None
+    """First frame whose slopes it multiplied."""
+
+
+class ReconstructorsView(View):
+    """The reconstructors the service remembers."""
+
+    in_use: str | None
+    """Id of the one the RTC multiplies with; null: unknown."""
+
+    reconstructors: tuple[ReconstructorView, ...]
+    """Oldest first."""
+
+
+class RtcView(View):
+    """The RTC as its last status message shows it."""
+
+    session: str
+    loop: str
+    """"open", "closed" or "partial"."""
+
+    frame_rate_hz: Number
+    delay_frames: Number
+    leak: Number
+    """Per frame."""
+
+    n_controlled: int
+    n_modes: int
+    n_slopes: int
+    cm_id: str | None
+    """The reconstructor it says it uses."""
+
+    basis_id: str
+    config_id: str
+    magnitude: Number
+    """Of the star; null: not known."""
+
+    max_dither_m: Number
+    """Largest dither it accepts, metres OPD RMS."""
+
+    max_dither_modes: int
+    t_ns_utc: int
+    """The RTC's own timestamp."""
+
+
+class DitherView(View):
+    """The dither now requested of the RTC."""
+
+    id: str
+    modes: tuple[int, ...]
+    """0-based basis indices."""
+
+    amplitude_m: tuple[Number, ...]
+    """RMS of each mode, metres OPD."""
+
+    frequency_hz: tuple[Number, ...]
+    duration_s: Number
+    start_seq: int | None
+    """First frame that contains it; null until the RTC has accepted."""
+
+
+class WatchdogView(View):
+    """The passive estimate, from ordinary telemetry."""
+
+    alpha: FourView
+    sigma: FourView
+    t_ns_utc: int
+    consistent: bool
+    """False: it contradicts the current estimate."""
+
+    text: str
+    """What to know about it."""
+
+
+class AlarmView(View):
+    """Something that must be seen, for as long as it lasts."""
+
+    name: str
+    since_ns_utc: int
+    text: str
+    """What was found, and what to do."""
+
+
+class LogEntryView(View):
+    """One thing that happened."""
+
+    t_ns_utc: int
+    level: Level
+    name: str
+    """Machine-readable, like ``reconstructor.applied``."""
+
+    text: str
+
+
+class EventsView(View):
+    """What happened, and what is wrong now."""
+
+    alarms: tuple[AlarmView, ...]
+    log: tuple[LogEntryView, ...]
+    """Oldest first."""
+
+
+class LinkView(View):
+    """What has passed on the link since the service started."""
+
+    rtc_alive: bool
+    session: str | None
+    frame_age_s: Number
+    """Since the last frame arrived, seconds; null: none has."""
+
+    latency_p50_s: Number
+    """Median from put to callback, seconds; null: not known."""
+
+    frames_received: int
+    frames_lost: int
+    frames_recovered: int
+    frames_duplicate: int
+    frames_late: int
+    frames_nonfinite: int
+    frames_overwritten: int
+    frames_refused: dict[str, int]
+    """By reason."""
+
+    messages_malformed: dict[str, int]
+    """By kind."""
+
+
+class StateView(View):
+    """What the service knows, at one glance."""
+
+    system: str
+    """The system it works for."""
+
+    mode: Mode
+    """How much the service may do by itself."""
+
+    ready: bool
+    ready_reason: str
+    """What it waits for."""
+
+    now_ns: int
+    """The service's clock, nanoseconds since the Unix epoch."""
+
+    uptime_s: float
+    registration: AlphaView | None
+    """Null until the first accepted window."""
+
+    in_use: str | None
+    """Id of the reconstructor the RTC multiplies with; null: unknown."""
+
+    margin: VerdictView | None
+    """The gate's verdict on the reconstructor in use, at the current estimate; null: not known."""
+
+    rtc: RtcView | None
+    """Null: no RTC has been heard, or it has vanished."""
+
+    basis_id: str | None
+    config_id: str | None
+    dither: DitherView | None
+    watchdog: WatchdogView | None
+    alarms: tuple[AlarmView, ...]
+    windows_accepted: int
+    windows_refused: int
+    link: LinkView
+
+    @classmethod
+    def of(cls, snapshot: Snapshot) -> StateView:
+        """Return the view of a snapshot."""
+        tracker = snapshot.tracker
+        same = {
+            name: getattr(tracker, name)
+            for name in cls.model_fields
+            if name != "registration" and hasattr(tracker, name)
+        }
+        registration = tracker.registration
+        return cls.model_validate(
+            same
+            | {
+                "ready": snapshot.ready,
+                "ready_reason": snapshot.ready_reason,
+                "now_ns": snapshot.now_ns,
+                "uptime_s": (snapshot.now_ns - snapshot.started_ns) / 1e9,
+                "registration": registration and AlphaView.of(registration, snapshot),
+                "link": snapshot.link,
+            }
+        )

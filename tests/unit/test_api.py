@@ -1,0 +1,671 @@
+"""The REST application over real HTTP messages, with a hand-written service behind it."""
+
+import hashlib
+import io
+import json
+import threading
+from dataclasses import dataclass, field, replace
+
+import httpx
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from service import __version__
+from service.api import Snapshot, create_app
+from service.control.gate import GateVerdict
+from service.errors import ArchiveError, CommandError, LinkError, ModelError, UnknownIdError
+from service.events import (
+    Approve,
+    Publish,
+    Refit,
+    Reject,
+    Rollback,
+    SetMode,
+    StartDither,
+    StopDither,
+)
+from service.link.statistics import LinkStatistics
+from service.model.misregistration import PARAMETERS, Misregistration
+from service.state import (
+    Alarm,
+    DitherView,
+    HistoryEntry,
+    Level,
+    LogEntry,
+    MatrixState,
+    Mode,
+    ReconstructorRecord,
+    Registration,
+    RtcView,
+    TrackerState,
+    Watchdog,
+)
+
+SECOND = 1_000_000_000
+ALPHA = Misregistration(
+    shift_x_subap=0.2, shift_y_subap=-0.1, rotation_rad=np.deg2rad(0.3), magnification=1.005
+)
+SIGMA = np.array([0.01, 0.02, np.deg2rad(0.03), 0.0004])
+VERDICT = GateVerdict(
+    accepted=True,
+    worst_pole_radius=0.8,
+    aligned_pole_radius=0.7,
+    bound=0.95,
+    n_points=9,
+    reason="stable",
+)
+MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4)
+LINK = LinkStatistics(
+    rtc_alive=True,
+    session="s-1",
+    basis_id="kl",
+    config_id="b1",
+    batches_received=300,
+    frames_received=3000,
+    frames_lost=2,
+    frames_recovered=1,
+    frames_duplicate=4,
+    frames_late=6,
+    frames_nonfinite=5,
+    frames_overwritten=7,
+    frames_refused={"basis": 8},
+    messages_malformed={"status": 9},
+    statuses_received=30,
+    acknowledgements_received=3,
+    acknowledgements_unknown=1,
+    events_dropped=0,
+    callback_errors=0,
+    frame_age_s=0.01,
+    latency_p50_s=None,
+)
+
+
+def entry(k):
+    return HistoryEntry(
+        t_ns_utc=k * SECOND,
+        measured=ALPHA,
+        measured_sigma=2 * SIGMA,
+        filtered=ALPHA,
+        filtered_sigma=SIGMA,
+        innovation=3.5,
+    )
+
+
+STATE = TrackerState(
+    system="flao-lbt",
+    mode=Mode.PROPOSE,
+    registration=Registration(
+        alpha=ALPHA,
+        covariance=np.diag(SIGMA**2),
+        floor=np.array([0.003, 0.003, np.deg2rad(0.005), 0.0003]),
+        t_ns_utc=90 * SECOND,
+        n_windows=4,
+        optical_gain=0.6,
+    ),
+    history=tuple(entry(k) for k in range(5)),
+    reconstructors=(
+        ReconstructorRecord(id="rtc-0", state=MatrixState.APPLIED, n_modes=400, created_ns_utc=1),
+        ReconstructorRecord(
+            id="cm-1",
+            state=MatrixState.PROPOSED,
+            n_modes=400,
+            created_ns_utc=2,
+            alpha=ALPHA,
+            sigma=SIGMA,
+            parent="rtc-0",
+            sha256=hashlib.sha256(MATRIX.tobytes()).hexdigest(),
+            condition_number=8.4,
+            gate=VERDICT,
+            reason="waits",
+        ),
+    ),
+    in_use="rtc-0",
+    margin=VERDICT,
+    rtc=RtcView(
+        session="s-1",
+        loop="closed",
+        frame_rate_hz=1000.0,
+        delay_frames=2.0,
+        leak=1.0,
+        gains=(0.4, 0.4),
+        n_controlled=400,
+        n_modes=594,
+        n_slopes=1384,
+        cm_id="rtc-0",
+        basis_id="kl",
+        config_id="b1",
+        magnitude=None,
+        max_dither_m=1e-7,
+        max_dither_modes=4,
+        dither_id="d-1",
+        t_ns_utc=99 * SECOND,
+    ),
+    basis_id="kl",
+    config_id="b1",
+    dither=DitherView(
+        id="d-1",
+        modes=(501, 450),
+        amplitude_m=(5e-9, 5e-9),
+        frequency_hz=(210.0, 250.0),
+        duration_s=60.0,
+        start_seq=17,
+        asked_ns_utc=5,
+    ),
+    watchdog=Watchdog(
+        alpha=ALPHA, sigma=10 * SIGMA, t_ns_utc=80 * SECOND, consistent=True, text="agrees"
+    ),
+    alarms=(Alarm(name="rtc.silent", since_ns_utc=70 * SECOND, text="no status: look at it"),),
+    log=tuple(
+        LogEntry(t_ns_utc=k, level=Level.INFO, name="window.accepted", text=f"window {k}")
+        for k in range(4)
+    ),
+    windows_accepted=4,
+    windows_refused=1,
+)
+
+
+@dataclass
+class FakeService:
+    """Holds a real state and remembers what it was asked."""
+
+    now: Snapshot
+    commands: list = field(default_factory=list)
+    refusal: Exception | None = None
+    thread: int | None = None
+
+    def snapshot(self):
+        return self.now
+
+    async def submit(self, command):
+        if self.refusal is not None:
+            raise self.refusal
+        self.commands.append(command)
+        return f"{type(command).__name__} is on its way"
+
+    def matrix(self, matrix_id):
+        self.thread = threading.get_ident()
+        if self.refusal is not None:
+            raise self.refusal
+        if matrix_id != "cm-1":
+            raise UnknownIdError(f"reconstructor {matrix_id}: no such matrix in the archive")
+        return MATRIX
+
+    def change(self, **changes):
+        self.now = replace(self.now, tracker=replace(self.now.tracker, **changes))
+
+
+@pytest.fixture
+def service():
+    return FakeService(
+        Snapshot(
+            tracker=STATE,
+            link=LINK,
+            now_ns=100 * SECOND,
+            started_ns=40 * SECOND,
+            ready=True,
+            ready_reason="telemetry flows",
+        )
+    )
+
+
+@pytest.fixture
+async def client(service):
+    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
+        yield client
+
+
+async def body_of(client, path, **parameters):
+    response = await client.get(path, params=parameters)
+    assert response.status_code == 200, response.text
+    return response.json()
+
+
+def assert_problem(response, status, kind, *words):
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    problem = response.json()
+    assert set(problem) == {"type", "title", "status", "detail", "instance"}
+    assert problem["type"] == f"urn:pyrcal:problem:{kind}"
+    assert problem["status"] == status
+    assert problem["title"]
+    assert problem["instance"] == response.request.url.path
+    for word in words:
+        assert word in problem["detail"], problem["detail"]
+
+
+# --- reading
+
+
+async def test_alpha_leaves_in_the_units_of_its_names(client):
+    body = await body_of(client, "/v1/alpha")
+    assert body["alpha"] == pytest.approx(
+        {"shift_x_subap": 0.2, "shift_y_subap": -0.1, "rotation_deg": 0.3, "magnification": 1.005}
+    )
+    assert body["sigma"]["rotation_deg"] == pytest.approx(np.hypot(0.03, 0.005))
+    assert body["floor"]["rotation_deg"] == pytest.approx(0.005)
+    assert body["parameters"] == list(PARAMETERS)
+    covariance = np.array(body["covariance"])
+    assert covariance.shape == (4, 4)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), list(body["sigma"].values()))
+    assert (body["age_s"], body["n_windows"], body["optical_gain"]) == (10.0, 4, 0.6)
+
+
+async def test_the_age_is_judged_by_arrival_where_it_is_known(client, service):
+    service.now = replace(service.now, estimate_arrival_ns=98 * SECOND)
+    assert (await body_of(client, "/v1/alpha"))["age_s"] == 2.0
+
+
+async def test_before_the_first_window_alpha_is_a_problem_and_state_says_null(client, service):
+    service.change(registration=None, windows_accepted=0, windows_refused=3)
+    response = await client.get("/v1/alpha")
+    assert_problem(response, 404, "no-estimate", "no estimate yet", "3 refused")
+    assert (await body_of(client, "/v1/state"))["registration"] is None
+
+
+async def test_state_shows_everything_at_one_glance(client):
+    body = await body_of(client, "/v1/state")
+    assert (body["system"], body["mode"], body["ready"]) == ("flao-lbt", "propose", True)
+    assert body["uptime_s"] == 60.0
+    assert body["registration"] == await body_of(client, "/v1/alpha")
+    assert body["margin"]["worst_pole_radius"] == 0.8
+    assert (body["rtc"]["frame_rate_hz"], body["rtc"]["magnitude"]) == (1000.0, None)
+    assert body["dither"]["modes"] == [501, 450]
+    assert body["watchdog"]["sigma"]["rotation_deg"] == pytest.approx(0.3)
+    assert body["alarms"][0]["name"] == "rtc.silent"
+    assert (body["windows_accepted"], body["windows_refused"]) == (4, 1)
+    assert body["link"]["frames_refused"] == {"basis": 8}
+
+
+async def test_the_state_of_a_service_that_knows_nothing_is_readable(client, service):
+    service.now = replace(service.now, tracker=TrackerState(system="bench"))
+    body = await body_of(client, "/v1/state")
+    assert body["rtc"] is body["margin"] is body["dither"] is body["watchdog"] is None
+
+
+async def test_history_is_the_newest_entries_oldest_first(client):
+    body = await body_of(client, "/v1/alpha/history", limit=2)
+    assert [e["t_ns_utc"] for e in body["entries"]] == [3 * SECOND, 4 * SECOND]
+    assert body["entries"][0]["measured_sigma"]["rotation_deg"] == pytest.approx(0.06)
+    assert len((await body_of(client, "/v1/alpha/history"))["entries"]) == 5
+
+
+async def test_reconstructors_are_listed_with_the_one_in_use(client):
+    body = await body_of(client, "/v1/reconstructors")
+    assert body["in_use"] == "rtc-0"
+    assert [r["id"] for r in body["reconstructors"]] == ["rtc-0", "cm-1"]
+    assert body["reconstructors"][0]["alpha"] is None
+
+
+async def test_one_reconstructor_is_shown_with_its_verdict(client):
+    body = await body_of(client, "/v1/reconstructors/cm-1")
+    assert (body["state"], body["parent"]) == ("proposed", "rtc-0")
+    assert body["alpha"]["rotation_deg"] == pytest.approx(0.3)
+    assert body["gate"]["accepted"] is True
+
+
+async def test_an_unknown_reconstructor_is_a_problem(client):
+    response = await client.get("/v1/reconstructors/cm-9")
+    assert_problem(response, 404, "unknown-id", "cm-9")
+
+
+async def test_events_are_the_log_and_the_alarms(client):
+    body = await body_of(client, "/v1/events", limit=1)
+    assert [e["text"] for e in body["log"]] == ["window 3"]
+    assert body["log"][0]["level"] == "info"
+    assert body["alarms"][0]["since_ns_utc"] == 70 * SECOND
+
+
+async def test_numbers_that_are_not_finite_leave_as_null(client, service):
+    verdict = replace(VERDICT, accepted=False, worst_pole_radius=float("inf"))
+    registration = replace(STATE.registration, covariance=np.full((4, 4), np.nan))
+    service.change(margin=verdict, registration=registration)
+    text = (await client.get("/v1/state")).text
+    body = json.loads(text, parse_constant=pytest.fail)
+    assert body["margin"]["worst_pole_radius"] is None
+    assert body["registration"]["covariance"][0][0] is None
+    assert body["registration"]["sigma"]["shift_x_subap"] is None
+
+
+# --- matrices
+
+
+async def test_a_matrix_is_a_numpy_file_by_default(client):
+    response = await client.get("/v1/reconstructors/cm-1/matrix")
+    assert response.headers["content-type"] == "application/octet-stream"
+    assert 'filename="cm-1.npy"' in response.headers["content-disposition"]
+    found = np.load(io.BytesIO(response.content), allow_pickle=False)
+    assert found.dtype == np.dtype("<f4")
+    np.testing.assert_array_equal(found, MATRIX)
+
+
+async def test_a_raw_matrix_has_its_shape_in_the_headers_and_the_records_checksum(client):
+    response = await client.get("/v1/reconstructors/cm-1/matrix?format=raw")
+    assert (response.headers["x-shape"], response.headers["x-dtype"]) == ("3,4", "<f4")
+    np.testing.assert_array_equal(np.frombuffer(response.content, "<f4").reshape(3, 4), MATRIX)
+    record = await body_of(client, "/v1/reconstructors/cm-1")
+    assert hashlib.sha256(response.content).hexdigest() == record["sha256"]
+
+
+async def test_a_matrix_is_read_outside_the_event_loop(client, service):
+    await client.get("/v1/reconstructors/cm-1/matrix")
+    assert service.thread not in {None, threading.get_ident()}
+
+
+async def test_a_matrix_nobody_has_is_a_problem(client):
+    response = await client.get("/v1/reconstructors/cm-9/matrix")
+    assert_problem(response, 404, "unknown-id", "cm-9: no such matrix")
+
+
+async def test_a_damaged_matrix_is_a_problem_that_says_so(client, service):
+    service.refusal = ArchiveError("cm-1.h5: damaged")
+    response = await client.get("/v1/reconstructors/cm-1/matrix")
+    assert_problem(response, 500, "archive", "cm-1.h5: damaged")
+
+
+# --- commands
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "command"),
+    [
+        ("POST", "/v1/refit", None, Refit()),
+        ("POST", "/v1/refit", {}, Refit()),
+        ("POST", "/v1/refit", {"n_modes": 500}, Refit(n_modes=500)),
+        ("POST", "/v1/dither", {"action": "stop"}, StopDither()),
+        ("POST", "/v1/dither", {"action": "start"}, StartDither()),
+        (
+            "POST",
+            "/v1/dither",
+            {
+                "action": "start",
+                "modes": [501, 450],
+                "amplitude_m": 5e-9,
+                "frequency_hz": [210, 250.5],
+                "duration_s": 60,
+            },
+            StartDither(
+                modes=(501, 450),
+                amplitude_m=5e-9,
+                frequency_hz=(210.0, 250.5),
+                duration_s=60.0,
+            ),
+        ),
+        ("POST", "/v1/reconstructors/cm-1/approve", None, Approve(id="cm-1")),
+        ("POST", "/v1/reconstructors/cm-1/reject", None, Reject(id="cm-1")),
+        (
+            "POST",
+            "/v1/reconstructors/cm-1/reject",
+            {"reason": "no"},
+            Reject(id="cm-1", reason="no"),
+        ),
+        ("POST", "/v1/reconstructors/cm-1/publish", {}, Publish(id="cm-1")),
+        ("POST", "/v1/rollback", None, Rollback()),
+        ("PUT", "/v1/mode", {"mode": "auto"}, SetMode(mode=Mode.AUTO)),
+    ],
+)
+async def test_a_command_is_handed_on_and_answered_202(
+    client, service, method, path, body, command
+):
+    response = await client.request(method, path, json=body)
+    assert response.status_code == 202, response.text
+    assert service.commands == [command]
+    answer = response.json()
+    assert answer["text"] == f"{type(command).__name__} is on its way"
+    for link in answer["links"].values():
+        assert (await client.get(link)).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "words"),
+    [
+        ("POST", "/v1/refit", {"n_mode": 5}, ["body.n_mode: unknown"]),
+        ("POST", "/v1/refit", {"n_modes": 0}, ["body.n_modes: found 0, expected greater than or"]),
+        ("POST", "/v1/refit", {"n_modes": "5"}, ["body.n_modes: found '5', expected a valid int"]),
+        ("POST", "/v1/refit", {"n_modes": 5.5}, ["body.n_modes: found 5.5"]),
+        ("POST", "/v1/refit", [1], ["body: found [1]"]),
+        ("POST", "/v1/dither", None, ["body: missing"]),
+        ("POST", "/v1/dither", {}, ["body: found {}", "action"]),
+        ("POST", "/v1/dither", {"action": "pause"}, ["'start', 'stop'"]),
+        ("POST", "/v1/dither", {"action": "stop", "modes": [1]}, ["modes: unknown"]),
+        ("POST", "/v1/dither", {"action": "start", "modes": [-1]}, ["modes.0: found -1"]),
+        ("POST", "/v1/dither", {"action": "start", "modes": []}, ["modes: found []"]),
+        ("POST", "/v1/dither", {"action": "start", "amplitude_m": 0}, ["amplitude_m: found 0"]),
+        (
+            "POST",
+            "/v1/dither",
+            {"action": "start", "modes": [1, 2], "frequency_hz": [200.0]},
+            ["one frequency_hz for each of modes: 1 given for 2"],
+        ),
+        ("POST", "/v1/reconstructors/cm-1/approve", {"force": True}, ["body.force: unknown"]),
+        ("POST", "/v1/reconstructors/cm-1/publish", {"force": True}, ["body.force: unknown"]),
+        ("POST", "/v1/reconstructors/cm-1/reject", {"why": ""}, ["body.why: unknown"]),
+        ("POST", "/v1/rollback", {"to": "cm-0"}, ["body.to: unknown"]),
+        ("PUT", "/v1/mode", {"mode": "manual"}, ["'auto', 'propose' or 'hold'"]),
+        ("PUT", "/v1/mode", {}, ["body.mode: missing"]),
+    ],
+)
+async def test_a_body_that_cannot_be_used_is_refused(client, service, method, path, body, words):
+    response = await client.request(method, path, json=body)
+    assert_problem(response, 422, "invalid", *words)
+    assert service.commands == []
+
+
+@pytest.mark.parametrize("content", ["{", "NaN", '{"action": "start", "amplitude_m": NaN}'])
+async def test_a_body_that_is_not_json_is_refused(client, service, content):
+    response = await client.post(
+        "/v1/dither", content=content, headers={"Content-Type": "application/json"}
+    )
+    assert_problem(response, 422, "invalid", "body")
+    assert service.commands == []
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/v1/alpha/history?limit=0",
+        "/v1/alpha/history?limit=many",
+        "/v1/alpha/history?limt=3",
+        "/v1/events?limit=-1",
+        "/v1/reconstructors/cm-1/matrix?format=csv",
+    ],
+)
+async def test_a_query_that_cannot_be_used_is_refused(client, path):
+    assert_problem(await client.get(path), 422, "invalid", "query.")
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "kind"),
+    [
+        (CommandError("no estimate yet: start a dither"), 409, "not-now"),
+        (UnknownIdError("reconstructor cm-1: nobody has heard of it"), 404, "unknown-id"),
+        (LinkError("the RTC did not answer within 1 s"), 504, "rtc-silent"),
+        (ModelError("no such registration"), 500, "internal"),
+    ],
+)
+async def test_a_refused_command_is_a_problem_in_the_services_own_words(
+    client, service, error, status, kind
+):
+    service.refusal = error
+    response = await client.post("/v1/reconstructors/cm-1/approve")
+    assert_problem(response, status, kind, str(error))
+
+
+async def test_a_fault_of_the_service_gives_nothing_away(client, service):
+    service.refusal = ZeroDivisionError("secret")
+    response = await client.post("/v1/rollback")
+    assert_problem(response, 500, "internal", "fault of the service")
+    assert "secret" not in response.text
+
+
+# --- no such thing
+
+
+async def test_an_unknown_path_is_a_problem(client):
+    assert_problem(await client.get("/v2/state"), 404, "http", "nothing at /v2/state")
+
+
+async def test_a_wrong_method_is_a_problem_that_says_what_is_allowed(client):
+    response = await client.get("/v1/mode")
+    assert_problem(response, 405, "http", "GET is not possible at /v1/mode")
+    assert response.headers["allow"] == "PUT"
+
+
+# --- health, metrics, description
+
+
+async def test_healthz_answers_while_the_process_lives(client):
+    assert await body_of(client, "/healthz") == {
+        "status": "ok",
+        "version": __version__,
+        "uptime_s": 60.0,
+    }
+
+
+async def test_readyz_says_what_the_service_waits_for(client, service):
+    assert await body_of(client, "/readyz") == {"ready": True, "reason": "telemetry flows"}
+    service.now = replace(service.now, ready=False, ready_reason="no RTC has been heard")
+    response = await client.get("/readyz")
+    assert_problem(response, 503, "not-ready", "no RTC has been heard")
+
+
+async def metrics_of(client):
+    response = await client.get("/metrics")
+    assert response.status_code == 200
+    assert response.headers["content-type"].startswith("text/plain; version=")
+    return {
+        (sample.name.removeprefix("pyrcal_"), *sample.labels.values()): sample.value
+        for family in text_string_to_metric_families(response.text)
+        for sample in family.samples
+    }
+
+
+async def test_metrics_count_everything_on_the_link(client):
+    found = await metrics_of(client)
+    for name in LinkStatistics.__slots__:
+        value = getattr(LINK, name)
+        if isinstance(value, dict):
+            for key, count in value.items():
+                assert found[f"{name}_total", key] == count
+        elif isinstance(value, int):
+            key = (name,) if name in {"rtc_alive", "frames_lost"} else (f"{name}_total",)
+            assert found[key] == value
+    assert found["frame_age_seconds",] == 0.01
+    assert np.isnan(found["latency_p50_seconds",])
+
+
+async def test_metrics_show_what_the_service_knows(client):
+    found = await metrics_of(client)
+    assert found["alpha_rotation_deg",] == pytest.approx(0.3)
+    assert found["alpha_sigma_rotation_deg",] == pytest.approx(np.hypot(0.03, 0.005))
+    assert found["alpha_age_seconds",] == 10.0
+    assert found["optical_gain_ratio",] == 0.6
+    assert (found["windows_total", "accepted"], found["windows_total", "refused"]) == (4, 1)
+    assert found["worst_pole_radius",] == 0.8
+    assert found["stability_margin",] == pytest.approx(0.2)
+    assert found["reconstructors", "proposed"] == 1
+    assert found["reconstructors", "rejected"] == 0
+    assert (found["alarms",], found["alarm", "rtc.silent"]) == (1, 1)
+    assert (found["mode", "propose"], found["mode", "auto"]) == (1, 0)
+    assert (found["ready",], found["uptime_seconds",]) == (1, 60.0)
+
+
+async def test_metrics_of_a_service_that_knows_nothing_are_readable(client, service):
+    service.now = replace(
+        service.now, tracker=TrackerState(system="bench"), link=replace(LINK, frame_age_s=None)
+    )
+    found = await metrics_of(client)
+    assert ("alpha_rotation_deg",) not in found
+    assert found["windows_total", "accepted"] == 0
+
+
+async def test_openapi_describes_every_route_with_its_answers_and_errors(client):
+    description = await body_of(client, "/openapi.json")
+    operations = {
+        f"{method.upper()} {path}": operation
+        for path, methods in description["paths"].items()
+        for method, operation in methods.items()
+    }
+    assert set(operations) == {
+        "GET /v1/state",
+        "GET /v1/alpha",
+        "GET /v1/alpha/history",
+        "GET /v1/reconstructors",
+        "GET /v1/reconstructors/{id}",
+        "GET /v1/reconstructors/{id}/matrix",
+        "GET /v1/events",
+        "POST /v1/refit",
+        "POST /v1/dither",
+        "POST /v1/reconstructors/{id}/approve",
+        "POST /v1/reconstructors/{id}/reject",
+        "POST /v1/reconstructors/{id}/publish",
+        "POST /v1/rollback",
+        "PUT /v1/mode",
+        "GET /healthz",
+        "GET /readyz",
+        "GET /metrics",
+    }
+    for name, operation in operations.items():
+        assert operation["description"], name
+        for status, answer in operation["responses"].items():
+            expected = "application/problem+json" if status[0] in "45" else None
+            assert answer["description"], name
+            assert expected is None or list(answer["content"]) == [expected], (name, status)
+        if not name.startswith("GET"):
+            assert "202" in operation["responses"], name
+    assert "HTTPValidationError" not in description["components"]["schemas"]
+    assert len({o["operationId"] for o in operations.values()}) == len(operations)
+
+
+async def test_every_reference_in_openapi_has_a_target(client):
+    text = (await client.get("/openapi.json")).text
+    description = json.loads(text)
+
+    def references(node):
+        if isinstance(node, dict):
+            yield from (v for k, v in node.items() if k == "$ref")
+            node = list(node.values())
+        if isinstance(node, list):
+            for child in node:
+                yield from references(child)
+
+    found = set(references(description))
+    assert found
+    for reference in found:
+        target = description
+        for part in reference.removeprefix("#/").split("/"):
+            target = target[part]
+
+
+UNITS = ("_s", "_m", "_hz", "_ns", "_ns_utc", "_deg", "_subap", "_frames", "_seq")
+DIMENSIONLESS = {
+    "bound",
+    "condition_number",
+    "innovation",
+    "leak",
+    "magnification",
+    "magnitude",
+    "max_dither_modes",
+    "optical_gain",
+    "status",
+}
+COUNTS = ("n_", "frames_", "windows_")
+
+
+async def test_every_number_carries_its_unit_in_its_name(client):
+    schemas = (await body_of(client, "/openapi.json"))["components"]["schemas"]
+
+    def is_number(schema):
+        types = {schema.get("type"), *(s.get("type") for s in schema.get("anyOf", ()))}
+        return bool(types & {"number", "integer"})
+
+    numbers = {
+        name
+        for schema in schemas.values()
+        for name, field in schema.get("properties", {}).items()
+        if is_number(field)
+    }
+    assert {"rotation_deg", "frame_rate_hz", "amplitude_m"} <= numbers
+    for name in numbers - DIMENSIONLESS:
+        assert name.endswith(("_radius", *UNITS)) or name.startswith(COUNTS), name

@@ -111,6 +111,8 @@ def _line(error: Mapping[str, Any]) -> str:
         return f"{where}: missing"
     if error["type"] == "json_invalid":
         return f"{where}: not JSON: {error['ctx']['error']}"
+    if isinstance(error["input"], bytes):
+        return f"{where}: expected JSON with Content-Type: application/json"
     expected = error["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     return f"{where}: found {error['input']!r:.80}, expected {expected}"
 

@@ -9,6 +9,9 @@ from dataclasses import dataclass, field, replace
 import httpx
 import numpy as np
 import pytest
+from prometheus_client.openmetrics.parser import (
+    text_string_to_metric_families as openmetrics_families,
+)
 from prometheus_client.parser import text_string_to_metric_families
 
 from service import __version__
@@ -461,6 +464,15 @@ async def test_a_body_that_is_not_json_is_refused(client, service, content):
     assert service.commands == []
 
 
+async def test_json_that_is_not_declared_as_json_is_refused_with_what_to_do(client):
+    response = await client.post(
+        "/v1/refit",
+        content='{"n_modes": 5}',
+        headers={"Content-Type": "application/x-www-form-urlencoded"},
+    )
+    assert_problem(response, 422, "invalid", "expected JSON with Content-Type: application/json")
+
+
 @pytest.mark.parametrize(
     "path",
     [
@@ -569,6 +581,14 @@ async def test_metrics_show_what_the_service_knows(client):
     assert (found["alarms",], found["alarm", "rtc.silent"]) == (1, 1)
     assert (found["mode", "propose"], found["mode", "auto"]) == (1, 0)
     assert (found["ready",], found["uptime_seconds",]) == (1, 60.0)
+
+
+async def test_metrics_leave_as_openmetrics_for_those_who_ask(client):
+    accept = {"Accept": "application/openmetrics-text; version=1.0.0"}
+    response = await client.get("/metrics", headers=accept)
+    assert response.headers["content-type"].startswith("application/openmetrics-text")
+    families = {f.name: f for f in openmetrics_families(response.text)}
+    assert families["pyrcal_frames_received"].samples[0].value == 3000
 
 
 async def test_metrics_of_a_service_that_knows_nothing_are_readable(client, service):

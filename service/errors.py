@@ -8,7 +8,8 @@
     ├── WireError            bytes from the RTC that break the contract
     ├── LinkError            the zenoh session cannot be opened or an RTC does not answer
     ├── CommandError         an operator's request that cannot be carried out now
-    │   └── UnknownIdError      a reconstructor, session or product nobody has heard of
+    │   └── UnknownIdError   a reconstructor, session or product nobody has heard of
+    ├── WorkerError          the worker process died; the job is lost, the service is not
     └── ArchiveError         a product that cannot be written, read, or fails its checksum
 
 Expected outcomes (a rejected fit, a refused reconstructor, too few frames) are values, not
@@ -42,6 +43,10 @@ class CommandError(PyrcalError):
 
 class UnknownIdError(CommandError):
     """The id names nothing this service knows."""
+
+
+class WorkerError(PyrcalError):
+    """The worker process died with a job in its hands."""
 
 
 class ArchiveError(PyrcalError):

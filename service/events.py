@@ -8,7 +8,7 @@ from service.control.gate import GateVerdict
 from service.estimation.instrumental import WindowEstimate
 from service.estimation.lockin import WindowRefused
 from service.estimation.passive import PassiveEstimate
-from service.state import DitherView, MatrixState, Mode, ReconstructorRecord, RtcView
+from service.state import DitherView, Level, MatrixState, Mode, ReconstructorRecord, RtcView
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,6 +111,15 @@ class Trouble:
     """The condition has ended."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noted:
+    """Something happened that changes nothing but should be on record."""
+
+    name: str
+    text: str
+    level: Level = Level.INFO
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WindowFitted:
     """The worker estimated α from one window."""
@@ -192,6 +201,7 @@ Event = (
     | SessionStarted
     | RtcVanished
     | Trouble
+    | Noted
     | WindowFitted
     | WindowLost
     | Watched

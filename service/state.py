@@ -237,6 +237,9 @@ class Alarm:
     text: str
     """What was found, and what to do."""
 
+    seen_ns_utc: int = 0
+    """When it was last found to be so."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogEntry:

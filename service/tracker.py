@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from service import events as ev
 from service.events import Command, Event
-from service.reactions.journal import with_alarm, without_alarm
+from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.matrices import (
     Step,
     on_acknowledgement,
@@ -63,6 +63,8 @@ def _react(  # noqa: C901 - one line for each event
             if over:
                 return without_alarm(state, name, now_ns), ()
             return with_alarm(state, name, text, now_ns), ()
+        case ev.Noted(name=name, text=text, level=level):
+            return logged(state, name, text, now_ns, level), ()
         case ev.WindowFitted(estimate=estimate):
             return on_window(state, estimate, policy, now_ns), ()
         case ev.WindowLost(refused=refused):

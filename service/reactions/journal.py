@@ -24,7 +24,7 @@ def with_alarm(state: TrackerState, name: str, text: str, now_ns: int) -> Tracke
     """Return the state with this alarm raised; one already raised keeps its beginning."""
     raised = next((a for a in state.alarms if a.name == name), None)
     since_ns = raised.since_ns_utc if raised is not None else now_ns
-    alarm = Alarm(name=name, since_ns_utc=since_ns, text=text)
+    alarm = Alarm(name=name, since_ns_utc=since_ns, text=text, seen_ns_utc=now_ns)
     others = tuple(a for a in state.alarms if a.name != name)
     state = replace(state, alarms=(*others, alarm))
     return state if raised is not None else logged(state, name, text, now_ns, Level.ALARM)

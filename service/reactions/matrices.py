@@ -37,7 +37,7 @@ def on_matrix(
     state = logged(
         state, "reconstructor.made", f"{record.id}, {record.n_modes} modes, {verdict}", now_ns
     )
-    if wanted or state.mode is Mode.AUTO:
+    if state.rtc is not None and (wanted or state.mode is Mode.AUTO):
         return send(state, record.id, now_ns)
     return state, ()
 

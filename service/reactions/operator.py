@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service import events as ev
-from service.errors import CommandError
+from service.errors import CommandError, ModelError
 from service.events import Event
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send
-from service.reactions.policy import Policy, plan_dither
+from service.reactions.policy import Policy, lock_in_plan, plan_dither
 from service.reactions.shelf import known_record, with_state
 from service.state import MatrixState, Mode, TrackerState
 
@@ -65,11 +65,10 @@ def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, no
         frequency_hz=event.frequency_hz,
         duration_s=event.duration_s,
     )
-    if len(dither.modes) != len(dither.frequency_hz):
-        raise CommandError(
-            f"dither: found {len(dither.frequency_hz)} frequencies for {len(dither.modes)} modes; "
-            "expected one for each"
-        )
+    try:
+        lock_in_plan(dither, rtc, policy.window_s)
+    except ModelError as error:
+        raise CommandError(f"dither: {error}") from error
     state = replace(state, dither=dither, dither_stopped=False)
     return logged(state, "dither.asked", f"modes {dither.modes}", now_ns), (
         ev.AskDither(dither=dither),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from service.estimation.lockin import LockInPlan
 from service.events import AskDither, Effect, FetchMatrix, JudgeMatrix, MakeMatrix
 from service.model.misregistration import BOUNDARY_SCALE
 from service.state import (
@@ -28,6 +29,9 @@ JUDGE_INTERVAL_S = 10.0
 
 LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
 """Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""
+
+SETTLING_S = 0.3
+"""Of the loop, after a dither has begun, before the first window."""
 
 _N_LINES = 4
 _OPEN = (MatrixState.PROPOSED, MatrixState.PUBLISHED, MatrixState.STAGED)
@@ -83,7 +87,7 @@ def decide(
     return state, tuple(effects)
 
 
-_PARALYSING = ("second-rtc", "basis-mismatch", "loop-diverging")
+_PARALYSING = ("second-rtc", "basis-mismatch", "instrument-mismatch", "loop-diverging")
 _Choice = tuple[TrackerState, tuple[Effect, ...]]
 
 
@@ -135,6 +139,24 @@ def plan_dither(
         duration_s=duration_s or policy.dither_duration_s,
         start_seq=None,
         asked_ns_utc=now_ns,
+    )
+
+
+def lock_in_plan(dither: DitherView, rtc: RtcView, window_s: float) -> LockInPlan:
+    """Return how a dither is demodulated, from where the loop has settled.
+
+    Raises
+    ------
+    ModelError
+        If its lines cannot be told apart in a window of ``window_s``.
+    """
+    return LockInPlan(
+        modes=dither.modes,
+        frequencies_hz=dither.frequency_hz,
+        amplitude_m=dither.amplitude_m,
+        frame_rate_hz=rtc.frame_rate_hz,
+        n_frames=round(window_s * rtc.frame_rate_hz),
+        first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
     )
 
 

@@ -14,6 +14,11 @@ from service.state import Level, MatrixState, RtcView, TrackerState
 ACKNOWLEDGE_WITHIN_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
 
+FORGOTTEN_AFTER_S = 15.0
+"""An alarm the link repeats while it lasts is over after this much silence."""
+
+_RENEWED = ("second-rtc", "basis-mismatch")
+
 COMPUTE_WITHIN_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
 
@@ -30,6 +35,10 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
             )
             state = with_state(state, record.id, MatrixState.FAILED, text)
             state = with_alarm(state, "no-acknowledgement", text, now_ns)
+    for alarm in state.alarms:
+        silent_ns = now_ns - alarm.seen_ns_utc
+        if alarm.name in _RENEWED and silent_ns > FORGOTTEN_AFTER_S * SECOND_NS:
+            state = without_alarm(state, alarm.name, now_ns)
     since_ns = state.making_since_ns_utc
     if since_ns is not None and now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
         state = replace(state, making_since_ns_utc=None)

@@ -1,0 +1,1 @@
+"""The running service: what is heard becomes events, what is decided becomes deeds."""

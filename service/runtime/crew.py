@@ -1,0 +1,53 @@
+"""The worker process as the event loop sees it: one job at a time, replaced when it dies."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Executor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from typing import Concatenate, ParamSpec, TypeVar
+
+from service.errors import WorkerError
+from service.worker import Workbench, run_job
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class Crew:
+    """Hands jobs to an executor made by ``hire``; a dead worker costs one job, not the service."""
+
+    def __init__(self, hire: Callable[[], Executor]) -> None:
+        self._hire = hire
+        self._executor: Executor | None = None
+        self.n_lost = 0
+
+    async def call(
+        self, job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """Run a method of the workbench and return its result.
+
+        Raises
+        ------
+        WorkerError
+            If the worker process died; a new one is there for the next job.
+        """
+        if self._executor is None:
+            self._executor = self._hire()
+        work = partial(run_job, job, *args, **kwargs)
+        executor = self._executor
+        try:
+            return await asyncio.get_running_loop().run_in_executor(executor, work)
+        except BrokenProcessPool as error:
+            if self._executor is executor:
+                self._executor = None
+                self.n_lost += 1
+            raise WorkerError(f"the worker process died during {job.__name__}") from error
+
+    def dismiss(self) -> None:
+        """End the worker; jobs that wait are dropped."""
+        executor, self._executor = self._executor, None
+        if executor is not None:
+            executor.shutdown(wait=False, cancel_futures=True)

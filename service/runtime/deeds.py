@@ -1,0 +1,305 @@
+"""Carrying out what the tracker has decided; every deed ends in an event, failures too."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service import __version__
+from service import events as ev
+from service.archive import Archive
+from service.control.gate import LoopSettings
+from service.errors import CommandError, LinkError, UnknownIdError
+from service.events import Effect, Event
+from service.model.instrument import Instrument
+from service.reactions.matrices import extended_gains
+from service.rtc_bridge import Bridge
+from service.runtime import translate
+from service.runtime.crew import Crew
+from service.state import MatrixState, ReconstructorRecord, Registration, RtcView, TrackerState
+from service.wire import (
+    DitherAction,
+    DitherKind,
+    DitherRequest,
+    LoopRequest,
+    checksum,
+    layout_of,
+)
+from service.worker import Workbench
+
+GAIN_SAFETY = 1.1
+"""The gate assumes optical gains this much above the measured ones, for modes not dithered."""
+
+MATRICES_KEPT = 16
+"""In memory; older ones come from the archive."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Publishing:
+    """What publication needs to know besides the state."""
+
+    system: str
+    chunk_bytes: int
+    pole_radius_bound: float
+    """Largest closed-loop pole radius of a matrix that may be published."""
+
+
+class Deeds:
+    """Everything the service does to the world: RTC, worker, archive."""
+
+    def __init__(
+        self,
+        *,
+        bridge: Bridge,
+        crew: Crew,
+        archive: Archive,
+        instrument: Instrument,
+        publishing: Publishing,
+        clock_ns: Callable[[], int],
+    ) -> None:
+        self._bridge = bridge
+        self._crew = crew
+        self._archive = archive
+        self._instrument = instrument
+        self._publishing = publishing
+        self._clock_ns = clock_ns
+        self._matrices: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
+        self._commanded_modes: int | None = None
+
+    async def carry_out(self, effect: Effect, state: TrackerState) -> Event | None:
+        """Do it and return what came of it; None when the answer comes over the link.
+
+        Raises
+        ------
+        PyrcalError
+            If it cannot be done now; nothing is half-done.
+        """
+        match effect:
+            case ev.MakeMatrix():
+                return await self._make(effect, state)
+            case ev.CopyMatrix():
+                return await self._copy(effect, state)
+            case ev.JudgeMatrix(id=matrix_id):
+                return await self._judge(matrix_id, state)
+            case ev.FetchMatrix(id=matrix_id):
+                return await self._fetch(matrix_id)
+            case ev.SendMatrix():
+                return await self._send(effect, state)
+            case ev.AskDither() | ev.AskNoDither():
+                return await self._dither(effect)
+
+    def matrix(self, matrix_id: str) -> NDArray[np.float32]:
+        """Return a reconstructor ``(n_modes, n_slopes)`` from memory or the archive.
+
+        Raises
+        ------
+        UnknownIdError
+            If neither has it.
+        ArchiveError
+            If the archive's file is damaged.
+        """
+        kept = self._matrices.get(matrix_id)
+        return kept if kept is not None else self._archive.matrix(matrix_id)
+
+    async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
+        rtc, registration = _there(state), _registered(state)
+        gains = extended_gains(rtc, effect.n_modes)[: effect.n_modes]
+        made = await self._crew.call(
+            Workbench.make,
+            registration.alpha,
+            registration.total_covariance,
+            _loop_settings(rtc, gains, registration),
+            self._publishing.pole_radius_bound,
+        )
+        accepted = made.gate.accepted
+        record = self._record(effect.n_modes, effect.why, registration, state.in_use)
+        record = replace(
+            record,
+            state=MatrixState.PROPOSED if accepted else MatrixState.REFUSED,
+            condition_number=made.condition_number,
+            gate=made.gate,
+            sha256=checksum(made.matrix),
+        )
+        await self._keep(record, made.matrix, registration, effect.why)
+        return ev.MatrixMade(record=record, wanted=False)
+
+    async def _copy(self, effect: ev.CopyMatrix, state: TrackerState) -> Event:
+        rtc, registration = _there(state), state.registration
+        source = state.reconstructor(effect.source)
+        matrix = await asyncio.to_thread(self.matrix, effect.source)
+        gate = None
+        if registration is not None:
+            gains = extended_gains(rtc, len(matrix))[: len(matrix)]
+            gate = await self._crew.call(
+                Workbench.judge,
+                matrix,
+                registration.alpha,
+                registration.total_covariance,
+                _loop_settings(rtc, gains, registration),
+                self._publishing.pole_radius_bound,
+            )
+        refused = gate is not None and not gate.accepted
+        record = replace(
+            self._record(len(matrix), effect.why, None, effect.source),
+            state=MatrixState.REFUSED if refused else MatrixState.PROPOSED,
+            alpha=None if source is None else source.alpha,
+            sigma=None if source is None else source.sigma,
+            condition_number=None if source is None else source.condition_number,
+            gate=gate,
+            sha256=checksum(matrix),
+        )
+        await self._keep(record, matrix, None, effect.why)
+        return ev.MatrixMade(record=record, wanted=True)
+
+    async def _judge(self, matrix_id: str, state: TrackerState) -> Event:
+        rtc, registration = _there(state), _registered(state)
+        matrix = await asyncio.to_thread(self.matrix, matrix_id)
+        verdict = await self._crew.call(
+            Workbench.judge,
+            matrix,
+            registration.alpha,
+            registration.total_covariance,
+            _loop_settings(rtc, rtc.gains[: len(matrix)], registration),
+            self._publishing.pole_radius_bound,
+        )
+        return ev.MarginJudged(id=matrix_id, verdict=verdict)
+
+    async def _fetch(self, matrix_id: str) -> Event:
+        manifest, matrix = await self._bridge.fetch_applied()
+        if manifest.id != matrix_id:
+            raise LinkError(f"the RTC offers {manifest.id}, its status says it uses {matrix_id}")
+        record = translate.record_of(manifest)
+        self._remember(record.id, matrix)
+        await asyncio.to_thread(self._store_foreign, record, matrix)
+        return ev.MatrixFetched(record=record)
+
+    async def _send(self, effect: ev.SendMatrix, state: TrackerState) -> Event | None:
+        rtc, record = _there(state), state.reconstructor(effect.id)
+        if record is None:
+            raise UnknownIdError(f"no reconstructor {effect.id}")
+        matrix = await asyncio.to_thread(self.matrix, effect.id)
+        commanded = self._commanded_modes or rtc.n_controlled
+        if effect.gains is not None or commanded != effect.n_modes:
+            await self._command_modes(effect)
+        layout = layout_of(matrix, self._publishing.chunk_bytes)
+        manifest = translate.manifest_of(record, layout, rtc, self._publishing.system)
+        await self._bridge.publish(manifest, matrix)
+        return None
+
+    async def _command_modes(self, effect: ev.SendMatrix) -> None:
+        """Tell the RTC how many modes the next matrix commands, and with which gains."""
+        reply = await self._bridge.command(
+            LoopRequest(
+                id=f"modes-{self._clock_ns()}", gains=effect.gains, n_controlled=effect.n_modes
+            )
+        )
+        if not reply.accepted:
+            raise CommandError(f"the RTC will not control {effect.n_modes} modes: {reply.reason}")
+        self._commanded_modes = effect.n_modes
+
+    async def _dither(self, effect: ev.AskDither | ev.AskNoDither) -> Event | None:
+        if isinstance(effect, ev.AskNoDither):
+            stop = DitherRequest(id=f"stop-{self._clock_ns()}", action=DitherAction.STOP)
+            reply = await self._bridge.command(stop)
+            if not reply.accepted:
+                raise CommandError(f"the RTC did not stop the dither: {reply.reason}")
+            return None
+        dither = effect.dither
+        request = DitherRequest(
+            id=dither.id,
+            action=DitherAction.START,
+            kind=DitherKind.SINE,
+            modes=dither.modes,
+            amplitude_m=dither.amplitude_m,
+            frequency_hz=dither.frequency_hz,
+            duration_s=dither.duration_s,
+        )
+        reply = await self._bridge.command(request)
+        return ev.DitherAnswered(
+            id=dither.id,
+            accepted=reply.accepted,
+            reason=reply.reason,
+            start_seq=reply.start_seq,
+        )
+
+    def _record(
+        self, n_modes: int, why: str, registration: Registration | None, parent: str | None
+    ) -> ReconstructorRecord:
+        now_ns = self._clock_ns()
+        stamp = datetime.fromtimestamp(now_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]
+        return ReconstructorRecord(
+            id=f"cm-{stamp}-{n_modes}",
+            state=MatrixState.PROPOSED,
+            n_modes=n_modes,
+            created_ns_utc=now_ns,
+            alpha=None if registration is None else registration.alpha,
+            sigma=None if registration is None else registration.sigma,
+            parent=parent,
+            reason=why,
+        )
+
+    async def _keep(
+        self,
+        record: ReconstructorRecord,
+        matrix: NDArray[np.float32],
+        registration: Registration | None,
+        why: str,
+    ) -> None:
+        """Archive before anybody hears of it, so that what was sent can always be found."""
+        self._remember(record.id, matrix)
+        covariance = None if registration is None else registration.total_covariance
+        provenance = {
+            "instrument": self._instrument.name,
+            "software": f"pyrcal {__version__}",
+            "why": why,
+        }
+        await asyncio.to_thread(self._archive.store, record, matrix, covariance, provenance)
+
+    def _remember(self, matrix_id: str, matrix: NDArray[np.float32]) -> None:
+        self._matrices[matrix_id] = matrix
+        while len(self._matrices) > MATRICES_KEPT:
+            self._matrices.popitem(last=False)
+
+    def _store_foreign(self, record: ReconstructorRecord, matrix: NDArray[np.float32]) -> None:
+        """Archive the RTC's own matrix, once; another one under the same id is an error."""
+        try:
+            same = checksum(self._archive.matrix(record.id)) == record.sha256
+        except UnknownIdError:
+            provenance = {"instrument": self._instrument.name, "why": record.reason}
+            self._archive.store(record, matrix, None, provenance)
+            return
+        if not same:
+            raise LinkError(
+                f"the RTC's matrix {record.id} is not the one archived under that id: give it "
+                "another id, or use another data directory"
+            )
+
+
+def _there(state: TrackerState) -> RtcView:
+    if state.rtc is None:
+        raise LinkError("no RTC is there")
+    return state.rtc
+
+
+def _registered(state: TrackerState) -> Registration:
+    if state.registration is None:
+        raise CommandError("α is not known")
+    return state.registration
+
+
+def _loop_settings(
+    rtc: RtcView, gains: tuple[float, ...], registration: Registration
+) -> LoopSettings:
+    measured = registration.optical_gain
+    return LoopSettings(
+        gains=np.array(gains),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        optical_gain=1.0 if measured is None else min(1.0, GAIN_SAFETY * measured),
+    )

@@ -1,0 +1,105 @@
+"""The streaming estimators, fed with every block of telemetry as it comes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from service.estimation import lockin, passive
+from service.estimation.frames import FrameBlock
+from service.estimation.health import LoopHealth, observe
+from service.estimation.lockin import LockIn, Spectra, WindowRefused
+from service.estimation.passive import Passive
+from service.reactions.policy import lock_in_plan
+from service.state import DitherView, RtcView
+from service.worker import Description
+
+PASSIVE_MEMORY_S = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Streams:
+    """The state of every streaming estimator; ``fed`` makes the next one."""
+
+    description: Description
+    """What telemetry must look like."""
+
+    rtc: RtcView | None = None
+    """The loop the frames come from."""
+
+    lock_in: LockIn | None = None
+    """None while no dither runs."""
+
+    dither_id: str | None = None
+    passive: Passive | None = None
+    health: LoopHealth = field(default_factory=LoopHealth)
+
+
+Window = Spectra | WindowRefused
+
+
+def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
+    """Follow the RTC: another loop makes the open window and the passive sums void."""
+    before = streams.rtc
+    streams = replace(streams, rtc=rtc)
+    if rtc is None:
+        return replace(streams, passive=None, lock_in=None, dither_id=None)
+    if before is not None and _same_loop(before, rtc):
+        return streams
+    memory = Passive(n_modes=rtc.n_controlled, memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz)
+    lock_in = streams.lock_in and replace(streams.lock_in, window=None)
+    return replace(streams, passive=memory, lock_in=lock_in)
+
+
+def _same_loop(before: RtcView, after: RtcView) -> bool:
+    return (
+        before.session == after.session
+        and before.loop == after.loop
+        and before.gains == after.gains
+        and before.leak == after.leak
+        and before.delay_frames == after.delay_frames
+        and before.frame_rate_hz == after.frame_rate_hz
+        and before.n_controlled == after.n_controlled
+    )
+
+
+def with_dither(streams: Streams, dither: DitherView | None, window_s: float) -> Streams:
+    """Follow the dither: a new one that has begun starts a new series of windows.
+
+    Raises
+    ------
+    ModelError
+        If its lines cannot be told apart in a window of ``window_s``.
+    """
+    rtc = streams.rtc
+    if dither is None or dither.start_seq is None or rtc is None:
+        return replace(streams, lock_in=None, dither_id=None)
+    if dither.id == streams.dither_id:
+        return streams
+    plan = lock_in_plan(dither, rtc, window_s)
+    return replace(streams, lock_in=LockIn(plan=plan), dither_id=dither.id)
+
+
+def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
+    """Return the state after one more block, and the windows that ended in it."""
+    rtc = streams.rtc
+    if rtc is None or block.session != rtc.session:
+        return streams, []
+    windows: list[Window] = []
+    if streams.lock_in is not None:
+        lock_in, windows = lockin.accumulate(streams.lock_in, block)
+        streams = replace(streams, lock_in=lock_in)
+    if streams.passive is not None and rtc.loop == "closed":
+        streams = replace(streams, passive=passive.accumulate(streams.passive, block))
+    variance = streams.description.mode_variance_m2
+    health = observe(streams.health, block, variance, rtc.n_controlled)
+    return replace(streams, health=health), windows
+
+
+def shape_mismatch(description: Description, rtc: RtcView) -> str | None:
+    """Return why this RTC's telemetry is not of the instrument in the file, or None."""
+    if (rtc.n_slopes, rtc.n_modes) == (description.n_slopes, description.n_modes):
+        return None
+    return (
+        f"the RTC has {rtc.n_slopes} slopes and {rtc.n_modes} modes, the instrument file "
+        f"{description.n_slopes} and {description.n_modes}: wrong instrument file?"
+    )

@@ -1,0 +1,315 @@
+"""The one task that owns the state: it hears, lets the tracker decide, and sees it done."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from dataclasses import replace
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from service import events as ev
+from service.archive import Archive
+from service.errors import ModelError, PyrcalError
+from service.estimation.instrumental import Loop
+from service.estimation.lockin import Spectra, WindowRefused
+from service.events import Command, Effect, Event
+from service.model.misregistration import Misregistration
+from service.reactions.policy import Policy
+from service.routes.service import Snapshot
+from service.rtc_bridge import Bridge
+from service.runtime import translate
+from service.runtime.crew import Crew
+from service.runtime.deeds import Deeds
+from service.runtime.streams import Streams, fed, shape_mismatch, with_dither, with_rtc
+from service.state import Level, LogEntry, RtcView, TrackerState
+from service.tracker import step
+from service.wire import AlarmMessage
+from service.worker import Workbench
+
+POLL_S = 0.05
+"""Longest time telemetry waits to be taken in: frames held for a hole ring no bell."""
+
+WATCH_INTERVAL_S = 10.0
+"""Between two looks of the passive watchdog."""
+
+WINDOWS_WAITING = 2
+"""Windows that may wait for the worker; then the oldest is given up."""
+
+_LEVELS = {Level.INFO: "info", Level.WARNING: "warning", Level.ALARM: "error"}
+
+
+class Supervisor:
+    """The running service; also what REST reads and commands (``service.api.Service``)."""
+
+    def __init__(
+        self,
+        *,
+        state: TrackerState,
+        policy: Policy,
+        bridge: Bridge,
+        crew: Crew,
+        archive: Archive,
+        deeds: Deeds,
+    ) -> None:
+        self._state = state
+        self._policy = policy
+        self._bridge = bridge
+        self._crew = crew
+        self._archive = archive
+        self._deeds = deeds
+        self._streams: Streams | None = None
+        self._windows: asyncio.Queue[Spectra] = asyncio.Queue(WINDOWS_WAITING)
+        self._records: asyncio.Queue[tuple[TrackerState, TrackerState]] = asyncio.Queue()
+        self._running: set[asyncio.Task[None]] = set()
+        self._started_ns = time.time_ns()
+        self._estimate_arrival_ns: int | None = None
+        self._log = structlog.get_logger().bind(system=state.system)
+
+    def snapshot(self) -> Snapshot:
+        """Return what is known now."""
+        ready = self._streams is not None
+        return Snapshot(
+            tracker=self._state,
+            link=self._bridge.statistics(),
+            now_ns=time.time_ns(),
+            started_ns=self._started_ns,
+            ready=ready,
+            ready_reason="ready" if ready else "the optical model is being prepared",
+            estimate_arrival_ns=self._estimate_arrival_ns,
+        )
+
+    async def submit(self, command: Command) -> str:
+        """Set an operator's command in motion; return one line that says what was."""
+        effects = self._post(command)
+        self._audit("operator", type(command).__name__, str(command))
+        return f"{type(command).__name__}: {len(effects)} action(s) under way"
+
+    def matrix(self, matrix_id: str) -> NDArray[np.float32]:
+        """Return a reconstructor ``(n_modes, n_slopes)``."""
+        return self._deeds.matrix(matrix_id)
+
+    async def run(self) -> None:
+        """Work until cancelled: prepare the model, then listen, tick, fit, watch and record."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._record())
+            description = await self._crew.call(Workbench.describe)
+            self._streams = Streams(description=description)
+            text = f"{description.n_slopes} slopes, {description.n_modes} modes"
+            self._post(ev.Noted(name="service.ready", text=text))
+            for work in (self._listen, self._tick, self._fit, self._watch):
+                group.create_task(work())
+
+    async def _listen(self) -> None:
+        """Take in what the link has: events first, for frames mean nothing without them."""
+        rung = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set))
+        while True:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(rung.wait(), POLL_S)
+            rung.clear()
+            for heard in self._bridge.events():
+                event = translate.event_of(heard)
+                if event is not None:
+                    self._post(event)
+                    self._check_shape()
+            self._feed()
+            # a bell for every batch would spend the core on waking up
+            await asyncio.sleep(POLL_S / 2)
+
+    def _feed(self) -> None:
+        if self._streams is None:
+            return
+        was_diverging = self._streams.health.diverging
+        for block in self._bridge.drain():
+            self._streams, windows = fed(self._streams, block)
+            for window in windows:
+                self._take(window)
+        health = self._streams.health
+        if health.diverging != was_diverging:
+            text = (
+                f"the loop is diverging: its high modes carry {health.ratio:.0f} times what "
+                "turbulence asks of them; open the loop, lower the gain or control fewer modes"
+            )
+            self._post(ev.Trouble(name="loop-diverging", text=text, over=was_diverging))
+
+    def _take(self, window: Spectra | WindowRefused) -> None:
+        if isinstance(window, WindowRefused):
+            self._post(ev.WindowLost(refused=window))
+            return
+        if self._windows.full():
+            late = self._windows.get_nowait()
+            reason = "the worker is too slow for the telemetry: a window was given up"
+            refused = WindowRefused(reason=reason, t_ns_utc=late.t_end_ns_utc)
+            self._post(ev.WindowLost(refused=refused))
+        self._windows.put_nowait(window)
+
+    async def _tick(self) -> None:
+        alarms: frozenset[tuple[str, str]] = frozenset()
+        while True:
+            self._post(ev.Tick())
+            now_ns = time.time_ns()
+            self._bridge.publish_state(translate.state_message(self._state, now_ns))
+            raised = frozenset((a.name, a.text) for a in self._state.alarms)
+            for name, text in raised ^ alarms:
+                self._bridge.publish_alarm(
+                    AlarmMessage(
+                        system=self._state.system,
+                        t_ns=now_ns,
+                        name=name,
+                        active=(name, text) in raised,
+                        text=text,
+                    )
+                )
+            alarms = raised
+            await asyncio.sleep(1.0)
+
+    async def _fit(self) -> None:
+        while True:
+            spectra = await self._windows.get()
+            arrived_ns = time.time_ns()
+            event = await self._fitted(spectra)
+            if isinstance(event, ev.WindowFitted):
+                self._estimate_arrival_ns = arrived_ns
+            self._post(event)
+
+    async def _fitted(self, spectra: Spectra) -> Event:
+        rtc, known = self._state.rtc, self._state.registration
+        if rtc is None or spectra.cm_id is None:
+            return _lost(spectra, "the RTC or its reconstructor is not known")
+        try:
+            matrix = await asyncio.to_thread(self._deeds.matrix, spectra.cm_id)
+            start = Misregistration() if known is None else known.alpha
+            outcome = await self._crew.call(Workbench.fit, spectra, _loop(rtc, matrix), start)
+        except PyrcalError as error:
+            return _lost(spectra, str(error))
+        if isinstance(outcome, WindowRefused):
+            return ev.WindowLost(refused=outcome)
+        return ev.WindowFitted(estimate=outcome)
+
+    async def _watch(self) -> None:
+        while True:
+            await asyncio.sleep(WATCH_INTERVAL_S)
+            known = self._state.registration
+            sums = self._streams.passive if self._streams is not None else None
+            if known is None or sums is None:
+                continue
+            try:
+                estimate = await self._crew.call(Workbench.watch, sums, known.alpha)
+            except PyrcalError as error:
+                self._note("watchdog.failed", str(error), Level.WARNING)
+                continue
+            if estimate is not None:
+                self._post(ev.Watched(estimate=estimate, t_ns_utc=time.time_ns()))
+
+    def _check_shape(self) -> None:
+        rtc = self._state.rtc
+        if rtc is None or self._streams is None:
+            return
+        reason = shape_mismatch(self._streams.description, rtc)
+        known = any(alarm.name == "instrument-mismatch" for alarm in self._state.alarms)
+        if (reason is not None) is not known:
+            text = reason or "the RTC's telemetry fits the instrument file again"
+            self._post(ev.Trouble(name="instrument-mismatch", text=text, over=known))
+
+    def _post(self, event: Event) -> tuple[Effect, ...]:
+        """Let the tracker decide, replace the state, and set what it wants in motion."""
+        before = self._state
+        self._state, effects = step(before, event, self._policy, time.time_ns())
+        self._tell(before)
+        if self._state.reconstructors != before.reconstructors or self._state.log != before.log:
+            self._records.put_nowait((before, self._state))
+        self._follow()
+        for effect in effects:
+            task = asyncio.get_running_loop().create_task(self._do(effect, self._state))
+            self._running.add(task)
+            task.add_done_callback(self._running.discard)
+        return effects
+
+    def _follow(self) -> None:
+        """Keep the streaming estimators in step with the RTC and the dither."""
+        if self._streams is None:
+            return
+        if any(alarm.name in _DEAF for alarm in self._state.alarms):
+            self._streams = with_rtc(self._streams, None)
+            return
+        self._streams = with_rtc(self._streams, self._state.rtc)
+        dither = self._state.dither
+        try:
+            self._streams = with_dither(self._streams, dither, self._policy.window_s)
+        except ModelError as error:
+            unusable = None if dither is None else dither.id
+            self._streams = replace(self._streams, lock_in=None, dither_id=unusable)
+            self._note("dither.unusable", str(error), Level.WARNING)
+
+    async def _do(self, effect: Effect, state: TrackerState) -> None:
+        try:
+            event = await self._deeds.carry_out(effect, state)
+        except PyrcalError as error:
+            event = ev.JobFailed(effect=effect, text=str(error))
+        except Exception as error:  # noqa: BLE001 - a bug in one deed must not end the service
+            self._log.exception("deed.broken", effect=type(effect).__name__)
+            event = ev.JobFailed(effect=effect, text=f"internal error: {error!r}")
+        if event is not None:
+            self._post(event)
+
+    def _note(self, name: str, text: str, level: Level) -> None:
+        self._post(ev.Noted(name=name, text=text, level=level))
+
+    def _tell(self, before: TrackerState) -> None:
+        """Log what is new in the state's log, at its level."""
+        for entry in _new_entries(before, self._state):
+            getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text)
+
+    def _audit(self, who: str, name: str, text: str) -> None:
+        task = asyncio.get_running_loop().create_task(
+            asyncio.to_thread(self._archive.audit, time.time_ns(), who, name, text)
+        )
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
+
+    async def _record(self) -> None:
+        """Write changes of reconstructors and the log to the archive, in order."""
+        while True:
+            before, after = await self._records.get()
+            try:
+                await asyncio.to_thread(_write, self._archive, before, after)
+            except PyrcalError as error:
+                self._log.error("archive.failed", text=str(error))
+
+
+_DEAF = ("instrument-mismatch", "basis-mismatch", "second-rtc")
+"""While one of these lasts, no telemetry is used."""
+
+
+def _new_entries(before: TrackerState, after: TrackerState) -> list[LogEntry]:
+    known = set(before.log)
+    return [entry for entry in after.log if entry not in known]
+
+
+def _write(archive: Archive, before: TrackerState, after: TrackerState) -> None:
+    old = {record.id: record for record in before.reconstructors}
+    for record in after.reconstructors:
+        if old.get(record.id) is not record:
+            archive.update(record)
+    for entry in _new_entries(before, after):
+        archive.audit(entry.t_ns_utc, "service", entry.name, entry.text)
+
+
+def _lost(spectra: Spectra, reason: str) -> Event:
+    refused = WindowRefused(reason=reason, t_ns_utc=spectra.t_end_ns_utc)
+    return ev.WindowLost(refused=refused)
+
+
+def _loop(rtc: RtcView, matrix: NDArray[np.float32]) -> Loop:
+    return Loop(
+        reconstructor=matrix,
+        gains=np.array(rtc.gains),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        frame_rate_hz=rtc.frame_rate_hz,
+    )

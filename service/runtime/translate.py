@@ -1,0 +1,128 @@
+"""Between the records of the wire and what the tracker knows."""
+
+from __future__ import annotations
+
+from service import events as ev
+from service.link import events as heard
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.state import Level, MatrixState, ReconstructorRecord, RtcView, TrackerState
+from service.wire import Acknowledgement, Manifest, MatrixLayout, StateMessage, Status
+
+
+def event_of(event: heard.LinkEvent) -> ev.Event | None:
+    """Return what the tracker makes of something heard on the link; None: nothing."""
+    match event:
+        case heard.StatusReceived(status=status):
+            return ev.StatusSeen(rtc=rtc_view(status))
+        case heard.AcknowledgementReceived(acknowledgement=acknowledgement):
+            return _acknowledged(acknowledgement)
+        case heard.SessionChanged(new=new):
+            return ev.SessionStarted(session=new)
+        case heard.RtcVanished():
+            return ev.RtcVanished()
+        case heard.RtcAppeared():
+            return ev.Noted(name="rtc.appeared", text="the RTC is there")
+        case _:
+            return _trouble(event)
+
+
+def _trouble(event: heard.LinkEvent) -> ev.Event | None:
+    match event:
+        case heard.SecondRtc(current=current, other=other):
+            text = f"two RTCs send at once, sessions {current} and {other}: stop one of them"
+            return ev.Trouble(name="second-rtc", text=text)
+        case heard.BasisMismatch(expected=expected, found=found):
+            text = (
+                f"the RTC's basis and configuration are {found[0]} and {found[1]}, expected "
+                f"{expected[0]} and {expected[1]}: no estimate, no publication until they agree"
+            )
+            return ev.Trouble(name="basis-mismatch", text=text)
+        case heard.IdsAdopted(basis_id=basis_id, config_id=config_id):
+            text = f"basis {basis_id}, configuration {config_id}"
+            return ev.Noted(name="ids.adopted", text=text)
+        case heard.MalformedMessage(kind=kind, text=text):
+            return ev.Noted(name="message.malformed", text=f"{kind}: {text}", level=Level.WARNING)
+        case _:
+            return None
+
+
+def rtc_view(status: Status) -> RtcView:
+    """Return the RTC as a status message shows it."""
+    return RtcView(
+        session=status.session,
+        loop=status.loop.value,
+        frame_rate_hz=status.frame_rate_hz,
+        delay_frames=status.delay_frames,
+        leak=status.leak,
+        gains=status.gains,
+        n_controlled=status.n_controlled,
+        n_modes=status.n_modes,
+        n_slopes=status.n_slopes,
+        cm_id=status.cm_id,
+        basis_id=status.basis_id,
+        config_id=status.config_id,
+        magnitude=status.magnitude,
+        max_dither_m=status.max_dither_m,
+        max_dither_modes=status.max_dither_modes,
+        dither_id=status.dither.request.id if status.dither is not None else None,
+        t_ns_utc=status.t_ns,
+    )
+
+
+def _acknowledged(acknowledgement: Acknowledgement) -> ev.Acknowledged:
+    return ev.Acknowledged(
+        id=acknowledgement.id,
+        state=MatrixState(acknowledgement.state.value),
+        reason=acknowledgement.reason,
+        frame_seq=acknowledgement.frame_seq,
+    )
+
+
+def manifest_of(
+    record: ReconstructorRecord, layout: MatrixLayout, rtc: RtcView, system: str
+) -> Manifest:
+    """Return the manifest a reconstructor travels with."""
+    return Manifest(
+        id=record.id,
+        layout=layout,
+        alpha=None if record.alpha is None else record.alpha.to_boundary(),
+        sigma=None
+        if record.sigma is None
+        else dict(zip(PARAMETERS, (record.sigma * BOUNDARY_SCALE).tolist(), strict=True)),
+        im_id=None,
+        parent=record.parent,
+        basis_id=rtc.basis_id,
+        config_id=rtc.config_id,
+        system=system,
+        created_ns=record.created_ns_utc,
+    )
+
+
+def record_of(manifest: Manifest) -> ReconstructorRecord:
+    """Return what is known of a matrix the RTC brought with it.
+
+    Its manifest may name an α, but nobody here can vouch for it.
+    """
+    return ReconstructorRecord(
+        id=manifest.id,
+        state=MatrixState.APPLIED,
+        n_modes=manifest.layout.shape[0],
+        created_ns_utc=manifest.created_ns,
+        sha256=manifest.layout.sha256,
+        reason="brought by the RTC",
+    )
+
+
+def state_message(state: TrackerState, now_ns: int) -> StateMessage:
+    """Return the short account of the state for whoever listens on the network."""
+    known = state.registration
+    sigma = None if known is None else known.sigma * BOUNDARY_SCALE
+    alpha: Misregistration | None = None if known is None else known.alpha
+    return StateMessage(
+        system=state.system,
+        t_ns=now_ns,
+        mode=state.mode.value,
+        alpha=None if alpha is None else alpha.to_boundary(),
+        sigma=None if sigma is None else dict(zip(PARAMETERS, sigma.tolist(), strict=True)),
+        in_use=state.in_use,
+    )

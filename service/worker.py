@@ -1,0 +1,203 @@
+"""The heavy work, in a process of its own: fitting, computing reconstructors, judging them.
+
+A compute thread beside the ingest raises its latency thirty-fold; a nice'd process leaves it
+alone. The executor is the seam: anything with ``submit`` may take its place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Concatenate, ParamSpec, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from service.control.gate import GateVerdict, LoopSettings, judge
+from service.control.reconstructor import invert
+from service.estimation import passive
+from service.estimation.instrumental import Loop, WindowEstimate, fit_window
+from service.estimation.lockin import Spectra, WindowRefused
+from service.model.instrument import Instrument
+from service.model.interaction import InteractionModel, Linearisation
+from service.model.misregistration import Misregistration
+from service.model.modes import karhunen_loeve_basis
+
+SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
+"""A step shorter than this (numeric units) leaves a linearisation error below 1e-4 of its unit."""
+
+REUSED = np.array([0.02, 0.02, 1e-3, 2e-3])
+"""A linearisation this close is used as it is; its second order is far below the noise."""
+
+MAX_LINEARISATIONS = 6
+"""From the edge of the capture range three are enough."""
+
+FIT_RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
+"""An estimate further out than this has diverged (numeric units)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Compute:
+    """What the worker may use and how finely it samples the optics."""
+
+    threads: int = 2
+    """Threads that share the rows of a product; BLAS itself keeps to one."""
+
+    nice: int = 10
+    pupil_sampling: int = 3
+    detector_nodes: int = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Description:
+    """What the service must know of the model to check telemetry against it."""
+
+    n_slopes: int
+    n_modes: int
+    mode_variance_m2: NDArray[np.float64]
+    """``(n_modes,)`` expected variance of each mode under the instrument's turbulence."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Made:
+    """A reconstructor and the gate's verdict on it."""
+
+    matrix: NDArray[np.float32]
+    """``(n_modes, n_slopes)`` metres per slope."""
+
+    condition_number: float
+    gate: GateVerdict
+
+
+class Workbench:
+    """The optical model and the last linearisation, kept between jobs."""
+
+    def __init__(self, instrument: Instrument, compute: Compute) -> None:
+        basis = karhunen_loeve_basis(instrument)
+        self._threads = ThreadPoolExecutor(compute.threads)
+        self._model = InteractionModel(
+            instrument,
+            basis,
+            pupil_sampling=compute.pupil_sampling,
+            detector_nodes=compute.detector_nodes,
+            mapper=self._threads.map,
+        )
+        self._linearisation: Linearisation | None = None
+
+    def describe(self) -> Description:
+        """Return what telemetry must look like, and prepare for the first fit."""
+        self._near(Misregistration())
+        return Description(
+            n_slopes=self._model.n_slopes,
+            n_modes=self._model.basis.mode_to_actuator.shape[1],
+            mode_variance_m2=self._model.basis.variance_m2,
+        )
+
+    def fit(
+        self, spectra: Spectra, loop: Loop, start: Misregistration
+    ) -> WindowEstimate | WindowRefused:
+        """Estimate α from one window, linearising anew until the step is short."""
+        linearisation = self._near(start)
+        for _ in range(MAX_LINEARISATIONS):
+            try:
+                estimate = fit_window(spectra, linearisation, loop)
+            except np.linalg.LinAlgError as error:
+                return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
+            if np.all(np.abs(estimate.step) <= SETTLED):
+                return estimate
+            if np.any(np.abs(estimate.alpha.vector - [0.0, 0.0, 0.0, 1.0]) > FIT_RANGE):
+                break
+            linearisation = self._near(estimate.alpha)
+        return WindowRefused(
+            reason=f"the fit did not settle within {MAX_LINEARISATIONS} linearisations: the "
+            "registration is outside the capture range, or the instrument file is another's",
+            t_ns_utc=spectra.t_end_ns_utc,
+        )
+
+    def make(
+        self,
+        alpha: Misregistration,
+        covariance: NDArray[np.float64],
+        loop: LoopSettings,
+        bound: float,
+    ) -> Made:
+        """Compute the reconstructor for α, as many modes as the loop has gains, and judge it."""
+        matrix = self._model.interaction_matrix(alpha)
+        inversion = invert(matrix, len(loop.gains))
+        verdict = self.judge(inversion.matrix, alpha, covariance, loop, bound)
+        return Made(
+            matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
+        )
+
+    def judge(
+        self,
+        reconstructor: NDArray[np.float32],
+        alpha: Misregistration,
+        covariance: NDArray[np.float64],
+        loop: LoopSettings,
+        bound: float,
+    ) -> GateVerdict:
+        """Return whether a reconstructor would hold the loop within α ± 3σ."""
+        return judge(reconstructor, self._near(alpha), alpha, covariance, loop, bound=bound)
+
+    def watch(
+        self, state: passive.Passive, start: Misregistration
+    ) -> passive.PassiveEstimate | None:
+        """Estimate α from ordinary telemetry; None when there is too little of it."""
+        return passive.fit(state, self._near(start))
+
+    def _near(self, alpha: Misregistration) -> Linearisation:
+        kept = self._linearisation
+        if kept is None or np.any(np.abs(alpha.vector - kept.alpha.vector) > REUSED):
+            kept = self._linearisation = self._model.linearise(alpha)
+        return kept
+
+
+_workbench: Workbench | None = None
+"""Of the worker process; an executor has no other place for what outlives a job."""
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def start_worker(instrument: Instrument, compute: Compute) -> ProcessPoolExecutor:
+    """Return an executor of one nice'd worker process; nothing runs before the first job."""
+    return ProcessPoolExecutor(
+        max_workers=1,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_enter,
+        initargs=(instrument, compute),
+    )
+
+
+def run_job(job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """Run a method of the workbench in the worker process."""
+    if _workbench is None:
+        raise RuntimeError("not in a worker process")
+    return job(_workbench, *args, **kwargs)
+
+
+def _enter(instrument: Instrument, compute: Compute) -> None:
+    """Prepare the worker process: polite, one BLAS thread, gone when the service is gone."""
+    global _workbench
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(compute.nice)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    threadpool_limits(1)
+    _workbench = Workbench(instrument, compute)
+
+
+def _follow_parent() -> None:
+    """End with the service, even when it was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        with contextlib.suppress(OSError):
+            parent.join()
+        os._exit(1)

@@ -61,8 +61,6 @@ class Intake:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for subscriber in self._declared:
-            subscriber.undeclare()
         self._stopped.set()
         self._thread.join()
 

@@ -114,7 +114,7 @@ class Link:
 
     @property
     def n_dropped_batches(self) -> int:
-        """Batches that never reached the wire because the publishing thread was behind."""
+        """Batches that were never published: the thread was behind, or there was no service yet."""
         return self._dropped
 
     def offer(self, batch: Batch) -> None:
@@ -131,14 +131,13 @@ class Link:
         if session is None:
             return
         with session:
-            intake = Intake(session, self._keys, self._computer)
-            with intake:
-                self._declare_commands(session)
-                self._declare_applied(session)
-                token = session.liveliness().declare_token(self._keys.alive(Role.RTC))
+            self._declare_queryables(session)
+            with (
+                Intake(session, self._keys, self._computer),
+                session.liveliness().declare_token(self._keys.alive(Role.RTC)),
+            ):
                 _log.info("link.open", endpoint=self._endpoint, system=self._keys.system)
                 self._publish(session)
-                token.undeclare()
 
     def _open(self) -> zenoh.Session | None:
         """Open the session, waiting for the service's router for as long as it takes."""
@@ -233,9 +232,10 @@ class Link:
             flux=self._detector.counts(snapshot.images).astype("<f4").tobytes(),
         )
 
-    def _declare_commands(self, session: zenoh.Session) -> None:
+    def _declare_queryables(self, session: zenoh.Session) -> None:
         for kind in CommandKind:
             session.declare_queryable(self._keys.command(kind), self._answering(kind))
+        session.declare_queryable(self._keys.applied, self._answer_applied)
 
     def _answering(self, kind: CommandKind) -> Callable[[zenoh.Query], None]:
         def answer(query: zenoh.Query) -> None:
@@ -261,9 +261,6 @@ class Link:
                 )
 
         return answer
-
-    def _declare_applied(self, session: zenoh.Session) -> None:
-        session.declare_queryable(self._keys.applied, self._answer_applied)
 
     def _answer_applied(self, query: zenoh.Query) -> None:
         with query:

@@ -1,0 +1,482 @@
+"""The simulated RTC as a process, met over real zenoh by nothing but the wire contract."""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import zenoh
+
+from service.wire import (
+    CommandKind,
+    DitherAction,
+    DitherKind,
+    DitherRequest,
+    Keys,
+    LoopRequest,
+    Manifest,
+    MeasureRequest,
+    Pattern,
+    Role,
+    decode_acknowledgement,
+    decode_frames,
+    decode_manifest,
+    decode_reply,
+    decode_status,
+    encode_command,
+    encode_manifest,
+    layout_of,
+    split,
+)
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+
+KEYS = Keys("flao-lbt")
+START_UP_S = 60.0
+CHUNK_BYTES = 500_000
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def open_router(port: int) -> zenoh.Session:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("scouting/gossip/enabled", "false")
+    return zenoh.open(config)
+
+
+class Listener:
+    """A minimal service: a router that keeps what the RTC says and can answer and ask."""
+
+    def __init__(self, port: int) -> None:
+        self.session = open_router(port)
+        self.lock = threading.Lock()
+        self.batches = []
+        self.statuses = []
+        self.tokens: queue.Queue = queue.Queue()
+        self.acknowledgements: queue.Queue = queue.Queue()
+        self.session.declare_subscriber(KEYS.frames, self._on_frames)
+        self.session.declare_subscriber(KEYS.status, self._on_status)
+        self.session.declare_subscriber(
+            KEYS.acknowledgement,
+            lambda sample: self.acknowledgements.put(
+                decode_acknowledgement(sample.payload.to_bytes())
+            ),
+        )
+        self.session.liveliness().declare_subscriber(
+            KEYS.alive(Role.RTC), lambda sample: self.tokens.put(sample.kind), history=True
+        )
+
+    def _on_frames(self, sample: zenoh.Sample) -> None:
+        batch = decode_frames(sample.payload.to_bytes(), sample.attachment.to_bytes())
+        with self.lock:
+            self.batches.append(batch)
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        status = decode_status(sample.payload.to_bytes())
+        with self.lock:
+            self.statuses.append(status)
+
+    def close(self) -> None:
+        self.session.close()
+
+    def wait_for(self, condition, timeout_s: float = 10.0):
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            found = condition()
+            if found:
+                return found
+            time.sleep(0.02)
+        raise AssertionError(f"nothing within {timeout_s} s")
+
+    def next_status(self):
+        with self.lock:
+            seen = len(self.statuses)
+        return self.wait_for(
+            lambda: self.statuses[-1] if len(self.statuses) > seen else None, START_UP_S
+        )
+
+    def seq(self) -> int:
+        with self.lock:
+            return self.batches[-1].header.seq0 if self.batches else -1
+
+    def frames(self, first: int, stop: int):
+        """Wait for these frames; return them in order: headers, slopes, commands, dither."""
+        self.wait_for(lambda: self.seq() >= stop, 30.0)
+        with self.lock:
+            chosen = [
+                b
+                for b in self.batches
+                if b.header.seq0 + b.header.n > first and b.header.seq0 < stop
+            ]
+        return sorted(chosen, key=lambda batch: batch.header.seq0)
+
+    def command(self, kind: CommandKind, command):
+        replies = self.session.get(KEYS.command(kind), payload=encode_command(command), timeout=1.0)
+        (reply,) = [r.ok.payload.to_bytes() for r in replies if r.ok is not None]
+        return decode_reply(reply)
+
+    def fetch(self, selector: str) -> bytes:
+        (reply,) = [r.ok.payload.to_bytes() for r in self.session.get(selector, timeout=2.0)]
+        return reply
+
+    def applied(self) -> tuple[Manifest, np.ndarray]:
+        manifest = decode_manifest(self.fetch(KEYS.applied))
+        data = b"".join(
+            self.fetch(f"{KEYS.applied}?chunk={k}") for k in range(manifest.layout.n_chunks)
+        )
+        return manifest, np.frombuffer(data, "<f4").reshape(manifest.layout.shape)
+
+    def commit(self, manifest: Manifest) -> None:
+        self.session.put(KEYS.commit(manifest.id), encode_manifest(manifest))
+
+    def send_chunks(self, manifest: Manifest, matrix: np.ndarray, leave_out=()) -> None:
+        for k, data in enumerate(split(matrix, manifest.layout.chunk_bytes)):
+            if k not in leave_out:
+                self.session.put(KEYS.chunk(manifest.id, k), data)
+
+    def acknowledgement(self, timeout_s: float = 8.0):
+        return self.acknowledgements.get(timeout=timeout_s)
+
+
+def start_rtc(port: int, *options: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-m", "sim_rtc", "--connect", f"tcp/127.0.0.1:{port}", *options],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def stop_rtc(process: subprocess.Popen) -> tuple[int, str]:
+    process.send_signal(signal.SIGTERM)
+    try:
+        _, text = process.communicate(timeout=15.0)
+    finally:
+        process.kill()
+    return process.returncode, text
+
+
+@pytest.fixture(scope="module")
+def rtc(tmp_path_factory):
+    """One RTC for all tests of the module, met by one listener."""
+    truth = tmp_path_factory.mktemp("rtc") / "truth.jsonl"
+    port = free_port()
+    listener = Listener(port)
+    process = start_rtc(port, "--seed", "5", "--gain", "0.35", "--truth", str(truth))
+    listener.process, listener.truth = process, truth
+    try:
+        listener.wait_for(lambda: listener.seq() > 200, START_UP_S)
+        yield listener
+        stop_rtc(process)
+    finally:
+        process.kill()
+        process.wait()
+        listener.close()
+
+
+def manifest_for(base: Manifest, matrix: np.ndarray, matrix_id: str, **changes) -> Manifest:
+    return replace(
+        base, id=matrix_id, layout=layout_of(matrix, CHUNK_BYTES), parent=base.id, **changes
+    )
+
+
+def test_frames_are_contiguous_and_come_in_real_time(rtc):
+    first = rtc.seq()
+    began = time.monotonic()
+    batches = rtc.frames(first, first + 2000)
+    assert time.monotonic() - began == pytest.approx(2.0, abs=0.5)
+    starts = [b.header.seq0 for b in batches]
+    assert starts == list(range(starts[0], starts[0] + 10 * len(starts), 10))
+    header = batches[0].header
+    assert header.dt_ns == 1_000_000
+    assert {b.header.t0_ns - b.header.seq0 * header.dt_ns for b in batches} == {
+        header.t0_ns - header.seq0 * header.dt_ns
+    }
+
+
+def test_status_describes_the_telemetry(rtc):
+    status = rtc.next_status()
+    batch = rtc.frames(status.seq, status.seq + 10)[0]
+    assert batch.header.session == status.session
+    assert (batch.header.n_slopes, batch.header.n_modes) == (status.n_slopes, status.n_modes)
+    assert batch.header.cm_id == status.cm_id
+    assert (status.n_controlled, status.delay_frames) == (400, 2.0)
+    assert set(status.gains[:400]) == {0.35}
+    assert set(status.gains[400:]) == {0.0}
+    # A star of R = 8 gives 1.8e5 electrons per frame in the four images together.
+    assert 1e5 < float(status.flux_images.sum()) < 3e5
+
+
+def test_commands_obey_the_integrator_equation_of_the_wire(rtc):
+    """c[k+2] = leak c[k+1] - gain R s[k], from nothing but what the RTC publishes."""
+    status = rtc.next_status()
+    _, matrix = rtc.applied()
+    batches = rtc.frames(status.seq, status.seq + 200)
+    slopes = np.concatenate([b.slopes for b in batches])
+    commands = np.concatenate([b.commands_m for b in batches])
+    expected = status.leak * commands[1:-1] - np.pad(
+        np.array(status.gains[:400]) * (slopes[:-2] @ matrix.T), ((0, 0), (0, 194))
+    )
+    # float32 sums over 1400 slopes of commands of a micrometre: 1e-11 m of rounding.
+    np.testing.assert_allclose(commands[2:], expected, atol=2e-11)
+
+
+def test_a_sine_dither_appears_as_announced_and_stays_out_of_the_integrator(rtc):
+    request = DitherRequest(
+        id="sine-1",
+        action=DitherAction.START,
+        kind=DitherKind.SINE,
+        modes=(501, 450),
+        amplitude_m=(5e-9, 3e-9),
+        frequency_hz=(240.0, 313.0),
+        duration_s=0.305,
+    )
+    reply = rtc.command(CommandKind.DITHER, request)
+    assert reply.accepted
+    assert rtc.command(CommandKind.DITHER, request) == reply
+    start = reply.start_seq
+    batches = rtc.frames(start, start + 400)
+    seq = np.concatenate([b.header.seq0 + np.arange(b.header.n) for b in batches])
+    dither = np.concatenate(
+        [np.zeros_like(b.commands_m) if b.dither_m is None else b.dither_m for b in batches]
+    )
+    commands = np.concatenate([b.commands_m for b in batches])
+    expected = np.zeros_like(dither)
+    playing = (seq >= start) & (seq < start + 305)
+    for mode, amplitude, frequency in zip(
+        request.modes, request.amplitude_m, request.frequency_hz, strict=True
+    ):
+        phase = 2 * np.pi * frequency * (seq[playing] - start) * 1e-3
+        expected[playing, mode] = amplitude * np.sqrt(2) * np.sin(phase)
+    np.testing.assert_allclose(dither, expected, atol=1e-14)
+    # Mode 501 is not controlled: its command is the dither and nothing else.
+    np.testing.assert_array_equal(commands[:, 501], dither[:, 501])
+    assert batches[-1].dither_m is None
+
+
+def test_a_second_dither_is_refused_until_the_first_is_stopped(rtc):
+    def request(name, action=DitherAction.START):
+        if action is DitherAction.STOP:
+            return DitherRequest(id=name, action=action)
+        return DitherRequest(
+            id=name,
+            action=action,
+            kind=DitherKind.BINARY,
+            modes=(500,),
+            amplitude_m=(4e-9,),
+            duration_s=20.0,
+            seed=3,
+        )
+
+    first = rtc.command(CommandKind.DITHER, request("binary-1"))
+    assert first.accepted
+    assert rtc.command(CommandKind.DITHER, request("binary-2")).reason.startswith("busy")
+    (batch, *_) = rtc.frames(first.start_seq, first.start_seq + 10)
+    np.testing.assert_allclose(np.abs(batch.dither_m[:, 500]), 4e-9, rtol=1e-6)
+    assert rtc.next_status().dither.start_seq == first.start_seq
+    assert rtc.command(CommandKind.DITHER, request("stop-1", DitherAction.STOP)).accepted
+    assert rtc.next_status().dither is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "command", "reason"),
+    [
+        (
+            CommandKind.MEASURE,
+            MeasureRequest(
+                id="measure-1",
+                pattern=Pattern.PUSH_PULL_MODAL,
+                modes=(0,),
+                amplitude_m=(1e-8,),
+                n_average=1,
+            ),
+            "unsupported",
+        ),
+        (CommandKind.LOOP, LoopRequest(id="loop-1", gains=(0.4,) * 400), "range: 400 gains"),
+        (CommandKind.LOOP, LoopRequest(id="loop-2", n_controlled=700), "range: n_controlled"),
+        (
+            CommandKind.DITHER,
+            DitherRequest(
+                id="far",
+                action=DitherAction.START,
+                kind=DitherKind.SINE,
+                modes=(600,),
+                amplitude_m=(1e-9,),
+                frequency_hz=(200.0,),
+                duration_s=1.0,
+            ),
+            "range: mode 600, expected 0 to 593",
+        ),
+    ],
+)
+def test_commands_it_cannot_carry_out_are_refused_with_a_reason(rtc, kind, command, reason):
+    reply = rtc.command(kind, command)
+    assert not reply.accepted
+    assert reply.reason.startswith(reason)
+
+
+def test_an_unreadable_command_is_answered(rtc):
+    (reply,) = rtc.session.get(KEYS.command("dither"), payload=b"\x01nonsense", timeout=1.0)
+    refused = decode_reply(reply.ok.payload.to_bytes())
+    assert not refused.accepted
+    assert refused.id is None
+
+
+def test_a_reconstructor_is_swapped_between_two_frames_at_the_announced_one(rtc):
+    base, matrix = rtc.applied()
+    new = manifest_for(base, 0.97 * matrix, "swap-1")
+    rtc.commit(new)
+    sent = time.monotonic()
+    rtc.send_chunks(new, 0.97 * matrix)
+    staged, applied = rtc.acknowledgement(), rtc.acknowledgement()
+    assert time.monotonic() - sent < 2.0
+    assert (staged.state, staged.id, staged.sha256) == ("staged", "swap-1", new.layout.sha256)
+    assert (applied.state, applied.id) == ("applied", "swap-1")
+    batches = rtc.frames(applied.frame_seq - 200, applied.frame_seq + 200)
+    for batch in batches:
+        before = batch.header.seq0 < applied.frame_seq
+        assert batch.header.cm_id == (base.id if before else "swap-1")
+    starts = np.array([b.header.seq0 for b in batches])
+    assert set(np.diff(starts)) == {10}
+    assert rtc.applied()[0].layout.sha256 == new.layout.sha256
+    rtc.commit(new)
+    assert rtc.acknowledgement() == applied
+
+
+def test_a_missing_chunk_is_asked_for(rtc):
+    base, matrix = rtc.applied()
+    new = manifest_for(base, matrix, "holes-1")
+    parts = split(matrix, CHUNK_BYTES)
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, parts[int(query.parameters.get("chunk"))])
+
+    queryable = rtc.session.declare_queryable(KEYS.matrix("holes-1"), answer)
+    rtc.send_chunks(new, matrix, leave_out=(1,))
+    rtc.commit(new)
+    assert [rtc.acknowledgement().state for _ in range(2)] == ["staged", "applied"]
+    queryable.undeclare()
+
+
+@pytest.mark.parametrize(
+    ("matrix_id", "rows", "changes", "reason"),
+    [
+        ("shape-1", 399, {}, r"range: shape [399, 1408], expected [400, 1408]"),
+        ("basis-1", 400, {"basis_id": "zernike"}, "id: basis_id 'zernike'"),
+        ("sensor-1", 400, {"config_id": "other"}, "id: config_id 'other'"),
+    ],
+)
+def test_a_reconstructor_that_does_not_fit_is_rejected(rtc, matrix_id, rows, changes, reason):
+    base, matrix = rtc.applied()
+    new = manifest_for(base, matrix[:rows], matrix_id, **changes)
+    rtc.send_chunks(new, matrix[:rows])
+    rtc.commit(new)
+    answer = rtc.acknowledgement()
+    assert (answer.state, answer.id) == ("rejected", matrix_id)
+    assert answer.reason.startswith(reason)
+    assert rtc.next_status().cm_id == base.id
+
+
+def test_wrong_bytes_and_a_used_id_are_rejected(rtc):
+    base, matrix = rtc.applied()
+    new = manifest_for(base, matrix, "bytes-1")
+    rtc.send_chunks(new, matrix * 2)
+    rtc.commit(new)
+    assert "sha256" in rtc.acknowledgement().reason
+    again = manifest_for(base, matrix * 3, base.id)
+    rtc.commit(again)
+    answer = rtc.acknowledgement()
+    assert (answer.state, answer.sha256) == ("rejected", again.layout.sha256)
+    assert answer.reason.startswith("id:")
+
+
+def test_more_modes_take_effect_with_the_next_matrix_of_that_shape(rtc):
+    base, matrix = rtc.applied()
+    reply = rtc.command(CommandKind.LOOP, LoopRequest(id="more-modes", n_controlled=401))
+    assert reply.accepted
+    assert rtc.next_status().n_controlled == 400
+    more = np.vstack([matrix, np.zeros_like(matrix[:1])])
+    new = manifest_for(base, more, "more-1")
+    rtc.commit(new)
+    rtc.send_chunks(new, more)
+    assert [rtc.acknowledgement().state for _ in range(2)] == ["staged", "applied"]
+    status = rtc.next_status()
+    assert status.n_controlled == 401
+    assert status.gains[400] == pytest.approx(0.35)
+    back = rtc.command(CommandKind.LOOP, LoopRequest(id="fewer-modes", n_controlled=400))
+    assert back.accepted
+    fewer = manifest_for(base, matrix, "fewer-1")
+    rtc.commit(fewer)
+    rtc.send_chunks(fewer, matrix)
+    assert [rtc.acknowledgement().state for _ in range(2)] == ["staged", "applied"]
+
+
+def test_the_truth_is_beside_the_run_and_not_on_the_wire(rtc):
+    def lines(kind):
+        found = [json.loads(line) for line in rtc.truth.read_text().splitlines()]
+        return [line for line in found if line["kind"] == kind]
+
+    wanted = {"swap-1", "more-1", "fewer-1"}
+    rtc.wait_for(lambda: wanted <= {line["cm_id"] for line in lines("swap")})
+    truth, swaps = lines("truth"), lines("swap")
+    assert {line["frames_skipped"] for line in swaps} == {0}
+    assert 80.0 < truth[-1]["wavefront_error_nm"] < 250.0
+    shift = np.hypot(truth[-1]["shift_x_subap"], truth[-1]["shift_y_subap"])
+    assert 0.0 < shift <= 0.2
+    # The only registration on the wire is the one the matrix in use was made for: none.
+    assert set(rtc.applied()[0].alpha.values()) == {0.0, 1.0}
+
+
+def test_opening_the_loop_zeroes_the_integrator_and_begins_a_session(rtc):
+    before = rtc.next_status()
+    assert rtc.command(CommandKind.LOOP, LoopRequest(id="open-1", loop="open")).accepted
+    status = rtc.next_status()
+    assert status.loop == "open"
+    assert status.session != before.session
+    (batch, *_) = rtc.frames(status.seq + 10, status.seq + 20)
+    assert not batch.commands_m.any()
+    assert rtc.command(CommandKind.LOOP, LoopRequest(id="close-1", loop="closed")).accepted
+    assert rtc.next_status().loop == "closed"
+
+
+def test_it_waits_for_the_service_outlives_it_and_ends_cleanly():
+    port = free_port()
+    process = start_rtc(port, "--alpha", "-0.1,0.05,0.1,1.002", "--quiet")
+    try:
+        time.sleep(8.0)
+        listener = Listener(port)
+        session = listener.next_status().session
+        assert listener.tokens.get(timeout=5.0) == zenoh.SampleKind.PUT
+        listener.close()
+        listener = Listener(port)
+        assert listener.next_status().session == session
+        status, text = stop_rtc(process)
+        assert status == 0, text
+        assert "Traceback" not in text
+        process = start_rtc(port, "--seconds", "1")
+        again = listener.wait_for(
+            lambda: [s for s in listener.statuses if s.session != session], START_UP_S
+        )
+        assert again[0].seq < 1000
+        assert process.wait(timeout=20.0) == 0
+        listener.close()
+    finally:
+        process.kill()
+        process.wait()
+        process.stderr.close()

@@ -11,7 +11,7 @@ import asyncio
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
 import structlog
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from service.errors import LinkError, UnknownIdError, WireError
 from service.estimation.frames import FrameBlock
+from service.link import requests
 from service.link import session as link
 from service.link.endpoint import Endpoint
 from service.link.events import LinkEvent
@@ -33,7 +34,6 @@ from service.wire import (
     MESSAGE_LIMIT,
     AckState,
     AlarmMessage,
-    ChunkAssembler,
     Command,
     Encodings,
     Keys,
@@ -42,12 +42,9 @@ from service.wire import (
     Role,
     StateMessage,
     chunk_index,
-    command_kind,
     decode_acknowledgement,
-    decode_manifest,
     decode_reply,
     encode_alarm,
-    encode_command,
     encode_manifest,
     encode_state,
     layout_of,
@@ -59,12 +56,6 @@ if TYPE_CHECKING:
     import zenoh.ext
 
 __all__ = ["Bridge", "Endpoint"]
-
-ABSENT_PAUSE_S: Final = 0.3
-"""Before a command is repeated: an RTC that is not there makes a query end at once."""
-
-MATRIX_TIMEOUT_S: Final = 2.0
-"""For the RTC to answer with a manifest or a part of its matrix."""
 
 _T = TypeVar("_T")
 
@@ -136,9 +127,9 @@ class Bridge:
     def set_wakeup(self, callback: Callable[[], object] | None) -> None:
         """Call ``callback`` from zenoh's threads when something new has come.
 
-        It rings once until the next :meth:`drain` or :meth:`events`; give it something like
-        ``lambda: loop.call_soon_threadsafe(event.set)``. Frames held back for the sake of a hole
-        ring no bell when their time is up: look at least a few times a second.
+        It rings once until the next :meth:`drain` or :meth:`events`, so look at both; give it
+        something like ``lambda: loop.call_soon_threadsafe(event.set)``. Frames held back for the
+        sake of a hole ring no bell when their time is up: look at least a few times a second.
         """
         self._intake.set_wakeup(callback)
 
@@ -222,7 +213,7 @@ class Bridge:
         LinkError
             If the RTC does not answer or has none.
         """
-        return await asyncio.to_thread(self._fetch_applied)
+        return await asyncio.to_thread(requests.fetch_applied, self._opened(), self._keys)
 
     def publish_state(self, message: StateMessage) -> None:
         """Tell whoever listens what the service knows; dropped while the network is slow."""
@@ -340,52 +331,15 @@ class Bridge:
         self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
 
     def _command(self, command: Command) -> Reply:
-        session = self._opened()
-        payload = encode_command(command)
-        kind = command_kind(command)
-        for attempt in range(self._endpoint.command_attempts):
-            if attempt:
-                time.sleep(ABSENT_PAUSE_S)
-            answer = link.ask(
-                session,
-                self._keys.command(kind),
-                self._endpoint.command_timeout_s,
-                payload,
-                Encodings.COMMAND,
-            )
-            if answer is not None:
-                return self._reply(command, answer)
-        raise LinkError(
-            f"no answer from the RTC to {kind} command {command.id} after "
-            f"{self._endpoint.command_attempts} attempts: whether it was carried out is unknown"
-        )
-
-    def _reply(self, command: Command, answer: bytes) -> Reply:
+        answer = requests.send_command(self._opened(), self._endpoint, command)
         try:
             reply = decode_reply(answer)
         except WireError as error:
             self._intake.malformed("reply", error)
-            raise LinkError(
-                f"the RTC's reply to command {command.id} is unusable: {error}"
-            ) from error
+            raise LinkError(f"the reply to command {command.id} is unusable: {error}") from error
         if reply.id not in {None, command.id}:
             raise LinkError(f"the RTC answered command {command.id} with a reply to {reply.id}")
         return reply
-
-    def _fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
-        session = self._opened()
-        manifest = decode_manifest(self._asked(session, self._keys.applied))
-        assembler = ChunkAssembler()
-        assembler.announce(manifest.layout)
-        for index in range(manifest.layout.n_chunks):
-            assembler.add(index, self._asked(session, f"{self._keys.applied}?chunk={index}"))
-        return manifest, assembler.matrix()
-
-    def _asked(self, session: zenoh.Session, selector: str) -> bytes:
-        answer = link.ask(session, selector, MATRIX_TIMEOUT_S)
-        if answer is None:
-            raise LinkError(f"no answer from the RTC on {selector} within {MATRIX_TIMEOUT_S} s")
-        return answer
 
     def _tell(self, key: str, data: bytes, encoding: str) -> None:
         publisher = self._publishers.get(key)

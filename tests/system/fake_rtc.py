@@ -44,7 +44,7 @@ T0_NS = 1_800_000_000_000_000_000
 DT_NS = 1_000_000
 
 
-def client_session(endpoint):
+def client_session(endpoint, stamped=True):
     """Open a zenoh client as wire.md asks an RTC to."""
     config = zenoh.Config()
     settings = {
@@ -57,7 +57,7 @@ def client_session(endpoint):
         },
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "timestamping/enabled": True,
+        "timestamping/enabled": stamped,
         "transport/link/tx/lease": 2000,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
         "transport/shared_memory/enabled": False,
@@ -80,6 +80,7 @@ class FakeRtc:
         self.commands = []
         self.silent = 0
         self.held = []
+        self.answers = []
         self.waiting = {}
         self.lock = threading.Lock()
         self.zenoh = client_session(endpoint)
@@ -266,6 +267,9 @@ class FakeRtc:
             self.held.append(query)  # the caller waits its whole timeout
             return
         with query:
+            if self.answers:
+                query.reply(query.key_expr, self.answers.pop(0))
+                return
             data = query.payload.to_bytes()
             try:
                 command = decode_command(kind, data)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,12 +37,16 @@ from service.wire import (
     Manifest,
     MeasuredManifest,
     Pattern,
+    Reply,
     StateMessage,
     decode_alarm,
     decode_state,
+    encode_frames,
+    encode_measured_manifest,
+    encode_reply,
     layout_of,
 )
-from tests.system.fake_rtc import FakeRtc
+from tests.system.fake_rtc import FakeRtc, client_session
 
 pytestmark = pytest.mark.system
 
@@ -356,6 +361,17 @@ def test_a_fault_in_the_consumers_bell_is_counted_and_ingest_goes_on(bridge, rtc
     assert bridge.statistics().callback_errors >= 1
 
 
+def test_latency_is_told_only_when_the_rtc_itself_stamps_its_messages(bridge, rtc, endpoint):
+    with client_session(endpoint.listen, stamped=False) as unstamped:
+        payload, attachment = encode_frames(rtc.header(0), rtc.rows(rtc.header(0)))
+        unstamped.put(rtc.keys.frames, payload, attachment=attachment)
+        drained(bridge, 10)
+    assert bridge.statistics().latency_p50_s is None
+    rtc.send(10)
+    drained(bridge, 10)
+    assert 0.0 < bridge.statistics().latency_p50_s < 1.0
+
+
 # ---------------------------------------------------------------- sessions and liveliness
 
 
@@ -525,6 +541,23 @@ def test_a_measured_matrix_is_put_together(bridge, rtc):
     assert np.array_equal(event.matrix, matrix)
 
 
+def test_a_measurement_that_failed_says_why(bridge, rtc):
+    matrix = np.zeros((6, 4), np.float32)
+    layout = replace(layout_of(matrix, 64), n_chunks=0, sha256="")
+    manifest = measured(rtc, matrix, layout=layout, reason="no light")
+    rtc.send_bytes(rtc.keys.measured_commit("im-1"), encode_measured_manifest(manifest))
+    event = Seen(bridge).first(MeasuredMatrix)
+    assert event.matrix is None
+    assert event.manifest.reason == "no light"
+
+
+def test_a_measured_matrix_under_another_name_is_refused(bridge, rtc):
+    manifest = measured(rtc, np.zeros((6, 4), np.float32))
+    rtc.send_bytes(rtc.keys.measured_commit("im-2"), encode_measured_manifest(manifest))
+    event = Seen(bridge).first(MalformedMessage)
+    assert "the manifest of im-1 of system bench came on the key of im-2" in event.text
+
+
 def test_a_measured_matrix_with_a_wrong_checksum_is_refused_and_the_next_one_taken(bridge, rtc):
     matrix = np.arange(24, dtype=np.float32).reshape(6, 4)
     seen = Seen(bridge)
@@ -557,6 +590,21 @@ async def test_a_command_without_an_answer_is_repeated_with_the_same_id(bridge, 
     reply = await bridge.command(LoopRequest(id="l-1", leak=0.98))
     assert reply.accepted
     assert [c.id for c in rtc.commands] == ["l-1"]
+
+
+async def test_a_reply_that_is_unusable_or_not_to_this_command_is_a_link_error(bridge, rtc):
+    rtc.answers = [b"junk", encode_reply(Reply(id="x", accepted=True, reason="", start_seq=1))]
+    with pytest.raises(LinkError, match="reply to command l-1 is unusable: range"):
+        await bridge.command(LoopRequest(id="l-1", leak=0.98))
+    with pytest.raises(LinkError, match="answered command l-2 with a reply to x"):
+        await bridge.command(LoopRequest(id="l-2", leak=0.98))
+    assert bridge.statistics().messages_malformed == {"reply": 1}
+
+
+async def test_a_matrix_of_another_system_is_not_sent(bridge, rtc):
+    manifest, matrix = reconstructor(rtc)
+    with pytest.raises(WireError, match="manifest r-1 is of system other, expected bench"):
+        await bridge.publish(replace(manifest, system="other"), matrix)
 
 
 async def test_no_rtc_at_all_is_a_link_error_within_seconds(bridge):
@@ -611,6 +659,10 @@ def test_nothing_works_before_open_and_closing_twice_is_fine(endpoint):
     bridge = Bridge(endpoint)
     with pytest.raises(LinkError, match="not open"):
         asyncio.run(bridge.fetch_applied())
+    with pytest.raises(LinkError, match="the link is not open"):
+        bridge.publish_state(
+            StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use=None)
+        )
     assert bridge.drain() == []
     bridge.open()
     with pytest.raises(LinkError, match="open already"):

@@ -1,6 +1,7 @@
 """The wire contract: what travels, and what is refused with which words."""
 
 import hashlib
+from dataclasses import replace
 
 import msgpack
 import numpy as np
@@ -258,6 +259,14 @@ def test_a_bad_status_is_refused_by_key_found_and_expected(changes, words):
 def test_a_whole_number_is_good_where_a_number_is_asked_for():
     status = decode_status(changed(encode_status(STATUS), frame_rate_hz=500, delay_frames=2))
     assert (status.frame_rate_hz, status.delay_frames) == (500.0, 2.0)
+
+
+def test_numbers_from_numpy_travel_as_plain_ones_and_anything_else_is_refused():
+    status = replace(STATUS, leak=np.float32(0.5), seq=np.int64(3), gains=np.full(3, 0.25))
+    received = decode_status(encode_status(status))
+    assert (received.leak, received.seq, received.gains) == (0.5, 3, (0.25, 0.25, 0.25))
+    with pytest.raises(WireError, match="of type object cannot travel"):
+        encode_status(replace(STATUS, leak=object()))
 
 
 def test_an_acknowledgement_has_a_frame_if_and_only_if_applied():

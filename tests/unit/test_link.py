@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.errors import UnknownId, WireError
+from service.errors import UnknownIdError, WireError
 from service.link.endpoint import Endpoint
 from service.link.events import EventQueue, MalformedMessage, RtcAppeared, SecondRtc, SessionChanged
 from service.link.intake import Intake
@@ -217,7 +217,7 @@ def test_an_offer_is_forgotten_after_its_time_unless_it_is_the_current_one():
     outbox.add(offer("used"))
     outbox.set_current("used")
     assert outbox.answer("old", 1, 59.0) == b"5678"
-    with pytest.raises(UnknownId, match="old is not on offer"):
+    with pytest.raises(UnknownIdError, match="old is not on offer"):
         outbox.answer("old", 1, 61.0)
     assert outbox.answer("used", None, 1e6) == outbox.current_commit()
     assert outbox.knows("old")
@@ -229,7 +229,7 @@ def test_the_number_of_offers_is_bounded_and_the_oldest_go_first():
     outbox.set_current("used")
     for k in range(OFFERS):
         outbox.add(offer(f"r{k}"))
-    with pytest.raises(UnknownId):
+    with pytest.raises(UnknownIdError):
         outbox.answer("r0", None, 1.0)
     assert outbox.answer("r1", 0, 1.0) == b"1234"
     assert outbox.answer("used", 0, 1.0) == b"1234"

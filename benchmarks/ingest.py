@@ -81,9 +81,9 @@ def main() -> None:
 
 def measure(arguments: argparse.Namespace) -> Result:
     """Return what one run of sender, link and worker gave."""
-    endpoint = Endpoint(system="benchmark", listen=f"tcp/127.0.0.1:{_free_port()}")
+    endpoint = Endpoint(system="benchmark", listen=(f"tcp/127.0.0.1:{_free_port()}",))
     sending = Sending(
-        endpoint=endpoint.listen,
+        endpoint=endpoint.listen[0],
         system=endpoint.system,
         frame_rate_hz=arguments.rate,
         frames_per_message=arguments.batch,

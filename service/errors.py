@@ -51,6 +51,3 @@ class WorkerError(PyrcalError):
 
 class ArchiveError(PyrcalError):
     """A product cannot be written or read, or its checksum does not match."""
-
-
-UnknownId = UnknownIdError

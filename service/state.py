@@ -152,7 +152,7 @@ class ReconstructorRecord:
     """Of the interaction matrix it inverts."""
 
     gate: GateVerdict | None = None
-    """The stability gate's verdict; None when the service did not make it."""
+    """The stability gate's latest verdict; None: not judged yet."""
 
     reason: str = ""
     """Why it is in this state: the RTC's or the operator's words."""

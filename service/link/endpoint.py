@@ -14,8 +14,8 @@ class Endpoint:
     system: str
     """The ``{system}`` of every key."""
 
-    listen: str = "tcp/127.0.0.1:7447"
-    """Endpoint of the embedded router; not used when ``connect`` is given."""
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Endpoints of the embedded router; not used when ``connect`` is given."""
 
     connect: tuple[str, ...] = ()
     """Endpoints of an observatory's own routers, of which the service becomes a client."""

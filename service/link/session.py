@@ -35,7 +35,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
     client = bool(endpoint.connect)
     settings: dict[str, object] = {
         "mode": "client" if client else "router",
-        "listen/endpoints": [] if client else [endpoint.listen],
+        "listen/endpoints": [] if client else list(endpoint.listen),
         "connect/endpoints": list(endpoint.connect),
         "connect/retry": RETRY,
         "scouting/multicast/enabled": False,
@@ -55,12 +55,13 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
 def _complaint(endpoint: Endpoint, text: str) -> str:
     if endpoint.connect:
         return f"no zenoh router answers at {', '.join(endpoint.connect)}: {text:.160}"
+    where = ", ".join(endpoint.listen)
     if "already in use" in text:
         return (
-            f"cannot listen on {endpoint.listen}: the address is already in use; stop the other "
+            f"cannot listen on {where}: the address is already in use; stop the other "
             "program (another pyrcal?) or set another listen endpoint"
         )
-    return f"cannot listen on {endpoint.listen}: {text:.160}"
+    return f"cannot listen on {where}: {text:.160}"
 
 
 def subscribe_frames(

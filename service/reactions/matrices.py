@@ -103,6 +103,10 @@ def on_margin(
     state: TrackerState, matrix_id: str, verdict: GateVerdict, now_ns: int
 ) -> TrackerState:
     """Note the margin of the matrix in use; raise an alarm when it is short."""
+    record = state.reconstructor(matrix_id)
+    if record is None:
+        return state
+    state = with_changed(state, replace(record, gate=verdict))
     if matrix_id != state.in_use:
         return state
     state = replace(state, margin=verdict)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation.lockin import LockInPlan
-from service.events import AskDither, Effect, FetchMatrix, JudgeMatrix, MakeMatrix
+from service.events import AskDither, AskNoDither, Effect, FetchMatrix, JudgeMatrix, MakeMatrix
 from service.model.misregistration import BOUNDARY_SCALE
 from service.state import (
     DitherView,
@@ -34,6 +34,7 @@ SETTLING_S = 0.3
 """Of the loop, after a dither has begun, before the first window."""
 
 _N_LINES = 4
+_OWN_DITHER = "dither-"
 _OPEN = (MatrixState.PROPOSED, MatrixState.PUBLISHED, MatrixState.STAGED)
 
 
@@ -106,6 +107,9 @@ def _dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> _
     wanted = policy.dither_enabled and not state.dither_stopped and state.dither is None
     if not ready or not wanted:
         return state, ()
+    if rtc.dither_id is not None and rtc.dither_id.startswith(_OWN_DITHER):
+        # left behind by this service before it was restarted
+        return replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS), (AskNoDither(),)
     dither = plan_dither(rtc, policy, now_ns)
     return replace(state, dither=dither), (AskDither(dither=dither),)
 
@@ -132,7 +136,7 @@ def plan_dither(
         lines = tuple(f * rtc.frame_rate_hz for f in LINE_FRACTIONS[: len(chosen)])
     amplitude = min(amplitude_m or policy.dither_amplitude_m, rtc.max_dither_m)
     return DitherView(
-        id=f"dither-{now_ns}",
+        id=f"{_OWN_DITHER}{now_ns}",
         modes=chosen,
         amplitude_m=(amplitude,) * len(chosen),
         frequency_hz=tuple(round(f * policy.window_s) / policy.window_s for f in lines),
@@ -237,7 +241,7 @@ def _busy(state: TrackerState, policy: Policy) -> bool:
 
 def _next_attempt_ns(state: TrackerState, policy: Policy) -> int:
     """Return before when no reconstructor is computed by itself."""
-    own = [r for r in state.reconstructors if r.gate is not None]
+    own = [r for r in state.reconstructors if r.parent is not None]
     if not own:
         return 0
     last = own[-1]

@@ -9,6 +9,27 @@ from service.state import MatrixState, ReconstructorRecord, TrackerState
 
 RECONSTRUCTORS_KEPT = 200
 
+_RESTARTED = {
+    MatrixState.PUBLISHED: MatrixState.FAILED,
+    MatrixState.STAGED: MatrixState.FAILED,
+    MatrixState.PROPOSED: MatrixState.DISCARDED,
+}
+
+
+def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRecord, ...]:
+    """Return what a restarted service takes over from its archive.
+
+    Only its own: what the RTC brought is fetched anew, for nobody can say it is the same as last
+    time. What was under way has failed; a proposal's verdict is of another day.
+    """
+    own = [record for record in records if record.parent is not None]
+    return tuple(
+        replace(record, state=_RESTARTED[record.state], reason="the service restarted")
+        if record.state in _RESTARTED
+        else record
+        for record in own[-RECONSTRUCTORS_KEPT:]
+    )
+
 
 def with_record(state: TrackerState, record: ReconstructorRecord) -> TrackerState:
     """Return the state with one more reconstructor."""

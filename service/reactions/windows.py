@@ -22,6 +22,9 @@ CAPTURE_RANGE = np.array([0.8, 0.8, np.deg2rad(2.0), 0.02])
 USEFUL_SIGMA = np.array([0.1, 0.1, np.deg2rad(0.3), 0.01])
 """A window less certain than this says nothing worth keeping (numeric units)."""
 
+EXPECTED = ("the reconstructor changed", "the dither ended")
+"""What cuts a window short when all is well."""
+
 GAIN_RANGE = (0.1, 1.5)
 """Optical gains outside this are not a pyramid seeing the dither."""
 
@@ -108,7 +111,8 @@ def refuse_window(state: TrackerState, reason: str, now_ns: int) -> TrackerState
     state = replace(state, windows_refused=state.windows_refused + 1)
     if reason.startswith("columns misaligned"):
         state = with_alarm(state, "columns-misaligned", reason, now_ns)
-    return logged(state, "window.refused", reason, now_ns, Level.WARNING)
+    level = Level.INFO if reason.startswith(EXPECTED) else Level.WARNING
+    return logged(state, "window.refused", reason, now_ns, level)
 
 
 def on_watchdog(state: TrackerState, event: ev.Watched, now_ns: int) -> TrackerState:

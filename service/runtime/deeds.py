@@ -107,6 +107,23 @@ class Deeds:
         kept = self._matrices.get(matrix_id)
         return kept if kept is not None else self._archive.matrix(matrix_id)
 
+    def offer(self, state: TrackerState) -> None:
+        """Let an RTC ask for the matrix in use, whoever made it.
+
+        Raises
+        ------
+        PyrcalError
+            If its numbers are not to be had.
+        """
+        record = state.reconstructor(state.in_use or "")
+        if record is None or state.rtc is None:
+            return
+        matrix = self.matrix(record.id)
+        layout = layout_of(matrix, self._publishing.chunk_bytes)
+        system = self._publishing.system
+        self._bridge.offer(translate.manifest_of(record, layout, state.rtc, system), matrix)
+        self._bridge.set_current(record.id)
+
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
         gains = extended_gains(rtc, effect.n_modes)[: effect.n_modes]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from collections.abc import Coroutine
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import structlog
@@ -85,8 +87,9 @@ class Supervisor:
     async def submit(self, command: Command) -> str:
         """Set an operator's command in motion; return one line that says what was."""
         effects = self._post(command)
-        self._audit("operator", type(command).__name__, str(command))
-        return f"{type(command).__name__}: {len(effects)} action(s) under way"
+        now_ns, name = time.time_ns(), type(command).__name__
+        await asyncio.to_thread(self._archive.audit, now_ns, "operator", name, str(command))
+        return f"{name}: {len(effects)} action(s) under way"
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)``."""
@@ -225,10 +228,22 @@ class Supervisor:
             self._records.put_nowait((before, self._state))
         self._follow()
         for effect in effects:
-            task = asyncio.get_running_loop().create_task(self._do(effect, self._state))
-            self._running.add(task)
-            task.add_done_callback(self._running.discard)
+            self._start(self._do(effect, self._state))
+        if self._state.in_use != before.in_use:
+            self._start(self._offer())
         return effects
+
+    def _start(self, deed: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(deed)
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
+
+    async def _offer(self) -> None:
+        """Offer the matrix in use to an RTC that comes late or asks again."""
+        try:
+            await asyncio.to_thread(self._deeds.offer, self._state)
+        except PyrcalError as error:
+            self._note("reconstructor.not-offered", str(error), Level.WARNING)
 
     def _follow(self) -> None:
         """Keep the streaming estimators in step with the RTC and the dither."""
@@ -264,13 +279,6 @@ class Supervisor:
         """Log what is new in the state's log, at its level."""
         for entry in _new_entries(before, self._state):
             getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text)
-
-    def _audit(self, who: str, name: str, text: str) -> None:
-        task = asyncio.get_running_loop().create_task(
-            asyncio.to_thread(self._archive.audit, time.time_ns(), who, name, text)
-        )
-        self._running.add(task)
-        task.add_done_callback(self._running.discard)
 
     async def _record(self) -> None:
         """Write changes of reconstructors and the log to the archive, in order."""

@@ -59,7 +59,7 @@ def endpoint():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    return Endpoint(system=SYSTEM, listen=f"tcp/127.0.0.1:{port}", chunk_bytes=64)
+    return Endpoint(system=SYSTEM, listen=(f"tcp/127.0.0.1:{port}",), chunk_bytes=64)
 
 
 @pytest.fixture
@@ -70,13 +70,13 @@ def bridge(endpoint):
 
 @pytest.fixture
 def rtc(bridge, endpoint):
-    with FakeRtc(endpoint.listen) as rtc:
+    with FakeRtc(endpoint.listen[0]) as rtc:
         yield rtc
 
 
 @contextmanager
 def rtc_process(endpoint, session, n_slopes=6, n_modes=4, rate_hz=1000, per_batch=10):
-    arguments = (endpoint.listen, SYSTEM, session, n_slopes, n_modes, rate_hz, per_batch)
+    arguments = (endpoint.listen[0], SYSTEM, session, n_slopes, n_modes, rate_hz, per_batch)
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.system.fake_rtc", *map(str, arguments)], cwd=ROOT
     )
@@ -301,7 +301,7 @@ def test_the_first_basis_seen_is_adopted_when_none_is_pinned(bridge, rtc):
 
 
 def test_frames_of_another_system_are_not_heard(bridge, rtc, endpoint):
-    with FakeRtc(endpoint.listen, system="other") as other:
+    with FakeRtc(endpoint.listen[0], system="other") as other:
         other.send(0)
         rtc.send(0)
         drained(bridge, 10)
@@ -332,7 +332,7 @@ def _whole(bridge, n_frames):
 
 def test_frames_nobody_drains_are_overwritten_oldest_first_and_counted(endpoint):
     small = Endpoint(system=SYSTEM, listen=endpoint.listen, ring_seconds=0.2)
-    with Bridge(small) as bridge, FakeRtc(endpoint.listen) as rtc:
+    with Bridge(small) as bridge, FakeRtc(endpoint.listen[0]) as rtc:
         for k in range(30):
             rtc.send(10 * k)
         wait_until(lambda: bridge.statistics().frames_received == 300)
@@ -362,7 +362,7 @@ def test_a_fault_in_the_consumers_bell_is_counted_and_ingest_goes_on(bridge, rtc
 
 
 def test_latency_is_told_only_when_the_rtc_itself_stamps_its_messages(bridge, rtc, endpoint):
-    with client_session(endpoint.listen, stamped=False) as unstamped:
+    with client_session(endpoint.listen[0], stamped=False) as unstamped:
         payload, attachment = encode_frames(rtc.header(0), rtc.rows(rtc.header(0)))
         unstamped.put(rtc.keys.frames, payload, attachment=attachment)
         drained(bridge, 10)
@@ -377,13 +377,13 @@ def test_latency_is_told_only_when_the_rtc_itself_stamps_its_messages(bridge, rt
 
 def test_a_restarted_rtc_is_a_new_session_counting_from_zero(bridge, endpoint):
     seen = Seen(bridge)
-    with FakeRtc(endpoint.listen, session="one") as rtc:
+    with FakeRtc(endpoint.listen[0], session="one") as rtc:
         rtc.send(5000)
         seen.first(RtcAppeared)
         seen.first(SessionChanged, old=None, new="one")
         drained(bridge, 10)
     seen.first(RtcVanished)
-    with FakeRtc(endpoint.listen, session="two") as rtc:
+    with FakeRtc(endpoint.listen[0], session="two") as rtc:
         rtc.send(0)
         seen.first(SessionChanged, old="one", new="two")
         (block,) = drained(bridge, 10)
@@ -403,7 +403,7 @@ def test_a_killed_rtc_vanishes_within_the_lease(bridge, endpoint):
 
 def test_interleaved_sessions_are_a_second_rtc(bridge, rtc, endpoint):
     seen = Seen(bridge)
-    with FakeRtc(endpoint.listen, session="s2") as other:
+    with FakeRtc(endpoint.listen[0], session="s2") as other:
         rtc.send(0)
         wait_until(lambda: bridge.statistics().session == "s1")
         other.send(0)
@@ -452,7 +452,7 @@ async def test_a_late_rtc_fetches_the_current_reconstructor_part_by_part(bridge,
     bridge.offer(manifest, matrix)
     assert rtc.fetch(rtc.keys.current) == "nothing to offer"
     bridge.set_current(manifest.id)
-    with FakeRtc(endpoint.listen, session="late") as late:
+    with FakeRtc(endpoint.listen[0], session="late") as late:
         fetched, received = late.fetch_current()
     assert fetched == manifest
     assert np.array_equal(received, matrix)
@@ -636,19 +636,19 @@ def test_a_busy_port_is_one_clear_line(bridge, endpoint):
     with pytest.raises(LinkError) as refusal:
         Bridge(endpoint).open()
     text = str(refusal.value)
-    assert endpoint.listen in text
+    assert endpoint.listen[0] in text
     assert "already in use" in text
     assert "\n" not in text
 
 
 def test_a_missing_router_is_one_clear_line(endpoint):
-    client = Endpoint(system=SYSTEM, connect=(endpoint.listen,))
+    client = Endpoint(system=SYSTEM, connect=endpoint.listen)
     with pytest.raises(LinkError, match="no zenoh router answers at tcp"):
         Bridge(client).open()
 
 
 def test_the_service_can_be_a_client_of_another_router(bridge, endpoint, rtc):
-    with Bridge(Endpoint(system=SYSTEM, connect=(endpoint.listen,))) as client:
+    with Bridge(Endpoint(system=SYSTEM, connect=endpoint.listen)) as client:
         seen = Seen(client)
         seen.first(RtcAppeared)
         rtc.send(0)

@@ -1,0 +1,257 @@
+"""The command line, and the only place that wires the service's parts together."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import structlog
+import uvicorn
+from threadpoolctl import threadpool_limits
+
+from service import __version__
+from service.api import create_app
+from service.archive import Archive
+from service.config import Settings, load_instrument, load_settings
+from service.demo import add_demo_arguments, run_demo
+from service.errors import ConfigurationError, PyrcalError
+from service.model.instrument import Instrument
+from service.reactions.policy import Policy
+from service.reactions.shelf import restored
+from service.rtc_bridge import Bridge, Endpoint
+from service.runtime.crew import Crew
+from service.runtime.deeds import Deeds, Publishing
+from service.runtime.supervisor import Supervisor
+from service.state import TrackerState
+from service.worker import Compute, start_worker
+
+_OPTIONS = {
+    "instrument": "service.instrument",
+    "mode": "service.mode",
+    "data_dir": "service.data_dir",
+    "listen": "zenoh.listen",
+    "connect": "zenoh.connect",
+    "host": "api.host",
+    "port": "api.port",
+}
+"""Command-line options that stand for a settings key."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status: 0 done, 1 failed, 2 refused at the start."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["sim"]:
+        os.execv(sys.executable, [sys.executable, "-m", "sim_rtc", *words[1:]])
+    options = _parser().parse_args(words)
+    try:
+        if options.command == "demo":
+            return run_demo(options)
+        return _run(options)
+    except PyrcalError as error:
+        sys.stderr.write(f"pyrcal: {error}\n")
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="pyrcal", description="Calibration service of an adaptive telescope."
+    )
+    parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser(
+        "run",
+        help="the service",
+        description="Run the service. Precedence: command line > environment "
+        "(PYRCAL_<SECTION>__<KEY>) > TOML file > defaults.",
+    )
+    run.add_argument("--config", type=Path, metavar="FILE", help="settings, TOML")
+    run.add_argument("--instrument", metavar="NAME|FILE", help="packaged name or TOML file")
+    run.add_argument("--mode", choices=["auto", "propose", "hold"], help="default: propose")
+    run.add_argument("--data-dir", metavar="DIR", help="products, index, audit trail; default var")
+    run.add_argument("--listen", metavar="ENDPOINT", help="zenoh, default tcp/127.0.0.1:7447")
+    run.add_argument("--connect", metavar="ENDPOINT", help="an observatory's own zenoh router")
+    run.add_argument("--host", help="of the REST API, default 127.0.0.1")
+    run.add_argument("--port", type=int, help="of the REST API, default 8080")
+    add_demo_arguments(commands)
+    commands.add_parser("sim", help="the simulated RTC: pyrcal sim --help", add_help=False)
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    given = {
+        key: getattr(options, option)
+        for option, key in _OPTIONS.items()
+        if getattr(options, option) is not None
+    }
+    for key in ("zenoh.listen", "zenoh.connect"):
+        if key in given:
+            given[key] = [given[key]]
+    settings = load_settings(options.config, os.environ, given)
+    instrument = load_instrument(settings.service.instrument)
+    # the event loop's own products are small; a second BLAS thread would only fight the RTC link
+    threadpool_limits(1)
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
+        ],
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+    )
+    return asyncio.run(_serve(settings, instrument))
+
+
+async def _serve(settings: Settings, instrument: Instrument) -> int:
+    """Open everything, run until asked to stop or the service fails, close everything."""
+    listener = _listener(settings.api.host, settings.api.port)
+    archive = Archive(settings.service.data_dir)
+    damaged = archive.open()
+    log = structlog.get_logger()
+    for line in damaged:
+        log.warning("archive.damaged", text=line)
+    system = settings.service.system or instrument.name
+    crew = Crew(lambda: start_worker(instrument, _compute(settings)))
+    try:
+        with archive, Bridge(_endpoint(settings, system)) as bridge:
+            bridge.expect(instrument.basis_id, instrument.config_id)
+            supervisor = _supervisor(settings, instrument, system, bridge, crew, archive)
+            return await _until_stopped(supervisor, listener)
+    finally:
+        crew.dismiss()
+
+
+async def _until_stopped(supervisor: Supervisor, listener: socket.socket) -> int:
+    config = uvicorn.Config(create_app(supervisor), log_config=None, access_log=False)
+    server = uvicorn.Server(config)
+    host, port = listener.getsockname()[:2]
+    structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
+    work = asyncio.create_task(supervisor.run())
+    web = asyncio.create_task(server.serve(sockets=[listener]))
+    await asyncio.wait({work, web}, return_when=asyncio.FIRST_COMPLETED)
+    failed = work.done()
+    server.should_exit = True
+    work.cancel()
+    outcomes = await asyncio.gather(work, web, return_exceptions=True)
+    for outcome in outcomes:
+        if isinstance(outcome, Exception):
+            structlog.get_logger().error("service.failed", exc_info=outcome)
+    return 1 if failed else 0
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    """Bind the REST port first: a busy one must be said in one line before anything starts."""
+    try:
+        listener = socket.create_server((host, port))
+    except OSError as error:
+        raise ConfigurationError(
+            f"api.port: cannot listen on {host}:{port}: {error.strerror or error}; "
+            "choose another with --port"
+        ) from error
+    return listener
+
+
+def _supervisor(
+    settings: Settings,
+    instrument: Instrument,
+    system: str,
+    bridge: Bridge,
+    crew: Crew,
+    archive: Archive,
+) -> Supervisor:
+    deeds = Deeds(
+        bridge=bridge,
+        crew=crew,
+        archive=archive,
+        instrument=instrument,
+        publishing=Publishing(
+            system=system,
+            chunk_bytes=settings.zenoh.chunk_bytes,
+            pole_radius_bound=settings.control.pole_radius_bound,
+        ),
+        clock_ns=time.time_ns,
+    )
+    state = TrackerState(
+        system=system,
+        mode=settings.service.mode,
+        reconstructors=restored(archive.records()),
+        basis_id=instrument.basis_id,
+        config_id=instrument.config_id,
+    )
+    return Supervisor(
+        state=state,
+        policy=_policy(settings),
+        bridge=bridge,
+        crew=crew,
+        archive=archive,
+        deeds=deeds,
+    )
+
+
+def _endpoint(settings: Settings, system: str) -> Endpoint:
+    return Endpoint(
+        system=system,
+        listen=settings.zenoh.listen,
+        connect=settings.zenoh.connect,
+        chunk_bytes=settings.zenoh.chunk_bytes,
+    )
+
+
+def _compute(settings: Settings) -> Compute:
+    table = settings.compute
+    return Compute(
+        threads=table.threads,
+        nice=table.nice,
+        pupil_sampling=table.pupil_sampling,
+        detector_nodes=table.detector_nodes,
+    )
+
+
+def _policy(settings: Settings) -> Policy:
+    dither, tracking, control = settings.dither, settings.tracking, settings.control
+    per_minute = np.array(
+        [
+            tracking.drift_subap_per_minute,
+            tracking.drift_subap_per_minute,
+            np.deg2rad(tracking.drift_deg_per_minute),
+            tracking.drift_magnification_per_minute,
+        ]
+    )
+    return Policy(
+        dither_enabled=dither.enabled,
+        dither_amplitude_m=dither.amplitude_m,
+        dither_modes=dither.modes,
+        dither_frequencies_hz=dither.frequencies_hz,
+        window_s=dither.window_s,
+        drift_rate=per_minute / np.sqrt(60.0),
+        floor=np.array(
+            [
+                tracking.floor_shift_subap,
+                tracking.floor_shift_subap,
+                np.deg2rad(tracking.floor_rotation_deg),
+                tracking.floor_magnification,
+            ]
+        ),
+        n_modes_target=control.n_modes_target,
+        update_threshold=np.array(
+            [
+                control.update_shift_subap,
+                control.update_shift_subap,
+                np.deg2rad(control.update_rotation_deg),
+                control.update_magnification,
+            ]
+        ),
+        minimum_interval_s=control.minimum_interval_s,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

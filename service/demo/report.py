@@ -1,0 +1,172 @@
+"""What came of the demo: the estimate against the truth, and the loop before and after."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from service.demo.truth import TruthFile
+from service.model.misregistration import PARAMETERS
+
+TOLERANCE = {
+    "shift_x_subap": 0.02,
+    "shift_y_subap": 0.02,
+    "rotation_deg": 0.05,
+    "magnification": 0.002,
+}
+"""Largest error of an estimate the demo calls good."""
+
+MAX_ERROR_IN_SIGMA = 4.0
+
+View = dict[str, Any]
+
+
+@dataclass(slots=True, kw_only=True)
+class Stage:
+    """The loop under one reconstructor."""
+
+    id: str | None = None
+    n_modes: int | None = None
+    wavefront_error_nm: float | None = None
+    """From the simulator's truth."""
+
+    worst_pole_radius: float | None = None
+    """As the service's gate predicts it within 3 sigma."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Report:
+    """The figures of one run."""
+
+    true_alpha: dict[str, float] | None = None
+    estimated_alpha: dict[str, float] | None = None
+    sigma: dict[str, float] | None = None
+    """1 σ, the model-error floor included."""
+
+    floor: dict[str, float] | None = None
+    """The model error that no integration removes, 1 σ: part of ``sigma``."""
+
+    error: dict[str, float] | None = None
+    error_in_sigma: dict[str, float] | None = None
+    start: Stage = field(default_factory=Stage)
+    first_update: Stage = field(default_factory=Stage)
+    target_modes: Stage = field(default_factory=Stage)
+    reconstructors_published: int = 0
+    reconstructors_applied: int = 0
+    reconstructors_refused_by_gate: int = 0
+    reconstructors_rejected_by_rtc: int = 0
+    swaps: list[View] = field(default_factory=list)
+    frames_received: int = 0
+    frames_lost: int = 0
+    seconds_to_first_applied: float | None = None
+    alarms: list[str] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+
+    @property
+    def good(self) -> bool:
+        """Whether the main job was done."""
+        return not self.failures
+
+    def to_json(self) -> str:
+        """Return the report as one JSON object."""
+        return json.dumps({**asdict(self), "good": self.good}, indent=2)
+
+
+def make_report(
+    state: View | None,
+    reconstructors: list[View],
+    truth: TruthFile,
+    seconds_to_first_applied: float | None,
+) -> Report:
+    """Compare what the service says with what was true."""
+    report = Report(seconds_to_first_applied=seconds_to_first_applied)
+    if state is None:
+        report.failures.append("the service never answered")
+        return report
+    report.frames_received = state["link"]["frames_received"]
+    report.frames_lost = state["link"]["frames_lost"]
+    report.alarms = [f"{alarm['name']}: {alarm['text']}" for alarm in state["alarms"]]
+    report.swaps = truth.swaps
+    _count(report, reconstructors)
+    _stages(report, reconstructors, truth)
+    _compare(report, state, truth)
+    _judge(report)
+    return report
+
+
+def _count(report: Report, reconstructors: list[View]) -> None:
+    own = [r for r in reconstructors if r["parent"] is not None]
+    report.reconstructors_published = sum(r["published_ns_utc"] is not None for r in own)
+    report.reconstructors_applied = sum(r["applied_frame_seq"] is not None for r in own)
+    report.reconstructors_refused_by_gate = sum(r["state"] == "refused" for r in own)
+    report.reconstructors_rejected_by_rtc = sum(r["state"] == "rejected" for r in own)
+
+
+def _stages(report: Report, reconstructors: list[View], truth: TruthFile) -> None:
+    foreign = [r for r in reconstructors if r["parent"] is None]
+    applied = [r for r in reconstructors if r["applied_frame_seq"] is not None]
+    if foreign:
+        report.start = _stage(foreign[0], truth)
+    if applied:
+        report.first_update = _stage(applied[0], truth)
+    larger = [r for r in applied if report.start.n_modes and r["n_modes"] > report.start.n_modes]
+    if larger:
+        report.target_modes = _stage(larger[-1], truth)
+
+
+def _stage(record: View, truth: TruthFile) -> Stage:
+    gate = record["gate"]
+    return Stage(
+        id=record["id"],
+        n_modes=record["n_modes"],
+        wavefront_error_nm=truth.wavefront_error_nm(record["id"]),
+        worst_pole_radius=None if gate is None else gate["worst_pole_radius"],
+    )
+
+
+def _compare(report: Report, state: View, truth: TruthFile) -> None:
+    known, last = state["registration"], truth.last
+    if last is not None:
+        report.true_alpha = {name: last[name] for name in PARAMETERS}
+    if known is None or report.true_alpha is None:
+        return
+    true = report.true_alpha
+    report.estimated_alpha, report.sigma = known["alpha"], known["sigma"]
+    report.floor = known["floor"]
+    report.error = {name: known["alpha"][name] - true[name] for name in PARAMETERS}
+    report.error_in_sigma = {name: report.error[name] / known["sigma"][name] for name in PARAMETERS}
+
+
+def _judge(report: Report) -> None:
+    """Say in words everything that is not as it should be."""
+    fail = report.failures.append
+    report.failures += _estimate_failures(report)
+    start, first, target = report.start, report.first_update, report.target_modes
+    if not _less(first.worst_pole_radius, start.worst_pole_radius):
+        fail("the stability margin has not recovered")
+    if not _less(target.wavefront_error_nm, start.wavefront_error_nm):
+        fail("the wavefront error with more modes is not below that of the start")
+    for swap in report.swaps:
+        if swap["frames_skipped"]:
+            fail(f"{swap['frames_skipped']} frames skipped at the swap to {swap['cm_id']}")
+    report.failures += [f"alarm {alarm}" for alarm in report.alarms]
+
+
+def _estimate_failures(report: Report) -> list[str]:
+    if report.error is None or report.error_in_sigma is None:
+        return ["no estimate of the registration"]
+    failures = []
+    for name in PARAMETERS:
+        if abs(report.error[name]) > TOLERANCE[name]:
+            failures.append(
+                f"{name} is off by {report.error[name]:+.5f}, allowed {TOLERANCE[name]}"
+            )
+        if abs(report.error_in_sigma[name]) > MAX_ERROR_IN_SIGMA:
+            failures.append(f"{name} is off by {report.error_in_sigma[name]:+.1f} sigma")
+    return failures
+
+
+def _less(value: float | None, limit: float | None) -> bool:
+    return value is not None and limit is not None and math.isfinite(value) and value < limit

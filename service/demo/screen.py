@@ -1,0 +1,110 @@
+"""What the demo prints: a line every few seconds, a table at the end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from service.demo.report import Report, Stage
+from service.demo.truth import Line
+from service.model.misregistration import PARAMETERS
+
+HEADING = (
+    "   time   frames  lost |  shift x        shift y        rotation         magnification     |"
+    "  age |   WFE  poles | matrix in use\n"
+    "      s                |  subap          subap          deg                                |"
+    "    s |    nm        |"
+)
+
+_FORMATS = {
+    "shift_x_subap": "{:+.4f}±{:.4f}",
+    "shift_y_subap": "{:+.4f}±{:.4f}",
+    "rotation_deg": "{:+.4f}±{:.4f}",
+    "magnification": "{:.5f}±{:.5f}",
+}
+
+
+def live_line(seconds: float, state: dict[str, Any] | None, truth: Line | None) -> str:
+    """Return one line of the running table."""
+    if state is None:
+        return f"{seconds:7.1f}  the service is starting"
+    link, known = state["link"], state["registration"]
+    registration = " not known yet".ljust(66)
+    age = "    -"
+    if known is not None:
+        cells = [
+            _FORMATS[name].format(known["alpha"][name], known["sigma"][name]) for name in PARAMETERS
+        ]
+        registration = " {:14} {:14} {:16} {:18}".format(*cells)
+        age = f"{known['age_s']:5.1f}"
+    error = "    -" if truth is None else f"{truth['wavefront_error_nm']:5.0f}"
+    margin = state["margin"]
+    poles = "    -" if margin is None else f"{margin['worst_pole_radius']:.3f}"
+    lost = link["frames_lost"]
+    return (
+        f"{seconds:7.1f} {link['frames_received']:8d} {lost:5d} |{registration}|{age} |"
+        f" {error}  {poles} | {_matrix(state)}"
+    )
+
+
+def _matrix(state: dict[str, Any]) -> str:
+    alarms = " ".join(f"[{alarm['name']}]" for alarm in state["alarms"])
+    if not state["ready"]:
+        return f"- {state['ready_reason']} {alarms}"
+    if state["rtc"] is None:
+        return f"- no RTC {alarms}"
+    return f"{state['in_use'] or '-'} ({state['rtc']['n_controlled']} modes) {alarms}"
+
+
+def table(report: Report) -> str:
+    """Return the closing table."""
+    lines = ["", "registration       true        estimated    sigma       error      in sigma"]
+    lines += [f"  {name:15}" + _row(report, name) for name in PARAMETERS]
+    lines += ["", "loop                           modes   wavefront error   worst pole radius"]
+    for label, stage in (
+        ("at the start", report.start),
+        ("after the first update", report.first_update),
+        ("with more modes", report.target_modes),
+    ):
+        lines.append(_stage_row(label, stage))
+    seconds = report.seconds_to_first_applied
+    first = "never" if seconds is None else f"{seconds:.1f} s after the start"
+    lines += [
+        "",
+        f"reconstructors: {report.reconstructors_published} published, "
+        f"{report.reconstructors_applied} applied, {report.reconstructors_refused_by_gate} refused "
+        f"by the gate, {report.reconstructors_rejected_by_rtc} rejected by the RTC; "
+        f"first applied {first}",
+        f"frames: {report.frames_received} received, {report.frames_lost} lost",
+    ]
+    lines += [
+        f"swap to {swap['cm_id']}: {swap['frames_skipped']} frames skipped, wavefront peak "
+        f"{swap['peak_before_nm']:.0f} nm before, {swap['peak_after_nm']:.0f} nm after"
+        for swap in report.swaps
+    ]
+    lines.append("")
+    lines += [f"FAILED: {text}" for text in report.failures] or ["GOOD: the main job was done"]
+    return "\n".join(lines)
+
+
+def _row(report: Report, name: str) -> str:
+    true = report.true_alpha
+    if true is None:
+        return "  not known"
+    if report.estimated_alpha is None or report.sigma is None or report.error is None:
+        return f"{true[name]:+11.5f}    no estimate"
+    in_sigma = (report.error_in_sigma or {})[name]
+    return (
+        f"{true[name]:+11.5f} {report.estimated_alpha[name]:+14.5f} {report.sigma[name]:9.5f} "
+        f"{report.error[name]:+11.5f} {in_sigma:+9.2f}"
+    )
+
+
+def _stage_row(label: str, stage: Stage) -> str:
+    if stage.id is None:
+        return f"  {label:28} never reached"
+    error, radius = stage.wavefront_error_nm, stage.worst_pole_radius
+    return (
+        f"  {label:28} {stage.n_modes:5d}   "
+        f"{'-' if error is None else f'{error:8.1f} nm':>15}   "
+        f"{'-' if radius is None else f'{radius:.3f}':>17}"
+    )

@@ -1,0 +1,54 @@
+"""The simulator's truth file, read while it grows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+Line = dict[str, Any]
+
+
+class TruthFile:
+    """Follows the file across a restart of the simulator, which begins it anew."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+        self._inode: int | None = None
+        self.lines: list[Line] = []
+
+    def read(self) -> None:
+        """Take in the whole lines that have been written since the last call."""
+        if not self._path.exists():
+            return
+        status = self._path.stat()
+        if status.st_size < self._offset or status.st_ino != self._inode:
+            self._offset, self._inode = 0, status.st_ino
+        with self._path.open("rb") as file:
+            file.seek(self._offset)
+            text = file.read()
+        whole = text[: text.rfind(b"\n") + 1]
+        self._offset += len(whole)
+        self.lines += [json.loads(line) for line in whole.splitlines()]
+
+    @property
+    def last(self) -> Line | None:
+        """The latest account of the truth."""
+        return next((line for line in reversed(self.lines) if line["kind"] == "truth"), None)
+
+    @property
+    def swaps(self) -> list[Line]:
+        """Swaps of reconstructors whose aftermath is known."""
+        return [line for line in self.lines if line["kind"] == "swap"]
+
+    def wavefront_error_nm(self, cm_id: str, settling_s: float = 1.0) -> float | None:
+        """Return the RMS wavefront error under one reconstructor, its first moments left out."""
+        under = [line for line in self.lines if line["kind"] == "truth" and line["cm_id"] == cm_id]
+        if not under:
+            return None
+        begin_ns = under[0]["t_ns_utc"] + settling_s * 1e9
+        squares = [
+            line["wavefront_error_nm"] ** 2 for line in under if line["t_ns_utc"] >= begin_ns
+        ]
+        return float((sum(squares) / len(squares)) ** 0.5) if squares else None

@@ -76,7 +76,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         last_batch = float("inf")
         if options.seconds is not None:
             last_batch = round(options.seconds * options.frame_rate_hz / BATCH_FRAMES)
-        watch = Watch(computer, pace)
+        watch = Watch(computer, pace, link)
         n_batches = 0
         _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.snapshot().session)
         while not stopped.is_set() and n_batches < last_batch:
@@ -94,9 +94,10 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
 class Watch:
     """Tells the log, at most every few seconds, how the loop is doing."""
 
-    def __init__(self, computer: RealTimeComputer, pace: Pace) -> None:
+    def __init__(self, computer: RealTimeComputer, pace: Pace, link: Link) -> None:
         self._computer = computer
         self._pace = pace
+        self._link = link
         self._since_s = time.monotonic()
         self._cpu_s = time.process_time()
         self._seq = 0
@@ -120,6 +121,7 @@ class Watch:
             cm_id=self._computer.snapshot().reconstructor.manifest.id,
             cpu_per_second=round((cpu_s - self._cpu_s) / max(now_s - self._since_s, 1e-9), 3),
             overrun_frames=late * BATCH_FRAMES,
+            unpublished_frames=self._link.n_dropped_batches * BATCH_FRAMES,
         )
         if self._clipped:
             _log.warning("loop.clipped", commands=self._clipped, text="the loop may diverge")

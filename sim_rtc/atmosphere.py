@@ -163,9 +163,7 @@ def frozen_layers(
         If there is no layer, or a share or a speed is not positive.
     """
     if not layers or any(layer.fraction <= 0 or layer.speed_m_s <= 0 for layer in layers):
-        raise ModelError(
-            f"atmosphere: expected layers with share > 0 and speed > 0, found {layers}"
-        )
+        raise ModelError(f"atmosphere: found {layers}; expected shares > 0 and speeds > 0")
     total = sum(layer.fraction for layer in layers)
     return tuple(
         FrozenLayer(

@@ -132,6 +132,9 @@ class Link:
             return
         with session:
             self._declare_queryables(session)
+            with self._ready:
+                # What has waited for a service is old: it would only arrive as a burst.
+                self._backlog.clear()
             with (
                 Intake(session, self._keys, self._computer),
                 session.liveliness().declare_token(self._keys.alive(Role.RTC)),

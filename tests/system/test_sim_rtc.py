@@ -150,6 +150,20 @@ class Listener:
             if k not in leave_out:
                 self.session.put(KEYS.chunk(manifest.id, k), data)
 
+    def offer_as_current(self, manifest: Manifest, matrix: np.ndarray) -> None:
+        """Do what a service does: answer queries first, then say that it is alive."""
+        parts = split(matrix, manifest.layout.chunk_bytes)
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                wanted = query.parameters.get("chunk")
+                data = encode_manifest(manifest) if wanted is None else parts[int(wanted)]
+                query.reply(query.key_expr, data)
+
+        self.session.declare_queryable(KEYS.current, answer)
+        self.session.declare_queryable(KEYS.matrix(manifest.id), answer)
+        self.token = self.session.liveliness().declare_token(KEYS.alive(Role.SERVICE))
+
     def acknowledgement(self, timeout_s: float = 8.0):
         return self.acknowledgements.get(timeout=timeout_s)
 
@@ -466,14 +480,22 @@ def test_it_waits_for_the_service_outlives_it_and_ends_cleanly():
         listener.close()
         listener = Listener(port)
         assert listener.next_status().session == session
+        base, matrix = listener.applied()
         status, text = stop_rtc(process)
         assert status == 0, text
         assert "Traceback" not in text
-        process = start_rtc(port, "--seconds", "1")
+        offered = manifest_for(base, 0.9 * matrix, "offered-1")
+        listener.offer_as_current(offered, 0.9 * matrix)
+        process = start_rtc(port, "--seconds", "4")
         again = listener.wait_for(
             lambda: [s for s in listener.statuses if s.session != session], START_UP_S
         )
         assert again[0].seq < 1000
+        answers = [listener.acknowledgement() for _ in range(2)]
+        assert [(a.id, a.state) for a in answers] == [
+            ("offered-1", "staged"),
+            ("offered-1", "applied"),
+        ]
         assert process.wait(timeout=20.0) == 0
         listener.close()
     finally:

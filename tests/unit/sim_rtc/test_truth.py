@@ -1,0 +1,89 @@
+import json
+
+import numpy as np
+import pytest
+
+from service.model.misregistration import Misregistration
+from sim_rtc.clock import FrameClock
+from sim_rtc.computer import Batch
+from sim_rtc.plant import Optics
+from sim_rtc.truth import TruthRecorder, WavefrontError
+
+N_POINTS = 50
+WEIGHTS = np.full(N_POINTS, 1 / N_POINTS)
+CLOCK = FrameClock(start_ns_utc=1_000, dt_ns=1_000_000)
+
+
+OPTICS = Optics(
+    alpha=Misregistration(shift_x_subap=0.1),
+    slopes_per_phase=np.zeros((4, N_POINTS), dtype=np.float32),
+    slopes_per_command=np.zeros((4, 2), dtype=np.float32),
+    opd_per_command=np.random.default_rng(1).standard_normal((N_POINTS, 2)).astype(np.float32),
+    images=np.ones((2, 1, 2, 1)),
+)
+
+
+def frames(seq0, phase_m, cm_id="a", commands_m=None):
+    return Batch(
+        session="s",
+        seq0=seq0,
+        slopes=np.zeros((10, 4), dtype=np.float32),
+        commands_m=np.zeros((10, 2), dtype=np.float32) if commands_m is None else commands_m,
+        dither_m=None,
+        cm_id=cm_id,
+        n_clipped=0,
+        closed=True,
+        n_controlled=2,
+        optics=OPTICS,
+        phase_m=phase_m,
+    )
+
+
+def ripple(rms_m, piston_m=3e-6):
+    return (piston_m + rms_m * np.tile([1.0, -1.0], N_POINTS // 2)).astype(np.float32)
+
+
+def test_the_wavefront_error_is_rms_without_piston_and_with_the_mirror():
+    commands = np.array([[1e-7, -2e-7]] + [[0.0, 0.0]] * 9, dtype=np.float32)
+    cancelled = -(OPTICS.opd_per_command @ commands[0]) + ripple(40e-9)
+    batches = [
+        frames(0, cancelled, commands_m=commands),
+        frames(10, ripple(25e-9)),
+    ]
+    # float32 beside a piston of 3 micrometres.
+    assert WavefrontError(WEIGHTS).rms_nm(batches) == pytest.approx([40.0, 25.0], abs=0.01)
+
+
+def test_lines_come_twice_a_second_and_swaps_tell_the_peaks_around_them(tmp_path):
+    path = tmp_path / "truth.jsonl"
+    with TruthRecorder(path, weights=WEIGHTS, clock=CLOCK) as recorder:
+        for seq in range(0, 4000, 10):
+            rms_m = 30e-9 if seq < 2250 else 20e-9
+            if seq in {300, 2000, 2400}:
+                rms_m += 50e-9
+            recorder.offer(
+                frames(seq, ripple(rms_m), cm_id="a" if seq < 2250 else "b"),
+                overrun_frames=seq // 1000,
+            )
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    truth = [line for line in lines if line["kind"] == "truth"]
+    assert [line["seq"] for line in truth] == [499, 999, 1499, 1999, 2249, 2749, 3249, 3749, 3999]
+    assert truth[1]["wavefront_error_nm"] == pytest.approx(30.0, abs=0.01)
+    assert truth[0]["wavefront_error_peak_nm"] == pytest.approx(80.0, abs=0.01)
+    assert truth[0]["shift_x_subap"] == 0.1
+    assert truth[0]["t_ns_utc"] == 1_000 + 500 * 1_000_000
+    assert [line["cm_id"] for line in truth] == ["a"] * 5 + ["b"] * 4
+    (swap,) = [line for line in lines if line["kind"] == "swap"]
+    assert (swap["seq"], swap["cm_id"], swap["frames_skipped"]) == (2250, "b", 0)
+    assert swap["peak_before_nm"] == pytest.approx(80.0, abs=0.01)
+    assert swap["peak_after_nm"] == pytest.approx(70.0, abs=0.01)
+
+
+def test_frames_that_were_skipped_at_a_swap_are_told(tmp_path):
+    path = tmp_path / "truth.jsonl"
+    with TruthRecorder(path, weights=WEIGHTS, clock=CLOCK) as recorder:
+        for seq in [*range(0, 500, 10), *range(530, 2000, 10)]:
+            batch = frames(seq, ripple(1e-8), cm_id="a" if seq < 500 else "b")
+            recorder.offer(batch, overrun_frames=0)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line["frames_skipped"] for line in lines if line["kind"] == "swap"] == [30]

@@ -9,13 +9,14 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from types import FrameType
 
 import structlog
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, PyrcalError
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.clock import FrameClock, Pace
 from sim_rtc.computer import Batch, RealTimeComputer
@@ -41,11 +42,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(name, stop)
     try:
         instrument = load_instrument(options.instrument)
+        _check_writable(options.truth)
         # Nested threading makes small products slower, and the service needs the other core.
         with threadpool_limits(1):
             telescope = build_telescope(options, instrument)
             run(telescope, options, stopped)
-    except ConfigurationError as error:
+    except PyrcalError as error:
         print(f"sim_rtc: {error}", file=sys.stderr)
         return 2
     return 0
@@ -129,6 +131,16 @@ class Watch:
             _log.warning("loop.late", frames=late * BATCH_FRAMES, behind_s=self._pace.behind_s)
         self._since_s, self._cpu_s, self._clipped = now_s, cpu_s, 0
         self._late = self._pace.late_batches
+
+
+def _check_writable(path: Path | None) -> None:
+    """Refuse a truth file that cannot be written before seconds are spent on the optics."""
+    if path is None:
+        return
+    try:
+        path.open("w", encoding="utf-8").close()
+    except OSError as error:
+        raise ConfigurationError(f"--truth: cannot write {path}: {error.strerror}") from error
 
 
 def _configure_log(*, quiet: bool) -> None:

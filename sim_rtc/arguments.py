@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -11,6 +12,8 @@ from service.errors import ModelError
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from sim_rtc.atmosphere import Layer
 from sim_rtc.schedule import Drift, Jump
+
+_ENDPOINT = re.compile(r"(tcp|tls|quic|ws)/.+:\d{1,5}|unixsock-stream/.+")
 
 
 def within(low: float, high: float) -> Callable[[str], float]:
@@ -85,6 +88,13 @@ def layer(text: str) -> Layer:
     if speed_m_s <= 0.0 or fraction <= 0.0:
         raise _refusal(text, expected)
     return Layer(fraction=fraction, speed_m_s=speed_m_s, direction_deg=direction_deg)
+
+
+def endpoint(text: str) -> str:
+    """Read a zenoh endpoint; a wrong one would only ever look like a service that does not come."""
+    if _ENDPOINT.fullmatch(text) is None:
+        raise _refusal(text, "PROTOCOL/ADDRESS like tcp/127.0.0.1:7447")
+    return text
 
 
 def _numbers(text: str, counts: tuple[int, ...], expected: str) -> list[float]:

@@ -37,7 +37,6 @@ _LEAD_BATCHES = 1
 """Whole batches between a command's acceptance and the first frame that contains it."""
 
 _LARGEST_GAIN = 2.0
-_REMEMBERED_S = 600.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -350,30 +349,6 @@ class RealTimeComputer:
         self._session = new_session()
         self._staged.clear()
         self._dither = None
-
-
-class CommandDesk:
-    """Carries out each command once: the same id gets the same reply for ten minutes."""
-
-    def __init__(self, computer: RealTimeComputer) -> None:
-        self._computer = computer
-        self._lock = threading.Lock()
-        self._replies: dict[str, tuple[float, Command, Reply]] = {}
-
-    def handle(self, command: Command, now_s: float) -> Reply:
-        """Return the reply; ``now_s`` is any clock that never goes back."""
-        with self._lock:
-            for known in [k for k, (t, _, _) in self._replies.items() if now_s - t > _REMEMBERED_S]:
-                del self._replies[known]
-            if command.id in self._replies:
-                _, earlier, reply = self._replies[command.id]
-                if earlier == command:
-                    return reply
-                reason = f"id: {command.id} was used for another command, expected a new id"
-                return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
-            reply = self._computer.execute(command)
-            self._replies[command.id] = (now_s, command, reply)
-            return reply
 
 
 def new_session() -> str:

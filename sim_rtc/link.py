@@ -37,7 +37,8 @@ from service.wire import (
     split,
 )
 from sim_rtc.clock import FrameClock
-from sim_rtc.computer import Batch, CommandDesk, RealTimeComputer
+from sim_rtc.computer import Batch, RealTimeComputer
+from sim_rtc.desk import CommandDesk
 from sim_rtc.detector import Detector
 from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.intake import Intake
@@ -95,7 +96,7 @@ class Link:
         self._detector = detector
         self._magnitude = magnitude
         self._keys = Keys(computer.identity.system)
-        self._desk = CommandDesk(computer)
+        self._desk = CommandDesk(computer.execute)
         self._backlog: deque[Batch] = deque()
         self._ready = threading.Condition()
         self._stopped = threading.Event()

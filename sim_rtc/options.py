@@ -266,6 +266,7 @@ def _add_loop(group: argparse._ArgumentGroup) -> None:
 def _add_run(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--connect",
+        type=arguments.endpoint,
         default="tcp/127.0.0.1:7447",
         metavar="ENDPOINT",
         help="zenoh endpoint of the service (default: %(default)s); may come up later",

@@ -61,6 +61,7 @@ def test_layers_jumps_and_drift_are_read():
         (["--delay", "1.5"], "--delay: found '1.5'; expected a whole number"),
         (["--mag", "bright"], "--mag: found 'bright'; expected a number from -5 to 20"),
         (["--plant", "cubic"], "--plant: invalid choice"),
+        (["--connect", "localhost"], "--connect: found 'localhost'; expected PROTOCOL/ADDRESS"),
         (["--nonsense"], "unrecognized arguments: --nonsense"),
     ],
 )
@@ -73,16 +74,26 @@ def test_an_impossible_option_is_one_line_and_status_two(capsys, arguments, text
     assert said.count("\n") == 1
 
 
-def test_more_modes_than_the_instrument_has_are_refused_before_anything_starts():
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--n-controlled", "700"], "--n-controlled: found 700; flao-lbt has 594 modes"),
+        (
+            ["--truth", "no/such/folder/truth.jsonl"],
+            "--truth: cannot write no/such/folder/truth.jsonl: No such file or directory",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_starts(arguments, text):
     ended = subprocess.run(
-        [sys.executable, "-m", "sim_rtc", "--n-controlled", "700"],
+        [sys.executable, "-m", "sim_rtc", *arguments],
         capture_output=True,
         text=True,
         timeout=30,
         check=False,
     )
     assert ended.returncode == 2
-    assert ended.stderr == "sim_rtc: --n-controlled: found 700; flao-lbt has 594 modes\n"
+    assert ended.stderr == f"sim_rtc: {text}\n"
 
 
 def test_help_reads_like_a_manual(capsys):

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import os
+import signal
 import socket
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import structlog
 import uvicorn
 from threadpoolctl import threadpool_limits
+from typing_extensions import override
 
 from service import __version__
 from service.api import create_app
@@ -131,7 +134,9 @@ async def _serve(settings: Settings, instrument: Instrument) -> int:
 
 async def _until_stopped(supervisor: Supervisor, listener: socket.socket) -> int:
     config = uvicorn.Config(create_app(supervisor), log_config=None, access_log=False)
-    server = uvicorn.Server(config)
+    server = _Server(config)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, server.stop)
     host, port = listener.getsockname()[:2]
     structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
     work = asyncio.create_task(supervisor.run())
@@ -145,6 +150,19 @@ async def _until_stopped(supervisor: Supervisor, listener: socket.socket) -> int
         if isinstance(outcome, Exception):
             structlog.get_logger().error("service.failed", exc_info=outcome)
     return 1 if failed else 0
+
+
+class _Server(uvicorn.Server):
+    """A uvicorn that leaves signals alone: it would raise them again before all is closed."""
+
+    @override
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+    def stop(self) -> None:
+        """End the service in good order."""
+        self.should_exit = True
 
 
 def _listener(host: str, port: int) -> socket.socket:

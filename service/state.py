@@ -80,6 +80,9 @@ class Registration:
     t_ns_utc: int
     """End of the last window that entered the estimate."""
 
+    arrived_ns_utc: int
+    """The same by the service's clock: age is judged by arrival, never by comparing clocks."""
+
     n_windows: int
     """Windows that entered the estimate."""
 

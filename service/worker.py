@@ -33,9 +33,6 @@ from service.model.modes import karhunen_loeve_basis
 SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
 """A step shorter than this (numeric units) leaves a linearisation error below 1e-4 of its unit."""
 
-REUSED = np.array([0.02, 0.02, 1e-3, 2e-3])
-"""A linearisation this close is used as it is; its second order is far below the noise."""
-
 MAX_LINEARISATIONS = 6
 """From the edge of the capture range three are enough."""
 
@@ -114,7 +111,7 @@ class Workbench:
                 return estimate
             if np.any(np.abs(estimate.alpha.vector - [0.0, 0.0, 0.0, 1.0]) > FIT_RANGE):
                 break
-            linearisation = self._near(estimate.alpha)
+            linearisation = self._linearise(estimate.alpha)
         return WindowRefused(
             reason=f"the fit did not settle within {MAX_LINEARISATIONS} linearisations: the "
             "registration is outside the capture range, or the instrument file is another's",
@@ -154,10 +151,15 @@ class Workbench:
         return passive.fit(state, self._near(start))
 
     def _near(self, alpha: Misregistration) -> Linearisation:
+        """Return the linearisation at hand if it is close enough, else a new one."""
         kept = self._linearisation
-        if kept is None or np.any(np.abs(alpha.vector - kept.alpha.vector) > REUSED):
-            kept = self._linearisation = self._model.linearise(alpha)
+        if kept is None or np.any(np.abs(alpha.vector - kept.alpha.vector) > SETTLED):
+            return self._linearise(alpha)
         return kept
+
+    def _linearise(self, alpha: Misregistration) -> Linearisation:
+        self._linearisation = self._model.linearise(alpha)
+        return self._linearisation
 
 
 _workbench: Workbench | None = None

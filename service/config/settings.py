@@ -104,7 +104,7 @@ class TrackingTable(Table):
     floor_shift_subap: float = Field(default=0.003, ge=0.0)
     """1 σ model error of each shift, subapertures; no integration removes it."""
 
-    floor_rotation_deg: float = Field(default=0.005, ge=0.0)
+    floor_rotation_deg: float = Field(default=0.008, ge=0.0)
     """Of the rotation, degrees."""
 
     floor_magnification: float = Field(default=0.0003, ge=0.0)

@@ -14,6 +14,9 @@ from service.state import Level, MatrixState, RtcView, TrackerState
 ACKNOWLEDGE_WITHIN_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
 
+STALE_AFTER_S = 20.0
+"""Ten windows of two seconds without one accepted."""
+
 FORGOTTEN_AFTER_S = 15.0
 """An alarm the link repeats while it lasts is over after this much silence."""
 
@@ -39,12 +42,28 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
         silent_ns = now_ns - alarm.seen_ns_utc
         if alarm.name in _RENEWED and silent_ns > FORGOTTEN_AFTER_S * SECOND_NS:
             state = without_alarm(state, alarm.name, now_ns)
+    state = _watch_age(state, now_ns)
     since_ns = state.making_since_ns_utc
     if since_ns is not None and now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
         state = replace(state, making_since_ns_utc=None)
         text = f"no reconstructor came within {COMPUTE_WITHIN_S:.0f} s"
         state = logged(state, "reconstructor.lost", text, now_ns, Level.WARNING)
     return state
+
+
+def _watch_age(state: TrackerState, now_ns: int) -> TrackerState:
+    """Raise an alarm when a dither runs and still nothing comes of it."""
+    known, dither = state.registration, state.dither
+    if known is None or dither is None:
+        return without_alarm(state, "estimate-stale", now_ns)
+    since_ns = max(known.arrived_ns_utc, dither.asked_ns_utc)
+    if now_ns - since_ns < STALE_AFTER_S * SECOND_NS:
+        return state
+    text = (
+        f"no window was accepted for {STALE_AFTER_S:.0f} s although a dither runs: α may have "
+        "moved; see the log for the reasons"
+    )
+    return with_alarm(state, "estimate-stale", text, now_ns)
 
 
 def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:

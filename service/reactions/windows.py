@@ -36,7 +36,8 @@ def on_window(
     reason = _why_useless(state, estimate)
     if reason is not None:
         return refuse_window(state, reason, now_ns)
-    state = without_alarm(state, "columns-misaligned", now_ns)
+    for alarm in ("columns-misaligned", "estimate-stale"):
+        state = without_alarm(state, alarm, now_ns)
     measured, noise = estimate.alpha.vector, estimate.covariance
     known = state.registration
     if known is None:
@@ -55,6 +56,7 @@ def on_window(
         covariance=filtered.covariance,
         floor=policy.floor,
         t_ns_utc=estimate.t_ns_utc,
+        arrived_ns_utc=now_ns,
         n_windows=1 if known is None or filtered.jumped else known.n_windows + 1,
         optical_gain=float(np.abs(estimate.optical_gain).mean()),
     )

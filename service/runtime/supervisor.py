@@ -68,12 +68,11 @@ class Supervisor:
         self._records: asyncio.Queue[tuple[TrackerState, TrackerState]] = asyncio.Queue()
         self._running: set[asyncio.Task[None]] = set()
         self._started_ns = time.time_ns()
-        self._estimate_arrival_ns: int | None = None
         self._log = structlog.get_logger().bind(system=state.system)
 
     def snapshot(self) -> Snapshot:
         """Return what is known now."""
-        ready = self._streams is not None
+        ready, known = self._streams is not None, self._state.registration
         return Snapshot(
             tracker=self._state,
             link=self._bridge.statistics(),
@@ -81,7 +80,7 @@ class Supervisor:
             started_ns=self._started_ns,
             ready=ready,
             ready_reason="ready" if ready else "the optical model is being prepared",
-            estimate_arrival_ns=self._estimate_arrival_ns,
+            estimate_arrival_ns=known.arrived_ns_utc if known is not None else None,
         )
 
     async def submit(self, command: Command) -> str:
@@ -174,11 +173,7 @@ class Supervisor:
     async def _fit(self) -> None:
         while True:
             spectra = await self._windows.get()
-            arrived_ns = time.time_ns()
-            event = await self._fitted(spectra)
-            if isinstance(event, ev.WindowFitted):
-                self._estimate_arrival_ns = arrived_ns
-            self._post(event)
+            self._post(await self._fitted(spectra))
 
     async def _fitted(self, spectra: Spectra) -> Event:
         rtc, known = self._state.rtc, self._state.registration

@@ -103,6 +103,7 @@ STATE = TrackerState(
         covariance=np.diag(SIGMA**2),
         floor=np.array([0.003, 0.003, np.deg2rad(0.005), 0.0003]),
         t_ns_utc=90 * SECOND,
+        arrived_ns_utc=80 * SECOND,
         n_windows=4,
         optical_gain=0.6,
     ),

@@ -26,6 +26,7 @@ from sim_rtc.options import Options, parse_options
 from sim_rtc.truth import TruthRecorder
 
 _REPORT_PERIOD_S = 10.0
+_WORRYING_DELAY_S = 0.5
 _log = structlog.get_logger("sim_rtc")
 
 
@@ -127,8 +128,8 @@ class Watch:
         )
         if self._clipped:
             _log.warning("loop.clipped", commands=self._clipped, text="the loop may diverge")
-        if late:
-            _log.warning("loop.late", frames=late * BATCH_FRAMES, behind_s=self._pace.behind_s)
+        if self._pace.behind_s > _WORRYING_DELAY_S:
+            _log.warning("loop.behind", behind_s=round(self._pace.behind_s, 2))
         self._since_s, self._cpu_s, self._clipped = now_s, cpu_s, 0
         self._late = self._pace.late_batches
 

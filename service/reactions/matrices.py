@@ -20,6 +20,9 @@ from service.state import Level, MatrixState, Mode, ReconstructorRecord, RtcView
 
 Step = tuple[TrackerState, tuple[Effect, ...]]
 
+_WRONG_RTC = ("second-rtc", "basis-mismatch", "instrument-mismatch")
+"""While one of these lasts, nobody knows whom a reconstructor would reach."""
+
 
 def on_matrix(
     state: TrackerState, record: ReconstructorRecord, *, wanted: bool, now_ns: int
@@ -37,7 +40,7 @@ def on_matrix(
     state = logged(
         state, "reconstructor.made", f"{record.id}, {record.n_modes} modes, {verdict}", now_ns
     )
-    if state.rtc is not None and (wanted or state.mode is Mode.AUTO):
+    if why_unsendable(state) is None and (wanted or state.mode is Mode.AUTO):
         return send(state, record.id, now_ns)
     return state, ()
 
@@ -48,11 +51,12 @@ def send(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
     Raises
     ------
     CommandError
-        If no RTC is there.
+        If no RTC is there, or it may be the wrong one.
     """
     record, rtc = known_record(state, matrix_id), state.rtc
-    if rtc is None:
-        raise CommandError(f"{matrix_id} cannot be sent: no RTC is there")
+    reason = why_unsendable(state)
+    if rtc is None or reason is not None:
+        raise CommandError(f"{matrix_id} cannot be sent: {reason}")
     state = with_changed(
         state, replace(record, state=MatrixState.PUBLISHED, published_ns_utc=now_ns, reason="")
     )
@@ -61,6 +65,13 @@ def send(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
     if record.n_modes != rtc.n_controlled:
         gains = extended_gains(rtc, record.n_modes)
     return state, (ev.SendMatrix(id=matrix_id, n_modes=record.n_modes, gains=gains),)
+
+
+def why_unsendable(state: TrackerState) -> str | None:
+    """Return why nothing may be published now, or None."""
+    if state.rtc is None:
+        return "no RTC is there"
+    return next((alarm.text for alarm in state.alarms if alarm.name in _WRONG_RTC), None)
 
 
 def extended_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:
@@ -82,6 +93,7 @@ def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int)
         record = replace(record, applied_frame_seq=event.frame_seq, reason=event.reason)
         state = with_in_use(with_changed(state, record), event.id)
         state = without_alarm(state, "no-acknowledgement", now_ns)
+        state = without_alarm(state, "margin", now_ns)
         state = replace(state, margin=record.gate, judged_ns_utc=now_ns)
         text = f"{event.id} applied from frame {event.frame_seq}"
         return logged(state, "reconstructor.applied", text, now_ns)

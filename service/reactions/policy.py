@@ -35,7 +35,7 @@ SETTLING_S = 0.3
 
 _N_LINES = 4
 _OWN_DITHER = "dither-"
-_OPEN = (MatrixState.PROPOSED, MatrixState.PUBLISHED, MatrixState.STAGED)
+_SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -195,7 +195,7 @@ def _update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> _
         return state, ()
     if rtc.loop != "closed" or state.making_since_ns_utc is not None:
         return state, ()
-    if _busy(state, policy) or now_ns < _next_attempt_ns(state, policy):
+    if _busy(state, policy) or now_ns < max(_next_attempt_ns(state, policy), state.retry_ns_utc):
         return state, ()
     in_use = state.reconstructor(state.in_use) if state.in_use else None
     if in_use is None:
@@ -232,9 +232,17 @@ def _why_moved(state: TrackerState, record: ReconstructorRecord) -> str:
 
 
 def _busy(state: TrackerState, policy: Policy) -> bool:
-    """Return whether a reconstructor is under way that still fits α."""
+    """Return whether a reconstructor is on its way, or one that fits α awaits an operator.
+
+    In auto nobody is going to decide on a proposal left from another mode or an absent RTC.
+    """
     return any(
-        r.state in _OPEN and not (r.state is MatrixState.PROPOSED and moved(state, r, policy))
+        r.state in _SENT
+        or (
+            r.state is MatrixState.PROPOSED
+            and state.mode is not Mode.AUTO
+            and not moved(state, r, policy)
+        )
         for r in state.reconstructors
     )
 

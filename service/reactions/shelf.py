@@ -32,8 +32,11 @@ def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRec
 
 
 def with_record(state: TrackerState, record: ReconstructorRecord) -> TrackerState:
-    """Return the state with one more reconstructor."""
-    return replace(state, reconstructors=(*state.reconstructors, record)[-RECONSTRUCTORS_KEPT:])
+    """Return the state with one more reconstructor; the oldest not in use gives way."""
+    shelf = [*(r for r in state.reconstructors if r.id != record.id), record]
+    if len(shelf) > RECONSTRUCTORS_KEPT:
+        shelf.remove(next(r for r in shelf if r.id != state.in_use))
+    return replace(state, reconstructors=tuple(shelf))
 
 
 def with_changed(state: TrackerState, record: ReconstructorRecord) -> TrackerState:

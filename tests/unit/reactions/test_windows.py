@@ -1,0 +1,147 @@
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.estimation.lockin import WindowRefused
+from service.estimation.passive import PassiveEstimate
+from service.model.misregistration import Misregistration
+from service.reactions.windows import HISTORY_LENGTH
+from service.state import Level, Mode
+
+from tests.unit.reactions.situations import ALPHA, PRECISE, START_NS, Story, estimate, moved
+
+
+@pytest.fixture
+def story():
+    return Story(Mode.HOLD).meet()
+
+
+def test_the_first_window_becomes_the_registration_with_the_floor_in_its_sigma(story):
+    story.see()
+    known = story.state.registration
+    assert known.alpha == ALPHA
+    np.testing.assert_allclose(known.covariance, PRECISE)
+    np.testing.assert_allclose(known.sigma, np.hypot([0.002, 0.002, 5e-5, 2e-4], known.floor))
+    assert (known.n_windows, known.optical_gain) == (1, pytest.approx(0.6))
+    assert story.state.windows_accepted == 1
+
+
+def test_two_equal_windows_halve_the_variance_but_for_the_walk_between_them(story):
+    story.see(n_windows=2)
+    walked = PRECISE + np.diag(story.policy.drift_rate**2 * 2.0)
+    expected = np.linalg.inv(np.linalg.inv(walked) + np.linalg.inv(PRECISE))
+    np.testing.assert_allclose(story.state.registration.covariance, expected)
+    assert story.state.registration.n_windows == 2
+
+
+def test_each_window_leaves_its_own_estimate_in_the_history(story):
+    story.see()
+    story.see(moved(shift_x_subap=0.004))
+    first, second = story.state.history
+    assert first.innovation == 0.0
+    assert second.measured.shift_x_subap == pytest.approx(0.124)
+    assert 0.12 < second.filtered.shift_x_subap < 0.124
+    assert 0.0 < second.innovation < 4.0
+
+
+def test_the_history_is_bounded(story):
+    story.see()
+    full = story.state.history * HISTORY_LENGTH
+    story.state = replace(story.state, history=full)
+    story.see(moved(shift_x_subap=0.001))
+    assert len(story.state.history) == HISTORY_LENGTH
+    assert story.state.history[-1].measured.shift_x_subap == pytest.approx(0.121)
+
+
+def test_a_jump_is_followed_at_once_and_counting_starts_again(story):
+    story.see(n_windows=3)
+    there = moved(shift_x_subap=0.1)
+    story.see(there)
+    known = story.state.registration
+    assert known.n_windows == 1
+    assert known.alpha.shift_x_subap == pytest.approx(there.shift_x_subap, abs=0.002)
+    entry = story.state.log[-1]
+    assert (entry.name, entry.level) == ("registration.jump", Level.WARNING)
+    assert "+0.100" in entry.text
+
+
+def test_a_window_from_before_the_estimate_does_not_shrink_its_uncertainty_below_zero(story):
+    story.see(n_windows=2)
+    early = estimate(t_ns=START_NS - 3_600_000_000_000)
+    story.tell(ev.WindowFitted(estimate=early))
+    assert np.all(np.linalg.eigvalsh(story.state.registration.covariance) > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"session": "s0"}, "the RTC has restarted since"),
+        ({"lag_frames": np.full(4, 0.9)}, r"lag commands by \+0.90 frame"),
+        ({"optical_gain": np.array([0.6, 0.6, 0.05, 0.6])}, "optical gains of 0.05 to 0.60"),
+        ({"optical_gain": np.array([0.6, 0.6, 2.0, 0.6])}, "optical gains of 0.60 to 2.00"),
+        ({"covariance": PRECISE * 1e4}, "too uncertain"),
+        ({"alpha": moved(shift_y_subap=-0.8)}, "outside the capture range"),
+        ({"alpha": moved(magnification=0.02)}, "outside the capture range"),
+    ],
+)
+def test_a_useless_window_is_refused_with_its_reason(story, changes, reason):
+    story.see()
+    before = story.state.registration
+    story.tell(ev.WindowFitted(estimate=estimate(**changes)))
+    assert story.state.registration is before
+    assert (story.state.windows_accepted, story.state.windows_refused) == (1, 1)
+    assert story.state.log[-1].name == "window.refused"
+    assert re.search(reason, story.state.log[-1].text)
+
+
+def test_misaligned_columns_are_an_alarm_until_a_window_is_good_again(story):
+    story.tell(ev.WindowFitted(estimate=estimate(lag_frames=np.full(4, -0.5))))
+    assert "columns-misaligned" in story.alarms
+    story.see()
+    assert "columns-misaligned" not in story.alarms
+
+
+def test_telemetry_of_a_diverging_loop_is_no_measurement(story):
+    story.tell(ev.Trouble(name="loop-diverging", text="it is"))
+    story.see()
+    assert story.state.registration is None
+    assert "diverging" in story.state.log[-1].text
+
+
+@pytest.mark.parametrize(
+    ("reason", "level"),
+    [
+        ("the reconstructor changed inside the window: a -> b", Level.INFO),
+        ("the dither ended inside the window", Level.INFO),
+        ("60 of 1000 frames missing, more than 5%: check the link to the RTC", Level.WARNING),
+    ],
+)
+def test_a_lost_window_is_a_warning_unless_the_service_itself_cut_it_short(story, reason, level):
+    story.tell(ev.WindowLost(refused=WindowRefused(reason=reason, t_ns_utc=START_NS)))
+    assert story.state.windows_refused == 1
+    assert story.state.log[-1].level is level
+
+
+def watched(alpha):
+    sigma = np.array([0.1, 0.1, 5e-4, 5e-4])
+    return PassiveEstimate(alpha=alpha, sigma=sigma, gains=np.full(400, 0.6), step=np.zeros(4))
+
+
+def test_the_watchdog_only_reports_while_there_is_nothing_to_compare_with(story):
+    story.tell(ev.Watched(estimate=watched(Misregistration()), t_ns_utc=START_NS))
+    assert story.state.watchdog.consistent
+    assert "no dithered estimate" in story.state.watchdog.text
+    assert not story.alarms
+
+
+def test_the_watchdog_barks_while_it_disagrees(story):
+    story.see()
+    story.tell(ev.Watched(estimate=watched(moved(rotation_rad=0.01)), t_ns_utc=START_NS))
+    assert not story.state.watchdog.consistent
+    assert "watchdog" in story.alarms
+    story.tell(ev.Watched(estimate=watched(moved(shift_x_subap=0.2)), t_ns_utc=START_NS))
+    assert story.state.watchdog.consistent
+    assert "watchdog" not in story.alarms

@@ -33,8 +33,18 @@ from service.model.modes import karhunen_loeve_basis
 SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
 """A step shorter than this (numeric units) leaves a linearisation error below 1e-4 of its unit."""
 
-MAX_LINEARISATIONS = 6
-"""From the edge of the capture range three are enough."""
+MAX_APPROACHES = 5
+"""Steps of the coarse model; from the edge of the capture range three are enough."""
+
+REACH = 4.0
+"""A coarse step this long, in units of ``SETTLED``, ends well within one of them."""
+
+CONTRACTION = 0.5
+"""A step longer than this share of the last one is not Newton's any more: the fit has failed."""
+
+COARSE_SAMPLING = 2
+"""Pupil points per subaperture and nodes of the coarse model: biased by 0.05 % of a subaperture,
+four times as fast."""
 
 FIT_RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
 """An estimate further out than this has diverged (numeric units)."""
@@ -86,6 +96,13 @@ class Workbench:
             detector_nodes=compute.detector_nodes,
             mapper=self._threads.map,
         )
+        self._coarse = InteractionModel(
+            instrument,
+            basis,
+            pupil_sampling=COARSE_SAMPLING,
+            detector_nodes=COARSE_SAMPLING,
+            mapper=self._threads.map,
+        )
         self._linearisation: Linearisation | None = None
 
     def describe(self) -> Description:
@@ -100,23 +117,36 @@ class Workbench:
     def fit(
         self, spectra: Spectra, loop: Loop, start: Misregistration
     ) -> WindowEstimate | WindowRefused:
-        """Estimate α from one window, linearising anew until the step is short."""
-        linearisation = self._near(start)
-        for _ in range(MAX_LINEARISATIONS):
-            try:
-                estimate = fit_window(spectra, linearisation, loop)
-            except np.linalg.LinAlgError as error:
-                return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
-            if np.all(np.abs(estimate.step) <= SETTLED):
-                return estimate
+        """Estimate α from one window.
+
+        Where the linearisation at hand is too far away, the coarse model leads to within reach of
+        one new, fine linearisation.
+        """
+        try:
+            estimate = fit_window(spectra, self._near(start), loop)
+            if not _settled(estimate):
+                near = self._approach(spectra, loop, estimate)
+                if near is None:
+                    return _unsettled(spectra)
+                estimate = fit_window(spectra, self._linearise(near), loop)
+        except np.linalg.LinAlgError as error:
+            return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
+        return estimate if _settled(estimate) else _unsettled(spectra)
+
+    def _approach(
+        self, spectra: Spectra, loop: Loop, estimate: WindowEstimate
+    ) -> Misregistration | None:
+        """Return where the coarse model's steps lead; None when they do not shrink."""
+        for _ in range(MAX_APPROACHES):
             if np.any(np.abs(estimate.alpha.vector - [0.0, 0.0, 0.0, 1.0]) > FIT_RANGE):
-                break
-            linearisation = self._linearise(estimate.alpha)
-        return WindowRefused(
-            reason=f"the fit did not settle within {MAX_LINEARISATIONS} linearisations: the "
-            "registration is outside the capture range, or the instrument file is another's",
-            t_ns_utc=spectra.t_end_ns_utc,
-        )
+                return None
+            before = _length(estimate)
+            estimate = fit_window(spectra, self._coarse.linearise(estimate.alpha), loop)
+            if _length(estimate) <= REACH:
+                return estimate.alpha
+            if _length(estimate) > CONTRACTION * before:
+                return None
+        return None
 
     def make(
         self,
@@ -160,6 +190,23 @@ class Workbench:
     def _linearise(self, alpha: Misregistration) -> Linearisation:
         self._linearisation = self._model.linearise(alpha)
         return self._linearisation
+
+
+def _length(estimate: WindowEstimate) -> float:
+    """Return the length of a step, in units of what counts as settled."""
+    return float(np.abs(estimate.step / SETTLED).max())
+
+
+def _settled(estimate: WindowEstimate) -> bool:
+    return _length(estimate) <= 1.0
+
+
+def _unsettled(spectra: Spectra) -> WindowRefused:
+    return WindowRefused(
+        reason="the fit did not settle: the mirror moved inside the window, the registration is "
+        "outside the capture range, or the instrument file is another's",
+        t_ns_utc=spectra.t_end_ns_utc,
+    )
 
 
 _workbench: Workbench | None = None

@@ -38,8 +38,8 @@ POLL_S = 0.05
 WATCH_INTERVAL_S = 10.0
 """Between two looks of the passive watchdog."""
 
-WINDOWS_WAITING = 2
-"""Windows that may wait for the worker; then the oldest is given up."""
+WINDOWS_WAITING = 1
+"""Windows that may wait for the worker; a newer one says more, so the older is given up."""
 
 _LEVELS = {Level.INFO: "info", Level.WARNING: "warning", Level.ALARM: "error"}
 

@@ -1,4 +1,4 @@
-"""Situations of the service as values: an RTC, windows, reconstructors, and a story to tell them."""
+"""Situations as values: an RTC, windows, reconstructors, and a story to tell them in."""
 
 from dataclasses import replace
 

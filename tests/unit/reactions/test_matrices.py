@@ -5,7 +5,6 @@ import pytest
 from service import events as ev
 from service.reactions.matrices import extended_gains
 from service.state import Level, MatrixState, Mode
-
 from tests.unit.reactions.situations import Story, foreign, of_kind, rtc, verdict
 
 

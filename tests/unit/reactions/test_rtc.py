@@ -5,7 +5,6 @@ import pytest
 
 from service import events as ev
 from service.state import Level, MatrixState, Mode
-
 from tests.unit.reactions.situations import Story, estimate, of_kind, rtc
 
 

@@ -9,7 +9,6 @@ from service.reactions.shelf import (
     with_state,
 )
 from service.state import MatrixState, TrackerState
-
 from tests.unit.reactions.situations import foreign, record
 
 STATE = TrackerState(system="flao")

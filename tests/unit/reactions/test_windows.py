@@ -10,7 +10,6 @@ from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.reactions.windows import HISTORY_LENGTH
 from service.state import Level, Mode
-
 from tests.unit.reactions.situations import ALPHA, PRECISE, START_NS, Story, estimate, moved
 
 

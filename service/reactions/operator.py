@@ -65,6 +65,10 @@ def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, no
         frequency_hz=event.frequency_hz,
         duration_s=event.duration_s,
     )
+    if max(dither.modes) >= rtc.n_modes:
+        raise CommandError(
+            f"dither: found mode {max(dither.modes)}; expected 0 to {rtc.n_modes - 1}"
+        )
     try:
         lock_in_plan(dither, rtc, policy.window_s)
     except ModelError as error:

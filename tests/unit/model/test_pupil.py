@@ -1,0 +1,73 @@
+"""The grey pupil."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.errors import ModelError
+from service.model.pupil import annular_pupil
+
+
+def pupil(sampling=3, diameter=30.0, obscuration=0.11, n=30):
+    return annular_pupil(
+        n_subapertures=n, diameter_subap=diameter, obscuration_ratio=obscuration, sampling=sampling
+    )
+
+
+@pytest.mark.parametrize("sampling", [1, 2, 3, 4])
+@pytest.mark.parametrize(("diameter", "obscuration"), [(30.0, 0.11), (29.3, 0.0), (12.0, 0.3)])
+def test_the_light_adds_up_to_the_area_of_the_annulus(sampling, diameter, obscuration):
+    """1e-4: what 32 Gauss-Legendre nodes per cell leave on the edge of a disc."""
+    area = pupil(sampling, diameter, obscuration).amplitude.sum() / sampling**2
+    expected = np.pi / 4 * diameter**2 * (1 - obscuration**2)
+    assert area == pytest.approx(expected, rel=1e-4)
+
+
+def test_cells_well_inside_are_full_and_cells_well_outside_are_dark():
+    grid = pupil()
+    radius = np.hypot(grid.coordinates[:, None], grid.coordinates)
+    assert np.all(grid.amplitude[(radius > 2.2) & (radius < 14.5)] == pytest.approx(1.0))
+    assert np.all(grid.amplitude[radius > 15.5] == 0.0)
+    assert np.all(grid.amplitude[radius < 1.2] == pytest.approx(0.0))
+
+
+def test_an_edge_cell_holds_the_fraction_that_is_lit():
+    """A disc of diameter 1 in one cell of width 1 covers π/4 of it."""
+    grid = pupil(sampling=1, diameter=1.0, obscuration=0.0, n=1)
+    assert grid.amplitude[0, 0] == pytest.approx(np.pi / 4, rel=1e-3)
+
+
+def test_the_pupil_is_its_own_image_under_flips_and_transposition():
+    amplitude = pupil().amplitude
+    np.testing.assert_allclose(amplitude, amplitude[::-1], atol=1e-12)
+    np.testing.assert_allclose(amplitude, amplitude[:, ::-1], atol=1e-12)
+    np.testing.assert_allclose(amplitude, amplitude.T, atol=1e-3)  # chords run along one axis
+
+
+def test_the_centre_of_the_grid_is_the_centre_of_the_pupil():
+    grid = pupil(sampling=2)
+    np.testing.assert_allclose(grid.coordinates, -grid.coordinates[::-1])
+    assert np.diff(grid.coordinates) == pytest.approx(0.5)
+    np.testing.assert_allclose(grid.weights @ grid.points, 0.0, atol=1e-12)
+
+
+def test_points_are_x_then_y_in_row_major_order_and_weights_sum_to_one():
+    grid = pupil()
+    first, second = grid.points[:2]
+    assert first[1] == second[1]  # same row
+    assert second[0] - first[0] == pytest.approx(1 / 3)  # one step along x
+    assert len(grid.points) == np.count_nonzero(grid.lit)
+    assert grid.weights.sum() == pytest.approx(1.0)
+
+
+def test_a_pupil_wider_than_the_sensor_gets_a_grid_that_holds_it():
+    assert pupil(sampling=2, diameter=31.5).coordinates[-1] == pytest.approx(15.75)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"sampling": 0}, {"obscuration": 1.0}, {"obscuration": -0.1}, {"diameter": 0.0}]
+)
+def test_impossible_pupils_are_refused_with_what_was_expected(wrong):
+    with pytest.raises(ModelError, match=r"expected >= 1, in \[0, 1\), > 0"):
+        pupil(**wrong)

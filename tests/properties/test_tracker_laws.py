@@ -1,0 +1,322 @@
+"""Whatever happens, in whatever order: what the service must and must not do."""
+
+from dataclasses import replace
+
+import hypothesis.strategies as st
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+
+from service import events as ev
+from service.errors import CommandError
+from service.estimation.lockin import WindowRefused
+from service.reactions.journal import LOG_LENGTH
+from service.reactions.shelf import RECONSTRUCTORS_KEPT
+from service.reactions.windows import HISTORY_LENGTH
+from service.state import MatrixState, Mode, TrackerState
+from service.tracker import step
+from tests.unit.reactions.situations import (
+    ALPHA,
+    POLICY,
+    START_NS,
+    estimate,
+    foreign,
+    moved,
+    record,
+    rtc,
+    verdict,
+)
+
+IDS = ["initial", "cm-1", "cm-2", "cm-3", "cm-4"]
+SESSIONS = ["s1", "s2"]
+TROUBLES = ["second-rtc", "basis-mismatch", "instrument-mismatch", "loop-diverging", "other"]
+COMMANDS = (
+    ev.SetMode,
+    ev.Refit,
+    ev.StartDither,
+    ev.StopDither,
+    ev.Approve,
+    ev.Reject,
+    ev.Publish,
+    ev.Rollback,
+)
+
+ids = st.sampled_from(IDS)
+statuses = st.builds(
+    lambda n, **changes: ev.StatusSeen(rtc=rtc(n, **changes)),
+    n=st.sampled_from([300, 400, 500, 594]),
+    session=st.sampled_from(SESSIONS),
+    loop=st.sampled_from(["open", "closed", "closed", "closed", "partial"]),
+    cm_id=st.one_of(st.none(), ids),
+    dither_id=st.sampled_from([None, "dither-1", "other"]),
+)
+windows = st.builds(
+    lambda x, session, dt, lag: ev.WindowFitted(
+        estimate=estimate(
+            moved(ALPHA, shift_x_subap=x),
+            session=session,
+            t_ns=START_NS + dt,
+            lag_frames=np.full(4, lag),
+        )
+    ),
+    x=st.sampled_from([0.0, 0.0, 0.001, 0.05, 0.3, 2.0]),
+    session=st.sampled_from(SESSIONS),
+    dt=st.integers(-(10**12), 10**12),
+    lag=st.sampled_from([0.0, 0.0, 0.0, 0.5]),
+)
+commands = st.one_of(
+    st.builds(ev.SetMode, mode=st.sampled_from(list(Mode))),
+    st.builds(ev.Refit, n_modes=st.sampled_from([None, 0, 1, 400, 594, 595])),
+    st.builds(
+        ev.StartDither,
+        modes=st.sampled_from([None, (501,), (501, 502), (700,)]),
+        frequency_hz=st.sampled_from([None, (250.0,), (1.0,)]),
+    ),
+    st.just(ev.StopDither()),
+    st.builds(ev.Approve, id=ids),
+    st.builds(ev.Reject, id=ids),
+    st.builds(ev.Publish, id=ids),
+    st.just(ev.Rollback()),
+)
+heard = st.one_of(
+    st.just(ev.Tick()),
+    statuses,
+    statuses,
+    windows,
+    windows,
+    st.builds(ev.SessionStarted, session=st.sampled_from(SESSIONS)),
+    st.just(ev.RtcVanished()),
+    st.builds(
+        ev.Trouble, name=st.sampled_from(TROUBLES), text=st.just("found"), over=st.booleans()
+    ),
+    st.builds(ev.Noted, name=st.just("n"), text=st.text(max_size=3)),
+    st.just(ev.WindowLost(refused=WindowRefused(reason="r", t_ns_utc=START_NS))),
+    st.builds(
+        lambda name, passed: ev.MarginJudged(id=name, verdict=verdict(accepted=passed)),
+        ids,
+        st.booleans(),
+    ),
+    st.builds(
+        ev.Acknowledged,
+        id=st.sampled_from([*IDS, "never-sent"]),
+        state=st.sampled_from([MatrixState.STAGED, MatrixState.APPLIED, MatrixState.REJECTED]),
+        reason=st.just("r"),
+        frame_seq=st.none() | st.integers(0, 10**6),
+    ),
+    st.builds(lambda name: ev.MatrixFetched(record=foreign(name)), ids),
+)
+answers = [st.just(how) for how in ("done",) * 9 + ("refused",) * 2 + ("failed",) * 2]
+# one_of counts the innermost alternatives: the answers need their own weight
+stories = st.lists(
+    st.tuples(
+        st.one_of(heard, commands, *answers),
+        st.sampled_from([0.0, 0.1, 1.0, 4.0, 31.0]),
+    ),
+    min_size=30,
+    max_size=60,
+)
+
+
+class Night:
+    """Plays a story; what the tracker asks for waits until the story answers it.
+
+    It begins where most nights are: a closed loop, its matrix known, α from two windows.
+    """
+
+    def __init__(self, mode=Mode.AUTO):
+        self.state = TrackerState(system="flao", mode=mode)
+        self.now_ns = START_NS
+        self.open = []
+        self.n_made = 0
+        self.last = ()
+        self.tell(ev.SessionStarted(session="s1"), 0.0)
+        self.tell(ev.StatusSeen(rtc=rtc()), 0.0)
+        self.tell("done", 0.1)
+        for _ in range(2):
+            self.tell(ev.WindowFitted(estimate=estimate(t_ns=self.now_ns)), 4.0)
+
+    def tell(self, event, after_s):
+        self.now_ns += round(after_s * 1e9)
+        if isinstance(event, str):
+            event = self.answer(event)
+            if event is None:
+                self.last = ()
+                return
+        try:
+            self.state, self.last = step(self.state, event, POLICY, self.now_ns)
+        except CommandError:
+            assert isinstance(event, COMMANDS)
+            self.last = ()
+        self.open += self.last
+
+    def answer(self, how):
+        """The world answers the oldest thing that was asked of it."""
+        if not self.open:
+            return None
+        effect = self.open.pop(0)
+        if how == "failed":
+            return ev.JobFailed(effect=effect, text="it could not be done")
+        match effect:
+            case ev.MakeMatrix() | ev.CopyMatrix() as asked:
+                self.n_made += 1
+                state = MatrixState.REFUSED if how == "refused" else MatrixState.PROPOSED
+                n = asked.n_modes if isinstance(asked, ev.MakeMatrix) else 400
+                made = record(f"made-{self.n_made}", state, n_modes=n, created_ns_utc=self.now_ns)
+                return ev.MatrixMade(record=made, wanted=isinstance(asked, ev.CopyMatrix))
+            case ev.AskDither(dither=dither):
+                accepted = how == "done"
+                return ev.DitherAnswered(
+                    id=dither.id, accepted=accepted, reason="r", start_seq=5 if accepted else None
+                )
+            case ev.FetchMatrix(id=matrix_id):
+                return ev.MatrixFetched(record=foreign(matrix_id))
+            case ev.JudgeMatrix(id=matrix_id):
+                return ev.MarginJudged(id=matrix_id, verdict=verdict(accepted=how == "done"))
+            case ev.SendMatrix(id=matrix_id):
+                done = MatrixState.APPLIED if how == "done" else MatrixState.REJECTED
+                return ev.Acknowledged(id=matrix_id, state=done, reason="r", frame_seq=1)
+            case _:
+                return None
+
+
+def check_shelf(state):
+    applied = [r.id for r in state.reconstructors if r.state is MatrixState.APPLIED]
+    assert len(applied) <= 1
+    assert len({r.id for r in state.reconstructors}) == len(state.reconstructors)
+    if state.in_use is not None:
+        assert state.reconstructor(state.in_use) is not None
+        if applied:
+            assert applied == [state.in_use]
+
+
+def check_bounds(state):
+    assert len(state.log) <= LOG_LENGTH
+    assert len(state.history) <= HISTORY_LENGTH
+    assert len(state.reconstructors) <= RECONSTRUCTORS_KEPT
+    assert len({alarm.name for alarm in state.alarms}) == len(state.alarms)
+
+
+LAWS = settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+)
+
+
+@LAWS
+@given(stories)
+def test_nothing_but_a_command_is_ever_refused_and_the_shelf_stays_in_order(story):
+    night = Night()
+    for event, after_s in story:
+        night.tell(event, after_s)
+        check_shelf(night.state)
+        check_bounds(night.state)
+
+
+@LAWS
+@given(stories)
+def test_what_the_gate_refused_is_never_sent(story):
+    night = Night()
+    for event, after_s in story:
+        refused = {r.id for r in night.state.reconstructors if r.state is MatrixState.REFUSED}
+        night.tell(event, after_s)
+        sent = {e.id for e in night.last if isinstance(e, ev.SendMatrix)}
+        assert not sent & refused
+        for matrix_id in sent:
+            assert night.state.reconstructor(matrix_id).gate.accepted
+
+
+@LAWS
+@given(stories)
+def test_nothing_is_sent_to_nobody_or_to_an_rtc_that_may_be_the_wrong_one(story):
+    night = Night()
+    for event, after_s in story:
+        night.tell(event, after_s)
+        if any(isinstance(effect, ev.SendMatrix) for effect in night.last):
+            assert night.state.rtc is not None
+            assert not {a.name for a in night.state.alarms} & set(TROUBLES[:3])
+
+
+@LAWS
+@given(stories)
+def test_in_hold_nothing_is_made_or_sent_by_itself(story):
+    night = Night(Mode.HOLD)
+    for event, after_s in story:
+        if isinstance(event, COMMANDS):
+            continue
+        night.tell(event, after_s)
+        assert not any(
+            isinstance(effect, ev.MakeMatrix | ev.CopyMatrix | ev.SendMatrix)
+            for effect in night.last
+        )
+
+
+@LAWS
+@given(stories)
+def test_in_propose_nothing_is_sent_but_what_an_operator_approved_or_asked_for_again(story):
+    night = Night(Mode.PROPOSE)
+    for event, after_s in story:
+        if isinstance(event, ev.SetMode):
+            continue
+        copied = any(isinstance(effect, ev.CopyMatrix) for effect in night.open[:1])
+        night.tell(event, after_s)
+        if any(isinstance(effect, ev.SendMatrix) for effect in night.last):
+            assert isinstance(event, ev.Approve) or copied
+
+
+@LAWS
+@given(stories, st.sampled_from([ev.RtcVanished(), ev.SessionStarted(session="s3")]))
+def test_the_registration_and_the_shelf_outlive_the_rtc(story, end):
+    night = Night()
+    for event, after_s in story:
+        night.tell(event, after_s)
+    before = night.state
+    after, _ = step(before, end, POLICY, night.now_ns)
+    assert [r.id for r in after.reconstructors] == [r.id for r in before.reconstructors]
+    assert after.history == before.history
+    assert (after.registration is None) is (before.registration is None)
+    if before.registration is not None:
+        assert after.registration.alpha == before.registration.alpha
+        np.testing.assert_array_equal(after.registration.covariance, before.registration.covariance)
+
+
+@LAWS
+@given(stories)
+def test_an_uncertainty_is_never_nothing_nor_negative(story):
+    night = Night()
+    for event, after_s in story:
+        night.tell(event, after_s)
+        known = night.state.registration
+        if known is not None:
+            assert np.all(np.linalg.eigvalsh(known.covariance) > 0.0)
+            assert np.all(known.sigma >= known.floor)
+
+
+@LAWS
+@given(stories)
+def test_only_one_reconstructor_is_under_way_at_a_time(story):
+    night = Night()
+    for event, after_s in story:
+        waiting = {
+            r.id
+            for r in night.state.reconstructors
+            if r.state in {MatrixState.PUBLISHED, MatrixState.STAGED}
+        }
+        night.tell(event, after_s)
+        if not isinstance(event, COMMANDS):
+            made = [effect for effect in night.last if isinstance(effect, ev.MakeMatrix)]
+            assert len(made) <= 1
+            still = {
+                m
+                for m in waiting
+                if night.state.reconstructor(m).state in {MatrixState.PUBLISHED, MatrixState.STAGED}
+            }
+            assert not (made and still)
+
+
+def test_a_long_night_fits_in_the_same_memory():
+    night = Night()
+    for number in range(3 * RECONSTRUCTORS_KEPT):
+        made = replace(record(f"cm-{number}", MatrixState.REFUSED), created_ns_utc=night.now_ns)
+        night.tell(ev.MatrixMade(record=made, wanted=False), 1.0)
+        night.tell(ev.Noted(name="n", text=str(number)), 1.0)
+    check_bounds(night.state)
+    check_shelf(night.state)
+    assert night.state.in_use == "initial"

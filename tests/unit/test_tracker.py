@@ -1,0 +1,155 @@
+"""Whole stories: what the service does, event after event, as a pure function of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.errors import CommandError
+from service.state import MatrixState, Mode, TrackerState
+from service.tracker import step
+from tests.unit.reactions.situations import (
+    ALPHA,
+    POLICY,
+    START_NS,
+    Story,
+    moved,
+    of_kind,
+    rtc,
+    verdict,
+)
+
+
+def apply_what_is_sent(story, effects, n_modes):
+    """Play the RTC's part of a publication: the mode number first, then the swap."""
+    (sent,) = of_kind(effects, ev.SendMatrix)
+    story.acknowledge(sent.id, MatrixState.STAGED)
+    story.acknowledge(sent.id)
+    story.tell(ev.StatusSeen(rtc=replace(rtc(n_modes), cm_id=sent.id)))
+
+
+def test_the_main_job_in_auto():
+    story = Story(Mode.AUTO)
+    story.meet()
+    dither = story.asked(ev.AskDither)[0].dither
+    story.tell(ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=10))
+    story.see(n_windows=2)
+    assert [effect.n_modes for effect in story.asked(ev.MakeMatrix)] == [400]
+    apply_what_is_sent(story, story.make("cm-1"), 400)
+    story.wait(6)
+    assert [effect.n_modes for effect in story.asked(ev.MakeMatrix)] == [400, 500]
+    apply_what_is_sent(story, story.make("cm-2", n_modes=500), 500)
+    assert story.state.in_use == "cm-2"
+    assert [record.state for record in story.state.reconstructors] == [
+        MatrixState.SUPERSEDED,
+        MatrixState.SUPERSEDED,
+        MatrixState.APPLIED,
+    ]
+    assert not story.alarms
+    assert story.state.registration.alpha == ALPHA
+
+
+def test_in_propose_nothing_is_sent_until_the_operator_has_spoken():
+    story = Story(Mode.PROPOSE).meet()
+    story.see(n_windows=10)
+    story.make("cm-1")
+    story.see(n_windows=30)
+    assert not story.asked(ev.SendMatrix)
+    apply_what_is_sent(story, story.tell(ev.Approve(id="cm-1")), 400)
+    assert story.state.in_use == "cm-1"
+    assert len(story.asked(ev.SendMatrix)) == 1
+
+
+def test_after_a_jump_the_loop_gets_a_reconstructor_for_the_new_place():
+    story = Story(Mode.AUTO).meet()
+    story.see(n_windows=2)
+    apply_what_is_sent(story, story.make("cm-1"), 400)
+    story.wait(10)
+    before = len(story.asked(ev.MakeMatrix))
+    there = moved(shift_x_subap=0.2)
+    story.make("cm-2", MatrixState.REFUSED)
+    story.see(there, n_windows=20)
+    last = story.asked(ev.MakeMatrix)[before:]
+    assert [effect.n_modes for effect in last] == [400]
+    assert "moved by +0.2" in last[0].why
+    assert story.state.registration.alpha.shift_x_subap == pytest.approx(0.32, abs=0.003)
+
+
+def test_a_restarted_rtc_gets_its_reconstructors_again():
+    story = Story(Mode.AUTO).meet()
+    story.see(n_windows=2)
+    apply_what_is_sent(story, story.make("cm-1"), 400)
+    story.tell(ev.RtcVanished(), after_s=10)
+    story.wait(20)
+    story.meet(session="s2")
+    assert story.state.in_use == "initial"
+    assert story.state.registration.alpha == ALPHA
+    dithers = story.asked(ev.AskDither)
+    assert dithers[-1].dither.id != dithers[0].dither.id
+    (made,) = of_kind(story.see(n_windows=2), ev.MakeMatrix)
+    assert made.n_modes == 400
+    (sent,) = of_kind(story.make("cm-2"), ev.SendMatrix)
+    assert sent.id == "cm-2"
+
+
+def test_a_restarted_service_knows_the_matrix_it_once_made():
+    shelf = Story(Mode.AUTO).meet().use("cm-1").state.reconstructors
+    again = Story(Mode.AUTO, state=TrackerState(system="flao", reconstructors=shelf[1:]))
+    again.tell(ev.SessionStarted(session="s1"))
+    again.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    assert again.state.in_use == "cm-1"
+    assert not again.asked(ev.FetchMatrix)
+
+
+def test_a_loop_that_diverges_stops_everything_and_is_named():
+    story = Story(Mode.AUTO).meet()
+    story.see()
+    story.tell(ev.Trouble(name="loop-diverging", text="open the loop"))
+    assert not story.see(n_windows=5)
+    assert not story.wait(60)
+    assert story.alarms >= {"loop-diverging"}
+    story.tell(ev.Trouble(name="loop-diverging", text="calm", over=True))
+    assert story.state.registration.n_windows == 1
+
+
+def test_a_step_leaves_the_state_it_was_given_as_it_was():
+    story = Story(Mode.AUTO).meet()
+    story.see(n_windows=2)
+    before = story.state
+    covariance = before.registration.covariance.copy()
+    n_logged, n_records = len(before.log), len(before.reconstructors)
+    after, _ = step(before, ev.RtcVanished(), POLICY, story.now_ns)
+    assert after.rtc is None
+    assert (len(before.log), len(before.reconstructors)) == (n_logged, n_records)
+    np.testing.assert_array_equal(before.registration.covariance, covariance)
+    assert before.rtc is not None
+
+
+def test_the_same_night_replays_to_the_same_decisions():
+    def night():
+        story = Story(Mode.AUTO).meet()
+        story.see(n_windows=3)
+        story.make("cm-1")
+        story.acknowledge("cm-1")
+        story.tell(ev.MarginJudged(id="cm-1", verdict=verdict()))
+        story.wait(30)
+        return story
+
+    one, other = night(), night()
+    assert [type(effect) for effect in one.effects] == [type(effect) for effect in other.effects]
+    assert one.state.log == other.state.log
+    assert one.state.alarms == other.state.alarms
+
+
+def test_a_command_that_is_refused_changes_nothing():
+    story = Story(Mode.PROPOSE)
+    with pytest.raises(CommandError):
+        story.tell(ev.Rollback())
+    assert story.state.log == ()
+    assert story.state.mode is Mode.PROPOSE
+
+
+def test_something_that_is_no_event_is_a_programming_error():
+    with pytest.raises(TypeError, match="does not know"):
+        step(TrackerState(system="flao"), object(), POLICY, START_NS)

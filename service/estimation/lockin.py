@@ -154,6 +154,8 @@ def _advance(
     if window is None:
         if seq < plan.first_seq:
             return lock_in, min(plan.first_seq - seq, block.n_frames - start), None
+        if block.dither_m is None:
+            return lock_in, block.n_frames - start, None
         window = _open(plan, block, start)
     reason = _why_broken(plan, window, block, start)
     if reason is not None:

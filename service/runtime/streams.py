@@ -82,7 +82,7 @@ def with_dither(streams: Streams, dither: DitherView | None, window_s: float) ->
 def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     """Return the state after one more block, and the windows that ended in it."""
     rtc = streams.rtc
-    if rtc is None or block.session != rtc.session:
+    if rtc is None or block.session != rtc.session or not _fits(rtc, block):
         return streams, []
     windows: list[Window] = []
     if streams.lock_in is not None:
@@ -93,6 +93,11 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     variance = streams.description.mode_variance_m2
     health = observe(streams.health, block, variance, rtc.n_controlled)
     return replace(streams, health=health), windows
+
+
+def _fits(rtc: RtcView, block: FrameBlock) -> bool:
+    """Return whether a block has as many slopes and modes as the RTC's status says."""
+    return (block.slopes.shape[1], block.commands_m.shape[1]) == (rtc.n_slopes, rtc.n_modes)
 
 
 def shape_mismatch(description: Description, rtc: RtcView) -> str | None:

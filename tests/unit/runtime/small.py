@@ -1,0 +1,22 @@
+"""An instrument small enough that a job takes milliseconds, and the loop that goes with it."""
+
+from pathlib import Path
+
+import numpy as np
+
+from service.config import load_instrument
+from service.control.gate import LoopSettings
+from service.worker import Compute
+
+INSTRUMENT = Path(__file__).with_name("small.toml")
+COMPUTE = Compute(threads=1, nice=0)
+N_CONTROLLED = 45
+SIGMA = np.array([0.003, 0.003, 1e-4, 3e-4])
+
+
+def small_instrument():
+    return load_instrument(str(INSTRUMENT))
+
+
+def loop_settings(n_modes=N_CONTROLLED, gain=0.4):
+    return LoopSettings(gains=np.full(n_modes, gain), leak=0.999, delay_frames=2.0)

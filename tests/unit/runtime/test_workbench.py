@@ -1,0 +1,147 @@
+"""The heavy work on a small instrument."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.estimation import passive
+from service.estimation.frames import FrameBlock
+from service.estimation.instrumental import Loop
+from service.estimation.lockin import LockIn, LockInPlan, Spectra, WindowRefused, accumulate
+from service.model.misregistration import Misregistration
+from service.worker import Workbench, run_job
+from tests.unit.runtime.small import (
+    COMPUTE,
+    N_CONTROLLED,
+    SIGMA,
+    loop_settings,
+    small_instrument,
+)
+
+ALPHA = Misregistration(
+    shift_x_subap=0.12, shift_y_subap=-0.08, rotation_rad=0.004, magnification=1.003
+)
+LINES = (210.0, 240.0, 280.0, 330.0)
+MODES = (63, 69, 75, 81)
+AMPLITUDE_M = 2e-8
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Workbench(small_instrument(), COMPUTE)
+
+
+@pytest.fixture(scope="module")
+def aligned(bench):
+    return bench.make(Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95).matrix
+
+
+def dithered_window(bench, alpha, *, gain=1.0, noise=1e-4, seed=1):
+    """An open loop with a dither and noise: slopes are D(α) times the commands."""
+    rng = np.random.default_rng(seed)
+    matrix = bench._model.interaction_matrix(alpha)
+    time = np.arange(1000) / 1000.0
+    dither = np.zeros((1000, matrix.shape[1]), np.float32)
+    for mode, line in zip(MODES, LINES, strict=True):
+        dither[:, mode] = AMPLITUDE_M * np.sqrt(2) * np.sin(2 * np.pi * line * time)
+    slopes = gain * dither @ matrix.T + noise * rng.standard_normal((1000, len(matrix)))
+    block = FrameBlock(
+        session="s1",
+        first_seq=0,
+        t0_ns_utc=0,
+        dt_ns=1_000_000,
+        slopes=slopes.astype(np.float32),
+        commands_m=dither,
+        dither_m=dither,
+        cm_id="initial",
+    )
+    plan = LockInPlan(
+        modes=MODES,
+        frequencies_hz=LINES,
+        amplitude_m=(AMPLITUDE_M,) * 4,
+        frame_rate_hz=1000.0,
+        n_frames=1000,
+        first_seq=0,
+    )
+    _, (window,) = accumulate(LockIn(plan=plan), block)
+    assert isinstance(window, Spectra)
+    return window
+
+
+def open_loop(reconstructor):
+    return Loop(
+        reconstructor=reconstructor,
+        gains=np.zeros(90),
+        leak=0.999,
+        delay_frames=2.0,
+        frame_rate_hz=1000.0,
+    )
+
+
+def test_it_describes_the_telemetry_it_expects(bench):
+    description = bench.describe()
+    assert (description.n_slopes, description.n_modes) == (224, 90)
+    assert description.mode_variance_m2.shape == (90,)
+    assert np.all(description.mode_variance_m2 > 0.0)
+
+
+@pytest.mark.parametrize("start", [Misregistration(), ALPHA, replace(ALPHA, shift_x_subap=0.4)])
+def test_a_window_gives_back_the_registration_it_was_made_with(bench, aligned, start):
+    window = dithered_window(bench, ALPHA, gain=0.6)
+    estimate = bench.fit(window, open_loop(aligned), start)
+    error = estimate.alpha.vector - ALPHA.vector
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    assert np.all(np.abs(error) < 4 * sigma + 2e-4)
+    np.testing.assert_allclose(np.abs(estimate.optical_gain), 0.6, atol=0.02)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.005, 0.011, 0.015, 0.019, 0.03])
+def test_no_distance_from_the_last_linearisation_keeps_a_fit_from_settling(bench, aligned, offset):
+    bench._near(ALPHA)
+    there = replace(ALPHA, shift_x_subap=ALPHA.shift_x_subap + offset)
+    estimate = bench.fit(dithered_window(bench, there, noise=1e-6), open_loop(aligned), ALPHA)
+    assert not isinstance(estimate, WindowRefused)
+    assert estimate.alpha.shift_x_subap == pytest.approx(there.shift_x_subap, abs=1e-3)
+
+
+def test_noise_without_a_signal_is_refused_in_words(bench, aligned):
+    window = dithered_window(bench, ALPHA, gain=0.0, noise=1.0)
+    outcome = bench.fit(window, open_loop(aligned), Misregistration())
+    if not isinstance(outcome, WindowRefused):
+        assert np.any(np.sqrt(np.diag(outcome.covariance)) > 0.1)
+    else:
+        assert "did not settle" in outcome.reason or "no fit" in outcome.reason
+
+
+def test_a_reconstructor_inverts_the_interaction_matrix_of_its_registration(bench):
+    made = bench.make(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95)
+    product = made.matrix @ bench._model.interaction_matrix(ALPHA)[:, :N_CONTROLLED]
+    np.testing.assert_allclose(product, np.eye(N_CONTROLLED), atol=1e-3)
+    assert made.gate.accepted
+    assert 1.0 < made.condition_number < 20.0
+
+
+def test_the_gate_sees_through_a_reconstructor_for_another_place(bench, aligned):
+    far = replace(ALPHA, rotation_rad=np.deg2rad(25.0))
+    verdict = bench.judge(aligned, far, np.diag(SIGMA**2), loop_settings(), 0.95)
+    assert not verdict.accepted
+    assert verdict.worst_pole_radius > 1.0
+    near = bench.judge(aligned, Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95)
+    assert near.accepted
+
+
+def test_a_gain_beyond_stability_is_refused_however_good_the_matrix(bench):
+    made = bench.make(ALPHA, np.diag(SIGMA**2), loop_settings(gain=1.2), 0.95)
+    assert not made.gate.accepted
+    assert "unstable" in made.gate.reason
+
+
+def test_the_watchdog_says_nothing_of_nothing(bench):
+    empty = passive.Passive(n_modes=N_CONTROLLED, memory_frames=1000.0)
+    assert bench.watch(empty, Misregistration()) is None
+
+
+def test_a_job_outside_a_worker_process_is_a_programming_error():
+    with pytest.raises(RuntimeError, match="not in a worker process"):
+        run_job(Workbench.describe)

@@ -9,7 +9,7 @@ from service.errors import CommandError, ModelError
 from service.events import Event
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send
-from service.reactions.policy import Policy, lock_in_plan, plan_dither
+from service.reactions.policy import Policy, lock_in_plan, moved, plan_dither
 from service.reactions.shelf import known_record, with_state
 from service.state import MatrixState, Mode, TrackerState
 
@@ -35,8 +35,7 @@ def on_command(  # noqa: C901 - one line for each command
         case ev.Refit(n_modes=n_modes):
             return _refit(state, n_modes, now_ns)
         case ev.Approve(id=matrix_id):
-            _proposed(state, matrix_id)
-            return send(state, matrix_id, now_ns)
+            return _approve(state, matrix_id, policy, now_ns)
         case ev.Reject(id=matrix_id, reason=reason):
             _proposed(state, matrix_id)
             state = with_state(state, matrix_id, MatrixState.DISCARDED, reason or "by the operator")
@@ -48,6 +47,14 @@ def on_command(  # noqa: C901 - one line for each command
             return _rollback(state, now_ns)
         case _:
             raise TypeError(f"an event the tracker does not know: {event!r}")
+
+
+def _approve(state: TrackerState, matrix_id: str, policy: Policy, now_ns: int) -> Step:
+    """Send a proposal, unless its verdict is of a registration that is no longer true."""
+    _proposed(state, matrix_id)
+    if moved(state, known_record(state, matrix_id), policy):
+        raise CommandError(f"{matrix_id} was judged for another α than the present one: refit")
+    return send(state, matrix_id, now_ns)
 
 
 def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, now_ns: int) -> Step:

@@ -20,7 +20,7 @@ from sim_rtc.atmosphere import fried_parameter_m, frozen_layers
 from sim_rtc.computer import Identity, LoopSettings, RealTimeComputer
 from sim_rtc.detector import Detector
 from sim_rtc.dither import DitherLimits
-from sim_rtc.feed import OpenLoopBlock, OpenLoopFeed
+from sim_rtc.feed import Block, Feed, OpenLoopFeed
 from sim_rtc.motion import MovingOptics, background_executor
 from sim_rtc.options import Options
 from sim_rtc.plant import LinearPlant
@@ -35,7 +35,7 @@ STROKE_M = 10e-6
 class Telescope:
     """Everything but the computer: what feeds it and what is known of it beforehand."""
 
-    feed: OpenLoopFeed
+    feed: Feed
     optics: MovingOptics
     detector: Detector
     identity: Identity
@@ -46,7 +46,7 @@ class Telescope:
     weights: NDArray[np.float64]
     """``(n_points,)`` share of the pupil's area at each point of the plant."""
 
-    def computer(self, blocks: Iterator[OpenLoopBlock]) -> RealTimeComputer:
+    def computer(self, blocks: Iterator[Block]) -> RealTimeComputer:
         """Return a computer that runs on these blocks of the feed."""
         return RealTimeComputer(
             blocks,

@@ -26,9 +26,10 @@ from service.wire import (
     Reply,
 )
 from sim_rtc.dither import Dither, DitherLimits, refusal
-from sim_rtc.feed import BATCH_FRAMES, OpenLoopBlock
-from sim_rtc.loop import LoopTerms, ModalLoop
-from sim_rtc.plant import Optics
+from sim_rtc.feed import BATCH_FRAMES, Block
+from sim_rtc.loop import ControlTerms, ModalLoop
+from sim_rtc.mirror import MirrorDrive
+from sim_rtc.plant import TelescopeOptics
 from sim_rtc.reconstructors import Reconstructor, Terms
 
 Array32 = NDArray[np.float32]
@@ -90,7 +91,7 @@ class Batch:
 
     closed: bool
     n_controlled: int
-    optics: Optics
+    optics: TelescopeOptics
     """The truth: never on the wire."""
 
     phase_m: Array32
@@ -125,22 +126,26 @@ class RealTimeComputer:
 
     def __init__(
         self,
-        blocks: Iterator[OpenLoopBlock],
+        blocks: Iterator[Block],
         *,
         identity: Identity,
         settings: LoopSettings,
         reconstructor: Reconstructor,
-        optics: Optics,
+        optics: TelescopeOptics,
         stroke_m: float,
         limits: DitherLimits,
+        drive: MirrorDrive | None = None,
     ) -> None:
         self._blocks = blocks
         self.identity = identity
         self._settings = settings
         self._limits = limits
-        self._n_slopes, self._n_modes = optics.slopes_per_command.shape
+        self._n_slopes, self._n_modes = optics.n_slopes, optics.opd_per_command.shape[1]
         self._loop = ModalLoop(
-            n_modes=self._n_modes, delay_frames=settings.delay_frames, stroke_m=stroke_m
+            n_modes=self._n_modes,
+            delay_frames=settings.delay_frames,
+            stroke_m=stroke_m,
+            drive=drive,
         )
         self._lock = threading.Lock()
         self._session = new_session()
@@ -149,8 +154,8 @@ class RealTimeComputer:
         self._staged: deque[Reconstructor] = deque()
         self._swaps: deque[tuple[str, int]] = deque(maxlen=16)
         self._dither: Dither | None = None
-        self._terms: LoopTerms | None = None
-        self._block: OpenLoopBlock | None = None
+        self._terms: ControlTerms | None = None
+        self._block: Block | None = None
         self._row = 0
         self._optics = optics
 
@@ -163,22 +168,21 @@ class RealTimeComputer:
         block, row = self._next_rows()
         with self._lock:
             self._swap()
-            self._optics = block.optics
             terms = self._current_terms(block.optics)
             dither_m = self._next_dither()
-            result = self._loop.run(block.slopes[row : row + BATCH_FRAMES], terms, dither_m)
+            result = block.run(row, self._loop, terms, dither_m)
             batch = Batch(
                 session=self._session,
                 seq0=self._seq,
                 slopes=result.slopes,
                 commands_m=result.commands_m,
-                dither_m=dither_m,
+                dither_m=result.dither_m,
                 cm_id=self._active.manifest.id,
                 n_clipped=result.n_clipped,
                 closed=self._settings.closed,
                 n_controlled=len(terms.gains),
                 optics=block.optics,
-                phase_m=block.phases_m[row // BATCH_FRAMES],
+                phase_m=block.phase_at(row),
             )
             self._seq += BATCH_FRAMES
             return batch
@@ -243,8 +247,8 @@ class RealTimeComputer:
                 reason = f"unsupported: this RTC does not measure matrices ({command.pattern})"
                 return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
 
-    def _next_rows(self) -> tuple[OpenLoopBlock, int]:
-        if self._block is None or self._row >= len(self._block.slopes):
+    def _next_rows(self) -> tuple[Block, int]:
+        if self._block is None or self._row >= self._block.n_frames:
             self._block, self._row = next(self._blocks), 0
         row = self._row
         self._row += BATCH_FRAMES
@@ -260,16 +264,12 @@ class RealTimeComputer:
         self._terms = None
         self._swaps.append((self._active.manifest.id, self._seq))
 
-    def _current_terms(self, optics: Optics) -> LoopTerms:
+    def _current_terms(self, optics: TelescopeOptics) -> ControlTerms:
         matrix = self._active.matrix
-        if self._terms is None or self._terms.slopes_per_command is not optics.slopes_per_command:
-            self._terms = LoopTerms(
-                reconstructor=matrix,
-                slopes_per_command=optics.slopes_per_command,
-                modal_response=matrix @ optics.slopes_per_command,
-                gains=np.array(self._effective_gains()[: len(matrix)], dtype=np.float32),
-                leak=self._settings.leak,
-            )
+        if self._terms is None or self._optics is not optics:
+            gains = np.array(self._effective_gains()[: len(matrix)], dtype=np.float32)
+            self._terms = optics.terms(matrix, gains, self._settings.leak)
+            self._optics = optics
         return self._terms
 
     def _next_dither(self) -> Array32 | None:

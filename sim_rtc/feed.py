@@ -10,14 +10,16 @@ import queue
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_rtc.atmosphere import FrozenLayer, cubic_weights
 from sim_rtc.detector import Detector
+from sim_rtc.loop import ControlTerms, LoopBlock, LoopTerms, ModalLoop
 from sim_rtc.motion import MovingOptics
-from sim_rtc.plant import Optics
+from sim_rtc.plant import Optics, TelescopeOptics
 
 Array32 = NDArray[np.float32]
 
@@ -44,6 +46,54 @@ class OpenLoopBlock:
 
     phases_m: Array32
     """``(n_batches, n_points)`` turbulence OPD at the first frame of each batch."""
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of the block."""
+        return len(self.slopes)
+
+    def phase_at(self, row: int) -> Array32:
+        """Return the turbulence OPD ``(n_points,)`` of a batch's first frame."""
+        return np.asarray(self.phases_m[row // BATCH_FRAMES])
+
+    def run(
+        self, row: int, loop: ModalLoop, terms: ControlTerms, dither_m: Array32 | None
+    ) -> LoopBlock:
+        """Run the batch that begins at ``row`` through the loop."""
+        if not isinstance(terms, LoopTerms):
+            raise TypeError(f"loop: found {type(terms).__name__}; a linear plant needs LoopTerms")
+        return loop.run(self.slopes[row : row + BATCH_FRAMES], terms, dither_m)
+
+
+class Block(Protocol):
+    """Consecutive frames through one set of optics, the mirror still to be added."""
+
+    @property
+    def first_frame(self) -> int:
+        """Number of row 0 since the start of the run."""
+
+    @property
+    def optics(self) -> TelescopeOptics:
+        """Valid for all of it."""
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of the block, a multiple of the batch."""
+
+    def phase_at(self, row: int) -> Array32:
+        """Return the turbulence OPD ``(n_points,)`` of a batch's first frame."""
+
+    def run(
+        self, row: int, loop: ModalLoop, terms: ControlTerms, dither_m: Array32 | None
+    ) -> LoopBlock:
+        """Run the batch that begins at ``row`` through the loop."""
+
+
+class Feed(Protocol):
+    """What makes blocks for ever."""
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the blocks; one ends where a jump falls."""
 
 
 class LayerHistory:
@@ -102,7 +152,7 @@ class OpenLoopFeed:
 
     def blocks(self) -> Iterator[OpenLoopBlock]:
         """Yield the blocks; one ends where a jump falls."""
-        first = self._optics.at(0.0)
+        first = _linear(self._optics.at(0.0))
         n_slopes, n_points = first.slopes_per_phase.shape
         histories = [LayerHistory(layer, n_points, n_slopes) for layer in self._layers]
         frame = 0
@@ -112,7 +162,7 @@ class OpenLoopFeed:
                 + [jump - frame for jump in self._jump_frames if jump > frame]
             )
             time_s = (frame + np.arange(n_frames)) / self._frame_rate_hz
-            optics = self._optics.at(float(time_s[0]))
+            optics = _linear(self._optics.at(float(time_s[0])))
             parts = [history.frames(time_s, optics) for history in histories]
             slopes = self._detector.noise(n_frames, self._rng)
             for part, _ in parts:
@@ -127,9 +177,9 @@ class OpenLoopFeed:
 class Ahead:
     """Blocks computed ahead in a thread of their own; two at most, then the thread waits."""
 
-    def __init__(self, blocks: Iterator[OpenLoopBlock]) -> None:
+    def __init__(self, blocks: Iterator[Block]) -> None:
         self._blocks = blocks
-        self._queue: queue.Queue[OpenLoopBlock | BaseException] = queue.Queue(_AHEAD_BLOCKS)
+        self._queue: queue.Queue[Block | BaseException] = queue.Queue(_AHEAD_BLOCKS)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._work, name="open-loop", daemon=True)
 
@@ -141,7 +191,7 @@ class Ahead:
         self._stopped.set()
         self._thread.join()
 
-    def __iter__(self) -> Iterator[OpenLoopBlock]:
+    def __iter__(self) -> Iterator[Block]:
         """Yield the blocks until the ``with`` block ends; re-raise what stopped the thread."""
         while not self._stopped.is_set():
             try:
@@ -160,7 +210,7 @@ class Ahead:
         except Exception as error:  # noqa: BLE001 - handed to the loop, which re-raises it
             self._put(error)
 
-    def _put(self, item: OpenLoopBlock | BaseException) -> bool:
+    def _put(self, item: Block | BaseException) -> bool:
         while not self._stopped.is_set():
             try:
                 self._queue.put(item, timeout=_POLL_S)
@@ -172,3 +222,9 @@ class Ahead:
 
 def _batch_boundary(time_s: float, frame_rate_hz: float) -> int:
     return int(np.ceil(time_s * frame_rate_hz / BATCH_FRAMES)) * BATCH_FRAMES
+
+
+def _linear(optics: TelescopeOptics) -> Optics:
+    if not isinstance(optics, Optics):
+        raise TypeError(f"feed: found {type(optics).__name__}; slopes need a linear plant's Optics")
+    return optics

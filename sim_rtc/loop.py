@@ -1,38 +1,50 @@
 """The modal integrator, in blocks of frames.
 
 ``c[k+d] = leak c[k+d-1] - gain R s[k]``, the dither added to what is applied and never fed back.
-The plant is linear, so ``R s = R s_open + (R D) c``: the first term is one product for the whole
-block, the second one small product per frame, and the slopes themselves follow at the end.
+A linear plant gives ``R s = R s_open + (R D) c``: the first term is one product for the whole
+block, the second one small product per frame, and the slopes themselves follow at the end. Any
+other plant is asked for its slopes frame by frame.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_rtc.mirror import MirrorDrive
+
 Array32 = NDArray[np.float32]
+
+Sense = Callable[[int, Array32], Array32]
+"""Slopes ``(n_slopes,)`` of frame k of the block, with this command on the mirror."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopTerms:
-    """What stays constant during a block."""
+class ControlTerms:
+    """What the integrator needs, constant during a block."""
 
     reconstructor: Array32
     """R ``(n_controlled, n_slopes)``, metres per slope."""
-
-    slopes_per_command: Array32
-    """D ``(n_slopes, n_modes)`` of the plant, slope per metre."""
-
-    modal_response: Array32
-    """R D ``(n_controlled, n_modes)``."""
 
     gains: Array32
     """``(n_controlled,)``; all 0 leaves the integrator to its leak."""
 
     leak: float
     """Per frame; 1 forgets nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopTerms(ControlTerms):
+    """The same with a linear plant in it."""
+
+    slopes_per_command: Array32
+    """D ``(n_slopes, n_modes)`` of the plant, slope per metre."""
+
+    modal_response: Array32
+    """R D ``(n_controlled, n_modes)``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,15 +57,27 @@ class LoopBlock:
     commands_m: Array32
     """``(n_frames, n_modes)`` on the mirror during each exposure, dither included, clipped."""
 
+    dither_m: Array32 | None
+    """``(n_frames, n_modes)`` its dither part: what was asked for, as the mirror follows it."""
+
     n_clipped: int
-    """Commands that met the stroke limit."""
+    """Commands that met a limit of the mirror."""
 
 
 class ModalLoop:
     """The integrator's memory: the commands already decided for the frames to come."""
 
-    def __init__(self, *, n_modes: int, delay_frames: int, stroke_m: float) -> None:
+    def __init__(
+        self,
+        *,
+        n_modes: int,
+        delay_frames: int,
+        stroke_m: float,
+        drive: MirrorDrive | None = None,
+    ) -> None:
+        """Take a drive for a mirror with limits or a lag; without one it obeys at once."""
         self._stroke_m = np.float32(stroke_m)
+        self._drive = drive
         self._decided = np.zeros((delay_frames, n_modes), dtype=np.float32)
 
     def reset(self) -> None:
@@ -70,29 +94,66 @@ class ModalLoop:
         A command beyond the stroke limit is clipped, in the integrator too: a loop that diverges
         stays finite and recovers.
         """
-        n_frames, delay = len(open_slopes), len(self._decided)
-        integrator = np.empty((n_frames + delay, self._decided.shape[1]), dtype=np.float32)
+        open_modes = open_slopes @ terms.reconstructor.T
+
+        def estimate(k: int, command: Array32) -> Array32:
+            modes = terms.modal_response @ command
+            modes += open_modes[k]
+            return modes
+
+        applied, dither_m, n_clipped = self._integrate(len(open_slopes), estimate, terms, dither_m)
+        return LoopBlock(
+            slopes=open_slopes + applied @ terms.slopes_per_command.T,
+            commands_m=applied,
+            dither_m=dither_m,
+            n_clipped=n_clipped,
+        )
+
+    def run_frames(
+        self, n_frames: int, sense: Sense, terms: ControlTerms, dither_m: Array32 | None
+    ) -> LoopBlock:
+        """Run frames one by one, each with the slopes that ``sense`` says it makes."""
+        slopes = np.empty((n_frames, terms.reconstructor.shape[1]), dtype=np.float32)
+
+        def estimate(k: int, command: Array32) -> Array32:
+            slopes[k] = sense(k, command)
+            return np.asarray(terms.reconstructor @ slopes[k])
+
+        applied, dither_m, n_clipped = self._integrate(n_frames, estimate, terms, dither_m)
+        return LoopBlock(slopes=slopes, commands_m=applied, dither_m=dither_m, n_clipped=n_clipped)
+
+    def _integrate(
+        self,
+        n_frames: int,
+        estimate: Callable[[int, Array32], Array32],
+        terms: ControlTerms,
+        dither_m: Array32 | None,
+    ) -> tuple[Array32, Array32 | None, int]:
+        """Return the commands on the mirror, their dither part, and how many were clipped.
+
+        ``estimate`` gives the modes ``(n_controlled,)`` that frame k shows.
+        """
+        delay, n_modes = self._decided.shape
+        integrator = np.empty((n_frames + delay, n_modes), dtype=np.float32)
         integrator[:delay] = self._decided
-        applied = np.zeros((n_frames, self._decided.shape[1]), dtype=np.float32)
+        applied = np.zeros((n_frames, n_modes), dtype=np.float32)
         if dither_m is not None:
             applied += dither_m
-        open_modes = open_slopes @ terms.reconstructor.T
+            dither_m = dither_m.copy()
         leak, stroke = np.float32(terms.leak), self._stroke_m
         n_controlled = len(terms.gains)
+        n_limited = 0
         for k in range(n_frames):
             command = applied[k]
             command += integrator[k]
             np.minimum(np.maximum(command, -stroke, out=command), stroke, out=command)
-            correction = terms.modal_response @ command
-            correction += open_modes[k]
+            if self._drive is not None:
+                n_limited += self._drive.follow(command, None if dither_m is None else dither_m[k])
+            correction = estimate(k, command)
             correction *= terms.gains
             decided = integrator[k + delay]
             np.multiply(integrator[k + delay - 1], leak, out=decided)
             decided[:n_controlled] -= correction
             np.minimum(np.maximum(decided, -stroke, out=decided), stroke, out=decided)
         self._decided = integrator[n_frames:].copy()
-        return LoopBlock(
-            slopes=open_slopes + applied @ terms.slopes_per_command.T,
-            commands_m=applied,
-            n_clipped=int(np.count_nonzero(np.abs(applied) >= stroke)),
-        )
+        return applied, dither_m, n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))

@@ -13,7 +13,7 @@ import threading
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-from sim_rtc.plant import Optics, Plant
+from sim_rtc.plant import Plant, TelescopeOptics
 from sim_rtc.schedule import Schedule
 
 _SEGMENT_S = 20.0
@@ -29,8 +29,8 @@ class _Segment:
 
     start_s: float
     stop_s: float
-    first: Optics
-    last: Optics
+    first: TelescopeOptics
+    last: TelescopeOptics
 
 
 class MovingOptics:
@@ -42,14 +42,14 @@ class MovingOptics:
         self._executor = executor
         self._segment: _Segment | None = None
         self._next: Future[_Segment] | None = None
-        self._current: tuple[int, Optics] | None = None
+        self._current: tuple[int, TelescopeOptics] | None = None
 
-    def start(self) -> Optics:
+    def start(self) -> TelescopeOptics:
         """Compute the optics at time 0; takes seconds."""
         self._adopt(self._compute(0.0, None))
         return self.at(0.0)
 
-    def at(self, time_s: float) -> Optics:
+    def at(self, time_s: float) -> TelescopeOptics:
         """Return the optics at this time: the same object for as long as nothing has moved."""
         if self._next is not None and self._next.done() and time_s >= self._next.result().start_s:
             self._adopt(self._next.result())
@@ -74,7 +74,7 @@ class MovingOptics:
     def _jumps_at(self, time_s: float) -> bool:
         return any(jump.time_s == time_s for jump in self._schedule.jumps)
 
-    def _compute(self, start_s: float, first: Optics | None) -> _Segment:
+    def _compute(self, start_s: float, first: TelescopeOptics | None) -> _Segment:
         schedule = self._schedule
         stop_s = schedule.next_jump_after(start_s)
         if first is None:

@@ -8,13 +8,13 @@ not where the drawing puts them, and an optical gain for every mode.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from service.model.instrument import Instrument, Mirror, Stop
+from service.model.instrument import Instrument, Stop
 from service.model.interaction import (
     instrument_pupil,
     normalised_jacobian,
@@ -26,6 +26,8 @@ from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
 from service.model.pyramid import PyramidOptics
+from sim_rtc.loop import ControlTerms, LoopTerms
+from sim_rtc.mirror import misplaced
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -53,9 +55,35 @@ class Imperfections:
     """Optical gain of the last mode, 0..1."""
 
 
+class TelescopeOptics(Protocol):
+    """What the telescope does to a wavefront at one registration, whatever the kind of plant."""
+
+    @property
+    def alpha(self) -> Misregistration:
+        """Where the mirror truly lies on the sensor."""
+
+    @property
+    def opd_per_command(self) -> Array32:
+        """``(n_points, n_modes)`` OPD at the plant's pupil points per metre of command."""
+
+    @property
+    def images(self) -> Array:
+        """``(2, n, 2, n)`` share of the detected light: side, row along y, side, column along x."""
+
+    @property
+    def n_slopes(self) -> int:
+        """Slopes of a frame."""
+
+    def terms(self, reconstructor: Array32, gains: Array32, leak: float) -> ControlTerms:
+        """Return what the integrator needs to run on these optics."""
+
+    def towards(self, other: Self, share: float) -> Self:
+        """Return the optics part of the way to ``other``, for small steps of a drift."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Optics:
-    """What the telescope does to a wavefront at one registration."""
+    """The optics of a linear plant."""
 
     alpha: Misregistration
     """Where the mirror truly lies on the sensor."""
@@ -71,6 +99,21 @@ class Optics:
 
     images: Array
     """``(2, n, 2, n)`` share of the detected light: side, row along y, side, column along x."""
+
+    @property
+    def n_slopes(self) -> int:
+        """Slopes of a frame."""
+        return len(self.slopes_per_command)
+
+    def terms(self, reconstructor: Array32, gains: Array32, leak: float) -> LoopTerms:
+        """Return the terms of a loop around the interaction matrix."""
+        return LoopTerms(
+            reconstructor=reconstructor,
+            slopes_per_command=self.slopes_per_command,
+            modal_response=reconstructor @ self.slopes_per_command,
+            gains=gains,
+            leak=leak,
+        )
 
     def towards(self, other: Optics, share: float) -> Optics:
         """Return the optics part of the way to ``other``: linear, for small steps of a drift."""
@@ -93,7 +136,7 @@ class Optics:
 
 
 class Plant(Protocol):
-    """A telescope whose slopes are linear in the phase at any one registration."""
+    """A telescope, at any registration."""
 
     @property
     def points_m(self) -> Array:
@@ -111,7 +154,7 @@ class Plant(Protocol):
     def valid(self) -> NDArray[np.bool_]:
         """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
 
-    def optics(self, alpha: Misregistration) -> Optics:
+    def optics(self, alpha: Misregistration) -> TelescopeOptics:
         """Return the optics at ``alpha``; takes seconds."""
 
 
@@ -132,11 +175,11 @@ class LinearPlant:
         uneven_rng, position_rng = rng.spawn(2)
         self._pyramid = PyramidOptics(
             wfs=instrument.wfs,
-            pupil=_uneven(pupil, imperfections.unevenness, uneven_rng),
+            pupil=uneven(pupil, imperfections.unevenness, uneven_rng),
             n_nodes=_NODES,
             n_modulation=_MODULATION_POINTS,
         )
-        mirror = _misplaced(instrument.mirror, imperfections.position_error, position_rng)
+        mirror = misplaced(instrument.mirror, imperfections.position_error, position_rng)
         self._surface = mirror_surface(mirror, instrument.subaperture_m)
         self._coefficients = self._surface.coefficients(basis.mode_to_actuator)
         self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)
@@ -197,7 +240,7 @@ def optical_gain(n_modes: int, imperfections: Imperfections) -> Array32:
     return (low + (high - low) * progress).astype(np.float32)
 
 
-def _uneven(pupil: PupilGrid, unevenness: float, rng: np.random.Generator) -> PupilGrid:
+def uneven(pupil: PupilGrid, unevenness: float, rng: np.random.Generator) -> PupilGrid:
     """Return the pupil lit by a random smooth map: polynomials up to third order, mean kept."""
     u = pupil.coordinates / np.abs(pupil.coordinates).max()
     x, y = u[None, :], u[:, None]
@@ -209,17 +252,3 @@ def _uneven(pupil: PupilGrid, unevenness: float, rng: np.random.Generator) -> Pu
     departure *= unevenness / np.abs(departure[pupil.lit]).max()
     flux = np.maximum(1.0 + np.where(pupil.lit, departure, 0.0), 0.0)
     return replace(pupil, amplitude=pupil.amplitude * np.sqrt(flux))
-
-
-def _misplaced(mirror: Mirror, position_error: float, rng: np.random.Generator) -> Mirror:
-    """Return the mirror with random position errors that contain no shift, rotation or scale.
-
-    A common movement of all actuators would be a registration: the true α would be another one.
-    """
-    nominal = mirror.positions_m @ np.array([1.0, 1.0j])
-    error = rng.normal(0.0, position_error * mirror.pitch_m, (len(nominal), 2)) @ [1.0, 1.0j]
-    similarity = np.column_stack([np.ones_like(nominal), nominal])
-    coefficients, *_ = np.linalg.lstsq(similarity, error, rcond=None)
-    error -= similarity @ coefficients
-    moved = nominal + error
-    return replace(mirror, positions_m=np.column_stack([moved.real, moved.imag]))

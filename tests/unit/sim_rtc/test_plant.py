@@ -6,7 +6,8 @@ import pytest
 from service.model.instrument import Stop
 from service.model.interaction import InteractionModel, instrument_pupil
 from service.model.misregistration import Misregistration
-from sim_rtc.plant import Imperfections, LinearPlant, _misplaced, _uneven, optical_gain
+from sim_rtc.mirror import misplaced
+from sim_rtc.plant import Imperfections, LinearPlant, optical_gain, uneven
 
 ALIGNED = Misregistration()
 TURNED = Misregistration(
@@ -83,7 +84,7 @@ def test_the_telescope_as_stop_moves_the_mirror_instead_of_the_images(
 
 def test_position_errors_contain_no_registration(small_instrument):
     mirror = small_instrument.mirror
-    moved = _misplaced(mirror, 0.02, np.random.default_rng(2)).positions_m
+    moved = misplaced(mirror, 0.02, np.random.default_rng(2)).positions_m
     error = moved - mirror.positions_m
     x, y = mirror.positions_m.T
     assert np.abs(error.mean(axis=0)).max() < 1e-12
@@ -95,11 +96,11 @@ def test_position_errors_contain_no_registration(small_instrument):
 
 def test_the_illumination_is_uneven_by_ten_per_cent(small_instrument):
     pupil = instrument_pupil(small_instrument, 4)
-    uneven = _uneven(pupil, 0.10, np.random.default_rng(3))
-    flux = (uneven.amplitude[pupil.lit] / pupil.amplitude[pupil.lit]) ** 2
+    lit = uneven(pupil, 0.10, np.random.default_rng(3))
+    flux = (lit.amplitude[pupil.lit] / pupil.amplitude[pupil.lit]) ** 2
     assert np.abs(flux - 1).max() == pytest.approx(0.10)
     assert flux @ pupil.weights == pytest.approx(1.0)
-    np.testing.assert_array_equal(uneven.lit, pupil.lit)
+    np.testing.assert_array_equal(lit.lit, pupil.lit)
 
 
 def test_a_small_drift_is_linear_between_exact_optics(plant):

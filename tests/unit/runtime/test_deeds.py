@@ -1,0 +1,312 @@
+"""What the tracker decides, done: a real worker and archive, an RTC written by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.archive import Archive
+from service.errors import CommandError, LinkError, UnknownIdError
+from service.model.misregistration import Misregistration
+from service.runtime.crew import Crew
+from service.runtime.deeds import Deeds, Publishing
+from service.runtime.translate import manifest_of
+from service.state import MatrixState, Registration, TrackerState
+from service.wire import DitherAction, LoopRequest, Reply, checksum, layout_of
+from service.worker import start_worker
+from tests.unit.reactions.situations import START_NS, foreign, record, rtc
+from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
+
+pytestmark = pytest.mark.timeout(60)
+
+N_SLOPES, N_MODES = 224, 90
+ALPHA = Misregistration(shift_x_subap=0.1, rotation_rad=0.003)
+RTC = rtc(
+    N_CONTROLLED,
+    n_modes=N_MODES,
+    n_slopes=N_SLOPES,
+    gains=(0.4,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED),
+)
+BROUGHT = np.full((N_CONTROLLED, N_SLOPES), 1e-6, np.float32)
+
+
+class HandmadeBridge:
+    """Keeps what it is told to send and answers as a test wants."""
+
+    def __init__(self):
+        self.published = []
+        self.commands = []
+        self.offered = []
+        self.current = None
+        self.refusal = None
+        self.applied = (manifest_of(foreign(), layout_of(BROUGHT, 4096), RTC, "small"), BROUGHT)
+
+    async def publish(self, manifest, matrix):
+        self.published.append((manifest, matrix))
+
+    async def command(self, command):
+        self.commands.append(command)
+        accepted = self.refusal is None
+        return Reply(id=command.id, accepted=accepted, reason=self.refusal or "", start_seq=77)
+
+    async def fetch_applied(self):
+        return self.applied
+
+    def offer(self, manifest, matrix):
+        self.offered.append((manifest, matrix))
+
+    def set_current(self, matrix_id):
+        self.current = matrix_id
+
+
+class Clock:
+    def __init__(self):
+        self.now_ns = START_NS
+
+    def __call__(self):
+        self.now_ns += 1_000_000
+        return self.now_ns
+
+
+@pytest.fixture(scope="module")
+def crew():
+    executor = start_worker(small_instrument(), COMPUTE)
+    crew = Crew(lambda: executor)
+    yield crew
+    crew.dismiss()
+    executor.shutdown(wait=True)
+
+
+@pytest.fixture
+def archive(tmp_path):
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        yield archive
+
+
+@pytest.fixture
+def bridge():
+    return HandmadeBridge()
+
+
+@pytest.fixture
+def deeds(bridge, crew, archive):
+    return Deeds(
+        bridge=bridge,
+        crew=crew,
+        archive=archive,
+        instrument=small_instrument(),
+        publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
+        clock_ns=Clock(),
+    )
+
+
+REGISTRATION = Registration(
+    alpha=ALPHA,
+    covariance=np.diag(SIGMA**2),
+    floor=SIGMA,
+    t_ns_utc=START_NS,
+    arrived_ns_utc=START_NS,
+    n_windows=2,
+    optical_gain=0.6,
+)
+STATE = TrackerState(
+    system="small",
+    rtc=RTC,
+    registration=REGISTRATION,
+    reconstructors=(foreign(),),
+    in_use="initial",
+)
+
+
+async def made(deeds, n_modes=N_CONTROLLED, state=STATE):
+    """Make a reconstructor; return its record and the state that knows it."""
+    event = await deeds.carry_out(ev.MakeMatrix(n_modes=n_modes, why="a test"), state)
+    shelf = (*state.reconstructors, event.record)
+    return event.record, replace(state, reconstructors=shelf)
+
+
+async def test_a_made_reconstructor_is_archived_before_anybody_hears_of_it(deeds, archive, bridge):
+    found, _ = await made(deeds)
+    matrix = archive.matrix(found.id)
+    assert matrix.shape == (N_CONTROLLED, N_SLOPES)
+    assert (found.state, found.sha256) == (MatrixState.PROPOSED, checksum(matrix))
+    assert (found.alpha, found.parent, found.reason) == (ALPHA, "initial", "a test")
+    np.testing.assert_allclose(found.sigma, SIGMA * np.sqrt(2))
+    assert found.gate.accepted
+    assert [kept.id for kept in archive.records()] == [found.id]
+    assert not bridge.published
+
+
+async def test_every_reconstructor_has_an_id_of_its_own(deeds):
+    first, _ = await made(deeds)
+    second, _ = await made(deeds)
+    assert first.id != second.id
+
+
+async def test_a_loop_that_no_matrix_can_hold_makes_a_refused_record(deeds):
+    wild = replace(RTC, gains=(1.9,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED))
+    found, _ = await made(deeds, state=replace(STATE, rtc=wild))
+    assert found.state is MatrixState.REFUSED
+    assert "unstable" in found.gate.reason
+
+
+async def test_more_modes_are_judged_with_the_gains_they_would_get(deeds):
+    found, _ = await made(deeds, 60)
+    assert found.n_modes == 60
+    assert found.gate.accepted
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "match"),
+    [
+        ({"rtc": None}, LinkError, "no RTC is there"),
+        ({"registration": None}, CommandError, "α is not known"),
+    ],
+)
+async def test_what_it_takes_to_make_one_must_be_there(deeds, changes, error, match):
+    with pytest.raises(error, match=match):
+        await made(deeds, state=replace(STATE, **changes))
+
+
+async def test_sending_the_same_number_of_modes_needs_no_command(deeds, bridge):
+    found, state = await made(deeds)
+    effect = ev.SendMatrix(id=found.id, n_modes=N_CONTROLLED, gains=None)
+    assert await deeds.carry_out(effect, state) is None
+    ((manifest, matrix),) = bridge.published
+    assert (manifest.id, manifest.layout.shape) == (found.id, (N_CONTROLLED, N_SLOPES))
+    assert manifest.layout.sha256 == checksum(matrix) == found.sha256
+    assert not bridge.commands
+
+
+async def test_sending_more_modes_tells_the_rtc_first(deeds, bridge):
+    found, state = await made(deeds, 60)
+    gains = (0.4,) * 60 + (0.0,) * 30
+    await deeds.carry_out(ev.SendMatrix(id=found.id, n_modes=60, gains=gains), state)
+    (command,) = bridge.commands
+    assert isinstance(command, LoopRequest)
+    assert (command.n_controlled, command.gains, command.loop) == (60, gains, None)
+    assert len(bridge.published) == 1
+
+
+async def test_an_rtc_that_will_not_control_so_many_modes_gets_no_matrix(deeds, bridge):
+    found, state = await made(deeds, 60)
+    bridge.refusal = "range: at most 50"
+    with pytest.raises(CommandError, match="will not control 60 modes: range: at most 50"):
+        await deeds.carry_out(ev.SendMatrix(id=found.id, n_modes=60, gains=(0.4,) * 90), state)
+    assert not bridge.published
+
+
+async def test_after_more_modes_were_commanded_in_vain_fewer_are_commanded_again(deeds, bridge):
+    many, state = await made(deeds, 60)
+    few, state = await made(deeds, N_CONTROLLED, state)
+    await deeds.carry_out(ev.SendMatrix(id=many.id, n_modes=60, gains=(0.4,) * 90), state)
+    await deeds.carry_out(ev.SendMatrix(id=few.id, n_modes=N_CONTROLLED, gains=None), state)
+    assert [command.n_controlled for command in bridge.commands] == [60, N_CONTROLLED]
+
+
+async def test_nothing_unknown_is_sent(deeds):
+    with pytest.raises(UnknownIdError, match="cm-9"):
+        await deeds.carry_out(ev.SendMatrix(id="cm-9", n_modes=45, gains=None), STATE)
+
+
+async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(deeds, archive):
+    source, state = await made(deeds)
+    effect = ev.CopyMatrix(source=source.id, why="back")
+    event = await deeds.carry_out(effect, state)
+    copy = event.record
+    assert event.wanted
+    assert copy.id != source.id
+    assert (copy.parent, copy.sha256, copy.alpha) == (source.id, source.sha256, ALPHA)
+    assert copy.gate is not source.gate
+    np.testing.assert_array_equal(archive.matrix(copy.id), archive.matrix(source.id))
+
+
+async def test_a_copy_that_would_not_hold_the_loop_any_more_is_refused(deeds):
+    source, state = await made(deeds)
+    far = replace(REGISTRATION, alpha=Misregistration(rotation_rad=0.5))
+    event = await deeds.carry_out(
+        ev.CopyMatrix(source=source.id, why="back"), replace(state, registration=far)
+    )
+    assert event.record.state is MatrixState.REFUSED
+
+
+async def test_the_margin_is_judged_at_the_registration_of_now(deeds):
+    found, state = await made(deeds)
+    event = await deeds.carry_out(ev.JudgeMatrix(id=found.id), state)
+    assert (event.id, event.verdict.accepted) == (found.id, True)
+    far = replace(REGISTRATION, alpha=Misregistration(rotation_rad=0.5))
+    event = await deeds.carry_out(ev.JudgeMatrix(id=found.id), replace(state, registration=far))
+    assert not event.verdict.accepted
+
+
+async def test_the_rtcs_own_matrix_is_fetched_and_archived_once(deeds, archive):
+    for _ in range(2):
+        event = await deeds.carry_out(ev.FetchMatrix(id="initial"), STATE)
+        assert (event.record.id, event.record.parent) == ("initial", None)
+    np.testing.assert_array_equal(archive.matrix("initial"), BROUGHT)
+    np.testing.assert_array_equal(deeds.matrix("initial"), BROUGHT)
+
+
+async def test_another_matrix_under_a_known_id_is_not_taken_for_the_same(deeds, bridge):
+    await deeds.carry_out(ev.FetchMatrix(id="initial"), STATE)
+    other = BROUGHT * 2
+    bridge.applied = (manifest_of(foreign(), layout_of(other, 4096), RTC, "small"), other)
+    with pytest.raises(LinkError, match="not the one archived under that id"):
+        await deeds.carry_out(ev.FetchMatrix(id="initial"), STATE)
+
+
+async def test_a_matrix_swapped_while_it_was_asked_for_is_named(deeds):
+    with pytest.raises(LinkError, match="offers initial, its status says it uses cm-1"):
+        await deeds.carry_out(ev.FetchMatrix(id="cm-1"), STATE)
+
+
+async def test_old_matrices_come_from_the_archive(deeds, archive):
+    archive.store(record("cm-old", n_modes=N_CONTROLLED, sha256=""), BROUGHT, None, {})
+    np.testing.assert_array_equal(deeds.matrix("cm-old"), BROUGHT)
+    with pytest.raises(UnknownIdError):
+        deeds.matrix("cm-never")
+
+
+async def test_the_matrix_in_use_is_offered_to_an_rtc_that_comes_late(deeds, bridge):
+    await deeds.carry_out(ev.FetchMatrix(id="initial"), STATE)
+    deeds.offer(STATE)
+    ((manifest, matrix),) = bridge.offered
+    assert (manifest.id, bridge.current) == ("initial", "initial")
+    np.testing.assert_array_equal(matrix, BROUGHT)
+
+
+async def test_nothing_is_offered_while_none_is_in_use(deeds, bridge):
+    deeds.offer(replace(STATE, in_use=None))
+    assert not bridge.offered
+
+
+class TestDither:
+    DITHER = ev.DitherView(
+        id="dither-1",
+        modes=(63, 69),
+        amplitude_m=(5e-9, 5e-9),
+        frequency_hz=(211.0, 239.0),
+        duration_s=120.0,
+        start_seq=None,
+        asked_ns_utc=START_NS,
+    )
+
+    async def test_the_answer_of_the_rtc_is_the_event(self, deeds, bridge):
+        event = await deeds.carry_out(ev.AskDither(dither=self.DITHER), STATE)
+        assert event == ev.DitherAnswered(id="dither-1", accepted=True, reason="", start_seq=77)
+        (request,) = bridge.commands
+        assert (request.action, request.modes) == (DitherAction.START, (63, 69))
+        assert request.frequency_hz == (211.0, 239.0)
+
+    async def test_a_refusal_is_an_answer_too(self, deeds, bridge):
+        bridge.refusal = "busy: measuring"
+        event = await deeds.carry_out(ev.AskDither(dither=self.DITHER), STATE)
+        assert (event.accepted, event.reason) == (False, "busy: measuring")
+
+    async def test_stopping_needs_only_an_id(self, deeds, bridge):
+        assert await deeds.carry_out(ev.AskNoDither(), STATE) is None
+        (request,) = bridge.commands
+        assert (request.action, request.modes) == (DitherAction.STOP, None)

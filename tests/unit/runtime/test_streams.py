@@ -1,0 +1,172 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.errors import ModelError
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import Spectra, WindowRefused
+from service.runtime.streams import Streams, fed, shape_mismatch, with_dither, with_rtc
+from service.state import DitherView
+from service.worker import Description
+from tests.unit.reactions.situations import rtc
+
+N_SLOPES, N_MODES = 6, 8
+DESCRIPTION = Description(
+    n_slopes=N_SLOPES, n_modes=N_MODES, mode_variance_m2=np.full(N_MODES, 1e-16)
+)
+RTC = rtc(4, n_modes=N_MODES, n_slopes=N_SLOPES, gains=(0.4,) * 4 + (0.0,) * 4)
+WINDOW_S = 0.5
+DITHER = DitherView(
+    id="dither-1",
+    modes=(6,),
+    amplitude_m=(5e-9,),
+    frequency_hz=(240.0,),
+    duration_s=60.0,
+    start_seq=0,
+    asked_ns_utc=0,
+)
+
+
+def block(first_seq, n=100, *, session="s1", cm_id="initial", dither=True, scale=1e-9):
+    rng = np.random.default_rng(first_seq)
+    commands = (scale * rng.standard_normal((n, N_MODES))).astype(np.float32)
+    added = np.zeros_like(commands)
+    seq = first_seq + np.arange(n)
+    added[:, 6] = 5e-9 * np.sqrt(2) * np.sin(2 * np.pi * 0.24 * seq)
+    return FrameBlock(
+        session=session,
+        first_seq=first_seq,
+        t0_ns_utc=first_seq * 1_000_000,
+        dt_ns=1_000_000,
+        slopes=rng.standard_normal((n, N_SLOPES)).astype(np.float32),
+        commands_m=commands + added,
+        dither_m=added if dither else None,
+        cm_id=cm_id,
+    )
+
+
+@pytest.fixture
+def streams():
+    return with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), DITHER, WINDOW_S)
+
+
+def play(streams, first_seq, n_blocks, **changes):
+    windows = []
+    for index in range(n_blocks):
+        streams, ended = fed(streams, block(first_seq + 100 * index, **changes))
+        windows += ended
+    return streams, windows
+
+
+def test_the_first_window_begins_when_the_loop_has_settled_and_each_lasts_as_long_as_asked(streams):
+    _, windows = play(streams, 0, 14)
+    assert [(type(w), w.first_seq) for w in windows] == [(Spectra, 300), (Spectra, 800)]
+    assert windows[0].cm_id == "initial"
+
+
+def test_without_a_dither_there_are_no_windows(streams):
+    streams = with_dither(streams, None, WINDOW_S)
+    _, windows = play(streams, 0, 14)
+    assert not windows
+
+
+def test_a_dither_the_rtc_has_not_accepted_yet_opens_nothing(streams):
+    waiting = replace(DITHER, id="dither-2", start_seq=None)
+    assert with_dither(streams, waiting, WINDOW_S).lock_in is None
+
+
+def test_the_same_dither_keeps_its_open_window(streams):
+    streams, _ = play(streams, 0, 5)
+    assert streams.lock_in.window is not None
+    assert with_dither(streams, DITHER, WINDOW_S) is streams
+
+
+def test_another_dither_starts_another_series(streams):
+    streams, _ = play(streams, 0, 5)
+    streams = with_dither(streams, replace(DITHER, id="dither-2", start_seq=5000), WINDOW_S)
+    assert streams.lock_in.window is None
+    assert streams.lock_in.plan.first_seq == 5300
+
+
+@pytest.mark.parametrize(
+    "changes", [{"gains": (0.3,) * 4 + (0.0,) * 4}, {"leak": 0.99}, {"loop": "partial"}]
+)
+def test_another_loop_makes_the_open_window_void(streams, changes):
+    streams, _ = play(streams, 0, 6)
+    streams = with_rtc(streams, replace(RTC, **changes))
+    assert streams.lock_in.window is None
+    _, windows = play(streams, 600, 6)
+    assert [w.first_seq for w in windows] == [600]
+
+
+def test_the_same_loop_seen_again_keeps_everything(streams):
+    streams, _ = play(streams, 0, 6)
+    again = with_rtc(streams, replace(RTC, t_ns_utc=5, magnitude=9.0, cm_id="cm-1"))
+    assert again.lock_in is streams.lock_in
+    assert again.passive is streams.passive
+
+
+def test_a_new_reconstructor_inside_a_window_cuts_it_short(streams):
+    streams, _ = play(streams, 0, 6)
+    _, (refused, whole) = play(streams, 600, 6, cm_id="cm-1")
+    assert isinstance(refused, WindowRefused)
+    assert refused.reason.startswith("the reconstructor changed")
+    assert (whole.first_seq, whole.cm_id) == (600, "cm-1")
+
+
+def test_an_ended_dither_gives_no_window_of_noise(streams):
+    streams, _ = play(streams, 0, 6)
+    _, windows = play(streams, 600, 8, dither=False)
+    assert windows
+    assert all(isinstance(window, WindowRefused) for window in windows)
+
+
+def test_frames_of_another_session_are_left_alone(streams):
+    after, windows = play(streams, 0, 14, session="s2")
+    assert after is streams
+    assert not windows
+
+
+def test_without_an_rtc_nothing_is_taken_in(streams):
+    gone = with_rtc(streams, None)
+    after, windows = play(gone, 0, 14)
+    assert (after.lock_in, after.passive, windows) == (None, None, [])
+
+
+def test_a_dither_goes_on_after_the_rtc_was_not_trusted_for_a_while(streams):
+    back = with_dither(with_rtc(with_rtc(streams, None), RTC), DITHER, WINDOW_S)
+    _, windows = play(back, 1000, 6)
+    assert [w.first_seq for w in windows] == [1000]
+
+
+def test_the_watchdog_counts_closed_loop_frames_only(streams):
+    closed, _ = play(streams, 0, 3)
+    opened, _ = play(with_rtc(streams, replace(RTC, loop="open")), 0, 3)
+    assert closed.passive.command_power is not None
+    assert opened.passive.command_power is None
+
+
+def test_a_loop_whose_high_modes_run_away_is_diverging_and_calms_down_again(streams):
+    calm, _ = play(streams, 0, 20, scale=1e-8)
+    assert not calm.health.diverging
+    wild, _ = play(calm, 2000, 20, scale=1e-6)
+    assert wild.health.diverging
+    calm, _ = play(wild, 4000, 60, scale=1e-8)
+    assert not calm.health.diverging
+
+
+def test_lines_that_cannot_be_told_apart_are_an_error(streams):
+    close = replace(
+        DITHER, id="d2", modes=(6, 7), amplitude_m=(1e-9,) * 2, frequency_hz=(240.0, 242.0)
+    )
+    with pytest.raises(ModelError, match="closer than 4 bins"):
+        with_dither(streams, close, WINDOW_S)
+
+
+def test_an_rtc_of_another_shape_is_described_with_both_shapes():
+    assert shape_mismatch(DESCRIPTION, RTC) is None
+    text = shape_mismatch(DESCRIPTION, replace(RTC, n_slopes=10))
+    assert text == (
+        "the RTC has 10 slopes and 8 modes, the instrument file 6 and 8: wrong instrument file?"
+    )

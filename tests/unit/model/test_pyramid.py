@@ -38,7 +38,7 @@ def test_a_wider_modulation_needs_more_points(modulation, least):
 
 
 def test_twice_the_modulation_points_change_nothing():
-    """At 28 points and 3 λ/D the sum over the circle has converged to 5e-5 (tip, full telescope)."""
+    """At 28 points and 3 λ/D the sum over the circle has converged to 5e-5 (tip, full pupil)."""
     valid = small_model().valid
     few, many = (
         optics(n_modulation=n, dtype=np.float64).response(valid).gradient for n in (28, 56)

@@ -1,0 +1,161 @@
+"""What keeps a bad matrix off the telescope."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.control.gate import LoopSettings, judge
+from service.control.reconstructor import invert
+from service.control.stability import pole_radius
+from service.model.misregistration import Misregistration
+from tests.numerics import N_CONTROLLED, SOMEWHERE, small_linearisation, small_model
+
+SIGMA = np.array([0.01, 0.01, np.deg2rad(0.01), 0.0005])
+BOUND = 0.95
+
+
+def settings(gain: float = 0.5, **other) -> LoopSettings:
+    return LoopSettings(gains=np.full(N_CONTROLLED, gain), leak=1.0, delay_frames=2.0, **other)
+
+
+def reconstructor_for(alpha: Misregistration):
+    return invert(small_model().interaction_matrix(alpha), N_CONTROLLED).matrix
+
+
+def verdict(made_for=None, truth=None, *, sigma=SIGMA, loop=None, bound=BOUND):
+    """The gate's word on a reconstructor made for one registration, the mirror being at another."""
+    return judge(
+        reconstructor_for(made_for or Misregistration()),
+        small_linearisation(),
+        truth or Misregistration(),
+        np.diag(sigma**2),
+        loop or settings(),
+        bound=bound,
+    )
+
+
+def turned(degrees: float) -> Misregistration:
+    return Misregistration(rotation_rad=np.deg2rad(degrees))
+
+
+def test_an_aligned_reconstructor_is_accepted():
+    found = verdict()
+    assert found.accepted
+    assert found.aligned_pole_radius == pytest.approx(np.sqrt(0.5), rel=1e-5)
+    assert found.worst_pole_radius < 0.75
+    assert found.n_points == 9
+    assert found.reason.startswith("stable: worst pole radius 0.7")
+
+
+def test_a_reconstructor_made_where_the_mirror_is_is_as_good_as_an_aligned_one():
+    """1 %: D at the estimate is the linearisation's, to first order."""
+    found = verdict(made_for=SOMEWHERE, truth=SOMEWHERE)
+    assert found.accepted
+    assert found.worst_pole_radius == pytest.approx(found.aligned_pole_radius, rel=0.1)
+
+
+def test_a_reconstructor_far_from_the_mirror_is_refused_and_says_what_to_do():
+    found = verdict(truth=turned(15.0))
+    assert not found.accepted
+    assert found.worst_pole_radius >= 1.0
+    assert found.reason.startswith(f"unstable: worst pole radius {found.worst_pole_radius:.3f}")
+    assert "use fewer modes, a lower gain, or dither longer" in found.reason
+
+
+def test_too_little_margin_is_refused_although_the_loop_would_hold():
+    radii = {degrees: verdict(truth=turned(degrees)) for degrees in (5.0, 7.0, 8.0, 9.0, 10.0)}
+    between = [v for v in radii.values() if BOUND < v.worst_pole_radius < 1.0]
+    assert between
+    for found in between:
+        assert not found.accepted
+        assert found.reason.startswith("too little margin: worst pole radius 0.9")
+        assert "bound 0.950; use fewer modes" in found.reason
+
+
+def test_the_worst_radius_grows_with_the_misregistration():
+    radii = [verdict(truth=turned(degrees)).worst_pole_radius for degrees in range(0, 12, 2)]
+    assert np.all(np.diff(radii) > 0)
+
+
+def test_the_worst_radius_grows_with_the_uncertainty():
+    radii = [verdict(sigma=scale * SIGMA).worst_pole_radius for scale in (0.1, 1, 3, 10, 20)]
+    assert np.all(np.diff(radii) > 0)
+
+
+def test_an_estimate_too_uncertain_to_be_safe_is_refused():
+    assert not verdict(sigma=60 * SIGMA).accepted
+
+
+def test_correlated_parameters_are_tried_along_their_own_axes():
+    """At the ends of the 3σ ellipsoid, found here without the gate's own algebra."""
+    correlation = np.array([[1, 0.9, 0, 0], [0.9, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    sigma = 20 * SIGMA
+    matrix = reconstructor_for(Misregistration())
+    found = judge(
+        matrix,
+        small_linearisation(),
+        Misregistration(),
+        correlation * np.outer(sigma, sigma),
+        settings(),
+        bound=BOUND,
+    )
+    steps = [
+        np.sqrt(power / 2) * np.array([1, sign, 0, 0]) for power, sign in ((1.9, 1), (0.1, -1))
+    ]
+    steps += [np.array([0, 0, 1, 0]), np.array([0, 0, 0, 1])]
+    radii = []
+    for step in [np.zeros(4), *steps, *(-s for s in steps)]:
+        alpha = Misregistration.from_vector(Misregistration().vector + 3 * sigma * step)
+        there = small_linearisation().matrix_at(alpha)[:, :N_CONTROLLED]
+        radii.append(pole_radius(np.linalg.eigvals(0.5 * matrix @ there)).max())
+    assert found.worst_pole_radius == pytest.approx(max(radii), rel=1e-3)
+
+
+def test_a_slow_loop_can_be_served_although_its_poles_lie_beyond_the_bound():
+    """At a gain of 0.05 the aligned loop itself has a radius of 0.947, of 0.01 one of 0.99."""
+    slow = verdict(loop=settings(gain=0.01))
+    assert slow.aligned_pole_radius > BOUND
+    assert slow.bound == pytest.approx((1 + slow.aligned_pole_radius) / 2)
+    assert slow.accepted
+    assert verdict(loop=settings(gain=0.05)).accepted
+
+
+def test_a_fast_loop_keeps_the_bound_it_was_given():
+    assert verdict(bound=0.93).bound == 0.93
+
+
+def test_a_loop_that_no_reconstructor_could_hold_is_refused():
+    found = verdict(loop=settings(gain=1.2))
+    assert found.aligned_pole_radius > 1.0
+    assert not found.accepted
+    assert found.reason.startswith("unstable")
+
+
+def test_a_lower_optical_gain_is_a_lower_loop_gain():
+    """Poles are roots of z² - z + g λ: only the product counts."""
+    weak = verdict(truth=turned(8.0), loop=settings(gain=0.5, optical_gain=0.6))
+    slow = verdict(truth=turned(8.0), loop=settings(gain=0.3))
+    assert weak.worst_pole_radius == pytest.approx(slow.worst_pole_radius, rel=1e-5)
+
+
+def test_a_longer_delay_costs_margin():
+    two, three = (
+        judge(
+            reconstructor_for(Misregistration()),
+            small_linearisation(),
+            Misregistration(),
+            np.diag(SIGMA**2),
+            LoopSettings(gains=np.full(N_CONTROLLED, 0.5), leak=1.0, delay_frames=delay),
+            bound=BOUND,
+        )
+        for delay in (2.0, 3.0)
+    )
+    assert three.worst_pole_radius > two.worst_pole_radius
+
+
+def test_a_reconstructor_of_fewer_modes_is_judged_on_its_own_modes():
+    few = invert(small_linearisation().matrix, 10).matrix
+    loop = LoopSettings(gains=np.full(10, 0.5), leak=1.0, delay_frames=2.0)
+    found = judge(few, small_linearisation(), turned(8.0), np.diag(SIGMA**2), loop, bound=BOUND)
+    assert found.worst_pole_radius < verdict(truth=turned(8.0)).worst_pole_radius

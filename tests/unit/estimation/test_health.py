@@ -1,0 +1,115 @@
+"""Is the loop holding?"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.control.stability import pole_radius
+from service.estimation.health import CALM_RATIO, DIVERGING_RATIO, LoopHealth, observe
+from service.model.misregistration import Misregistration
+from tests.numerics import (
+    N_CONTROLLED,
+    N_MODES,
+    Sky,
+    block_of,
+    closed_loop,
+    part,
+    small_basis,
+    small_loop,
+    small_model,
+)
+
+VARIANCE = small_basis().variance_m2
+UPPER = slice(N_CONTROLLED // 2, N_CONTROLLED)
+
+
+def times_expectation(factor: float, n_frames: int = 100):
+    """A block whose upper half has ``factor`` times the RMS turbulence asks of it."""
+    rng = np.random.default_rng(12)
+    commands = factor * np.sqrt(VARIANCE) * rng.normal(size=(n_frames, N_MODES))
+    return block_of(np.zeros((n_frames, 2)), commands, None)
+
+
+def after(health: LoopHealth, factor: float, n_blocks: int = 60) -> LoopHealth:
+    """Six seconds of it: twelve memories."""
+    for _ in range(n_blocks):
+        health = observe(health, times_expectation(factor), VARIANCE, N_CONTROLLED)
+    return health
+
+
+def test_the_ratio_of_a_loop_that_follows_turbulence_is_one():
+    """5 %: 1500 random numbers to the block."""
+    assert after(LoopHealth(), 1.0).ratio == pytest.approx(1.0, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.0, 3.0])
+def test_a_loop_that_holds_is_left_in_peace(factor):
+    assert not after(LoopHealth(), factor).diverging
+
+
+def test_a_loop_ten_times_beyond_its_expectation_is_diverging():
+    assert after(LoopHealth(), 1.1 * DIVERGING_RATIO).diverging
+    assert not after(LoopHealth(), 0.9 * DIVERGING_RATIO).diverging
+
+
+def test_a_loop_that_was_diverging_must_fall_to_half_the_limit_to_count_as_calm():
+    between = (CALM_RATIO + DIVERGING_RATIO) / 2
+    diverging = after(LoopHealth(), 20.0)
+    assert after(diverging, between).diverging
+    assert not after(LoopHealth(), between).diverging
+    assert not after(after(diverging, between), 0.8 * CALM_RATIO).diverging
+
+
+def test_only_the_upper_half_of_the_controlled_modes_is_watched():
+    """Low modes carry the turbulence, uncontrolled ones the dither."""
+    commands = np.full((100, N_MODES), 1.0)
+    commands[:, UPPER] = 0.0
+    block = block_of(np.zeros((100, 2)), commands, None)
+    assert observe(LoopHealth(), block, VARIANCE, N_CONTROLLED).ratio == 0.0
+
+
+def test_a_burst_of_one_frame_is_forgotten_within_three_seconds():
+    burst = times_expectation(100.0, n_frames=1)
+    health = after(observe(LoopHealth(), burst, VARIANCE, N_CONTROLLED), 1.0, n_blocks=30)
+    assert health.ratio == pytest.approx(1.0, rel=0.1)
+
+
+def test_the_split_into_blocks_hardly_matters():
+    block = times_expectation(4.0, 400)
+    whole = observe(LoopHealth(), block, VARIANCE, N_CONTROLLED)
+    health = LoopHealth()
+    for start in range(0, 400, 10):
+        health = observe(health, part(block, start, start + 10), VARIANCE, N_CONTROLLED)
+    assert health.ratio == pytest.approx(whole.ratio, rel=0.05)
+
+
+def observed(**loop) -> list[bool]:
+    """What the health says, block by block, of two simulated seconds."""
+    sky = Sky(turbulence=1.0, alpha=loop.pop("truth"))
+    block = closed_loop(small_loop(**loop), sky, np.zeros((2000, N_MODES)))
+    health, seen = LoopHealth(), []
+    for start in range(0, 2000, 50):
+        health = observe(health, part(block, start, start + 50), VARIANCE, N_CONTROLLED)
+        seen.append(health.diverging)
+    return seen
+
+
+def test_a_simulated_loop_that_diverges_is_recognised_and_one_that_holds_is_not():
+    """Turned by 7 degrees the small loop's poles leave the unit circle; 0.7 is its optical gain."""
+    turned = Misregistration(rotation_rad=np.deg2rad(7.0))
+    matrix = small_model().interaction_matrix(turned)[:, :N_CONTROLLED]
+    product = small_loop().reconstructor @ matrix
+    radius = pole_radius(np.linalg.eigvals(0.7 * 0.7 * product), leak=0.999).max()
+    assert 1.0 < radius < 1.02
+    assert observed(truth=turned, gain=0.7)[-1]
+    assert not any(observed(truth=Misregistration(), gain=0.7))
+
+
+@pytest.mark.xfail(
+    strict=True,
+    raises=ZeroDivisionError,
+    reason="with no controlled mode there is no expectation to compare with",
+)
+def test_an_rtc_that_controls_no_mode_is_not_diverging():
+    assert not observe(LoopHealth(), times_expectation(1.0), VARIANCE, 0).diverging

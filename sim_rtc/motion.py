@@ -1,8 +1,8 @@
 """The optics as the registration moves: computed ahead in the background, never waited for.
 
 A new registration takes seconds to compute. A jump's optics are therefore prepared from the moment
-the previous one is in place; if they are late, the old ones stay until they are ready. A drift is
-a chain of exact optics, with linear steps in between.
+the previous one is in place; if they are late, the old ones stay until they are ready. A drift, a
+flexure or a walk is a chain of exact optics, with linear steps in between.
 """
 
 from __future__ import annotations
@@ -15,9 +15,6 @@ from dataclasses import dataclass
 
 from sim_rtc.plant import Plant, TelescopeOptics
 from sim_rtc.schedule import Schedule
-
-_SEGMENT_S = 20.0
-"""Longest stretch of a drift between two exact optics."""
 
 _STEPS_PER_SEGMENT = 10
 _BACKGROUND_NICENESS = 10
@@ -81,7 +78,7 @@ class MovingOptics:
             first = self._plant.optics(schedule.alpha_at(start_s))
         last = first
         if schedule.drifts:
-            stop_s = min(stop_s, start_s + _SEGMENT_S)
+            stop_s = min(stop_s, start_s + schedule.segment_s)
             last = self._plant.optics(schedule.alpha_before(stop_s))
         return _Segment(start_s=start_s, stop_s=stop_s, first=first, last=last)
 

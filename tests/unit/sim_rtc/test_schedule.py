@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from service.model.misregistration import Misregistration
-from sim_rtc.schedule import Drift, Jump, Schedule, random_registration
+from sim_rtc.schedule import Drift, Flexure, Jump, Schedule, Walk, random_registration
 
 START = Misregistration(shift_x_subap=0.1)
 
@@ -35,3 +35,43 @@ def test_random_registrations_fill_the_range_a_loop_can_hold():
     assert np.mean(shift < 0.2 * np.sqrt(0.5)) == pytest.approx(0.5, abs=0.1)
     assert 0.28 < np.abs(drawn[:, 2]).max() <= 0.3
     assert 0.0047 < np.abs(drawn[:, 3] - 1).max() <= 0.005
+
+
+def test_a_flexure_is_a_sine_that_begins_at_zero():
+    flexure = Flexure(shift_x_subap=0.2, rotation_deg=0.1, period_s=80.0)
+    schedule = Schedule(start=START, flexure=flexure)
+    moved = [schedule.alpha_at(t).to_boundary() for t in (0.0, 20.0, 40.0, 60.0)]
+    assert [m["shift_x_subap"] for m in moved] == pytest.approx([0.1, 0.3, 0.1, -0.1])
+    assert moved[1]["rotation_deg"] == pytest.approx(0.1)
+    assert schedule.drifts
+    # Straight pieces of a twelfth of the period.
+    assert schedule.segment_s == pytest.approx(80.0 / 12)
+
+
+def test_a_walk_is_the_same_whatever_was_asked_before_and_continuous():
+    walk = Walk(shift_x_subap=0.05, magnification=0.001, seed=7)
+    late_first = [walk.offset(t) for t in (100.0, 10.0)]
+    early_first = [walk.offset(t) for t in (10.0, 100.0)][::-1]
+    np.testing.assert_array_equal(late_first, early_first)
+    times = np.arange(0.0, 200.0, 0.5)
+    steps = np.abs(np.diff([walk.offset(t) for t in times], axis=0))
+    assert steps[:, 0].max() < 0.5 / 20 * 0.05 * 4
+    assert not steps[:, 1].any()
+    np.testing.assert_array_equal(walk.offset(0.0), 0.0)
+
+
+def test_a_walk_spreads_with_the_square_root_of_time():
+    ends = np.array(
+        [
+            [Walk(shift_x_subap=0.05, seed=seed).offset(t)[0] for t in (60.0, 540.0)]
+            for seed in range(400)
+        ]
+    )
+    # 400 walks: 3.5 % on a standard deviation.
+    np.testing.assert_allclose(ends.std(axis=0), [0.05, 0.15], rtol=0.14)
+
+
+def test_nothing_asked_for_is_nothing_moved():
+    still = Schedule(start=START)
+    assert not still.drifts
+    assert still.alpha_at(1e4) == START

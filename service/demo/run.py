@@ -18,12 +18,13 @@ import httpx
 from service.demo.report import Report, make_report
 from service.demo.screen import HEADING, live_line, table
 from service.demo.truth import TruthFile
-from service.errors import LinkError
+from service.errors import ConfigurationError, LinkError
 
 POLL_S = 0.5
 LINE_S = 2.0
 HEADING_EVERY = 20
 STOP_WITHIN_S = 15.0
+LOG = "service.log"
 
 _FORWARDED = ("alpha", "mag", "gain", "plant")
 _REPEATED = ("jump", "wind")
@@ -58,8 +59,7 @@ def add_demo_arguments(commands: argparse._SubParsersAction[argparse.ArgumentPar
 
 def run_demo(options: argparse.Namespace) -> int:
     """Run the demo; return 0 if the main job was done, else 1."""
-    shutil.rmtree(options.dir, ignore_errors=True)
-    options.dir.mkdir(parents=True)
+    _emptied(options.dir)
     service_words, sim_words = _commands(options)
     url = f"http://127.0.0.1:{options.port}"
     _say(f"service    pyrcal {' '.join(service_words)}")
@@ -82,6 +82,20 @@ def run_demo(options: argparse.Namespace) -> int:
     if options.json is not None:
         options.json.write_text(report.to_json() + "\n", encoding="utf-8")
     return 0 if report.good else 1
+
+
+def _emptied(directory: Path) -> None:
+    """Begin with an empty directory; one that no earlier demo has filled is left alone.
+
+    Raises
+    ------
+    ConfigurationError
+        If it holds something else.
+    """
+    if directory.exists() and any(directory.iterdir()) and not (directory / LOG).exists():
+        raise ConfigurationError(f"--dir {directory}: holds other files; name a new directory")
+    shutil.rmtree(directory, ignore_errors=True)
+    directory.mkdir(parents=True)
 
 
 def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:

@@ -9,9 +9,9 @@ from service.demo.truth import Line
 from service.model.misregistration import PARAMETERS
 
 HEADING = (
-    "   time   frames  lost |  shift x        shift y        rotation         magnification     |"
+    "   time   frames  lost |  shift x        shift y        rotation         magnification    |"
     "  age |   WFE  poles | matrix in use\n"
-    "      s                |  subap          subap          deg                                |"
+    "      s                |  subap          subap          deg                               |"
     "    s |    nm        |"
 )
 

@@ -1,0 +1,166 @@
+import json
+
+import pytest
+
+from service.demo.report import make_report
+from service.demo.truth import TruthFile
+
+TRUE = {"shift_x_subap": 0.1, "shift_y_subap": 0.0, "rotation_deg": 0.2, "magnification": 1.003}
+SIGMA = {
+    "shift_x_subap": 0.004,
+    "shift_y_subap": 0.004,
+    "rotation_deg": 0.006,
+    "magnification": 0.0004,
+}
+
+
+def gate(radius):
+    return {"worst_pole_radius": radius}
+
+
+def shelf(**changes):
+    """The RTC's own matrix, one for 400 modes, one for 500."""
+    records = []
+    for name, n_modes, parent, radius in (
+        ("initial", 400, None, 0.93),
+        ("cm-400", 400, "initial", 0.66),
+        ("cm-500", 500, "cm-400", 0.67),
+    ):
+        records.append(
+            {
+                "id": name,
+                "n_modes": n_modes,
+                "parent": parent,
+                "state": "applied",
+                "gate": gate(radius),
+                "published_ns_utc": None if parent is None else 5,
+                "applied_frame_seq": None if parent is None else 100,
+            }
+            | changes.get(name.replace("-", "_"), {})
+        )
+    return records
+
+
+def service_state(alarms=(), **error):
+    alpha = {name: TRUE[name] + error.get(name, 0.0) for name in TRUE}
+    return {
+        "link": {"frames_received": 50_000, "frames_lost": 0},
+        "alarms": [{"name": name, "text": "found"} for name in alarms],
+        "registration": {"alpha": alpha, "sigma": SIGMA, "floor": SIGMA},
+    }
+
+
+@pytest.fixture
+def truth(tmp_path):
+    """Three seconds under each matrix, the error falling with the number of modes."""
+    lines = []
+    for index, (name, error_nm) in enumerate(
+        [("initial", 120.0), ("cm-400", 119.0), ("cm-500", 105.0)]
+    ):
+        for second in range(4):
+            t_ns = (10 * index + second) * 1_000_000_000
+            lines.append(
+                TRUE
+                | {
+                    "kind": "truth",
+                    "t_ns_utc": t_ns,
+                    "wavefront_error_nm": 999.0 if second == 0 else error_nm,
+                    "cm_id": name,
+                }
+            )
+    path = tmp_path / "truth.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    file = TruthFile(path)
+    file.read()
+    return file
+
+
+def test_a_night_that_went_well_is_good(truth):
+    report = make_report(service_state(), shelf(), truth, 12.0)
+    assert report.failures == []
+    assert report.good
+    assert report.start.worst_pole_radius == 0.93
+    assert report.first_update.wavefront_error_nm == pytest.approx(119.0)
+    assert report.target_modes.wavefront_error_nm == pytest.approx(105.0)
+    assert (report.reconstructors_published, report.reconstructors_applied) == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("shift_x_subap", 0.0201),
+        ("shift_y_subap", -0.0201),
+        ("rotation_deg", 0.0501),
+        ("magnification", -0.00201),
+    ],
+)
+def test_an_estimate_beyond_its_tolerance_fails(truth, name, error):
+    report = make_report(service_state(**{name: error}), shelf(), truth, 12.0)
+    assert not report.good
+    assert any(text.startswith(f"{name} is off by") for text in report.failures)
+
+
+def test_an_estimate_within_its_tolerance_but_surer_than_it_may_be_fails(truth):
+    report = make_report(service_state(rotation_deg=0.03), shelf(), truth, 12.0)
+    assert report.failures == ["rotation_deg is off by +5.0 sigma"]
+    assert report.error_in_sigma["rotation_deg"] == pytest.approx(5.0)
+
+
+def test_a_margin_that_did_not_recover_fails(truth):
+    report = make_report(service_state(), shelf(cm_400={"gate": gate(0.94)}), truth, 12.0)
+    assert report.failures == ["the stability margin has not recovered"]
+
+
+def test_more_modes_that_do_not_lower_the_wavefront_error_fail(truth):
+    for line in truth.lines:
+        if line["cm_id"] == "cm-500":
+            line["wavefront_error_nm"] = 121.0
+    report = make_report(service_state(), shelf(), truth, 12.0)
+    assert report.failures == ["the wavefront error with more modes is not below that of the start"]
+
+
+def test_a_night_without_more_modes_fails(truth):
+    report = make_report(service_state(), shelf()[:2], truth, 12.0)
+    assert report.target_modes.id is None
+    assert not report.good
+
+
+def test_frames_skipped_at_a_swap_fail(truth):
+    truth.lines.append({"kind": "swap", "cm_id": "cm-500", "frames_skipped": 3})
+    report = make_report(service_state(), shelf(), truth, 12.0)
+    assert report.failures == ["3 frames skipped at the swap to cm-500"]
+
+
+def test_an_alarm_that_lasts_to_the_end_fails(truth):
+    report = make_report(service_state(alarms=["margin"]), shelf(), truth, 12.0)
+    assert report.failures == ["alarm margin: found"]
+
+
+def test_without_a_registration_there_is_nothing_to_compare(truth):
+    state = service_state() | {"registration": None}
+    report = make_report(state, shelf(), truth, None)
+    assert "no estimate of the registration" in report.failures
+    assert report.true_alpha == TRUE
+
+
+def test_a_service_that_never_answered_fails(truth):
+    report = make_report(None, [], truth, None)
+    assert report.failures == ["the service never answered"]
+
+
+def test_what_was_refused_and_rejected_is_counted(truth):
+    extra = [
+        shelf(cm_400={"state": state, "applied_frame_seq": None})[1]
+        for state in ("refused", "rejected", "rejected")
+    ]
+    report = make_report(service_state(), shelf() + extra, truth, 12.0)
+    assert report.reconstructors_refused_by_gate == 1
+    assert report.reconstructors_rejected_by_rtc == 2
+
+
+def test_the_report_is_json_with_its_verdict(truth):
+    report = make_report(service_state(), shelf(), truth, 12.0)
+    found = json.loads(report.to_json())
+    assert found["good"] is True
+    assert found["true_alpha"] == TRUE
+    assert found["target_modes"]["n_modes"] == 500

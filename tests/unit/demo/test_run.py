@@ -1,0 +1,54 @@
+import argparse
+
+import pytest
+
+from service.demo.run import _commands, _emptied, add_demo_arguments
+from service.errors import ConfigurationError
+from sim_rtc.options import parse_options
+
+
+def options(*words):
+    parser = argparse.ArgumentParser()
+    add_demo_arguments(parser.add_subparsers())
+    return parser.parse_args(["demo", *words])
+
+
+def test_the_simulator_gets_what_is_meant_for_it_and_understands_it():
+    _, simulator = _commands(
+        options(
+            "--alpha=-0.1,0.05,0.2,0.998",
+            *("--mag", "7", "--seed", "5", "--gain", "0.3"),
+            *("--jump", "30:0.2,0,0,0", "--jump", "60:-0.2,0,0,0", "--zenoh-port", "7500"),
+        )
+    )
+    found = parse_options(simulator)
+    assert found.alpha.shift_x_subap == -0.1
+    assert (found.magnitude, found.seed, found.gain) == (7.0, 5, 0.3)
+    assert [jump.time_s for jump in found.jumps] == [30.0, 60.0]
+    assert found.connect == "tcp/127.0.0.1:7500"
+
+
+def test_both_meet_at_the_same_place_and_the_service_is_never_told_the_truth(tmp_path):
+    service, simulator = _commands(options("--alpha", "0.1,0,0,1", "--dir", str(tmp_path)))
+    assert service[service.index("--listen") + 1] == simulator[simulator.index("--connect") + 1]
+    assert service[service.index("--mode") + 1] == "auto"
+    assert not any("0.1,0,0,1" in word or "truth" in word for word in service)
+
+
+def test_the_leftovers_of_an_earlier_demo_are_removed(tmp_path):
+    (tmp_path / "service.log").write_text("old", encoding="utf-8")
+    (tmp_path / "data").mkdir()
+    _emptied(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_directory_of_somebody_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="holds other files"):
+        _emptied(tmp_path)
+    assert (tmp_path / "thesis.tex").exists()
+
+
+def test_a_new_directory_is_made(tmp_path):
+    _emptied(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir()

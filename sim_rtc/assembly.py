@@ -46,6 +46,9 @@ class Telescope:
     weights: NDArray[np.float64]
     """``(n_points,)`` share of the pupil's area at each point of the plant."""
 
+    mode_to_actuator: NDArray[np.float64]
+    """``(n_actuators, n_modes)`` of the basis."""
+
     def computer(self, blocks: Iterator[Block]) -> RealTimeComputer:
         """Return a computer that runs on these blocks of the feed."""
         return RealTimeComputer(
@@ -56,6 +59,7 @@ class Telescope:
             optics=self.optics.at(0.0),
             stroke_m=STROKE_M,
             limits=DitherLimits(most_modes=len(self.settings.gains)),
+            mode_to_actuator=self.mode_to_actuator,
         )
 
 
@@ -119,6 +123,7 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
             n_controlled_next=options.n_controlled,
         ),
         weights=plant.weights,
+        mode_to_actuator=basis.mode_to_actuator,
     )
 
 

@@ -28,6 +28,7 @@ from service.wire import (
 from sim_rtc.dither import Dither, DitherLimits, refusal
 from sim_rtc.feed import BATCH_FRAMES, Block
 from sim_rtc.loop import ControlTerms, ModalLoop
+from sim_rtc.measure import Bench, Measured, Measurements
 from sim_rtc.mirror import MirrorDrive
 from sim_rtc.plant import TelescopeOptics
 from sim_rtc.reconstructors import Reconstructor, Terms
@@ -38,6 +39,9 @@ _LEAD_BATCHES = 1
 """Whole batches between a command's acceptance and the first frame that contains it."""
 
 _LARGEST_GAIN = 2.0
+
+_SETTLING_FRAMES = 20
+"""Between the opening of the loop and the first stroke: the mirror comes to rest."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +70,8 @@ class Identity:
     system: str
     basis_id: str
     config_id: str
+    double_pass: bool = False
+    """Whether the light sees the mirror twice, as with a retro-reflector by day."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -135,6 +141,7 @@ class RealTimeComputer:
         stroke_m: float,
         limits: DitherLimits,
         drive: MirrorDrive | None = None,
+        mode_to_actuator: NDArray[np.float64] | None = None,
     ) -> None:
         self._blocks = blocks
         self.identity = identity
@@ -154,6 +161,13 @@ class RealTimeComputer:
         self._staged: deque[Reconstructor] = deque()
         self._swaps: deque[tuple[str, int]] = deque(maxlen=16)
         self._dither: Dither | None = None
+        self._measurements = Measurements()
+        self._bench = Bench(
+            n_modes=self._n_modes,
+            n_slopes=self._n_slopes,
+            frame_rate_hz=settings.frame_rate_hz,
+            mode_to_actuator=mode_to_actuator,
+        )
         self._terms: ControlTerms | None = None
         self._block: Block | None = None
         self._row = 0
@@ -169,14 +183,18 @@ class RealTimeComputer:
         with self._lock:
             self._swap()
             terms = self._current_terms(block.optics)
-            dither_m = self._next_dither()
-            result = block.run(row, self._loop, terms, dither_m)
+            measuring = self._measurements.current
+            added_m = self._next_dither()
+            if measuring is not None:
+                added_m = measuring.commands(self._seq, BATCH_FRAMES)
+            result = block.run(row, self._loop, terms, added_m)
+            open_strokes = measuring is not None and measuring.needs_open_loop
             batch = Batch(
                 session=self._session,
                 seq0=self._seq,
                 slopes=result.slopes,
                 commands_m=result.commands_m,
-                dither_m=result.dither_m,
+                dither_m=None if open_strokes else result.dither_m,
                 cm_id=self._active.manifest.id,
                 n_clipped=result.n_clipped,
                 closed=self._settings.closed,
@@ -184,6 +202,7 @@ class RealTimeComputer:
                 optics=block.optics,
                 phase_m=block.phase_at(row),
             )
+            self._read_back(batch)
             self._seq += BATCH_FRAMES
             return batch
 
@@ -198,6 +217,11 @@ class RealTimeComputer:
             swaps = list(self._swaps)
             self._swaps.clear()
         return swaps
+
+    def take_measured(self) -> list[Measured]:
+        """Return the measurements that have ended since the last call."""
+        with self._lock:
+            return self._measurements.take_ended()
 
     def terms(self) -> Terms:
         """Return what a new reconstructor must fit at present."""
@@ -244,8 +268,7 @@ class RealTimeComputer:
             case LoopRequest():
                 return self._change_loop(command)
             case MeasureRequest():
-                reason = f"unsupported: this RTC does not measure matrices ({command.pattern})"
-                return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
+                return self._start_measurement(command)
 
     def _next_rows(self) -> tuple[Block, int]:
         if self._block is None or self._row >= self._block.n_frames:
@@ -281,6 +304,12 @@ class RealTimeComputer:
             self._dither = None
         return commands
 
+    def _read_back(self, batch: Batch) -> None:
+        ended = self._measurements.take(batch.session, batch.seq0, batch.slopes, batch.commands_m)
+        if ended and self._measurements.closes_again:
+            self._settings = replace(self._settings, closed=True)
+            self._terms = None
+
     def _effective_gains(self) -> tuple[float, ...]:
         n_controlled = len(self._active.matrix) if self._settings.closed else 0
         unused = (0.0,) * int(self._n_modes - n_controlled)
@@ -298,9 +327,8 @@ class RealTimeComputer:
         if reason:
             return Reply(id=request.id, accepted=False, reason=reason, start_seq=None)
         with self._lock:
-            if self._dither is not None:
-                reason = f"busy: dither {self._dither.request.id} is on until frame "
-                reason += f"{self._dither.stop_seq}; stop it first"
+            reason = self._busy()
+            if reason:
                 return Reply(id=request.id, accepted=False, reason=reason, start_seq=None)
             start_seq = self._seq + _LEAD_BATCHES * BATCH_FRAMES
             self._dither = Dither(
@@ -313,11 +341,42 @@ class RealTimeComputer:
             self._dither = None
             return Reply(id=request.id, accepted=True, reason="", start_seq=self._seq)
 
-    def _change_loop(self, request: LoopRequest) -> Reply:
-        reason = self._loop_refusal(request)
+    def _busy(self) -> str:
+        """Return what occupies the mirror, in the wire's words; empty: nothing."""
+        if self._dither is not None:
+            return (
+                f"busy: dither {self._dither.request.id} is on until frame "
+                f"{self._dither.stop_seq}; stop it first"
+            )
+        return self._measurements.busy()
+
+    def _start_measurement(self, request: MeasureRequest) -> Reply:
+        reason = self._bench.refusal(request)
         if reason:
             return Reply(id=request.id, accepted=False, reason=reason, start_seq=None)
+        measurement = self._bench.measurement(request)
         with self._lock:
+            reason = self._busy()
+            if not reason and not measurement.needs_open_loop and not self._settings.closed:
+                reason = f"unsupported: {request.pattern} while the loop is open; close it first"
+            if reason:
+                return Reply(id=request.id, accepted=False, reason=reason, start_seq=None)
+            self._measurements.closes_again = self._settings.closed
+            if measurement.needs_open_loop and self._settings.closed:
+                self._settings = replace(self._settings, closed=False)
+                self._terms = None
+                self._start_over()
+            start_seq = self._seq + _LEAD_BATCHES * BATCH_FRAMES + _SETTLING_FRAMES
+            measurement.start_seq = start_seq
+            self._measurements.current = measurement
+        return Reply(id=request.id, accepted=True, reason="", start_seq=start_seq)
+
+    def _change_loop(self, request: LoopRequest) -> Reply:
+        reason = self._loop_refusal(request)
+        with self._lock:
+            reason = reason or self._measurements.busy()
+            if reason:
+                return Reply(id=request.id, accepted=False, reason=reason, start_seq=None)
             was_closed, old = self._settings.closed, self._settings
             self._settings = replace(
                 old,
@@ -349,6 +408,8 @@ class RealTimeComputer:
         self._session = new_session()
         self._staged.clear()
         self._dither = None
+        reason = "the loop started over during the measurement"
+        self._measurements.end(self._session, self._n_slopes, reason)
 
 
 def new_session() -> str:

@@ -32,6 +32,7 @@ from service.wire import (
     decode_command,
     encode_frames,
     encode_manifest,
+    encode_measured_manifest,
     encode_reply,
     encode_status,
     split,
@@ -42,6 +43,7 @@ from sim_rtc.desk import CommandDesk
 from sim_rtc.detector import Detector
 from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.intake import Intake
+from sim_rtc.measure import Circumstances, Measured, product
 
 _OPEN_TIMEOUT_MS = 1000
 _LEASE_MS = 2000
@@ -185,6 +187,43 @@ class Link:
             if now_s >= next_status_s:
                 status.put(encode_status(self._status()))
                 next_status_s = now_s + _STATUS_PERIOD_S
+                for measured in self._computer.take_measured():
+                    self._send_measured(session, measured)
+
+    def _send_measured(self, session: zenoh.Session, measured: Measured) -> None:
+        """Send a measured matrix in parts, then its manifest, or why there is none."""
+        identity = self._computer.identity
+        circumstances = Circumstances(
+            system=identity.system,
+            basis_id=identity.basis_id,
+            config_id=identity.config_id,
+            double_pass=identity.double_pass,
+            created_ns=time.time_ns(),
+        )
+        manifest, matrix = product(measured, circumstances)
+        parts = [] if matrix is None else split(matrix, manifest.layout.chunk_bytes)
+        for index, part in enumerate(parts):
+            session.put(
+                self._keys.measured_chunk(manifest.id, index),
+                part,
+                encoding=Encodings.BYTES,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+        session.put(
+            self._keys.measured_commit(manifest.id),
+            encode_measured_manifest(manifest),
+            encoding=Encodings.MEASURED_COMMIT,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA_HIGH,
+        )
+        _log.info(
+            "matrix.measured",
+            id=manifest.id,
+            pattern=str(manifest.pattern),
+            shape=manifest.layout.shape,
+            reason=manifest.reason or "",
+        )
 
     def _next(self) -> Batch | None:
         with self._ready:

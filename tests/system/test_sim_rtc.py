@@ -315,11 +315,11 @@ def test_a_second_dither_is_refused_until_the_first_is_stopped(rtc):
             MeasureRequest(
                 id="measure-1",
                 pattern=Pattern.PUSH_PULL_MODAL,
-                modes=(0,),
+                modes=(600,),
                 amplitude_m=(1e-8,),
                 n_average=1,
             ),
-            "unsupported",
+            "range: mode 600, expected 0 to 593",
         ),
         (CommandKind.LOOP, LoopRequest(id="loop-1", gains=(0.4,) * 400), "range: 400 gains"),
         (CommandKind.LOOP, LoopRequest(id="loop-2", n_controlled=700), "range: n_controlled"),

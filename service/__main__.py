@@ -147,9 +147,24 @@ async def _until_stopped(supervisor: Supervisor, listener: socket.socket) -> int
     work.cancel()
     outcomes = await asyncio.gather(work, web, return_exceptions=True)
     for outcome in outcomes:
-        if isinstance(outcome, Exception):
-            structlog.get_logger().error("service.failed", exc_info=outcome)
+        _explain(outcome)
     return 1 if failed else 0
+
+
+def _explain(outcome: BaseException | None) -> None:
+    """Log why the service failed; what it refused on purpose ends as one line.
+
+    Raises
+    ------
+    PyrcalError
+        The refusal itself.
+    """
+    while isinstance(outcome, BaseExceptionGroup):
+        outcome = outcome.exceptions[0]
+    if isinstance(outcome, PyrcalError):
+        raise outcome
+    if isinstance(outcome, Exception):
+        structlog.get_logger().error("service.failed", exc_info=outcome)
 
 
 class _Server(uvicorn.Server):

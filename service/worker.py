@@ -7,6 +7,7 @@ alone. The executor is the seam: anything with ``submit`` may take its place.
 from __future__ import annotations
 
 import contextlib
+import functools
 import multiprocessing
 import os
 import signal
@@ -209,7 +210,7 @@ def _unsettled(spectra: Spectra) -> WindowRefused:
     )
 
 
-_workbench: Workbench | None = None
+_open_workbench: Callable[[], Workbench] | None = None
 """Of the worker process; an executor has no other place for what outlives a job."""
 
 P = ParamSpec("P")
@@ -228,19 +229,20 @@ def start_worker(instrument: Instrument, compute: Compute) -> ProcessPoolExecuto
 
 def run_job(job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs) -> R:
     """Run a method of the workbench in the worker process."""
-    if _workbench is None:
+    if _open_workbench is None:
         raise RuntimeError("not in a worker process")
-    return job(_workbench, *args, **kwargs)
+    return job(_open_workbench(), *args, **kwargs)
 
 
 def _enter(instrument: Instrument, compute: Compute) -> None:
     """Prepare the worker process: polite, one BLAS thread, gone when the service is gone."""
-    global _workbench
+    global _open_workbench
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(compute.nice)
     threading.Thread(target=_follow_parent, daemon=True).start()
     threadpool_limits(1)
-    _workbench = Workbench(instrument, compute)
+    # made by the first job, so that an impossible instrument fails that job and says why
+    _open_workbench = functools.cache(lambda: Workbench(instrument, compute))
 
 
 def _follow_parent() -> None:

@@ -65,7 +65,7 @@ class Supervisor:
         self._deeds = deeds
         self._streams: Streams | None = None
         self._windows: asyncio.Queue[Spectra] = asyncio.Queue(WINDOWS_WAITING)
-        self._records: asyncio.Queue[tuple[TrackerState, TrackerState]] = asyncio.Queue()
+        self._unrecorded = asyncio.Event()
         self._running: set[asyncio.Task[None]] = set()
         self._started_ns = time.time_ns()
         self._log = structlog.get_logger().bind(system=state.system)
@@ -220,7 +220,7 @@ class Supervisor:
         self._state, effects = step(before, event, self._policy, time.time_ns())
         self._tell(before)
         if self._state.reconstructors != before.reconstructors or self._state.log != before.log:
-            self._records.put_nowait((before, self._state))
+            self._unrecorded.set()
         self._follow()
         for effect in effects:
             self._start(self._do(effect, self._state))
@@ -276,11 +276,14 @@ class Supervisor:
             getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text)
 
     async def _record(self) -> None:
-        """Write changes of reconstructors and the log to the archive, in order."""
+        """Keep the archive in step with the state: reconstructors and the audit trail."""
+        recorded = self._state
         while True:
-            before, after = await self._records.get()
+            await self._unrecorded.wait()
+            self._unrecorded.clear()
+            before, recorded = recorded, self._state
             try:
-                await asyncio.to_thread(_write, self._archive, before, after)
+                await asyncio.to_thread(_write, self._archive, before, recorded)
             except PyrcalError as error:
                 self._log.error("archive.failed", text=str(error))
 

@@ -1,8 +1,8 @@
 """The telescope the loop really has: finer, uneven, misaligned, and not the service's model.
 
 It is linear: the slopes are ``K_eff turbulence + D G command``. It differs from the service's
-model by its grid (q = 4), its quadrature and modulation points, uneven light, actuators that are
-not where the drawing puts them, and an optical gain for every mode.
+model by its grid (q = 4), its quadrature and modulation points, by everything in ``Imperfections``,
+and by an optical gain for every mode.
 """
 
 from __future__ import annotations
@@ -26,33 +26,24 @@ from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
 from service.model.pyramid import PyramidOptics
+from sim_rtc.imperfections import (
+    Imperfections,
+    SlopeErrors,
+    distorted,
+    non_common_path,
+    true_sensor,
+)
 from sim_rtc.loop import ControlTerms, LoopTerms
 from sim_rtc.mirror import misplaced
+from sim_rtc.scene import Scene
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 _SAMPLING = 4
 _NODES = 4
-_MODULATION_POINTS = 32
+_FEWEST_MODULATION_POINTS = 32
 _RENDER_ROWS = 512
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Imperfections:
-    """How far the plant is from the drawing."""
-
-    unevenness: float = 0.10
-    """Largest departure of the illumination from its mean, ratio of the flux."""
-
-    position_error: float = 0.02
-    """RMS error of an actuator's position per axis, in actuator pitches."""
-
-    lowest_optical_gain: float = 0.6
-    """Optical gain of the first mode, 0..1."""
-
-    highest_optical_gain: float = 0.9
-    """Optical gain of the last mode, 0..1."""
 
 
 class TelescopeOptics(Protocol):
@@ -168,26 +159,36 @@ class LinearPlant:
         *,
         rng: np.random.Generator,
         imperfections: Imperfections | None = None,
+        scene: Scene | None = None,
     ) -> None:
-        imperfections = imperfections or Imperfections()
+        imperfections, scene = imperfections or Imperfections(), scene or Scene()
         self._instrument = instrument
+        self._passes = np.float32(scene.passes)
         pupil = instrument_pupil(instrument, _SAMPLING)
-        uneven_rng, position_rng = rng.spawn(2)
+        pupil = scene.light(pupil, instrument.subaperture_m)
+        uneven_rng, position_rng, pixel_rng, path_rng = rng.spawn(4)
+        wfs = true_sensor(instrument.wfs, imperfections)
         self._pyramid = PyramidOptics(
-            wfs=instrument.wfs,
+            wfs=wfs,
             pupil=uneven(pupil, imperfections.unevenness, uneven_rng),
             n_nodes=_NODES,
-            n_modulation=_MODULATION_POINTS,
+            n_modulation=_modulation_points(wfs.modulation_lambda_over_d),
         )
         mirror = misplaced(instrument.mirror, imperfections.position_error, position_rng)
         self._surface = mirror_surface(mirror, instrument.subaperture_m)
         self._coefficients = self._surface.coefficients(basis.mode_to_actuator)
         self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)
-        self._points = pupil.points
-        self.points_m: Array = pupil.points * instrument.subaperture_m
+        self._points = distorted(pupil.points, pupil.weights, imperfections)
+        self.points_m: Array = self._points * instrument.subaperture_m
         self.pitch_m: float = instrument.subaperture_m / _SAMPLING
         self.weights: Array = pupil.weights
         self.valid: NDArray[np.bool_] = valid_subapertures(instrument, self._pyramid)
+        self.slope_errors = SlopeErrors(self.valid, imperfections, pixel_rng)
+        """What the sensor makes of correct slopes."""
+        self.sensor_opd_m: Array32 = non_common_path(
+            self._points, self.weights, imperfections, path_rng
+        )
+        """``(n_points,)`` static OPD that the sensor sees and the science does not."""
 
     def optics(self, alpha: Misregistration) -> Optics:
         """Return the optics at ``alpha``: K at the shifted images, modes turned and scaled.
@@ -199,14 +200,15 @@ class LinearPlant:
         response = self._pyramid.response(self.valid, shift)
         jacobian = normalised_jacobian(response, self.valid)
         jacobian *= np.float32(2 * np.pi / self._instrument.wfs.wavelength_m)
+        jacobian = self.slope_errors.applied(jacobian)
         modes = self._render(alpha)
         matrix = jacobian @ modes
         jacobian += (matrix * (self._gain - 1.0)) @ self._projection(modes)
         return Optics(
             alpha=alpha,
             slopes_per_phase=jacobian,
-            slopes_per_command=matrix * self._gain,
-            opd_per_command=modes,
+            slopes_per_command=matrix * (self._gain * self._passes),
+            opd_per_command=modes * self._passes,
             images=response.images / response.images.sum(),
         )
 
@@ -231,6 +233,12 @@ class LinearPlant:
         weighted = modes * self.weights[:, None].astype(np.float32)
         gram = (modes.T @ weighted).astype(np.float64)
         return np.asarray(cho_solve(cho_factor(gram), weighted.T.astype(np.float64)), np.float32)
+
+
+def _modulation_points(radius_lambda_over_d: float) -> int:
+    """Return an even number of points that is enough for the radius."""
+    enough = 2 * int(np.ceil(3 * radius_lambda_over_d)) + 10
+    return max(_FEWEST_MODULATION_POINTS, enough)
 
 
 def optical_gain(n_modes: int, imperfections: Imperfections) -> Array32:

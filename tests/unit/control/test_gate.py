@@ -87,6 +87,14 @@ def test_an_estimate_too_uncertain_to_be_safe_is_refused():
     assert not verdict(sigma=60 * SIGMA).accepted
 
 
+def test_both_ends_of_every_axis_are_tried():
+    """The small mirror is its own mirror image: being turned either way is equally bad."""
+    sigma = SIGMA * [1, 1, 50, 1]
+    left, right = (verdict(truth=turned(degrees), sigma=sigma) for degrees in (4.0, -4.0))
+    assert left.worst_pole_radius == pytest.approx(right.worst_pole_radius, rel=1e-3)
+    assert left.worst_pole_radius > verdict(truth=turned(4.0)).worst_pole_radius + 0.01
+
+
 def test_correlated_parameters_are_tried_along_their_own_axes():
     """At the ends of the 3σ ellipsoid, found here without the gate's own algebra."""
     correlation = np.array([[1, 0.9, 0, 0], [0.9, 1, 0, 0], [0, 0, 1, 0.5], [0, 0, 0.5, 1]])

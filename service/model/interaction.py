@@ -13,7 +13,13 @@ from service.model.instrument import Instrument, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid, annular_pupil
-from service.model.pyramid import Mapper, Nodes, PyramidOptics, Response
+from service.model.pyramid import (
+    Mapper,
+    Nodes,
+    PyramidOptics,
+    Response,
+    enough_modulation_points,
+)
 
 Array = NDArray[Any]
 Value = TypeVar("Value")
@@ -55,7 +61,7 @@ class InteractionModel:
         *,
         pupil_sampling: int = 3,
         detector_nodes: int = 3,
-        n_modulation: int = 28,
+        n_modulation: int | None = None,
         dtype: type[np.float32] | type[np.float64] = np.float32,
         mapper: Mapper = map,
     ) -> None:
@@ -66,7 +72,7 @@ class InteractionModel:
             wfs=instrument.wfs,
             pupil=self.pupil,
             n_nodes=detector_nodes,
-            n_modulation=n_modulation,
+            n_modulation=n_modulation or enough_modulation_points(instrument.wfs),
             dtype=dtype,
         )
         self.valid = valid_subapertures(instrument, self.optics)
@@ -204,7 +210,7 @@ def valid_subapertures(instrument: Instrument, optics: PyramidOptics) -> NDArray
         return instrument.wfs.valid_subapertures
     fine = instrument_pupil(instrument, 8).amplitude
     n = instrument.wfs.n_subapertures
-    margin = (len(fine) // 8 - n) // 2 * 8
+    margin = (len(fine) - 8 * n) // 2
     inner = fine[margin : margin + 8 * n, margin : margin + 8 * n]
     flux = inner.reshape(n, 8, n, 8).mean(axis=(1, 3))
     return np.asarray(flux >= instrument.wfs.flux_threshold)

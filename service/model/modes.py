@@ -97,6 +97,7 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
         gram, covariance, _parity_sectors(instrument.mirror.positions_m), turbulence.n_modes
     )
     strokes = _unit_rms(strokes, surface, influence, _pupil(instrument, _NORM_SAMPLING))
+    strokes = _tilts_along_axes(strokes, instrument.mirror.positions_m)
     strokes = _fix_signs(strokes, instrument.mirror.positions_m)
     return ModalBasis(
         surface=surface,
@@ -210,6 +211,19 @@ def _unit_rms(strokes: Array, surface: Surface, influence: Array, pupil: PupilGr
     gram = shapes.T @ (shapes * pupil.weights[:, None])
     upper = cholesky(gram)
     return np.asarray(solve_triangular(upper, strokes.T, trans="T").T)
+
+
+def _tilts_along_axes(strokes: Array, positions_m: Array) -> Array:
+    """Turn the first two modes in their plane until mode 1 holds no tilt along x.
+
+    They are equally strong, so without a symmetry their orientation is any. The turn leaves both
+    orthonormal.
+    """
+    along = positions_m[:, 0] @ strokes[:, :2]
+    cosine, sine = along / np.hypot(*along)
+    turned = strokes.copy()
+    turned[:, :2] = strokes[:, :2] @ np.array([[cosine, -sine], [sine, cosine]])
+    return turned
 
 
 def _fix_signs(strokes: Array, positions_m: Array) -> Array:

@@ -245,14 +245,7 @@ def test_the_valid_subapertures_are_those_half_lit():
     assert not valid[radius > 6.8].any()
 
 
-MISPLACED = pytest.mark.xfail(
-    strict=True,
-    reason="valid_subapertures cuts whole subapertures off a grid that is an odd number wider "
-    "than the sensor: the mask is half a subaperture off",
-)
-
-
-@pytest.mark.parametrize("diameter", [11.4, 12.0, pytest.param(12.6, marks=MISPLACED), 13.5])
+@pytest.mark.parametrize("diameter", [11.4, 12.0, 12.6, 13.5])
 def test_the_mask_is_symmetric_whatever_the_pupils_diameter(diameter):
     instrument = small_instrument(pupil_diameter_subap=diameter)
     valid = InteractionModel(instrument, small_basis()).valid

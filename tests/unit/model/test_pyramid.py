@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from service.errors import ModelError
 from service.model.instrument import Pyramid
-from service.model.interaction import instrument_pupil
-from service.model.pyramid import Nodes, PyramidOptics
-from tests.numerics import small_instrument, small_model
+from service.model.interaction import InteractionModel, instrument_pupil
+from service.model.pyramid import Nodes, PyramidOptics, enough_modulation_points
+from tests.numerics import small_basis, small_instrument, small_model
 
 
 def optics(*, modulation: float = 3.0, **arguments) -> PyramidOptics:
@@ -35,6 +37,15 @@ def test_a_wider_modulation_needs_more_points(modulation, least):
     optics(modulation=modulation, n_modulation=least)
     with pytest.raises(ModelError, match="modulation points"):
         optics(modulation=modulation, n_modulation=least - 2)
+
+
+@pytest.mark.parametrize(("modulation", "enough"), [(2.0, 22), (2.5, 26), (3.0, 28), (5.0, 40)])
+def test_the_model_chooses_an_even_number_of_points_that_is_enough(modulation, enough):
+    instrument = small_instrument()
+    wfs = replace(instrument.wfs, modulation_lambda_over_d=modulation)
+    assert enough_modulation_points(wfs) == enough
+    model = InteractionModel(replace(instrument, wfs=wfs), small_basis())
+    assert model.optics.n_modulation == enough
 
 
 def test_twice_the_modulation_points_change_nothing():

@@ -1,0 +1,200 @@
+"""A service and a simulated RTC as processes of their own, met as an operator would."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import httpx
+
+ROOT = Path(__file__).parents[2]
+INSTRUMENT = Path(__file__).with_name("small.toml")
+N_START, N_TARGET = 45, 60
+ALPHA = {
+    "shift_x_subap": 0.12,
+    "shift_y_subap": -0.08,
+    "rotation_deg": 0.3,
+    "magnification": 1.004,
+}
+# The simulator's actuators are displaced by 2 % of the pitch: with 144 of them that alone turns and
+# scales the mirror's image by 7e-4, more than on the full instrument.
+SETTINGS = f"""
+[tracking]
+floor_rotation_deg = 0.04
+floor_magnification = 0.0007
+[dither]
+window_s = 1.0
+amplitude_m = 20e-9
+[control]
+n_modes_target = {N_TARGET}
+minimum_interval_s = 1.0
+"""
+ENDS_WITHIN_S = 8.0
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(condition, timeout_s=30.0, what=""):
+    """Return the first truthy answer; say what was waited for when none comes."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.1)
+    raise AssertionError(f"not within {timeout_s} s: {what or condition}")
+
+
+def _processes():
+    """Yield (id, parent, session) of every process that lives."""
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            with suppress(OSError):
+                state, parent, _, session = (
+                    (entry / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[:4]
+                )
+                if state != "Z":
+                    yield int(entry.name), int(parent), int(session)
+
+
+def session_members(leader):
+    """Return the processes of the session a process leads: itself and all it has started."""
+    return [pid for pid, _, session in _processes() if session == leader]
+
+
+def children_of(pid):
+    """Return the processes a process has started, whatever sessions they lead."""
+    return [child for child, parent, _ in _processes() if parent == pid]
+
+
+class Process:
+    """A child in a session of its own, its output in a file."""
+
+    def __init__(self, name, words, directory):
+        self.log_path = directory / f"{name}-{time.monotonic_ns()}.log"
+        with self.log_path.open("wb") as log:
+            self.popen = subprocess.Popen(
+                [sys.executable, "-m", *words],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                cwd=ROOT,
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+            )
+
+    @property
+    def log(self):
+        return self.log_path.read_text(encoding="utf-8")
+
+    def send(self, number):
+        self.popen.send_signal(number)
+
+    def end(self, number=signal.SIGINT, within_s=ENDS_WITHIN_S):
+        """Ask it to end and return its status; whatever is left is killed."""
+        if self.popen.poll() is None:
+            self.send(number)
+        try:
+            return self.popen.wait(within_s)
+        finally:
+            self.kill()
+
+    def kill(self):
+        leaders = [self.popen.pid, *children_of(self.popen.pid)]
+        for member in [member for leader in leaders for member in session_members(leader)]:
+            with suppress(ProcessLookupError):
+                os.kill(member, signal.SIGKILL)
+        self.popen.wait(5.0)
+
+
+class Night:
+    """One system: where its service and its RTC meet, and what an operator asks there."""
+
+    def __init__(self, directory):
+        self.directory = directory
+        self.zenoh = f"tcp/127.0.0.1:{free_port()}"
+        self.port = free_port()
+        self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=5.0)
+        self.settings = directory / "settings.toml"
+        self.settings.write_text(SETTINGS, encoding="utf-8")
+        self.processes = []
+
+    def start(self, name, words):
+        process = Process(name, words, self.directory)
+        self.processes.append(process)
+        return process
+
+    def service(self, mode="auto", instrument=INSTRUMENT, *, wait=True):
+        words = ["service", "run", "--config", str(self.settings), "--instrument", str(instrument)]
+        words += ["--mode", mode, "--listen", self.zenoh, "--port", str(self.port)]
+        process = self.start("service", [*words, "--data-dir", str(self.directory / "data")])
+        if wait:
+            wait_for(lambda: self.ready(process), 40.0, f"a ready service; {process.log_path}")
+        return process
+
+    def ready(self, process):
+        assert process.popen.poll() is None, process.log
+        try:
+            return self.client.get("/readyz").status_code == httpx.codes.OK
+        except httpx.TransportError:
+            return False
+
+    def rtc(self, *words, alpha=ALPHA, instrument=INSTRUMENT):
+        values = ",".join(str(value) for value in alpha.values())
+        given = ["sim_rtc", "--connect", self.zenoh, "--instrument", str(instrument)]
+        given += [f"--alpha={values}", "--seed", "3", "--mag", "6"]
+        return self.start("rtc", [*given, "--n-controlled", str(N_START), *words])
+
+    @property
+    def state(self):
+        answer = self.client.get("/v1/state")
+        answer.raise_for_status()
+        return answer.json()
+
+    @property
+    def shelf(self):
+        return self.client.get("/v1/reconstructors").json()["reconstructors"]
+
+    def ids(self, state):
+        return [record["id"] for record in self.shelf if record["state"] == state]
+
+    @property
+    def alarms(self):
+        return {alarm["name"]: alarm["text"] for alarm in self.state["alarms"]}
+
+    @property
+    def metrics(self):
+        lines = self.client.get("/metrics").text.splitlines()
+        pairs = (line.rpartition(" ") for line in lines if not line.startswith("#"))
+        return {name: float(value) for name, _, value in pairs}
+
+    def post(self, path, body=None):
+        answer = self.client.post(path, json=body)
+        assert answer.status_code == httpx.codes.ACCEPTED, answer.text
+
+    def n_modes_in_use(self):
+        """Modes of the reconstructor in use that this service made; 0 while it is another's."""
+        in_use = self.state["in_use"]
+        own = [r["n_modes"] for r in self.shelf if r["id"] == in_use and r["parent"] is not None]
+        return own[0] if own else 0
+
+    def wait_for_modes(self, n_modes, timeout_s=40.0):
+        wait_for(lambda: self.n_modes_in_use() == n_modes, timeout_s, f"{n_modes} modes in use")
+
+
+@contextmanager
+def a_night(directory):
+    night = Night(directory)
+    try:
+        yield night
+    finally:
+        night.client.close()
+        for process in night.processes:
+            process.kill()

@@ -1,0 +1,313 @@
+"""The service as an operator meets it: real processes, real zenoh, real HTTP."""
+
+import json
+import os
+import signal
+import socket
+import time
+
+import pytest
+import zenoh
+
+from service.wire import Keys
+from tests.system.fake_rtc import client_session
+from tests.system.night import (
+    ALPHA,
+    INSTRUMENT,
+    N_START,
+    N_TARGET,
+    a_night,
+    session_members,
+    wait_for,
+)
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+
+TOLERANCE = {
+    "shift_x_subap": 0.02,
+    "shift_y_subap": 0.02,
+    "rotation_deg": 0.05,
+    "magnification": 0.002,
+}
+
+
+@pytest.fixture
+def night(tmp_path):
+    with a_night(tmp_path) as night:
+        yield night
+
+
+def check_registration(known):
+    for name, tolerance in TOLERANCE.items():
+        error = known["alpha"][name] - ALPHA[name]
+        assert abs(error) < tolerance, (name, error)
+        assert abs(error) < 4 * known["sigma"][name], (name, error, known["sigma"][name])
+
+
+def other_instrument(night, **replacements):
+    text = INSTRUMENT.read_text(encoding="utf-8")
+    for old, new in replacements.items():
+        key = f"{old} = "
+        (line,) = [line for line in text.splitlines() if line.startswith(key)]
+        text = text.replace(line, f"{key}{new}")
+    path = night.directory / "other.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_in_auto_the_registration_is_found_and_the_loop_served_first_its_modes_then_more(night):
+    service = night.service("auto")
+    night.rtc()
+    night.wait_for_modes(N_TARGET)
+    state = night.state
+    check_registration(state["registration"])
+    assert state["margin"]["accepted"]
+    assert state["rtc"]["cm_id"] == state["in_use"]
+    assert state["rtc"]["n_controlled"] == N_TARGET
+    own = [record for record in night.shelf if record["parent"] is not None]
+    assert [record["n_modes"] for record in own[:2]] == [N_START, N_TARGET]
+    assert all(record["applied_frame_seq"] > 0 for record in own[:2])
+    assert state["link"]["frames_lost"] == 0
+    assert set(night.alarms) <= {"watchdog"}
+
+    assert len(session_members(service.popen.pid)) > 1
+    began = time.monotonic()
+    service.send(signal.SIGINT)
+    assert service.popen.wait(8.0) == 0, service.log
+    assert time.monotonic() - began < 5.0
+    wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
+    assert "Traceback" not in service.log
+
+
+def test_in_propose_the_operator_decides(night):
+    night.service("propose")
+    night.rtc()
+    (first,) = wait_for(lambda: night.ids("proposed"), 40.0, "a proposal")
+    initial = night.state["in_use"]
+    time.sleep(3.0)
+    assert night.state["in_use"] == initial
+    assert not night.ids("published")
+
+    night.post(f"/v1/reconstructors/{first}/approve")
+    wait_for(lambda: night.state["in_use"] == first, 10.0, "the approved one in use")
+
+    (second,) = wait_for(lambda: night.ids("proposed"), 20.0, "the next proposal")
+    night.post(f"/v1/reconstructors/{second}/reject", {"reason": "not tonight"})
+    assert night.client.get(f"/v1/reconstructors/{second}").json()["state"] == "discarded"
+    answer = night.client.post(f"/v1/reconstructors/{second}/approve")
+    assert answer.status_code == 409
+    assert "discarded, not proposed" in answer.json()["detail"]
+
+    night.post("/v1/rollback")
+    wait_for(lambda: night.state["in_use"] not in {first, initial}, 10.0, "a copy in use")
+    copy = night.client.get(f"/v1/reconstructors/{night.state['in_use']}").json()
+    assert copy["parent"] == initial
+    assert night.state["mode"] == "hold"
+    n_known = len(night.shelf)
+    time.sleep(4.0)
+    assert len(night.shelf) == n_known
+    assert night.state["in_use"] == copy["id"]
+
+
+def test_an_rtc_that_is_killed_and_restarted_is_calibrated_again(night):
+    night.service("auto")
+    rtc = night.rtc()
+    night.wait_for_modes(N_TARGET)
+    before = night.state
+    n_known = len(night.shelf)
+    rtc.kill()
+    wait_for(lambda: "rtc-vanished" in night.alarms, 10.0, "the alarm")
+    after = night.state
+    assert after["rtc"] is None
+    alpha = before["registration"]["alpha"]
+    assert after["registration"]["alpha"] == pytest.approx(alpha, abs=0.05)
+    assert len(night.shelf) >= n_known
+
+    night.rtc("--seed", "4")
+    wait_for(lambda: night.state["rtc"], 30.0, "the RTC is back")
+    assert night.state["rtc"]["session"] != before["rtc"]["session"]
+    assert night.state["registration"]["n_windows"] == 0
+    night.wait_for_modes(N_TARGET)
+    state = night.state
+    assert "rtc-vanished" not in night.alarms
+    assert state["in_use"] != before["in_use"]
+    check_registration(state["registration"])
+
+
+def test_a_service_that_is_killed_and_restarted_picks_up_where_it_was(night):
+    service = night.service("auto")
+    night.rtc()
+    night.wait_for_modes(N_TARGET)
+    in_use, ids = night.state["in_use"], [r["id"] for r in night.shelf if r["parent"]]
+    service.kill()
+
+    night.service("auto")
+    wait_for(lambda: night.state["in_use"] == in_use, 20.0, "the matrix in use is known")
+    kept = [record["id"] for record in night.shelf if record["parent"]]
+    assert kept[: len(ids)] == ids
+    wait_for(lambda: night.state["registration"], 30.0, "a window")
+    check_registration(night.state["registration"])
+    matrix = night.client.get(f"/v1/reconstructors/{in_use}/matrix")
+    assert matrix.status_code == 200
+
+
+def test_an_rtc_that_was_there_first_is_served(night):
+    rtc = night.rtc()
+    time.sleep(4.0)
+    assert rtc.popen.poll() is None, rtc.log
+    night.service("auto")
+    night.wait_for_modes(N_START)
+
+
+def test_a_killed_worker_costs_a_job_but_not_the_service(night):
+    service = night.service("auto")
+    night.rtc()
+    wait_for(lambda: night.state["registration"], 40.0, "a window")
+    accepted = night.state["windows_accepted"]
+    for member in session_members(service.popen.pid):
+        if member != service.popen.pid:
+            os.kill(member, signal.SIGKILL)
+    wait_for(lambda: night.state["windows_accepted"] > accepted + 1, 30.0, "more windows")
+    assert service.popen.poll() is None
+
+
+class TestRefusedAtTheStart:
+    """Exit status 2 and one line that names what to change."""
+
+    def refused(self, night, *words):
+        process = night.start("service", ["service", "run", *words])
+        assert process.popen.wait(20.0) == 2, process.log
+        lines = [line for line in process.log.splitlines() if line.startswith("pyrcal: ")]
+        assert len(lines) == 1, process.log
+        assert "Traceback" not in process.log
+        return lines[0]
+
+    def test_an_unknown_key_in_the_settings(self, night):
+        night.settings.write_text("[dither]\nampltude_m = 1e-9\n", encoding="utf-8")
+        line = self.refused(night, "--config", str(night.settings))
+        assert "ampltude_m" in line
+        assert str(night.settings) in line
+
+    def test_an_unknown_key_in_the_instrument(self, night):
+        path = night.directory / "typo.toml"
+        text = INSTRUMENT.read_text(encoding="utf-8")
+        text = text.replace("[wfs]", "[wfs]\nmodulation = 3.0")
+        path.write_text(text, encoding="utf-8")
+        line = self.refused(night, "--instrument", str(path), "--data-dir", str(night.directory))
+        assert "wfs.modulation" in line
+        assert str(path) in line
+
+    def test_a_file_that_is_not_there(self, night):
+        assert "nowhere.toml" in self.refused(night, "--config", "nowhere.toml")
+
+    def test_a_busy_rest_port(self, night):
+        with socket.create_server(("127.0.0.1", night.port)):
+            line = self.refused(
+                night, "--port", str(night.port), "--data-dir", str(night.directory / "data")
+            )
+        assert str(night.port) in line
+        assert "api.port" in line
+
+    def test_a_busy_zenoh_port(self, night):
+        port = int(night.zenoh.rpartition(":")[2])
+        words = ["--port", "0", "--listen", night.zenoh, "--instrument", str(INSTRUMENT)]
+        with socket.create_server(("127.0.0.1", port)):
+            line = self.refused(night, *words, "--data-dir", str(night.directory / "data"))
+        assert str(port) in line
+
+    def test_a_data_directory_another_service_uses(self, night):
+        night.service("hold")
+        data = str(night.directory / "data")
+        line = self.refused(night, "--port", "0", "--data-dir", data)
+        assert "in use by another service" in line
+
+
+def test_telemetry_that_makes_no_sense_is_counted_and_the_service_goes_on(night):
+    night.service("hold")
+    keys = Keys("small")
+    before = night.metrics
+    with client_session(night.zenoh) as session:
+        session.put(keys.frames, b"\x00" * 100)
+        session.put(keys.frames, b"\x00" * 100, attachment=b"not msgpack")
+        session.put(keys.status, b"\xff\xff")
+        session.put(keys.acknowledgement, b"")
+        session.put(keys.status, b"\x80")
+
+        def moved():
+            now = night.metrics
+            return all(
+                now.get(f'pyrcal_messages_malformed_total{{kind="{kind}"}}', 0.0)
+                >= before.get(f'pyrcal_messages_malformed_total{{kind="{kind}"}}', 0.0) + count
+                for kind, count in (("frames", 2), ("status", 2), ("ack", 1))
+            )
+
+        wait_for(moved, 10.0, f"counters: {json.dumps(night.metrics, indent=1)}")
+    assert night.client.get("/healthz").status_code == 200
+    assert night.state["rtc"] is None
+    events = night.client.get("/v1/events").json()["log"]
+    assert any(event["name"] == "message.malformed" for event in events)
+
+
+def test_a_stranger_on_the_network_cannot_stop_the_telemetry(night):
+    night.service("hold")
+    night.rtc()
+    wait_for(lambda: night.state["rtc"], 30.0, "the RTC")
+    with client_session(night.zenoh) as session:
+        for size in (0, 1, 10_000):
+            session.put(
+                Keys("small").frames,
+                b"\x01" * size,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+        received = night.state["link"]["frames_received"]
+        wait_for(
+            lambda: night.state["link"]["frames_received"] > received + 500, 10.0, "more frames"
+        )
+    assert night.state["link"]["frames_lost"] == 0
+
+
+def test_an_rtc_of_another_instrument_is_named_and_gets_nothing(night):
+    night.service("auto")
+    night.rtc(instrument=other_instrument(night, n_modes="80"))
+    wait_for(lambda: "instrument-mismatch" in night.alarms, 30.0, "the alarm")
+    assert "80 modes, the instrument file 224 and 90" in night.alarms["instrument-mismatch"]
+    time.sleep(5.0)
+    assert night.state["registration"] is None
+    assert not [record for record in night.shelf if record["published_ns_utc"]]
+
+
+def test_an_rtc_of_another_basis_than_the_pinned_one_is_named_and_gets_nothing(night):
+    pinned = other_instrument(night, name='"small"\nbasis_id = "kl-of-last-year"')
+    night.service("auto", pinned)
+    night.rtc()
+    wait_for(lambda: "basis-mismatch" in night.alarms, 30.0, "the alarm")
+    assert "kl-of-last-year" in night.alarms["basis-mismatch"]
+    time.sleep(4.0)
+    assert night.state["registration"] is None
+    assert not [record for record in night.shelf if record["published_ns_utc"]]
+
+
+def test_a_loop_that_diverges_is_recognised_and_named(night):
+    night.service("auto")
+    night.rtc("--gain", "1.2")
+    wait_for(lambda: "loop-diverging" in night.alarms, 30.0, "the alarm")
+    assert "lower the gain" in night.alarms["loop-diverging"]
+    assert not [record for record in night.shelf if record["published_ns_utc"]]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_ends_in_good_order_while_the_model_is_still_being_prepared(night, number):
+    service = night.service(instrument="flao-lbt", wait=False)
+    wait_for(lambda: "api.listening" in service.log, 20.0, "the first line")
+    time.sleep(0.5)
+    service.send(number)
+    assert service.popen.wait(8.0) == 0, service.log
+    wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
+
+
+def test_ctrl_c_in_a_terminal_reaches_the_worker_too_and_still_ends_in_good_order(night):
+    service = night.service("hold")
+    os.killpg(service.popen.pid, signal.SIGINT)
+    assert service.popen.wait(8.0) == 0, service.log
+    wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
+    assert "Traceback" not in service.log

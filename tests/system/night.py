@@ -33,7 +33,6 @@ amplitude_m = 20e-9
 n_modes_target = {N_TARGET}
 minimum_interval_s = 1.0
 """
-ENDS_WITHIN_S = 8.0
 
 
 def free_port():
@@ -96,15 +95,6 @@ class Process:
 
     def send(self, number):
         self.popen.send_signal(number)
-
-    def end(self, number=signal.SIGINT, within_s=ENDS_WITHIN_S):
-        """Ask it to end and return its status; whatever is left is killed."""
-        if self.popen.poll() is None:
-            self.send(number)
-        try:
-            return self.popen.wait(within_s)
-        finally:
-            self.kill()
 
     def kill(self):
         leaders = [self.popen.pid, *children_of(self.popen.pid)]

@@ -1,0 +1,148 @@
+"""The one task that owns the state, beside a real worker, archive and (idle) link."""
+
+import asyncio
+import contextlib
+import socket
+from dataclasses import replace
+
+import pytest
+
+from service import events as ev
+from service.archive import Archive
+from service.errors import CommandError
+from service.rtc_bridge import Bridge, Endpoint
+from service.runtime.crew import Crew
+from service.runtime.deeds import Deeds, Publishing
+from service.runtime.supervisor import Supervisor
+from service.state import Mode, TrackerState
+from service.worker import start_worker
+from tests.unit.reactions.situations import POLICY, record
+from tests.unit.runtime.small import COMPUTE, small_instrument
+
+pytestmark = pytest.mark.timeout(60)
+
+
+@pytest.fixture(scope="module")
+def crew():
+    executor = start_worker(small_instrument(), COMPUTE)
+    crew = Crew(lambda: executor)
+    yield crew
+    crew.dismiss()
+    executor.shutdown(wait=True)
+
+
+@pytest.fixture
+def archive(tmp_path):
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        yield archive
+
+
+@pytest.fixture
+def bridge():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with Bridge(Endpoint(system="small", listen=(f"tcp/127.0.0.1:{port}",))) as bridge:
+        yield bridge
+
+
+@pytest.fixture
+def supervisor(crew, archive, bridge):
+    deeds = Deeds(
+        bridge=bridge,
+        crew=crew,
+        archive=archive,
+        instrument=small_instrument(),
+        publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
+        clock_ns=lambda: 5,
+    )
+    return Supervisor(
+        state=TrackerState(system="small", mode=Mode.HOLD),
+        policy=replace(POLICY),
+        bridge=bridge,
+        crew=crew,
+        archive=archive,
+        deeds=deeds,
+    )
+
+
+async def until(condition, timeout_s=5.0):
+    for _ in range(round(timeout_s / 0.02)):
+        if condition():
+            return
+        await asyncio.sleep(0.02)
+    raise AssertionError(f"not within {timeout_s} s")
+
+
+@contextlib.asynccontextmanager
+async def running(supervisor):
+    task = asyncio.create_task(supervisor.run())
+    try:
+        await until(lambda: supervisor.snapshot().ready, 30.0)
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def test_it_is_ready_when_the_model_is(supervisor):
+    before = supervisor.snapshot()
+    assert not before.ready
+    assert "being prepared" in before.ready_reason
+    async with running(supervisor):
+        log = supervisor.snapshot().tracker.log
+        assert log[0].name == "service.ready"
+        assert log[0].text == "224 slopes, 90 modes"
+
+
+async def test_a_command_changes_the_state_and_enters_the_audit_trail(supervisor, archive):
+    text = await supervisor.submit(ev.SetMode(mode=Mode.AUTO))
+    assert text.startswith("SetMode")
+    assert supervisor.snapshot().tracker.mode is Mode.AUTO
+    (entry,) = archive.audit_trail()
+    assert (entry.who, entry.name) == ("operator", "SetMode")
+    assert "auto" in entry.text
+
+
+async def test_a_command_that_cannot_be_carried_out_is_the_callers_to_hear_of(supervisor):
+    before = supervisor.snapshot().tracker
+    with pytest.raises(CommandError, match="no RTC is there"):
+        await supervisor.submit(ev.Refit())
+    assert supervisor.snapshot().tracker is before
+
+
+async def test_what_happens_is_written_to_the_archive_in_order(supervisor, archive):
+    async with running(supervisor):
+        await supervisor.submit(ev.SetMode(mode=Mode.AUTO))
+        await supervisor.submit(ev.SetMode(mode=Mode.PROPOSE))
+
+        def names():
+            return [entry.text for entry in archive.audit_trail() if entry.who == "service"]
+
+        await until(lambda: "mode is propose" in names())
+    found = names()
+    assert found.index("224 slopes, 90 modes") < found.index("mode is auto")
+    assert found.index("mode is auto") < found.index("mode is propose")
+
+
+async def test_a_reconstructor_on_the_shelf_is_known_after_a_restart(supervisor, archive):
+    async with running(supervisor):
+        supervisor._post(ev.MatrixMade(record=record("cm-1"), wanted=False))
+        await until(lambda: archive.records())
+    assert [kept.id for kept in archive.records()] == ["cm-1"]
+
+
+async def test_a_deed_that_fails_is_on_record_and_the_service_goes_on(supervisor):
+    async with running(supervisor):
+        await supervisor.submit(ev.StopDither())
+        await until(lambda: any(e.name == "job.failed" for e in supervisor.snapshot().tracker.log))
+        assert supervisor.snapshot().ready
+
+
+async def test_cancelled_it_ends_at_once(supervisor):
+    async with running(supervisor):
+        began = asyncio.get_running_loop().time()
+    assert asyncio.get_running_loop().time() - began < 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,17 +13,22 @@ from numpy.typing import NDArray
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument, KarhunenLoeve
 from service.model.interaction import InteractionModel
+from service.model.mirror import mirror_surface
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.wire import CHUNK_LIMIT, Manifest, layout_of
 from sim_rtc.atmosphere import fried_parameter_m, frozen_layers
 from sim_rtc.computer import Identity, LoopSettings, RealTimeComputer
 from sim_rtc.detector import Detector
+from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.dither import DitherLimits
 from sim_rtc.feed import Block, Feed, OpenLoopFeed
+from sim_rtc.mirror import MirrorDrive, MirrorFaults
 from sim_rtc.motion import MovingOptics, background_executor
 from sim_rtc.options import Options
-from sim_rtc.plant import LinearPlant
+from sim_rtc.phases import PhaseFeed
+from sim_rtc.pixels import PixelDetector, binned
+from sim_rtc.plant import LinearPlant, Plant
 from sim_rtc.reconstructors import Reconstructor, truncated_inverse
 from sim_rtc.schedule import Schedule, random_registration
 
@@ -49,6 +54,9 @@ class Telescope:
     mode_to_actuator: NDArray[np.float64]
     """``(n_actuators, n_modes)`` of the basis."""
 
+    drive: MirrorDrive | None
+    """Limits and lag of the mirror; None: it obeys at once."""
+
     def computer(self, blocks: Iterator[Block]) -> RealTimeComputer:
         """Return a computer that runs on these blocks of the feed."""
         return RealTimeComputer(
@@ -60,6 +68,7 @@ class Telescope:
             stroke_m=STROKE_M,
             limits=DitherLimits(most_modes=len(self.settings.gains)),
             mode_to_actuator=self.mode_to_actuator,
+            drive=self.drive,
         )
 
 
@@ -71,6 +80,7 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
     ConfigurationError
         If more modes are to be controlled than the instrument has.
     """
+    devices = options.devices
     n_modes = instrument.modes.n_modes
     if options.n_controlled > n_modes:
         raise ConfigurationError(
@@ -78,7 +88,9 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
         )
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
     basis = karhunen_loeve_basis(instrument)
-    plant = LinearPlant(instrument, basis, rng=plant_rng)
+    basis = binned_basis(instrument, basis, devices.binning)
+    instrument = binned(instrument, devices.binning)
+    plant = build_plant(options, instrument, basis, plant_rng)
     schedule = Schedule(
         start=options.alpha or random_registration(alpha_rng),
         drift=options.drift,
@@ -91,6 +103,7 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
         valid=plant.valid,
         magnitude=options.magnitude,
         frame_rate_hz=options.frame_rate_hz,
+        camera=devices.camera,
     )
     layers = frozen_layers(
         options.layers,
@@ -101,16 +114,31 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
         ),
         rng=sky_rng,
     )
-    identity = identity_of(instrument, plant.valid)
-    return Telescope(
-        feed=OpenLoopFeed(
+    jump_times_s = tuple(jump.time_s for jump in options.jumps)
+    feed: Feed
+    if options.plant == "diffractive":
+        feed = PhaseFeed(
+            layers=layers,
+            optics=optics,
+            detector=PixelDetector(
+                electrons_per_light=detector.electrons_per_frame, camera=devices.camera
+            ),
+            frame_rate_hz=options.frame_rate_hz,
+            jump_times_s=jump_times_s,
+            rng=noise_rng,
+        )
+    else:
+        feed = OpenLoopFeed(
             layers=layers,
             optics=optics,
             detector=detector,
             frame_rate_hz=options.frame_rate_hz,
-            jump_times_s=tuple(jump.time_s for jump in options.jumps),
+            jump_times_s=jump_times_s,
             rng=noise_rng,
-        ),
+        )
+    identity = identity_of(instrument, plant.valid)
+    return Telescope(
+        feed=feed,
         optics=optics,
         detector=detector,
         identity=identity,
@@ -124,7 +152,55 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
         ),
         weights=plant.weights,
         mode_to_actuator=basis.mode_to_actuator,
+        drive=build_drive(options, instrument, basis),
     )
+
+
+def build_plant(
+    options: Options, instrument: Instrument, basis: ModalBasis, rng: np.random.Generator
+) -> Plant:
+    """Return the plant of these options, for an instrument that is binned already.
+
+    Raises
+    ------
+    ConfigurationError
+        If actuators are to fail, or pixels to be binned, on a plant that cannot show it.
+    """
+    faults, binning = options.devices.faults, options.devices.binning
+    if options.plant == "diffractive":
+        return DiffractivePlant(instrument, basis, rng=rng, faults=faults, binning=binning)
+    if faults != MirrorFaults() or binning > 1:
+        raise ConfigurationError(
+            "--dead-actuators, --stuck-actuators and a binned sensor (--preset) need "
+            "--plant diffractive; found --plant linear"
+        )
+    return LinearPlant(instrument, basis, rng=rng)
+
+
+def build_drive(options: Options, instrument: Instrument, basis: ModalBasis) -> MirrorDrive | None:
+    """Return what limits and slows the mirror; None for a linear plant's ideal one."""
+    devices = options.devices
+    if options.plant == "linear" and not devices.needs_drive:
+        return None
+    return MirrorDrive(
+        instrument.mirror,
+        basis.mode_to_actuator,
+        frame_rate_hz=options.frame_rate_hz,
+        rise_s=devices.rise_s,
+        limits=devices.limits,
+    )
+
+
+def binned_basis(instrument: Instrument, basis: ModalBasis, binning: int) -> ModalBasis:
+    """Return the same modes in the larger subapertures of a binned sensor.
+
+    They are found with the finest ones: coarser, they could not be told from one another.
+    """
+    if binning == 1:
+        return basis
+    surface = mirror_surface(instrument.mirror, binned(instrument, binning).subaperture_m)
+    coefficients = surface.coefficients(basis.mode_to_actuator)
+    return replace(basis, surface=surface, coefficients=coefficients)
 
 
 def initial_reconstructor(

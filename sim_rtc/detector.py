@@ -30,6 +30,17 @@ class Camera:
     read_noise_electrons: float = 4.0
     """RMS per pixel and read; a subaperture is one pixel in each of the four images."""
 
+    excess_noise: float = 1.0
+    """Variance of the photon noise over Poisson's: 2 for an electron-multiplying CCD."""
+
+    def electrons_per_frame(
+        self, instrument: Instrument, *, magnitude: float, frame_rate_hz: float
+    ) -> float:
+        """Return the electrons of a star in all four images together."""
+        area_m2 = np.pi / 4 * instrument.diameter_m**2 * (1 - instrument.obscuration_ratio**2)
+        flux = self.zero_point_photons * 10 ** (-0.4 * magnitude) * area_m2
+        return float(flux * self.throughput / frame_rate_hz)
+
 
 class Detector:
     """Photon and read noise of the slopes, as Gaussian noise per subaperture from its own flux."""
@@ -46,17 +57,13 @@ class Detector:
     ) -> None:
         """Take the share of the light in each pixel, ``images`` ``(2, n, 2, n)``, at the start."""
         camera = camera or Camera()
-        area_m2 = np.pi / 4 * instrument.diameter_m**2 * (1 - instrument.obscuration_ratio**2)
-        self.electrons_per_frame: float = float(
-            camera.zero_point_photons
-            * 10 ** (-0.4 * magnitude)
-            * camera.throughput
-            * area_m2
-            / frame_rate_hz
+        self.electrons_per_frame: float = camera.electrons_per_frame(
+            instrument, magnitude=magnitude, frame_rate_hz=frame_rate_hz
         )
         """Detected in all four images together."""
         own = images.sum(axis=(0, 2))[valid] * self.electrons_per_frame
-        variance = (own + 4 * camera.read_noise_electrons**2) / own.mean() ** 2
+        variance = camera.excess_noise * own + 4 * camera.read_noise_electrons**2
+        variance /= own.mean() ** 2
         self.sigma: Array32 = np.sqrt(np.tile(variance, 2)).astype(np.float32)
         """``(n_slopes,)`` 1 σ of a slope in one frame."""
 

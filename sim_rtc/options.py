@@ -12,13 +12,24 @@ from typing import NoReturn
 
 from typing_extensions import override
 
+from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration
 from sim_rtc import arguments
 from sim_rtc.atmosphere import Layer
+from sim_rtc.options_device import (
+    PRESETS,
+    DeviceOptions,
+    add_devices,
+    apply_preset,
+    device_options,
+)
 from sim_rtc.schedule import Drift, Jump
 
 _MOST_LAYERS = 3
 _DEFAULT_WIND = Layer(fraction=1.0, speed_m_s=12.0, direction_deg=35.0)
+
+_USUAL_SPEED = {"linear": 1.0, "diffractive": 0.0}
+"""The diffractive plant cannot keep up with a real loop: it takes the time it needs."""
 
 _DESCRIPTION = """\
 Simulated real-time computer of an adaptive telescope with a pyramid sensor. It closes the loop on
@@ -27,7 +38,17 @@ dithers, loop commands and reconstructors, as the service's wire contract says. 
 mis-registered on the sensor by an amount that it tells nobody on the wire.
 """
 
-_EPILOG = """\
+_EPILOG = f"""\
+plants
+  linear       one matrix, real time at 1 kHz; an optical gain of its own invention.
+  diffractive  the field of the pyramid for every frame: the optical gain is what the residual
+               wavefront makes it. Other influence functions and pupil grid than the service's.
+               150 to 200 frames a second on one core; timestamps follow the loop's own time.
+
+presets
+  --preset flao looks at the magnitude:
+{PRESETS}
+
 registration
   X,Y in subapertures, rotation in degrees from +x towards +y, magnification as a ratio. A jump
   T:dx,dy,drot_deg,dmag happens at T seconds of loop time, at the next batch of 10 frames; its
@@ -36,7 +57,8 @@ registration
 
 light
   A star of R = 0 gives 2.1e10 photons per second and square metre in the band (600 to 900 nm); a
-  quarter of them are detected; read noise is 4 electrons RMS per pixel.
+  quarter of them are detected. The linear plant adds their noise to its slopes, the diffractive one
+  counts electrons in every pixel.
 
 truth file
   One JSON object a line, twice a second: registration, wavefront error (RMS and peak, nm) over the
@@ -78,6 +100,9 @@ class Options:
     n_controlled: int
     frame_rate_hz: float
     plant: str
+    devices: DeviceOptions
+    """Mirror and detector."""
+
     truth: Path | None
     jumps: tuple[Jump, ...]
     drift: Drift
@@ -96,6 +121,10 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
     found = parser.parse_args(_joined(sys.argv[1:] if given is None else given))
     if found.wind is not None and len(found.wind) > _MOST_LAYERS:
         parser.error(f"--wind: found {len(found.wind)} layers; expected at most {_MOST_LAYERS}")
+    try:
+        apply_preset(found)
+    except ConfigurationError as error:
+        parser.error(str(error))
     return Options(
         connect=found.connect,
         instrument=found.instrument,
@@ -111,11 +140,12 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         n_controlled=found.n_controlled,
         frame_rate_hz=found.rate,
         plant=found.plant,
+        devices=device_options(found),
         truth=found.truth,
         jumps=tuple(found.jump or ()),
         drift=found.drift,
         seconds=found.seconds,
-        speed=found.speed,
+        speed=_USUAL_SPEED[found.plant] if found.speed is None else found.speed,
         quiet=found.quiet,
     )
 
@@ -151,6 +181,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_instrument(parser.add_argument_group("instrument and truth"))
     _add_sky(parser.add_argument_group("star and sky"))
     _add_loop(parser.add_argument_group("loop"))
+    add_devices(parser)
     _add_run(parser.add_argument_group("run"))
     return parser
 
@@ -164,7 +195,7 @@ def _add_instrument(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--plant",
-        choices=["linear"],
+        choices=["linear", "diffractive"],
         default="linear",
         help="model of the telescope (default: %(default)s)",
     )
@@ -280,8 +311,7 @@ def _add_run(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--speed",
         type=arguments.within(0.0, 100.0),
-        default=1.0,
         metavar="X",
-        help="loop time over wall-clock time, 0: as fast as it goes (default: %(default)s)",
+        help="loop time over wall-clock time, 0: as fast as it goes (default: 1; diffractive: 0)",
     )
     group.add_argument("--quiet", action="store_true", help="say only what is wrong")

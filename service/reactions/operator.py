@@ -41,7 +41,7 @@ def on_command(  # noqa: C901 - one line for each command
             state = with_state(state, matrix_id, MatrixState.DISCARDED, reason or "by the operator")
             return logged(state, "reconstructor.discarded", matrix_id, now_ns), ()
         case ev.Publish(id=matrix_id):
-            known_record(state, matrix_id)
+            _judgeable(state, matrix_id)
             return _copy(state, matrix_id, f"the operator publishes {matrix_id} again", now_ns)
         case ev.Rollback():
             return _rollback(state, now_ns)
@@ -122,3 +122,12 @@ def _proposed(state: TrackerState, matrix_id: str) -> None:
     record = known_record(state, matrix_id)
     if record.state is not MatrixState.PROPOSED:
         raise CommandError(f"{matrix_id} is {record.state}, not proposed")
+
+
+def _judgeable(state: TrackerState, matrix_id: str) -> None:
+    """Refuse what has never been in use while the gate cannot judge it."""
+    used = known_record(state, matrix_id).state in {MatrixState.APPLIED, MatrixState.SUPERSEDED}
+    if state.registration is None and not used:
+        raise CommandError(
+            f"{matrix_id} cannot be judged: α is not known yet; start a dither, wait for a window"
+        )

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 
 from service import events as ev
@@ -129,6 +131,12 @@ class TestGoingBack:
 
     def test_but_no_unknown_one(self, story):
         refused(story, ev.Publish(id="cm-9"), "no reconstructor cm-9", UnknownIdError)
+
+    def test_while_the_gate_cannot_judge_only_what_has_been_in_use_is_sent(self, story):
+        story.make("cm-3", MatrixState.REFUSED)
+        story.state = replace(story.state, registration=None)
+        refused(story, ev.Publish(id="cm-3"), "α is not known yet")
+        assert of_kind(story.tell(ev.Publish(id="cm-1")), ev.CopyMatrix)
 
     def test_there_must_be_something_to_go_back_to(self):
         refused(Story().meet(), ev.Rollback(), "no earlier reconstructor has been in use")

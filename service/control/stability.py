@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import ModelError
+
 
 def pole_radius(
     loop_eigenvalues: NDArray[Any], *, leak: float = 1.0, delay_frames: float = 2.0
@@ -16,7 +18,14 @@ def pole_radius(
     The loop ``c[k+d] = leak c[k+d-1] - R s[k]`` has its poles at the roots of
     ``z^d - leak z^(d-1) + λ``. A fractional delay is a share of each neighbouring whole one:
     ``z^(n+1) - leak z^n + λ ((1 - f) z + f)`` for ``d = n + f``.
+
+    Raises
+    ------
+    ModelError
+        If the delay is below one frame: no loop can answer an exposure before it ends.
     """
+    if delay_frames < 1.0:
+        raise ModelError(f"poles: found a delay of {delay_frames} frames; expected at least 1")
     whole = int(np.floor(delay_frames))
     share = delay_frames - whole
     values = np.asarray(loop_eigenvalues, dtype=complex)

@@ -40,6 +40,8 @@ def observe(
     commands = block.commands_m[:, upper]
     power = float(np.mean(np.sum(commands.astype(np.float64) ** 2, axis=1)))
     expected = float(mode_variance_m2[upper].sum())
+    if expected <= 0.0:
+        return health
     fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / _MEMORY_S))
     ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * power / expected))
     limit = CALM_RATIO if health.diverging else DIVERGING_RATIO

@@ -210,7 +210,14 @@ def _add(plan: LockInPlan, window: _Window, block: FrameBlock, rows: slice) -> _
     n_rows = rows.stop - rows.start
     seq = block.first_seq + rows.start
     if n_rows == 0:
-        return replace(window, next_seq=window.first_seq + plan.n_frames)
+        # the window's last frames never came: the block begins behind its end
+        lost = window.first_seq + plan.n_frames - window.next_seq
+        return replace(
+            window,
+            next_seq=window.next_seq + lost,
+            n_missing=window.n_missing + lost,
+            next_t_ns=window.next_t_ns + lost * block.dt_ns,
+        )
     index = np.arange(n_rows) + (seq - window.first_seq)
     hann = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / plan.n_frames)
     turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, index)
@@ -253,7 +260,7 @@ def _close(plan: LockInPlan, window: _Window) -> Spectra | WindowRefused:
         session=window.session,
         cm_id=window.cm_id,
         first_seq=window.first_seq,
-        t_end_ns_utc=window.next_t_ns,
+        t_end_ns_utc=window.next_t_ns - round(1e9 / plan.frame_rate_hz),
         n_missing=window.n_missing,
         slopes=window.slopes,
         commands=window.commands,

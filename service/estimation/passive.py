@@ -27,6 +27,7 @@ MIN_FRAMES_PER_MODE = 5
 """Fewer effective frames leave the command covariance too noisy to invert."""
 
 _RIDGE = 1e-6
+_STILL_RIDGE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,9 +95,23 @@ def interaction_matrix(state: Passive) -> Array | None:
         return None
     if state.n_effective < MIN_FRAMES_PER_MODE * state.n_modes:
         return None
-    power = state.command_power.astype(np.float64)
-    power += np.diag(_RIDGE * np.diag(power))
+    power = _invertible_power(state.command_power)
+    if power is None:
+        return None
     return np.asarray(np.linalg.solve(power, state.cross.T.astype(np.float64)).T)
+
+
+def _invertible_power(command_power: Array) -> Array | None:
+    """Return the command covariance with a ridge; None when no mode has moved at all.
+
+    The ridge is relative to each mode's own power, or the strongest would drown the weakest, with
+    just enough of the mean for a mode that never moves.
+    """
+    power = command_power.astype(np.float64)
+    own = np.diag(power)
+    if not own.any():
+        return None
+    return np.asarray(power + np.diag(_RIDGE * own + _STILL_RIDGE * own.mean()))
 
 
 def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
@@ -138,8 +153,7 @@ def _column_weights(state: Passive, measured: Array) -> Array:
     The residual slopes are as noisy for every column, so a column's noise is what the inverse of
     the command covariance makes of it.
     """
-    power = np.asarray(state.command_power, dtype=np.float64)
-    power = power + np.diag(_RIDGE * np.diag(power))
-    noise = np.diag(np.linalg.inv(power))
+    power = _invertible_power(np.asarray(state.command_power))
+    noise = np.ones(state.n_modes) if power is None else np.diag(np.linalg.inv(power))
     scale = np.mean(np.einsum("sm,sm->m", measured, measured)) * noise
     return np.asarray(1.0 / scale)

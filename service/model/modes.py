@@ -86,10 +86,10 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
     turbulence = instrument.modes
     surface = mirror_surface(instrument.mirror, instrument.subaperture_m)
     n_actuators = len(instrument.mirror.positions_m)
-    if turbulence.n_modes >= n_actuators:
+    if not 2 <= turbulence.n_modes < n_actuators:
         raise ModelError(
-            f"modes: found n_modes = {turbulence.n_modes}; expected fewer than the "
-            f"{n_actuators} actuators (piston is left out)"
+            f"modes: found n_modes = {turbulence.n_modes}; expected at least tip and tilt, and "
+            f"fewer than the {n_actuators} actuators (piston is left out)"
         )
     influence = surface.coefficients(np.eye(n_actuators))
     gram, covariance = _pupil_statistics(instrument, surface, influence)

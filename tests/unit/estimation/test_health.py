@@ -106,10 +106,5 @@ def test_a_simulated_loop_that_diverges_is_recognised_and_one_that_holds_is_not(
     assert not any(observed(truth=Misregistration(), gain=0.7))
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=ZeroDivisionError,
-    reason="with no controlled mode there is no expectation to compare with",
-)
 def test_an_rtc_that_controls_no_mode_is_not_diverging():
     assert not observe(LoopHealth(), times_expectation(1.0), VARIANCE, 0).diverging

@@ -170,15 +170,6 @@ def test_noise_widens_sigma_beyond_the_floor():
     assert np.all(found.sigma > 2 * BIAS_FLOOR)
 
 
-FROZEN = pytest.mark.xfail(
-    strict=True,
-    raises=np.linalg.LinAlgError,
-    reason="a mode that never moves (gain 0 in a partial loop) makes the command covariance "
-    "singular: the ridge is relative to each mode's own power, 0",
-)
-
-
-@FROZEN
 @pytest.mark.parametrize("still", [slice(7, 8), slice(None)], ids=["one mode", "all modes"])
 def test_modes_that_never_move_do_not_break_the_watchdog(still):
     block = quiet_block(1000)

@@ -26,6 +26,7 @@ from service.config import Settings, load_instrument, load_settings
 from service.demo import add_demo_arguments, run_demo
 from service.errors import ConfigurationError, PyrcalError
 from service.model.instrument import Instrument
+from service.reactions.measurements import MEASUREMENTS_KEPT
 from service.reactions.policy import Policy
 from service.reactions.shelf import restored
 from service.rtc_bridge import Bridge, Endpoint
@@ -216,6 +217,7 @@ def _supervisor(
         system=system,
         mode=settings.service.mode,
         reconstructors=restored(archive.records()),
+        measurements=archive.measured.records()[-MEASUREMENTS_KEPT:],
         basis_id=instrument.basis_id,
         config_id=instrument.config_id,
     )

@@ -6,7 +6,7 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 
 from service import __version__
-from service.routes import health, operating, problems, reading
+from service.routes import health, measurements, operating, problems, reading
 from service.routes.service import Link, Service, Snapshot
 
 __all__ = ["Link", "Service", "Snapshot", "create_app"]
@@ -36,7 +36,7 @@ def create_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     problems.install(app)
-    for router in (reading.router, operating.router, health.router):
+    for router in (reading.router, operating.router, measurements.router, health.router):
         app.include_router(router)
     return app
 

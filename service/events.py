@@ -8,7 +8,16 @@ from service.control.gate import GateVerdict
 from service.estimation.instrumental import WindowEstimate
 from service.estimation.lockin import WindowRefused
 from service.estimation.passive import PassiveEstimate
-from service.state import DitherView, Level, MatrixState, Mode, ReconstructorRecord, RtcView
+from service.state import (
+    DitherView,
+    Level,
+    MatrixState,
+    MeasurementRecord,
+    MeasurePattern,
+    Mode,
+    ReconstructorRecord,
+    RtcView,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +83,33 @@ class Rollback:
     """Go back to the reconstructor that was in use before the present one."""
 
 
-Command = SetMode | Refit | StartDither | StopDither | Approve | Reject | Publish | Rollback
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measure:
+    """Have the RTC measure an interaction matrix; None: the service's own choice."""
+
+    id: str
+    """Of the matrix to come; never used before."""
+
+    pattern: MeasurePattern
+    modes: tuple[int, ...] | None = None
+    """0-based basis indices."""
+
+    amplitude_m: float | None = None
+    """RMS of each mode's stroke, metres OPD."""
+
+    n_average: int | None = None
+    """Repetitions; None for a sine."""
+
+    frequency_hz: tuple[float, ...] | None = None
+    """One for each mode of a sine."""
+
+    duration_s: float | None = None
+    """Of a sine."""
+
+
+Command = (
+    SetMode | Refit | StartDither | StopDither | Approve | Reject | Publish | Rollback | Measure
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,6 +222,13 @@ class DitherAnswered:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MatrixMeasured:
+    """A measured interaction matrix is one step further: begun, refused, failed or stored."""
+
+    record: MeasurementRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class JobFailed:
     """Something that was to be done could not be."""
 
@@ -210,6 +252,7 @@ Event = (
     | MarginJudged
     | Acknowledged
     | DitherAnswered
+    | MatrixMeasured
     | JobFailed
 )
 
@@ -266,4 +309,20 @@ class AskNoDither:
     """Ask the RTC to stop its dither."""
 
 
-Effect = MakeMatrix | CopyMatrix | JudgeMatrix | SendMatrix | FetchMatrix | AskDither | AskNoDither
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskMeasurement:
+    """Ask the RTC to measure an interaction matrix."""
+
+    record: MeasurementRecord
+
+
+Effect = (
+    MakeMatrix
+    | CopyMatrix
+    | JudgeMatrix
+    | SendMatrix
+    | FetchMatrix
+    | AskDither
+    | AskNoDither
+    | AskMeasurement
+)

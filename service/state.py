@@ -56,6 +56,41 @@ class MatrixState(StrEnum):
     """No acknowledgement came in time."""
 
 
+class MeasurePattern(StrEnum):
+    """How the RTC measures an interaction matrix."""
+
+    PUSH_PULL_MODAL = "push-pull-modal"
+    """One mode after the other, loop open."""
+
+    PUSH_PULL_ZONAL = "push-pull-zonal"
+    """One actuator after the other, loop open."""
+
+    HADAMARD = "hadamard"
+    """All modes at once with the signs of a Hadamard matrix, loop open."""
+
+    SINE = "sine"
+    """All modes at once, each at its own frequency, loop closed."""
+
+
+class MeasureState(StrEnum):
+    """Where a measurement of an interaction matrix is."""
+
+    ASKED = "asked"
+    """The RTC has not answered yet."""
+
+    RUNNING = "running"
+    """The RTC measures."""
+
+    REFUSED = "refused"
+    """The RTC would not; the reason is the RTC's."""
+
+    FAILED = "failed"
+    """There is no matrix; the reason says why."""
+
+    STORED = "stored"
+    """The matrix is in the archive."""
+
+
 class Level(StrEnum):
     """How loudly an event speaks."""
 
@@ -168,6 +203,58 @@ class ReconstructorRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MeasurementRecord:
+    """All that is known of one measured interaction matrix but its numbers."""
+
+    id: str
+    """Never reused."""
+
+    state: MeasureState
+    pattern: MeasurePattern
+    modes: tuple[int, ...]
+    """0-based basis indices, one for each column."""
+
+    amplitude_m: tuple[float, ...]
+    """RMS of each mode's stroke, metres OPD."""
+
+    n_average: int | None
+    """Repetitions averaged; None: the pattern has none."""
+
+    frequency_hz: tuple[float, ...] | None = None
+    """Of each mode; None: not a sine, or asked for by somebody else."""
+
+    duration_s: float | None = None
+    """Of a sine; None as above."""
+
+    asked_ns_utc: int | None = None
+    """When the service asked for it; None: it did not."""
+
+    start_seq: int | None = None
+    """First frame that contained a stroke; None: not known."""
+
+    overdue_since_ns_utc: int | None = None
+    """Since when everything looks as if it were over, but no matrix has come."""
+
+    reason: str = ""
+    """Why there is no matrix."""
+
+    created_ns_utc: int | None = None
+    """When it was measured, by the RTC's clock; None: it was not, or not yet."""
+
+    n_slopes: int | None = None
+    double_pass: bool | None = None
+    """Whether the light saw the mirror twice: the matrix is then twice as large."""
+
+    session: str | None = None
+    """The RTC's session."""
+
+    basis_id: str | None = None
+    config_id: str | None = None
+    sha256: str = ""
+    """Of the matrix as it travels, 64 lower-case hex digits."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RtcView:
     """The RTC as its last status message shows it."""
 
@@ -273,6 +360,9 @@ class TrackerState:
     reconstructors: tuple[ReconstructorRecord, ...] = ()
     """Oldest first, bounded; the one in use is always among them once known."""
 
+    measurements: tuple[MeasurementRecord, ...] = ()
+    """Of interaction matrices, oldest first, bounded."""
+
     in_use: str | None = None
     """Id of the matrix the RTC multiplies with; None: unknown."""
 
@@ -314,3 +404,13 @@ class TrackerState:
     def reconstructor(self, matrix_id: str) -> ReconstructorRecord | None:
         """Return the record of this id, or None."""
         return next((r for r in reversed(self.reconstructors) if r.id == matrix_id), None)
+
+    def measurement(self, measurement_id: str) -> MeasurementRecord | None:
+        """Return the record of this measured matrix, or None."""
+        return next((r for r in reversed(self.measurements) if r.id == measurement_id), None)
+
+    @property
+    def measuring(self) -> MeasurementRecord | None:
+        """The measurement under way, or None."""
+        under_way = {MeasureState.ASKED, MeasureState.RUNNING}
+        return next((r for r in reversed(self.measurements) if r.state in under_way), None)

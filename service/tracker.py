@@ -16,6 +16,7 @@ from service.reactions.matrices import (
     on_margin,
     on_matrix,
 )
+from service.reactions.measurements import MEASURING, meanwhile, on_measurement
 from service.reactions.operator import on_command
 from service.reactions.policy import Policy, decide
 from service.reactions.rtc import (
@@ -42,7 +43,9 @@ def step(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step
     UnknownIdError
         If it names a reconstructor nobody has heard of.
     """
-    state, effects = _react(state, event, policy, now_ns)
+    state, effects = _react(meanwhile(state, event, now_ns), event, policy, now_ns)
+    if state.measuring is not None:
+        return state, effects
     state, more = decide(state, policy, now_ns)
     return state, (*effects, *more)
 
@@ -65,6 +68,10 @@ def _react(  # noqa: C901 - one line for each event
             return with_alarm(state, name, text, now_ns), ()
         case ev.Noted(name=name, text=text, level=level):
             return logged(state, name, text, now_ns, level), ()
+        case ev.Measure() | ev.MatrixMeasured() | ev.JobFailed(effect=ev.AskMeasurement()):
+            return on_measurement(state, event, policy, now_ns)
+        case ev.WindowFitted() if state.measuring is not None:
+            return refuse_window(state, MEASURING, now_ns), ()
         case ev.WindowFitted(estimate=estimate):
             return on_window(state, estimate, policy, now_ns), ()
         case ev.WindowLost(refused=refused):

@@ -93,7 +93,7 @@ def hadamard_shapes(
     With all modes always at work the noise of each is that of ``n`` times as many pushes.
     """
     signs = hadamard(hadamard_order(len(modes)))[:, : len(modes)]
-    return (signs @ modal(modes, amplitude_m, n_modes)).astype(np.float32)
+    return np.asarray(signs @ modal(modes, amplitude_m, n_modes), dtype=np.float32)
 
 
 def pokes(mode_to_actuator: Array, amplitude_m: float) -> Array32:

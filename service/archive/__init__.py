@@ -3,9 +3,10 @@
 ::
 
     <directory>/
-      reconstructors/<id>.h5   one reconstructor each, written once, complete or absent
-      index.sqlite             where each is on its way, and who did what, when
-      lock                     held while a service uses the directory
+      reconstructors/<id>.h5        one reconstructor each, written once, complete or absent
+      interaction_matrices/<id>.h5  one measured interaction matrix each, likewise
+      index.sqlite                  where each is on its way, and who did what, when
+      lock                          held while a service uses the directory
 """
 
 from service.archive.archive import Archive

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.archive.index import AuditEntry, Index
+from service.archive.measured import MeasuredArchive
 from service.archive.product import Provenance, read_matrix, read_product, write_product
 from service.errors import ArchiveError, UnknownIdError
 from service.state import ReconstructorRecord
@@ -35,6 +36,8 @@ class Archive:
         self._directory = directory
         self._products = directory / "reconstructors"
         self._index = Index(directory / "index.sqlite")
+        self.measured = MeasuredArchive(directory / "interaction_matrices", self._index)
+        """Interaction matrices the RTC has measured."""
         self._lock: IO[str] | None = None
 
     def __enter__(self) -> Self:
@@ -66,12 +69,13 @@ class Archive:
             self._lock = _locked(self._directory / "lock")
             for leftover in self._products.glob("*.part"):
                 leftover.unlink()
+            self.measured.prepare()
         except OSError as error:
             self.close()
             raise ArchiveError(f"{self._directory}: cannot be used: {error}") from error
         try:
             self._index.open()
-            return self._adopt()
+            return (*self._adopt(), *self.measured.adopt())
         except ArchiveError:
             self.close()
             raise

@@ -4,16 +4,33 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-from service.archive.records import record_from_json, record_to_json
+from service.archive.records import (
+    measurement_from_json,
+    measurement_to_json,
+    record_from_json,
+    record_to_json,
+)
 from service.errors import ArchiveError
-from service.state import ReconstructorRecord
+from service.state import MeasurementRecord, ReconstructorRecord
 
-_SCHEMA_VERSION = 1
+_Record = TypeVar("_Record")
+
+_SCHEMA_VERSION = 2
+
+_MEASUREMENTS = """
+CREATE TABLE measurement (
+    id TEXT PRIMARY KEY,
+    created_ns_utc INTEGER NOT NULL,
+    record TEXT NOT NULL,
+    product_sha256 TEXT NOT NULL
+);
+"""
 
 _SCHEMA = f"""
 BEGIN;
@@ -33,6 +50,14 @@ CREATE TRIGGER audit_keeps_its_entries BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
 CREATE TRIGGER audit_keeps_its_words BEFORE UPDATE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
+{_MEASUREMENTS}
+PRAGMA user_version = {_SCHEMA_VERSION};
+COMMIT;
+"""
+
+_FROM_VERSION_1 = f"""
+BEGIN;
+{_MEASUREMENTS}
 PRAGMA user_version = {_SCHEMA_VERSION};
 COMMIT;
 """
@@ -84,6 +109,8 @@ class Index:
                 version = connection.execute("PRAGMA user_version").fetchone()[0]
                 if version == 0:
                     connection.executescript(_SCHEMA)
+                elif version == 1:
+                    connection.executescript(_FROM_VERSION_1)
                 elif version != _SCHEMA_VERSION:
                     raise ArchiveError(
                         f"{self._path}: found version {version}, expected {_SCHEMA_VERSION}"
@@ -153,7 +180,50 @@ class Index:
             rows = connection.execute(
                 "SELECT id, record FROM reconstructor ORDER BY created_ns_utc, rowid"
             ).fetchall()
-        return tuple(self._record(*row) for row in rows)
+        return tuple(
+            self._understood(record_from_json, f"reconstructor {name}", text) for name, text in rows
+        )
+
+    def add_measurement(self, record: MeasurementRecord, sha256: str) -> None:
+        """Enter a measured interaction matrix whose product is on the disk.
+
+        Raises
+        ------
+        ArchiveError
+            If one of this id is already there.
+        """
+        with self._use() as connection:
+            done = connection.execute(
+                "INSERT INTO measurement VALUES (?, ?, ?, ?) ON CONFLICT (id) DO NOTHING",
+                (record.id, record.created_ns_utc or 0, measurement_to_json(record), sha256),
+            )
+        if done.rowcount == 0:
+            raise ArchiveError(f"measurement {record.id}: already stored, ids are never reused")
+
+    def measurement_sha256(self, measurement_id: str) -> str | None:
+        """Return the checksum of a measured matrix, None where there is none."""
+        with self._use() as connection:
+            row = connection.execute(
+                "SELECT product_sha256 FROM measurement WHERE id = ?", (measurement_id,)
+            ).fetchone()
+        return None if row is None else row[0]
+
+    def measurements(self) -> tuple[MeasurementRecord, ...]:
+        """Return every measured interaction matrix, oldest first.
+
+        Raises
+        ------
+        ArchiveError
+            If one was written by a version that this one does not understand.
+        """
+        with self._use() as connection:
+            rows = connection.execute(
+                "SELECT id, record FROM measurement ORDER BY created_ns_utc, rowid"
+            ).fetchall()
+        return tuple(
+            self._understood(measurement_from_json, f"measurement {name}", text)
+            for name, text in rows
+        )
 
     def audit(self, entry: AuditEntry) -> None:
         """Add an entry."""
@@ -174,12 +244,12 @@ class Index:
             for t, who, name, text in reversed(rows)
         )
 
-    def _record(self, matrix_id: str, text: str) -> ReconstructorRecord:
+    def _understood(self, read: Callable[[str], _Record], name: str, text: str) -> _Record:
         try:
-            return record_from_json(text)
+            return read(text)
         except (ValueError, KeyError, TypeError) as error:
             raise ArchiveError(
-                f"{self._path}: record of reconstructor {matrix_id} not understood: {error!r}"
+                f"{self._path}: record of {name} not understood: {error!r}"
             ) from error
 
     @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from service.wire import checksum
 Provenance = str | int | float | bool | NDArray[Any]
 """What an HDF5 attribute can hold."""
 
-_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
+DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 """What h5py raises, depending on where a file is damaged."""
 
 
@@ -39,11 +39,26 @@ def write_product(
     ArchiveError
         If the disk refuses.
     """
+
+    def fill(file: h5py.File) -> None:
+        _fill(file, record, np.asarray(matrix, "<f4"), covariance)
+        file.create_group("provenance").attrs.update(provenance)
+
+    write_whole(path, fill)
+
+
+def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
+    """Write a file that is complete or absent, and read-only.
+
+    Raises
+    ------
+    ArchiveError
+        If the disk refuses.
+    """
     part = path.with_name(path.name + ".part")
     try:
         with h5py.File(part, "w") as file:
-            _fill(file, record, np.asarray(matrix, "<f4"), covariance)
-            file.create_group("provenance").attrs.update(provenance)
+            fill(file)
         part.chmod(0o444)
         _flush(part)
         part.rename(path)
@@ -66,7 +81,7 @@ def read_matrix(path: Path) -> NDArray[np.float32]:
             return _matrix(file)
     except FileNotFoundError as error:
         raise ArchiveError(f"{path}: missing, although it was stored") from error
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise ArchiveError(f"{path}: damaged: {error}") from error
 
 
@@ -83,7 +98,7 @@ def read_product(path: Path) -> tuple[ReconstructorRecord, NDArray[np.float32]]:
             record = record_from_json(file.attrs["record"])
             matrix = _matrix(file)
             sha256 = file.attrs["sha256"]
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise ArchiveError(f"{path}: damaged: {error}") from error
     if record.id != path.stem:
         raise ArchiveError(f"{path}: found reconstructor {record.id} in it, expected {path.stem}")

@@ -1,4 +1,4 @@
-"""``ReconstructorRecord`` <-> JSON, with boundary units and names."""
+"""Records of products <-> JSON, with boundary units and names."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from service.control.gate import GateVerdict
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
-from service.state import MatrixState, ReconstructorRecord
+from service.state import (
+    MatrixState,
+    MeasurementRecord,
+    MeasurePattern,
+    MeasureState,
+    ReconstructorRecord,
+)
 
 
 def record_to_json(record: ReconstructorRecord) -> str:
@@ -44,6 +50,31 @@ def record_from_json(text: str) -> ReconstructorRecord:
         sigma=None if sigma is None else _numeric(sigma),
         gate=None if gate is None else GateVerdict(**gate),
     )
+
+
+def measurement_to_json(record: MeasurementRecord) -> str:
+    """Return the record of a measured interaction matrix as JSON."""
+    return json.dumps(asdict(record))
+
+
+def measurement_from_json(text: str) -> MeasurementRecord:
+    """Return the record that :func:`measurement_to_json` wrote.
+
+    Raises
+    ------
+    ValueError, KeyError, TypeError
+        If the text is something else.
+    """
+    values = json.loads(text)
+    lines = values["frequency_hz"]
+    values |= {
+        "state": MeasureState(values["state"]),
+        "pattern": MeasurePattern(values["pattern"]),
+        "modes": tuple(values["modes"]),
+        "amplitude_m": tuple(values["amplitude_m"]),
+        "frequency_hz": None if lines is None else tuple(lines),
+    }
+    return MeasurementRecord(**values)
 
 
 def _numeric(sigma: dict[str, float]) -> NDArray[np.float64]:

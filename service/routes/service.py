@@ -152,6 +152,30 @@ class Service(Protocol):
             If it is damaged.
         """
 
+    def measured_matrix(self, measurement_id: str) -> NDArray[np.float32]:
+        """Return a measured interaction matrix, ``(n_slopes, n_modes)``, slope per metre OPD.
+
+        Called from a worker thread.
+
+        Raises
+        ------
+        UnknownIdError
+            If there is none of this id.
+        ArchiveError
+            If it is damaged.
+        """
+
+    def measured_file(self, measurement_id: str) -> bytes:
+        """Return the HDF5 file of a measured interaction matrix; called from a worker thread.
+
+        Raises
+        ------
+        UnknownIdError
+            If there is none of this id.
+        ArchiveError
+            If it is missing.
+        """
+
 
 def _service_of(request: Request) -> Service:
     service: Service = request.app.state.service

@@ -17,12 +17,21 @@ from service.archive import Archive
 from service.control.gate import LoopSettings
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.events import Effect, Event
+from service.link.events import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.reactions.matrices import extended_gains
 from service.rtc_bridge import Bridge
 from service.runtime import translate
 from service.runtime.crew import Crew
-from service.state import MatrixState, ReconstructorRecord, Registration, RtcView, TrackerState
+from service.state import (
+    MatrixState,
+    MeasurementRecord,
+    MeasureState,
+    ReconstructorRecord,
+    Registration,
+    RtcView,
+    TrackerState,
+)
 from service.wire import (
     DitherAction,
     DitherKind,
@@ -93,6 +102,8 @@ class Deeds:
                 return await self._send(effect, state)
             case ev.AskDither() | ev.AskNoDither():
                 return await self._dither(effect)
+            case ev.AskMeasurement(record=record):
+                return await self._measure(record)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)`` from memory or the archive.
@@ -123,6 +134,28 @@ class Deeds:
         system = self._publishing.system
         self._bridge.offer(translate.manifest_of(record, layout, state.rtc, system), matrix)
         self._bridge.set_current(record.id)
+
+    async def keep_measured(self, heard: MeasuredMatrix) -> Event:
+        """Archive an interaction matrix the RTC has measured, whoever asked for it.
+
+        Raises
+        ------
+        ArchiveError
+            If it cannot be written, or another one has its id.
+        """
+        record = translate.measurement_of(heard.manifest)
+        if heard.matrix is not None:
+            instrument = self._instrument.name
+            store = self._archive.measured.store
+            await asyncio.to_thread(store, record, heard.matrix, instrument)
+        return ev.MatrixMeasured(record=record)
+
+    async def _measure(self, record: MeasurementRecord) -> Event:
+        reply = await self._bridge.command(translate.measure_request(record))
+        state = MeasureState.RUNNING if reply.accepted else MeasureState.REFUSED
+        return ev.MatrixMeasured(
+            record=replace(record, state=state, reason=reply.reason, start_seq=reply.start_seq)
+        )
 
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)

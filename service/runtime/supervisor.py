@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from service import events as ev
 from service.archive import Archive
-from service.errors import ModelError, PyrcalError
+from service.errors import CommandError, LinkError, ModelError, PyrcalError
 from service.estimation.instrumental import Loop
 from service.estimation.lockin import Spectra, WindowRefused
 from service.events import Command, Effect, Event
+from service.link.events import MeasuredMatrix
 from service.model.misregistration import Misregistration
 from service.reactions.policy import Policy
 from service.routes.service import Snapshot
@@ -27,7 +28,7 @@ from service.runtime import translate
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.runtime.streams import Streams, fed, shape_mismatch, with_dither, with_rtc
-from service.state import Level, LogEntry, RtcView, TrackerState
+from service.state import Level, LogEntry, MeasureState, RtcView, TrackerState
 from service.tracker import step
 from service.wire import AlarmMessage
 from service.worker import Workbench
@@ -85,14 +86,34 @@ class Supervisor:
 
     async def submit(self, command: Command) -> str:
         """Set an operator's command in motion; return one line that says what was."""
+        running = set(self._running)
         effects = self._post(command)
         now_ns, name = time.time_ns(), type(command).__name__
         await asyncio.to_thread(self._archive.audit, now_ns, "operator", name, str(command))
+        if isinstance(command, ev.Measure):
+            await asyncio.wait(self._running - running)
+            self._check_measuring(command.id)
         return f"{name}: {len(effects)} action(s) under way"
+
+    def _check_measuring(self, measurement_id: str) -> None:
+        """Let whoever asked for a matrix know why there will be none."""
+        record = self._state.measurement(measurement_id)
+        if record is not None and record.state is MeasureState.REFUSED:
+            raise CommandError(f"the RTC refused: {record.reason}")
+        if record is not None and record.state is MeasureState.FAILED:
+            raise LinkError(record.reason)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)``."""
         return self._deeds.matrix(matrix_id)
+
+    def measured_matrix(self, measurement_id: str) -> NDArray[np.float32]:
+        """Return a measured interaction matrix ``(n_slopes, n_modes)``."""
+        return self._archive.measured.matrix(measurement_id)
+
+    def measured_file(self, measurement_id: str) -> bytes:
+        """Return the HDF5 file of a measured interaction matrix."""
+        return self._archive.measured.file(measurement_id)
 
     async def run(self) -> None:
         """Work until cancelled: prepare the model, then listen, tick, fit, watch and record."""
@@ -115,6 +136,8 @@ class Supervisor:
                 await asyncio.wait_for(rung.wait(), POLL_S)
             rung.clear()
             for heard in self._bridge.events():
+                if isinstance(heard, MeasuredMatrix):
+                    self._start(self._keep_measured(heard))
                 event = translate.event_of(heard)
                 if event is not None:
                     self._post(event)
@@ -266,6 +289,12 @@ class Supervisor:
             event = ev.JobFailed(effect=effect, text=f"internal error: {error!r}")
         if event is not None:
             self._post(event)
+
+    async def _keep_measured(self, heard: MeasuredMatrix) -> None:
+        try:
+            self._post(await self._deeds.keep_measured(heard))
+        except PyrcalError as error:
+            self._note("measurement.not-kept", str(error), Level.WARNING)
 
     def _note(self, name: str, text: str, level: Level) -> None:
         self._post(ev.Noted(name=name, text=text, level=level))

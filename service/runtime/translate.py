@@ -5,8 +5,26 @@ from __future__ import annotations
 from service import events as ev
 from service.link import events as heard
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
-from service.state import Level, MatrixState, ReconstructorRecord, RtcView, TrackerState
-from service.wire import Acknowledgement, Manifest, MatrixLayout, StateMessage, Status
+from service.state import (
+    Level,
+    MatrixState,
+    MeasurementRecord,
+    MeasurePattern,
+    MeasureState,
+    ReconstructorRecord,
+    RtcView,
+    TrackerState,
+)
+from service.wire import (
+    Acknowledgement,
+    Manifest,
+    MatrixLayout,
+    MeasuredManifest,
+    MeasureRequest,
+    Pattern,
+    StateMessage,
+    Status,
+)
 
 
 def event_of(event: heard.LinkEvent) -> ev.Event | None:
@@ -110,6 +128,40 @@ def record_of(manifest: Manifest) -> ReconstructorRecord:
         created_ns_utc=manifest.created_ns,
         sha256=manifest.layout.sha256,
         reason="brought by the RTC",
+    )
+
+
+def measure_request(record: MeasurementRecord) -> MeasureRequest:
+    """Return the command that asks the RTC for a measurement."""
+    return MeasureRequest(
+        id=record.id,
+        pattern=Pattern(record.pattern.value),
+        modes=record.modes,
+        amplitude_m=record.amplitude_m,
+        n_average=record.n_average,
+        frequency_hz=record.frequency_hz,
+        duration_s=record.duration_s,
+    )
+
+
+def measurement_of(manifest: MeasuredManifest) -> MeasurementRecord:
+    """Return what is known of an interaction matrix the RTC sends, or of why there is none."""
+    there = manifest.reason is None
+    return MeasurementRecord(
+        id=manifest.id,
+        state=MeasureState.STORED if there else MeasureState.FAILED,
+        pattern=MeasurePattern(manifest.pattern.value),
+        modes=manifest.modes,
+        amplitude_m=manifest.amplitude_m,
+        n_average=None if manifest.pattern is Pattern.SINE else manifest.n_average,
+        reason=manifest.reason or "",
+        created_ns_utc=manifest.created_ns,
+        n_slopes=manifest.layout.shape[0],
+        double_pass=manifest.double_pass,
+        session=manifest.session,
+        basis_id=manifest.basis_id,
+        config_id=manifest.config_id,
+        sha256=manifest.layout.sha256,
     )
 
 

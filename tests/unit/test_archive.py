@@ -251,7 +251,7 @@ def test_an_index_of_a_later_version_is_refused(tmp_path):
     connection = sqlite3.connect(tmp_path / "index.sqlite")
     connection.execute("PRAGMA user_version = 99")
     connection.close()
-    with pytest.raises(ArchiveError, match="found version 99, expected 1"):
+    with pytest.raises(ArchiveError, match="found version 99, expected 2"):
         Archive(tmp_path).open()
 
 

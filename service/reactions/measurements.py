@@ -1,0 +1,200 @@
+"""Interaction matrices the RTC measures: asked for by an operator, waited for, kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from service import events as ev
+from service.errors import CommandError
+from service.events import Event
+from service.reactions.journal import logged
+from service.reactions.matrices import Step
+from service.reactions.policy import SECOND_NS, Policy
+from service.state import (
+    Level,
+    MatrixState,
+    MeasurementRecord,
+    MeasurePattern,
+    MeasureState,
+    RtcView,
+    TrackerState,
+)
+
+MEASUREMENTS_KEPT = 200
+
+STROKE_M = 20e-9
+"""RMS of a push or pull, metres OPD: small enough for a pyramid, far above its noise."""
+
+N_AVERAGE = 10
+N_TONES = 40
+"""Modes of a sine measurement that names none."""
+
+TONE_BAND = (0.05, 0.45)
+"""Of the frame rate: above the loop's bandwidth and below half the rate."""
+
+TONES_LAST_S = 10.0
+
+OVERDUE_S = 15.0
+"""For the matrix to come once the loop is closed again."""
+
+LONGEST_S = 3600.0
+"""Of any measurement."""
+
+MEASURING = "an interaction matrix is being measured: these frames are no ordinary telemetry"
+
+_SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
+_OVER = (MeasureState.REFUSED, MeasureState.FAILED, MeasureState.STORED)
+_WAIT_FOR_IT = (ev.StartDither, ev.Refit, ev.Approve, ev.Publish, ev.Rollback)
+
+
+def meanwhile(state: TrackerState, event: Event, now_ns: int) -> TrackerState:
+    """Return the state as a measurement under way sees this event, before anybody else does.
+
+    Raises
+    ------
+    CommandError
+        If an operator asks for something that has to wait for the matrix.
+    """
+    current = state.measuring
+    if current is None:
+        return state
+    match event:
+        case _ if isinstance(event, _WAIT_FOR_IT):
+            raise CommandError(
+                f"{type(event).__name__}: interaction matrix {current.id} is being measured; "
+                "wait for it"
+            )
+        case ev.RtcVanished():
+            return _failed(state, current, "the RTC vanished", now_ns)
+        case ev.Tick():
+            return _watched(state, current, now_ns)
+        case _:
+            return state
+
+
+def on_measurement(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
+    """Ask for a matrix, or note how far one is.
+
+    Raises
+    ------
+    CommandError
+        If none can be measured now.
+    """
+    match event:
+        case ev.Measure():
+            return _ask(state, event, policy, now_ns)
+        case ev.MatrixMeasured(record=record):
+            return _heard(state, record, now_ns), ()
+        case ev.JobFailed(effect=ev.AskMeasurement(record=record), text=text):
+            return _failed(state, record, text, now_ns), ()
+        case _:
+            raise TypeError(f"no event of a measurement: {event!r}")
+
+
+def _ask(state: TrackerState, command: ev.Measure, policy: Policy, now_ns: int) -> Step:
+    rtc = state.rtc
+    if rtc is None:
+        raise CommandError("measure: no RTC is there")
+    reason = _occupied(state)
+    if reason:
+        raise CommandError(f"measure: {reason}")
+    if state.measurement(command.id) is not None:
+        raise CommandError(f"measure: {command.id} was measured before; ids are never reused")
+    record = _planned(command, rtc, policy, now_ns)
+    if max(record.modes) >= rtc.n_modes:
+        raise CommandError(
+            f"measure: found mode {max(record.modes)}; expected 0 to {rtc.n_modes - 1}"
+        )
+    text = f"{record.id}: {record.pattern} of {len(record.modes)} modes"
+    state = logged(_with(state, record), "measurement.asked", text, now_ns)
+    return state, (ev.AskMeasurement(record=record),)
+
+
+def _occupied(state: TrackerState) -> str:
+    """Return what must end first; empty: nothing."""
+    if state.measuring is not None:
+        return f"{state.measuring.id} is being measured; wait for it"
+    if state.dither is not None:
+        return f"{state.dither.id} is running; stop it first"
+    if state.making_since_ns_utc is not None:
+        return "a reconstructor is being computed; wait for it"
+    sent = next((r.id for r in state.reconstructors if r.state in _SENT), None)
+    if sent is not None:
+        return f"reconstructor {sent} is on its way to the RTC; wait for it"
+    return ""
+
+
+def _planned(command: ev.Measure, rtc: RtcView, policy: Policy, now_ns: int) -> MeasurementRecord:
+    sine = command.pattern is MeasurePattern.SINE
+    modes = command.modes or tuple(range(rtc.n_controlled))
+    if sine and command.modes is None:
+        modes = modes[:: -(-len(modes) // N_TONES)]
+    stroke_m = command.amplitude_m or (policy.dither_amplitude_m if sine else STROKE_M)
+    duration_s = (command.duration_s or TONES_LAST_S) if sine else None
+    lines = command.frequency_hz
+    if duration_s is not None and lines is None:
+        band_hz = np.linspace(*TONE_BAND, len(modes)) * rtc.frame_rate_hz
+        lines = tuple((np.round(band_hz * duration_s) / duration_s).tolist())
+    return MeasurementRecord(
+        id=command.id,
+        state=MeasureState.ASKED,
+        pattern=command.pattern,
+        modes=modes,
+        amplitude_m=(stroke_m,) * len(modes),
+        n_average=None if sine else command.n_average or N_AVERAGE,
+        frequency_hz=lines,
+        duration_s=duration_s,
+        asked_ns_utc=now_ns,
+    )
+
+
+def _heard(state: TrackerState, record: MeasurementRecord, now_ns: int) -> TrackerState:
+    """Take over how far a measurement is; one that is over does not begin again."""
+    known = state.measurement(record.id)
+    if known is not None:
+        if known.state in _OVER and record.state not in _OVER:
+            return state
+        record = replace(
+            record,
+            frequency_hz=known.frequency_hz,
+            duration_s=known.duration_s,
+            asked_ns_utc=known.asked_ns_utc,
+            start_seq=known.start_seq if record.start_seq is None else record.start_seq,
+        )
+    if record.state is MeasureState.FAILED:
+        return _failed(state, record, record.reason, now_ns)
+    text = {
+        MeasureState.RUNNING: f"{record.id} starts at frame {record.start_seq}",
+        MeasureState.REFUSED: f"{record.id}: the RTC refused: {record.reason}",
+        MeasureState.STORED: f"{record.id}: {record.n_slopes} slopes, {len(record.modes)} modes",
+    }.get(record.state, record.id)
+    level = Level.WARNING if record.state is MeasureState.REFUSED else Level.INFO
+    return logged(_with(state, record), f"measurement.{record.state}", text, now_ns, level)
+
+
+def _watched(state: TrackerState, record: MeasurementRecord, now_ns: int) -> TrackerState:
+    """Give up a matrix that does not come although everything looks as if it were over."""
+    asked_ns, rtc = record.asked_ns_utc or now_ns, state.rtc
+    if now_ns - asked_ns > LONGEST_S * SECOND_NS:
+        return _failed(state, record, f"no matrix came within {LONGEST_S:.0f} s", now_ns)
+    opened = record.pattern is not MeasurePattern.SINE
+    over = opened and rtc is not None and rtc.loop == "closed" and record.start_seq is not None
+    if not over:
+        return _with(state, replace(record, overdue_since_ns_utc=None))
+    since_ns = record.overdue_since_ns_utc or now_ns
+    if now_ns - since_ns > OVERDUE_S * SECOND_NS:
+        text = f"the loop has been closed for {OVERDUE_S:.0f} s and no matrix came"
+        return _failed(state, record, text, now_ns)
+    return _with(state, replace(record, overdue_since_ns_utc=since_ns))
+
+
+def _failed(state: TrackerState, record: MeasurementRecord, text: str, now_ns: int) -> TrackerState:
+    state = _with(state, replace(record, state=MeasureState.FAILED, reason=text))
+    return logged(state, "measurement.failed", f"{record.id}: {text}", now_ns, Level.WARNING)
+
+
+def _with(state: TrackerState, record: MeasurementRecord) -> TrackerState:
+    others = tuple(r for r in state.measurements if r.id != record.id)
+    return replace(state, measurements=(*others, record)[-MEASUREMENTS_KEPT:])

@@ -49,7 +49,7 @@ def test_arms_darken_the_images(small_instrument, small_basis):
 
 
 def test_the_fibre_shines_past_no_arm():
-    with pytest.raises(ConfigurationError, match="--spiders: .* expected --scene onsky"):
+    with pytest.raises(ConfigurationError, match=r"--spiders: .* expected --scene onsky"):
         Scene(kind=SceneKind.DAYTIME, spiders=Spiders(n_arms=2, width_m=0.1))
 
 

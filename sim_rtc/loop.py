@@ -88,9 +88,17 @@ class ModalLoop:
         """Zero the modes from ``n_controlled`` on: nothing would correct them any more."""
         self._decided[:, n_controlled:] = 0.0
 
-    def run(self, open_slopes: Array32, terms: LoopTerms, dither_m: Array32 | None) -> LoopBlock:
+    def run(
+        self,
+        open_slopes: Array32,
+        terms: LoopTerms,
+        dither_m: Array32 | None,
+        played_m: Array32 | None = None,
+    ) -> LoopBlock:
         """Run the frames whose slopes, mirror apart, are ``open_slopes`` ``(n_frames, n_slopes)``.
 
+        ``dither_m`` and ``played_m`` are ``(n_frames, n_modes)``, added to the integrator's
+        command: the dither is told on the wire, what is played is not.
         A command beyond the stroke limit is clipped, in the integrator too: a loop that diverges
         stays finite and recovers.
         """
@@ -101,16 +109,22 @@ class ModalLoop:
             modes += open_modes[k]
             return modes
 
-        applied, dither_m, n_clipped = self._integrate(len(open_slopes), estimate, terms, dither_m)
+        added = _Added.of(dither_m, played_m, (len(open_slopes), len(self._decided[0])))
+        n_clipped = self._integrate(estimate, terms, added)
         return LoopBlock(
-            slopes=open_slopes + applied @ terms.slopes_per_command.T,
-            commands_m=applied,
-            dither_m=dither_m,
+            slopes=open_slopes + added.applied @ terms.slopes_per_command.T,
+            commands_m=added.applied,
+            dither_m=added.dither,
             n_clipped=n_clipped,
         )
 
     def run_frames(
-        self, n_frames: int, sense: Sense, terms: ControlTerms, dither_m: Array32 | None
+        self,
+        n_frames: int,
+        sense: Sense,
+        terms: ControlTerms,
+        dither_m: Array32 | None,
+        played_m: Array32 | None = None,
     ) -> LoopBlock:
         """Run frames one by one, each with the slopes that ``sense`` says it makes."""
         slopes = np.empty((n_frames, terms.reconstructor.shape[1]), dtype=np.float32)
@@ -119,27 +133,26 @@ class ModalLoop:
             slopes[k] = sense(k, command)
             return np.asarray(terms.reconstructor @ slopes[k])
 
-        applied, dither_m, n_clipped = self._integrate(n_frames, estimate, terms, dither_m)
-        return LoopBlock(slopes=slopes, commands_m=applied, dither_m=dither_m, n_clipped=n_clipped)
+        added = _Added.of(dither_m, played_m, (n_frames, len(self._decided[0])))
+        n_clipped = self._integrate(estimate, terms, added)
+        return LoopBlock(
+            slopes=slopes, commands_m=added.applied, dither_m=added.dither, n_clipped=n_clipped
+        )
 
     def _integrate(
         self,
-        n_frames: int,
         estimate: Callable[[int, Array32], Array32],
         terms: ControlTerms,
-        dither_m: Array32 | None,
-    ) -> tuple[Array32, Array32 | None, int]:
-        """Return the commands on the mirror, their dither part, and how many were clipped.
+        added: _Added,
+    ) -> int:
+        """Complete the commands of ``added`` frame by frame; return how many were clipped.
 
         ``estimate`` gives the modes ``(n_controlled,)`` that frame k shows.
         """
-        delay, n_modes = self._decided.shape
-        integrator = np.empty((n_frames + delay, n_modes), dtype=np.float32)
+        applied, dither = added.applied, added.dither
+        n_frames, delay = len(applied), len(self._decided)
+        integrator = np.empty((n_frames + delay, applied.shape[1]), dtype=np.float32)
         integrator[:delay] = self._decided
-        applied = np.zeros((n_frames, n_modes), dtype=np.float32)
-        if dither_m is not None:
-            applied += dither_m
-            dither_m = dither_m.copy()
         leak, stroke = np.float32(terms.leak), self._stroke_m
         n_controlled = len(terms.gains)
         n_limited = 0
@@ -148,7 +161,7 @@ class ModalLoop:
             command += integrator[k]
             np.minimum(np.maximum(command, -stroke, out=command), stroke, out=command)
             if self._drive is not None:
-                n_limited += self._drive.follow(command, None if dither_m is None else dither_m[k])
+                n_limited += self._drive.follow(command, None if dither is None else dither[k])
             correction = estimate(k, command)
             correction *= terms.gains
             decided = integrator[k + delay]
@@ -156,4 +169,25 @@ class ModalLoop:
             decided[:n_controlled] -= correction
             np.minimum(np.maximum(decided, -stroke, out=decided), stroke, out=decided)
         self._decided = integrator[n_frames:].copy()
-        return applied, dither_m, n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
+        return n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Added:
+    """What is added to the integrator's commands; both arrays become the mirror's in place."""
+
+    applied: Array32
+    """``(n_frames, n_modes)`` dither and played commands together."""
+
+    dither: Array32 | None
+    """``(n_frames, n_modes)``."""
+
+    @classmethod
+    def of(
+        cls, dither_m: Array32 | None, played_m: Array32 | None, shape: tuple[int, int]
+    ) -> _Added:
+        applied = np.zeros(shape, dtype=np.float32)
+        for part in (dither_m, played_m):
+            if part is not None:
+                applied += part
+        return cls(applied=applied, dither=None if dither_m is None else dither_m.copy())

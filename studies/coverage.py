@@ -118,6 +118,8 @@ def main() -> None:
     parser.add_argument("--windows", type=int, default=24)
     parser.add_argument("--window-s", type=float, default=2.0)
     parser.add_argument("--mag", type=float, default=8.0)
+    parser.add_argument("--plant", default="linear")
+    parser.add_argument("--gain", type=float, default=0.4)
     given = parser.parse_args()
     threadpool_limits(1)
     instrument = load_instrument("flao-lbt")
@@ -133,7 +135,9 @@ def main() -> None:
     )
     ratios, errors, distances = [], [], []
     for seed in range(given.telescopes):
-        options = parse_options([f"--seed={seed}", f"--mag={given.mag}"])
+        options = parse_options(
+            [f"--{name}={value}" for name, value in (("seed", seed), *_simulated(given))]
+        )
         true, found = estimates(
             options, instrument, bench, window_s=given.window_s, n_windows=given.windows
         )
@@ -155,6 +159,10 @@ def main() -> None:
         f"{len(distances)} windows: mean chi2/4 {np.mean(distances) / 4:.2f}, "
         f"{inside:.1%} inside the 95 % ellipse, floor included\n"
     )
+
+
+def _simulated(given: argparse.Namespace) -> list[tuple[str, object]]:
+    return [(name, getattr(given, name)) for name in ("mag", "plant", "gain")]
 
 
 def _say(label: str, values: Array) -> None:

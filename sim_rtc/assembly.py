@@ -30,7 +30,10 @@ from sim_rtc.phases import PhaseFeed
 from sim_rtc.pixels import PixelDetector, binned
 from sim_rtc.plant import LinearPlant, Plant
 from sim_rtc.reconstructors import Reconstructor, truncated_inverse
+from sim_rtc.scene import PlayedTurbulence, SceneKind
 from sim_rtc.schedule import Schedule, random_registration
+from sim_rtc.sky import Sky, Turbulence
+from sim_rtc.vibration import Vibrations
 
 STROKE_M = 10e-6
 """Largest command of one mode, metres RMS OPD: seven times the tilt of median seeing."""
@@ -94,6 +97,8 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
     schedule = Schedule(
         start=options.alpha or random_registration(alpha_rng),
         drift=options.drift,
+        flexure=options.sky.flexure,
+        walk=replace(options.sky.walk, seed=int(alpha_rng.integers(2**63))),
         jumps=options.jumps,
     )
     optics = MovingOptics(plant, schedule, background_executor())
@@ -104,21 +109,14 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
         magnitude=options.magnitude,
         frame_rate_hz=options.frame_rate_hz,
         camera=devices.camera,
+        silent=plant.slope_errors.silent,
     )
-    layers = frozen_layers(
-        options.layers,
-        points_m=plant.points_m,
-        pitch_m=plant.pitch_m,
-        turbulence=KarhunenLoeve(
-            r0_m=fried_parameter_m(options.seeing_arcsec), outer_scale_m=options.outer_scale_m
-        ),
-        rng=sky_rng,
-    )
+    sky = build_sky(options, instrument, basis, plant, sky_rng)
     jump_times_s = tuple(jump.time_s for jump in options.jumps)
     feed: Feed
     if options.plant == "diffractive":
         feed = PhaseFeed(
-            layers=layers,
+            sky=sky,
             optics=optics,
             detector=PixelDetector(
                 electrons_per_light=detector.electrons_per_frame, camera=devices.camera
@@ -129,8 +127,9 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
         )
     else:
         feed = OpenLoopFeed(
-            layers=layers,
+            sky=sky,
             optics=optics,
+            sensor_opd_m=plant.sensor_opd_m,
             detector=detector,
             frame_rate_hz=options.frame_rate_hz,
             jump_times_s=jump_times_s,
@@ -168,13 +167,59 @@ def build_plant(
     """
     faults, binning = options.devices.faults, options.devices.binning
     if options.plant == "diffractive":
-        return DiffractivePlant(instrument, basis, rng=rng, faults=faults, binning=binning)
+        return DiffractivePlant(
+            instrument,
+            basis,
+            rng=rng,
+            imperfections=options.sky.imperfections,
+            scene=options.sky.scene,
+            faults=faults,
+            binning=binning,
+        )
     if faults != MirrorFaults() or binning > 1:
         raise ConfigurationError(
             "--dead-actuators, --stuck-actuators and a binned sensor (--preset) need "
             "--plant diffractive; found --plant linear"
         )
-    return LinearPlant(instrument, basis, rng=rng)
+    return LinearPlant(
+        instrument,
+        basis,
+        rng=rng,
+        imperfections=options.sky.imperfections,
+        scene=options.sky.scene,
+    )
+
+
+def build_sky(
+    options: Options,
+    instrument: Instrument,
+    basis: ModalBasis,
+    plant: Plant,
+    rng: np.random.Generator,
+) -> Sky:
+    """Return what comes to the sensor of this plant, and what is played on its mirror."""
+    sky, scene = options.sky, options.sky.scene
+    layers = frozen_layers(
+        sky.layers,
+        points_m=plant.points_m,
+        pitch_m=plant.pitch_m,
+        turbulence=KarhunenLoeve(
+            r0_m=fried_parameter_m(sky.seeing.start_arcsec), outer_scale_m=options.outer_scale_m
+        ),
+        rng=rng,
+    )
+    vibrations = Vibrations(
+        sky.vibrations,
+        points=plant.points_m,
+        weights=plant.weights,
+        frame_rate_hz=options.frame_rate_hz,
+        rng=rng.spawn(1)[0],
+    )
+    played = None
+    if scene.kind is SceneKind.DAYTIME:
+        modes = basis.render(plant.points_m / instrument.subaperture_m).astype(np.float32)
+        played = PlayedTurbulence(modes, plant.weights, passes=scene.passes)
+    return Sky(turbulence=Turbulence(layers, sky.seeing), vibrations=vibrations, played=played)
 
 
 def build_drive(options: Options, instrument: Instrument, basis: ModalBasis) -> MirrorDrive | None:

@@ -54,8 +54,12 @@ class Detector:
         magnitude: float,
         frame_rate_hz: float,
         camera: Camera | None = None,
+        silent: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Take the share of the light in each pixel, ``images`` ``(2, n, 2, n)``, at the start."""
+        """Take the share of the light in each pixel, ``images`` ``(2, n, 2, n)``, at the start.
+
+        ``silent`` ``(n_valid,)`` are subapertures that read 0, noise included.
+        """
         camera = camera or Camera()
         self.electrons_per_frame: float = camera.electrons_per_frame(
             instrument, magnitude=magnitude, frame_rate_hz=frame_rate_hz
@@ -66,6 +70,8 @@ class Detector:
         variance /= own.mean() ** 2
         self.sigma: Array32 = np.sqrt(np.tile(variance, 2)).astype(np.float32)
         """``(n_slopes,)`` 1 σ of a slope in one frame."""
+        if silent is not None:
+            self.sigma[np.tile(silent, 2)] = 0.0
 
     def counts(self, images: Array) -> Array32:
         """Return ``(4, n, n)`` electrons per frame of these images ``(2, n, 2, n)``.

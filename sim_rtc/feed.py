@@ -15,11 +15,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_rtc.atmosphere import FrozenLayer, cubic_weights
 from sim_rtc.detector import Detector
 from sim_rtc.loop import ControlTerms, LoopBlock, LoopTerms, ModalLoop
 from sim_rtc.motion import MovingOptics
 from sim_rtc.plant import Optics, TelescopeOptics
+from sim_rtc.sky import Sky
 
 Array32 = NDArray[np.float32]
 
@@ -42,10 +42,13 @@ class OpenLoopBlock:
     """Valid for all of it."""
 
     slopes: Array32
-    """``(n_frames, n_slopes)`` turbulence and noise; n_frames is a multiple of the batch."""
+    """``(n_frames, n_slopes)`` what comes in, and noise; n_frames is a multiple of the batch."""
 
     phases_m: Array32
-    """``(n_batches, n_points)`` turbulence OPD at the first frame of each batch."""
+    """``(n_batches, n_points)`` OPD that comes in at the first frame of each batch."""
+
+    played_m: Array32 | None = None
+    """``(n_frames, n_modes)`` turbulence played on the mirror; None: none is."""
 
     @property
     def n_frames(self) -> int:
@@ -62,7 +65,8 @@ class OpenLoopBlock:
         """Run the batch that begins at ``row`` through the loop."""
         if not isinstance(terms, LoopTerms):
             raise TypeError(f"loop: found {type(terms).__name__}; a linear plant needs LoopTerms")
-        return loop.run(self.slopes[row : row + BATCH_FRAMES], terms, dither_m)
+        played = batch_rows(self.played_m, row)
+        return loop.run(self.slopes[row : row + BATCH_FRAMES], terms, dither_m, played)
 
 
 class Block(Protocol):
@@ -96,65 +100,32 @@ class Feed(Protocol):
         """Yield the blocks; one ends where a jump falls."""
 
 
-class LayerHistory:
-    """The last steps of one layer: phases and the slopes they make."""
-
-    def __init__(self, layer: FrozenLayer, n_points: int, n_slopes: int) -> None:
-        self._layer = layer
-        self._first_step = 0
-        self._phases = np.empty((0, n_points), dtype=np.float32)
-        self._slopes = np.empty((0, n_slopes), dtype=np.float32)
-        self._optics: Optics | None = None
-
-    def frames(self, time_s: NDArray[np.float64], optics: Optics) -> tuple[Array32, Array32]:
-        """Return slopes ``(n_frames, n_slopes)`` and the phases of each batch's first frame."""
-        position = time_s * self._layer.steps_per_second + 1.0
-        self._cover(int(position[0]) - 1, int(position[-1]) + 2, optics)
-        step = position.astype(np.intp)
-        weights = np.zeros((len(time_s), len(self._phases)), dtype=np.float32)
-        rows = np.arange(len(time_s))[:, None]
-        weights[rows, step[:, None] - self._first_step + np.arange(-1, 3)] = cubic_weights(
-            position - step
-        )
-        return weights @ self._slopes, weights[::BATCH_FRAMES] @ self._phases
-
-    def _cover(self, first_step: int, last_step: int, optics: Optics) -> None:
-        known = self._first_step + len(self._phases)
-        new = self._layer.advance(last_step + 1 - known)
-        kept = slice(first_step - self._first_step, None)
-        self._phases = np.concatenate([self._phases, new])[kept]
-        if optics is self._optics:
-            self._slopes = np.concatenate([self._slopes, new @ optics.slopes_per_phase.T])[kept]
-        else:
-            self._slopes = self._phases @ optics.slopes_per_phase.T
-        self._first_step, self._optics = first_step, optics
-
-
 class OpenLoopFeed:
     """Blocks of open-loop slopes, one after the other for ever."""
 
     def __init__(
         self,
         *,
-        layers: tuple[FrozenLayer, ...],
+        sky: Sky,
         optics: MovingOptics,
+        sensor_opd_m: Array32,
         detector: Detector,
         frame_rate_hz: float,
         jump_times_s: tuple[float, ...],
         rng: np.random.Generator,
     ) -> None:
-        self._layers = layers
+        """Take among others the static OPD ``(n_points,)`` that only the sensor sees."""
+        self._sky = sky
         self._optics = optics
+        self._sources = np.column_stack([sky.vibrations.phase_per_line, sensor_opd_m])
         self._detector = detector
         self._frame_rate_hz = frame_rate_hz
-        self._jump_frames = [_batch_boundary(time, frame_rate_hz) for time in jump_times_s]
+        self._jump_frames = [batch_boundary(time, frame_rate_hz) for time in jump_times_s]
         self._rng = rng
 
     def blocks(self) -> Iterator[OpenLoopBlock]:
         """Yield the blocks; one ends where a jump falls."""
-        first = _linear(self._optics.at(0.0))
-        n_slopes, n_points = first.slopes_per_phase.shape
-        histories = [LayerHistory(layer, n_points, n_slopes) for layer in self._layers]
+        optics, source_slopes = None, np.empty((0, 0), dtype=np.float32)
         frame = 0
         while True:
             n_frames = min(
@@ -162,16 +133,36 @@ class OpenLoopFeed:
                 + [jump - frame for jump in self._jump_frames if jump > frame]
             )
             time_s = (frame + np.arange(n_frames)) / self._frame_rate_hz
-            optics = _linear(self._optics.at(float(time_s[0])))
-            parts = [history.frames(time_s, optics) for history in histories]
-            slopes = self._detector.noise(n_frames, self._rng)
-            for part, _ in parts:
-                slopes += part
-            phases = np.sum([phase for _, phase in parts], axis=0, dtype=np.float32)
-            yield OpenLoopBlock(
-                first_frame=frame, optics=optics, slopes=slopes, phases_m=np.asarray(phases)
-            )
+            now = _linear(self._optics.at(float(time_s[0])))
+            if now is not optics:
+                optics, source_slopes = now, self._sources.T @ now.slopes_per_phase.T
+            yield self._block(frame, time_s, optics, source_slopes)
             frame += n_frames
+
+    def _block(
+        self,
+        first_frame: int,
+        time_s: NDArray[np.float64],
+        optics: Optics,
+        source_slopes: Array32,
+    ) -> OpenLoopBlock:
+        """Return the block of these times; ``source_slopes`` are vibrations' and static slopes."""
+        slopes = self._detector.noise(len(time_s), self._rng)
+        strength = self._sky.vibrations.frames(len(time_s))
+        slopes += strength @ source_slopes[:-1]
+        slopes += source_slopes[-1]
+        phases = strength[::BATCH_FRAMES] @ self._sky.vibrations.phase_per_line.T
+        turbulence, played = self._sky.turbulence.at(time_s), self._sky.played
+        if played is None:
+            slopes += turbulence.through(optics.slopes_per_phase)
+            phases += turbulence.phases_m(BATCH_FRAMES)
+        return OpenLoopBlock(
+            first_frame=first_frame,
+            optics=optics,
+            slopes=slopes,
+            phases_m=phases,
+            played_m=None if played is None else turbulence.through(played.commands_per_phase),
+        )
 
 
 class Ahead:
@@ -220,7 +211,13 @@ class Ahead:
         return False
 
 
-def _batch_boundary(time_s: float, frame_rate_hz: float) -> int:
+def batch_rows(played_m: Array32 | None, row: int) -> Array32 | None:
+    """Return the rows of the batch that begins at ``row`` of the block."""
+    return None if played_m is None else played_m[row : row + BATCH_FRAMES]
+
+
+def batch_boundary(time_s: float, frame_rate_hz: float) -> int:
+    """Return the first frame of the first batch that begins at this time or later."""
     return int(np.ceil(time_s * frame_rate_hz / BATCH_FRAMES)) * BATCH_FRAMES
 
 

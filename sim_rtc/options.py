@@ -15,7 +15,6 @@ from typing_extensions import override
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration
 from sim_rtc import arguments
-from sim_rtc.atmosphere import Layer
 from sim_rtc.options_device import (
     PRESETS,
     DeviceOptions,
@@ -23,10 +22,18 @@ from sim_rtc.options_device import (
     apply_preset,
     device_options,
 )
+from sim_rtc.options_scene import (
+    EPILOG as SCENE_EPILOG,
+)
+from sim_rtc.options_scene import (
+    SceneOptions,
+    add_imperfections,
+    add_motion,
+    add_scene,
+    apply_scene,
+    scene_options,
+)
 from sim_rtc.schedule import Drift, Jump
-
-_MOST_LAYERS = 3
-_DEFAULT_WIND = Layer(fraction=1.0, speed_m_s=12.0, direction_deg=35.0)
 
 _USUAL_SPEED = {"linear": 1.0, "diffractive": 0.0}
 """The diffractive plant cannot keep up with a real loop: it takes the time it needs."""
@@ -52,9 +59,11 @@ presets
 registration
   X,Y in subapertures, rotation in degrees from +x towards +y, magnification as a ratio. A jump
   T:dx,dy,drot_deg,dmag happens at T seconds of loop time, at the next batch of 10 frames; its
-  optics take a few seconds to compute, so a jump in the first seconds comes late. A drift moves in
-  linear steps of 2 s between exact optics 20 s apart.
+  optics take a few seconds to compute, so a jump in the first seconds comes late. A drift, a
+  flexure and a random walk move in linear steps of 2 s or less between exact optics 20 s or less
+  apart. All of them add up.
 
+{SCENE_EPILOG}
 light
   A star of R = 0 gives 2.1e10 photons per second and square metre in the band (600 to 900 nm); a
   quarter of them are detected. The linear plant adds their noise to its slopes, the diffractive one
@@ -68,6 +77,8 @@ truth file
 examples
   python -m sim_rtc --alpha 0.12,-0.08,0.2,1.003 --truth truth.jsonl
   python -m sim_rtc --seed 7 --mag 10 --jump 30:0.2,0,0,0 --seconds 60
+  python -m sim_rtc --scene daytime --imperfections realistic
+  python -m sim_rtc --profile three-layer --seeing-at 60:1.5 --spiders 3:0.2 --vibration tip:13:50
 
 exit status
   0 it ended as asked (time is up, SIGINT, SIGTERM); 2 an option that cannot be.
@@ -91,9 +102,10 @@ class Options:
     seed: int | None
     """Of everything random; None: different every time."""
 
-    seeing_arcsec: float
+    sky: SceneOptions
+    """Scene, turbulence, vibrations, imperfections, ways the registration moves."""
+
     outer_scale_m: float
-    layers: tuple[Layer, ...]
     gain: float
     leak: float
     delay_frames: int
@@ -119,10 +131,10 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
     """Return the options; an impossible one ends the program with one line and status 2."""
     parser = _parser()
     found = parser.parse_args(_joined(sys.argv[1:] if given is None else given))
-    if found.wind is not None and len(found.wind) > _MOST_LAYERS:
-        parser.error(f"--wind: found {len(found.wind)} layers; expected at most {_MOST_LAYERS}")
     try:
+        apply_scene(found)
         apply_preset(found)
+        sky = scene_options(found)
     except ConfigurationError as error:
         parser.error(str(error))
     return Options(
@@ -131,9 +143,8 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         alpha=found.alpha,
         magnitude=found.mag,
         seed=found.seed,
-        seeing_arcsec=found.seeing,
+        sky=sky,
         outer_scale_m=found.outer_scale,
-        layers=tuple(found.wind or (_DEFAULT_WIND,)),
         gain=found.gain,
         leak=found.leak,
         delay_frames=found.delay,
@@ -141,7 +152,7 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         frame_rate_hz=found.rate,
         plant=found.plant,
         devices=device_options(found),
-        truth=found.truth,
+        truth=sky.truth,
         jumps=tuple(found.jump or ()),
         drift=found.drift,
         seconds=found.seconds,
@@ -179,7 +190,8 @@ def _parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     _add_instrument(parser.add_argument_group("instrument and truth"))
-    _add_sky(parser.add_argument_group("star and sky"))
+    _add_sky(parser.add_argument_group("scene: star and sky, or fibre"))
+    add_imperfections(parser.add_argument_group("imperfections"))
     _add_loop(parser.add_argument_group("loop"))
     add_devices(parser)
     _add_run(parser.add_argument_group("run"))
@@ -219,25 +231,30 @@ def _add_instrument(group: argparse._ArgumentGroup) -> None:
         metavar="DX,DY,DROT_DEG,DMAG",
         help="steady change of the registration, per minute",
     )
+    add_motion(group)
     group.add_argument(
-        "--truth", type=Path, metavar="FILE", help="write the truth there (never on the wire)"
+        "--truth",
+        type=arguments.truth,
+        action="append",
+        metavar="FILE",
+        help="write the truth there (never on the wire)",
     )
 
 
 def _add_sky(group: argparse._ArgumentGroup) -> None:
+    add_scene(group)
     group.add_argument(
         "--mag",
         type=arguments.within(-5.0, 20.0),
-        default=8.0,
         metavar="R",
-        help="magnitude of the guide star (default: %(default)s)",
+        help="magnitude of the guide star, or of the fibre (default: 8; by day 7)",
     )
     group.add_argument(
         "--seeing",
         type=arguments.within(0.05, 5.0),
         default=1.0,
         metavar="ARCSEC",
-        help="seeing at 500 nm (default: %(default)s)",
+        help="seeing at 500 nm; by day, of what is played (default: %(default)s)",
     )
     group.add_argument(
         "--outer-scale",
@@ -251,7 +268,7 @@ def _add_sky(group: argparse._ArgumentGroup) -> None:
         type=arguments.layer,
         action="append",
         metavar="SPEED,DIR_DEG[,SHARE]",
-        help=f"a layer: m/s, direction it moves to, share; up to {_MOST_LAYERS} (default: 12,35)",
+        help="a layer: m/s, direction it moves to, share; up to 3, instead of a profile",
     )
     group.add_argument("--seed", type=arguments.count(0), metavar="N", help="of everything random")
 
@@ -267,9 +284,8 @@ def _add_loop(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--gain",
         type=arguments.within(0.0, 2.0),
-        default=0.4,
         metavar="G",
-        help="integrator gain of every controlled mode (default: %(default)s)",
+        help="integrator gain of every controlled mode (default: 0.4; by day 0.2)",
     )
     group.add_argument(
         "--leak",

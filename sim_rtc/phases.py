@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_rtc.atmosphere import FrozenLayer, cubic_weights
 from sim_rtc.diffractive_plant import DiffractiveOptics
-from sim_rtc.feed import BATCH_FRAMES
+from sim_rtc.feed import BATCH_FRAMES, batch_boundary, batch_rows
 from sim_rtc.loop import ControlTerms, LoopBlock, ModalLoop
 from sim_rtc.motion import MovingOptics
 from sim_rtc.pixels import PixelDetector
+from sim_rtc.sky import Sky
 
 Array32 = NDArray[np.float32]
 
@@ -36,7 +36,10 @@ class PhaseBlock:
     """Valid for all of it."""
 
     phases_m: Array32
-    """``(n_frames, n_points)`` turbulence and stuck actuators; n_frames a multiple of the batch."""
+    """``(n_frames, n_points)`` what comes in and stuck actuators; n_frames: whole batches."""
+
+    played_m: Array32 | None
+    """``(n_frames, n_modes)`` turbulence played on the mirror; None: none is."""
 
     detector: PixelDetector
     rng: np.random.Generator
@@ -61,7 +64,8 @@ class PhaseBlock:
             opd_m += self.phases_m[row + k]
             return self.optics.slopes(opd_m, self.detector, self.rng)
 
-        return loop.run_frames(BATCH_FRAMES, sense, terms, dither_m)
+        played = batch_rows(self.played_m, row)
+        return loop.run_frames(BATCH_FRAMES, sense, terms, dither_m, played)
 
 
 class PhaseFeed:
@@ -70,21 +74,18 @@ class PhaseFeed:
     def __init__(
         self,
         *,
-        layers: tuple[FrozenLayer, ...],
+        sky: Sky,
         optics: MovingOptics,
         detector: PixelDetector,
         frame_rate_hz: float,
         jump_times_s: tuple[float, ...],
         rng: np.random.Generator,
     ) -> None:
-        self._histories = [_LayerPhases(layer) for layer in layers]
+        self._sky = sky
         self._optics = optics
         self._detector = detector
         self._frame_rate_hz = frame_rate_hz
-        self._jump_frames = [
-            int(np.ceil(time_s * frame_rate_hz / BATCH_FRAMES)) * BATCH_FRAMES
-            for time_s in jump_times_s
-        ]
+        self._jump_frames = [batch_boundary(time, frame_rate_hz) for time in jump_times_s]
         self._rng = rng
 
     def blocks(self) -> Iterator[PhaseBlock]:
@@ -99,41 +100,14 @@ class PhaseFeed:
             optics = self._optics.at(float(time_s[0]))
             if not isinstance(optics, DiffractiveOptics):
                 raise TypeError(f"feed: found {type(optics).__name__}; expected DiffractiveOptics")
-            phases = np.tile(optics.stuck_opd_m, (n_frames, 1))
-            for history in self._histories:
-                phases += history.frames(time_s)
+            phases, played = self._sky.seen(time_s)
+            phases += optics.stuck_opd_m
             yield PhaseBlock(
                 first_frame=frame,
                 optics=optics,
                 phases_m=phases,
+                played_m=played,
                 detector=self._detector,
                 rng=self._rng,
             )
             frame += n_frames
-
-
-class _LayerPhases:
-    """The last steps of one layer."""
-
-    def __init__(self, layer: FrozenLayer) -> None:
-        self._layer = layer
-        self._first_step = 0
-        self._phases = layer.advance(1)
-
-    def frames(self, time_s: NDArray[np.float64]) -> Array32:
-        """Return the phases ``(n_frames, n_points)`` at these times, later than all before."""
-        position = time_s * self._layer.steps_per_second + 1.0
-        self._cover(int(position[0]) - 1, int(position[-1]) + 2)
-        step = position.astype(np.intp)
-        weights = np.zeros((len(time_s), len(self._phases)), dtype=np.float32)
-        rows = np.arange(len(time_s))[:, None]
-        weights[rows, step[:, None] - self._first_step + np.arange(-1, 3)] = cubic_weights(
-            position - step
-        )
-        return np.asarray(weights @ self._phases)
-
-    def _cover(self, first_step: int, last_step: int) -> None:
-        known = self._first_step + len(self._phases)
-        new = self._layer.advance(last_step + 1 - known)
-        self._phases = np.concatenate([self._phases, new])[first_step - self._first_step :]
-        self._first_step = first_step

@@ -145,6 +145,14 @@ class Plant(Protocol):
     def valid(self) -> NDArray[np.bool_]:
         """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
 
+    @property
+    def slope_errors(self) -> SlopeErrors:
+        """What the sensor makes of correct slopes."""
+
+    @property
+    def sensor_opd_m(self) -> Array32:
+        """``(n_points,)`` static OPD that the sensor sees and the science does not."""
+
     def optics(self, alpha: Misregistration) -> TelescopeOptics:
         """Return the optics at ``alpha``; takes seconds."""
 

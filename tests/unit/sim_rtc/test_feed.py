@@ -9,9 +9,17 @@ from service.model.misregistration import Misregistration
 from sim_rtc.atmosphere import Layer, frozen_layers
 from sim_rtc.detector import Detector
 from sim_rtc.feed import Ahead, OpenLoopFeed
+from sim_rtc.imperfections import Imperfections
 from sim_rtc.motion import MovingOptics
 from sim_rtc.plant import LinearPlant
-from sim_rtc.schedule import Drift, Jump, Schedule
+from sim_rtc.scene import PlayedTurbulence
+from sim_rtc.schedule import Drift, Flexure, Jump, Schedule
+from sim_rtc.seeing import SeeingSchedule
+from sim_rtc.sky import Sky, Turbulence
+from sim_rtc.vibration import Shape, VibrationLine, Vibrations
+
+STILL = Schedule(start=Misregistration())
+STEADY = SeeingSchedule(start_arcsec=1.0)
 
 
 class Immediate(Executor):
@@ -35,7 +43,16 @@ def plant(small_instrument, small_basis):
     return LinearPlant(small_instrument, small_basis, rng=np.random.default_rng(1))
 
 
-def make_feed(plant, instrument, schedule, executor=None, winds=((20.0, 10.0), (7.0, 100.0))):
+def make_feed(
+    plant,
+    instrument,
+    schedule,
+    executor=None,
+    winds=((20.0, 10.0), (7.0, 100.0)),
+    seeing=STEADY,
+    lines=(),
+    played=None,
+):
     optics = MovingOptics(plant, schedule, executor or Immediate())
     detector = Detector(
         instrument,
@@ -52,8 +69,19 @@ def make_feed(plant, instrument, schedule, executor=None, winds=((20.0, 10.0), (
         rng=np.random.default_rng(2),
     )
     return OpenLoopFeed(
-        layers=layers,
+        sky=Sky(
+            turbulence=Turbulence(layers, seeing),
+            vibrations=Vibrations(
+                lines,
+                points=plant.points_m,
+                weights=plant.weights,
+                frame_rate_hz=500.0,
+                rng=np.random.default_rng(4),
+            ),
+            played=played,
+        ),
         optics=optics,
+        sensor_opd_m=plant.sensor_opd_m,
         detector=detector,
         frame_rate_hz=500.0,
         jump_times_s=tuple(jump.time_s for jump in schedule.jumps),
@@ -124,3 +152,73 @@ def test_blocks_are_computed_ahead_and_errors_reach_the_loop():
         assert next(blocks) == 1
         with pytest.raises(ValueError, match="screen torn"):
             next(blocks)
+
+
+def test_vibrations_reach_slopes_and_phases_alike(plant, small_instrument):
+    lines = (
+        VibrationLine(shape=Shape.TIP, frequency_hz=20.0, rms_m=3e-6),
+        VibrationLine(shape=Shape.FOCUS, frequency_hz=60.0, rms_m=1e-6, damping=0.0),
+    )
+    (quiet,), (shaken,) = (
+        islice(make_feed(plant, small_instrument, STILL, lines=chosen).blocks(), 1)
+        for chosen in ((), lines)
+    )
+    phases = shaken.phases_m - quiet.phases_m
+    assert phases.std() > 1e-6
+    expected = phases @ shaken.optics.slopes_per_phase.T
+    np.testing.assert_allclose(
+        (shaken.slopes - quiet.slopes)[::10], expected, atol=1e-3 * expected.std()
+    )
+
+
+def test_the_seeing_scales_the_turbulence_as_it_changes(plant, small_instrument):
+    changing = SeeingSchedule(start_arcsec=1.0, later=((0.6, 2.0),))
+    steady_blocks, changing_blocks = (
+        list(islice(make_feed(plant, small_instrument, STILL, seeing=seeing).blocks(), 2))
+        for seeing in (STEADY, changing)
+    )
+    assert changing_blocks[0].first_frame == 0
+    for steady, changed in zip(steady_blocks, changing_blocks, strict=True):
+        time_s = (changed.first_frame + np.arange(0, 500, 10)) / 500.0
+        ratio = np.linalg.norm(changed.phases_m, axis=1) / np.linalg.norm(steady.phases_m, axis=1)
+        np.testing.assert_allclose(ratio, changing.strength(time_s), rtol=1e-5)
+
+
+def test_a_static_wavefront_of_the_sensor_is_in_the_slopes_alone(small_instrument, small_basis):
+    flawed = LinearPlant(
+        small_instrument,
+        small_basis,
+        rng=np.random.default_rng(1),
+        imperfections=Imperfections(ncpa_nm=50.0),
+    )
+    (block,) = islice(make_feed(flawed, small_instrument, STILL).blocks(), 1)
+    offset = block.slopes[::10] - block.phases_m @ block.optics.slopes_per_phase.T
+    expected = block.optics.slopes_per_phase @ flawed.sensor_opd_m
+    np.testing.assert_allclose(offset.mean(axis=0), expected, atol=0.01 * np.abs(expected).max())
+
+
+def test_by_day_the_turbulence_is_on_the_mirror_and_not_in_the_air(
+    plant, small_instrument, small_basis
+):
+    modes = small_basis.render(plant.points_m / small_instrument.subaperture_m)
+    played = PlayedTurbulence(modes.astype(np.float32), plant.weights, passes=2)
+    (night,), (day,) = (
+        islice(make_feed(plant, small_instrument, STILL, played=chosen).blocks(), 1)
+        for chosen in (None, played)
+    )
+    assert not day.phases_m.any()
+    # What two passes over 40 modes make of it is nearly all of the turbulence.
+    seen_twice = 2 * day.played_m[::10] @ modes.T.astype(np.float32)
+    left = night.phases_m - seen_twice
+    left -= left @ plant.weights[:, None].astype(np.float32)
+    assert left.std() < 0.2 * night.phases_m.std()
+
+
+def test_a_flexure_is_followed_through_exact_optics(plant):
+    schedule = Schedule(start=Misregistration(), flexure=Flexure(shift_x_subap=0.1, period_s=60.0))
+    optics = MovingOptics(plant, schedule, Immediate())
+    optics.start()
+    times = np.arange(0.0, 60.0, 0.25)
+    truth = np.array([optics.at(t).alpha.shift_x_subap for t in times])
+    # Twelve straight pieces of ten steps each: 3.4 % and half a degree of phase.
+    assert np.abs(truth - 0.1 * np.sin(2 * np.pi * times / 60.0)).max() < 0.1 * (0.034 + 0.06)

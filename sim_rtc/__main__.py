@@ -21,6 +21,7 @@ from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.clock import FrameClock, Pace
 from sim_rtc.computer import Batch, RealTimeComputer
 from sim_rtc.feed import BATCH_FRAMES, Ahead
+from sim_rtc.gains import Tuner
 from sim_rtc.link import Link
 from sim_rtc.options import Options, parse_options
 from sim_rtc.truth import TruthRecorder
@@ -74,11 +75,16 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         )
         truth = None
         if options.truth is not None:
-            recorder = TruthRecorder(options.truth, weights=telescope.weights, clock=clock)
+            recorder = TruthRecorder(
+                options.truth, weights=telescope.weights, clock=clock, options=options
+            )
             truth = stack.enter_context(recorder)
         last_batch = float("inf")
         if options.seconds is not None:
             last_batch = round(options.seconds * options.frame_rate_hz / BATCH_FRAMES)
+        tuner = None
+        if options.gain_ramp_s is not None:
+            tuner = Tuner(computer, step_s=options.gain_ramp_s)
         watch = Watch(computer, pace, link)
         n_batches = 0
         _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.snapshot().session)
@@ -88,6 +94,8 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
             link.offer(batch)
             if truth is not None:
                 truth.offer(batch, pace.late_batches * BATCH_FRAMES)
+            if tuner is not None:
+                tuner.look(batch)
             pace.done()
             watch.look(batch)
             n_batches += 1

@@ -70,8 +70,9 @@ light
   counts electrons in every pixel.
 
 truth file
-  One JSON object a line, twice a second: registration, wavefront error (RMS and peak, nm) over the
-  pupil, matrix in use; and one for each reconstructor swap with the peaks one second before and
+  One JSON object a line. The first is the setup: all of the scene, imperfections and movements. Then
+  twice a second registration, seeing, wavefront error (RMS and peak, nm) over the pupil, matrix in
+  use; and one for each reconstructor swap with the peaks one second before and
   after it.
 
 examples
@@ -107,6 +108,9 @@ class Options:
 
     outer_scale_m: float
     gain: float
+    gain_ramp_s: float | None
+    """Seconds at each gain of a ramp at the start; None: no ramp."""
+
     leak: float
     delay_frames: int
     n_controlled: int
@@ -146,6 +150,7 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         sky=sky,
         outer_scale_m=found.outer_scale,
         gain=found.gain,
+        gain_ramp_s=found.gain_ramp,
         leak=found.leak,
         delay_frames=found.delay,
         n_controlled=found.n_controlled,
@@ -286,6 +291,15 @@ def _add_loop(group: argparse._ArgumentGroup) -> None:
         type=arguments.within(0.0, 2.0),
         metavar="G",
         help="integrator gain of every controlled mode (default: 0.4; by day 0.2)",
+    )
+    group.add_argument(
+        "--gain-ramp",
+        type=arguments.within(0.05, 60.0),
+        nargs="?",
+        const=1.0,
+        metavar="S",
+        help="at the start raise the gain of tip and tilt, of the modes to 100, and of the rest in "
+        "turn, S seconds a step (default: 1), and keep those of least residual slopes",
     )
     group.add_argument(
         "--leak",

@@ -6,7 +6,7 @@ import json
 import queue
 import threading
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sim_rtc.clock import FrameClock
 from sim_rtc.computer import Batch
+from sim_rtc.options import Options
 
 _LINE_S = 0.5
 _SWAP_S = 1.0
@@ -53,8 +54,17 @@ class WavefrontError:
 class TruthRecorder:
     """Writes JSON lines in a thread of its own while its ``with`` block lasts."""
 
-    def __init__(self, path: Path, *, weights: NDArray[np.float64], clock: FrameClock) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        weights: NDArray[np.float64],
+        clock: FrameClock,
+        options: Options | None = None,
+    ) -> None:
+        """Take the pupil's ``weights`` ``(n_points,)``, and the options if they are to be told."""
         self._path = path
+        self._options = options
         self._error = WavefrontError(weights)
         self._clock = clock
         self._line_frames = round(_LINE_S * 1e9 / clock.dt_ns)
@@ -67,6 +77,8 @@ class TruthRecorder:
 
     def __enter__(self) -> TruthRecorder:
         self._file: TextIO = self._path.open("w", encoding="utf-8")
+        if self._options is not None:
+            self._write({"kind": "setup", **setup_of(self._options)})
         self._thread.start()
         return self
 
@@ -120,6 +132,7 @@ class TruthRecorder:
                 "t_ns_utc": self._clock.end_of_exposure_ns(end_seq),
                 "seq": end_seq,
                 **last.optics.alpha.to_boundary(),
+                "seeing_arcsec": self._seeing_arcsec(end_seq),
                 "wavefront_error_nm": round(float(np.sqrt(np.mean(np.square(errors_nm)))), 3),
                 "wavefront_error_peak_nm": round(max(errors_nm), 3),
                 "cm_id": last.cm_id,
@@ -134,6 +147,12 @@ class TruthRecorder:
         while self._recent and self._recent[0][0] < end_seq - self._swap_frames:
             self._recent.popleft()
         self._last = last
+
+    def _seeing_arcsec(self, seq: int) -> float | None:
+        if self._options is None:
+            return None
+        time_s = np.array([seq * self._clock.dt_ns * 1e-9])
+        return round(float(self._options.sky.seeing.arcsec(time_s)[0]), 4)
 
     def _note_swap(self, first: Batch) -> None:
         last = self._last
@@ -166,3 +185,21 @@ class TruthRecorder:
     def _write(self, record: dict[str, Any]) -> None:
         self._file.write(json.dumps(record) + "\n")
         self._file.flush()
+
+
+def setup_of(options: Options) -> dict[str, Any]:
+    """Return what stays as it is for the run, as JSON can hold it."""
+    sky = asdict(options.sky)
+    del sky["truth"]
+    return {
+        "plant": options.plant,
+        "instrument": options.instrument,
+        "seed": options.seed,
+        "magnitude": options.magnitude,
+        "frame_rate_hz": options.frame_rate_hz,
+        "delay_frames": options.delay_frames,
+        "outer_scale_m": options.outer_scale_m,
+        "drift_per_minute": asdict(options.drift),
+        "jumps": [asdict(jump) for jump in options.jumps],
+        **sky,
+    }

@@ -6,6 +6,7 @@ import pytest
 from service.model.misregistration import Misregistration
 from sim_rtc.clock import FrameClock
 from sim_rtc.computer import Batch
+from sim_rtc.options import parse_options
 from sim_rtc.plant import Optics
 from sim_rtc.truth import TruthRecorder, WavefrontError
 
@@ -87,3 +88,23 @@ def test_frames_that_were_skipped_at_a_swap_are_told(tmp_path):
             recorder.offer(batch, overrun_frames=0)
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert [line["frames_skipped"] for line in lines if line["kind"] == "swap"] == [30]
+
+
+def test_the_setup_comes_first_and_the_seeing_of_the_moment_with_every_line(tmp_path):
+    path = tmp_path / "truth.jsonl"
+    words = ["--scene", "onsky", "--seeing-at", "2:3", "--spiders", "3:0.2", "--truth", "realistic"]
+    words += ["--vibration", "tip:13:50", "--walk", "0.1,0,0,0", "--seed", "4", "--seeing", "1"]
+    options = parse_options([*words, "--truth", str(path)])
+    with TruthRecorder(path, weights=WEIGHTS, clock=CLOCK, options=options) as recorder:
+        for seq in range(0, 2500, 10):
+            recorder.offer(frames(seq, ripple(1e-8)), overrun_frames=0)
+    setup, *truth = [json.loads(line) for line in path.read_text().splitlines()]
+    assert setup["kind"] == "setup"
+    assert setup["scene"] == {"kind": "onsky", "spiders": {"n_arms": 3, "width_m": 0.2}}
+    assert setup["imperfections"]["ncpa_nm"] == 30.0
+    assert setup["vibrations"][0]["shape"] == "tip"
+    assert setup["walk"]["shift_x_subap"] == 0.1
+    assert setup["seed"] == 4
+    seeing = [line["seeing_arcsec"] for line in truth]
+    assert seeing[0] < seeing[1] < seeing[2] < seeing[3]
+    assert seeing[3:] == pytest.approx([3.0, 3.0], abs=0.01)

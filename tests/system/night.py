@@ -136,10 +136,10 @@ class Night:
         except httpx.TransportError:
             return False
 
-    def rtc(self, *words, alpha=ALPHA, instrument=INSTRUMENT):
+    def rtc(self, *words, alpha=ALPHA, instrument=INSTRUMENT, seed=3):
         values = ",".join(str(value) for value in alpha.values())
         given = ["sim_rtc", "--connect", self.zenoh, "--instrument", str(instrument)]
-        given += [f"--alpha={values}", "--seed", "3", "--mag", "6"]
+        given += [f"--alpha={values}", "--seed", str(seed), "--mag", "6"]
         return self.start("rtc", [*given, "--n-controlled", str(N_START), *words])
 
     @property
@@ -174,6 +174,15 @@ class Night:
         in_use = self.state["in_use"]
         own = [r["n_modes"] for r in self.shelf if r["id"] == in_use and r["parent"] is not None]
         return own[0] if own else 0
+
+    def wait_for_rtc(self, process):
+        """Wait until the service knows the RTC; one that has ended says why."""
+
+        def met():
+            assert process.popen.poll() is None, process.log
+            return self.state["rtc"] is not None
+
+        wait_for(met, 30.0, f"the RTC is known; {process.log_path}")
 
     def wait_for_modes(self, n_modes, timeout_s=40.0):
         wait_for(lambda: self.n_modes_in_use() == n_modes, timeout_s, f"{n_modes} modes in use")

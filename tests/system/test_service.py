@@ -123,8 +123,7 @@ def test_an_rtc_that_is_killed_and_restarted_is_calibrated_again(night):
     assert after["registration"]["alpha"] == pytest.approx(alpha, abs=0.05)
     assert len(night.shelf) >= n_known
 
-    night.rtc("--seed", "4")
-    wait_for(lambda: night.state["rtc"], 30.0, "the RTC is back")
+    night.wait_for_rtc(night.rtc(seed=4))
     assert night.state["rtc"]["session"] != before["rtc"]["session"]
     assert night.state["registration"]["n_windows"] == 0
     night.wait_for_modes(N_TARGET)
@@ -250,8 +249,7 @@ def test_telemetry_that_makes_no_sense_is_counted_and_the_service_goes_on(night)
 
 def test_a_stranger_on_the_network_cannot_stop_the_telemetry(night):
     night.service("hold")
-    night.rtc()
-    wait_for(lambda: night.state["rtc"], 30.0, "the RTC")
+    night.wait_for_rtc(night.rtc())
     with client_session(night.zenoh) as session:
         for size in (0, 1, 10_000):
             session.put(

@@ -20,6 +20,7 @@ from service.model.pyramid import (
     Response,
     enough_modulation_points,
 )
+from service.model.workingpoint import Halo
 
 Array = NDArray[Any]
 Value = TypeVar("Value")
@@ -62,6 +63,7 @@ class InteractionModel:
         pupil_sampling: int = 3,
         detector_nodes: int = 3,
         n_modulation: int | None = None,
+        halo: Halo | None = None,
         dtype: type[np.float32] | type[np.float64] = np.float32,
         mapper: Mapper = map,
     ) -> None:
@@ -74,6 +76,7 @@ class InteractionModel:
             n_nodes=detector_nodes,
             n_modulation=n_modulation or enough_modulation_points(instrument.wfs),
             dtype=dtype,
+            halo=halo,
         )
         self.valid = valid_subapertures(instrument, self.optics)
         self._map = mapper

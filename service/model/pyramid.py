@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Pyramid
 from service.model.pupil import PupilGrid
+from service.model.workingpoint import Halo
 
 Array = NDArray[Any]
 
@@ -68,8 +69,9 @@ class PyramidOptics:
     """The pyramid's small-signal response to pupil phase, for one pupil illumination.
 
     The Jacobian of the intensity at x with respect to the phase at u is
-    ``-(2/M) A(u) Im{ Wy Wx sum_m conj(psi_m(x)) exp(i k_m u) }``, psi_m the field at rest of
-    modulation point m. Points m and M-1-m share their component along y, which halves the work.
+    ``-2 A(u) Im{ Wy Wx sum_m w_m conj(psi_m(x)) exp(i k_m u) }``, psi_m the field at rest of source
+    point m, w_m its share of the light. Points m and M-1-m of a ring share their component along
+    y, which halves the work.
     """
 
     wfs: Pyramid
@@ -86,6 +88,9 @@ class PyramidOptics:
 
     dtype: type[np.float32] | type[np.float64] = np.float32
     """Precision of the products; float64 for derivative checks."""
+
+    halo: Halo | None = None
+    """What residual turbulence makes of the star; None: a flat wavefront."""
 
     def __post_init__(self) -> None:
         """Refuse a modulation that the formulas cannot fold.
@@ -154,17 +159,34 @@ class PyramidOptics:
         kernel = _roof_kernel(distance, half, self.pupil.sampling)
         return _Roof(kernel=kernel.astype(self._complex), weights=nodes.weights)
 
-    def _tilts(self) -> tuple[Array, Array]:
-        """Return modulation phasors ``(M/2, N)`` along y and ``(M/2, 2, N)`` along x.
+    def _source(self) -> tuple[Array, Array, Array]:
+        """Return radius, angle and weight of every pair of source points, ``(M/2,)`` each.
 
-        The second index along x is the pair of points that share their y component.
+        Without a halo the source is the modulation circle. A pair shares its component along y.
         """
-        angle = 2 * np.pi * (np.arange(self.n_modulation // 2) + 0.5) / self.n_modulation
-        radius = 2 * np.pi * self.wfs.modulation_lambda_over_d / self.wfs.pupil_diameter
+        circle = 2 * np.pi * self.wfs.modulation_lambda_over_d / self.wfs.pupil_diameter
+        rings = [(circle, 1.0 if self.halo is None else self.halo.core_weight, self.n_modulation)]
+        if self.halo is not None:
+            rings += [
+                (float(radius), float(weight), self.halo.n_points)
+                for radius, weight in zip(self.halo.radii, self.halo.weights, strict=True)
+            ]
+        radii = np.concatenate([np.full(n // 2, radius) for radius, _, n in rings])
+        angles = np.concatenate([2 * np.pi * (np.arange(n // 2) + 0.5) / n for _, _, n in rings])
+        weights = np.concatenate([np.full(n // 2, weight / n) for _, weight, n in rings])
+        return radii, angles, weights
+
+    def _tilts(self) -> tuple[Array, Array]:
+        """Return source phasors ``(M/2, N)`` along y and ``(M/2, 2, N)`` along x.
+
+        The second index along x is the pair of points that share their y component. The phasor
+        along y carries the root of the point's weight: it enters every product twice.
+        """
+        radii, angles, weights = self._source()
         u = self.pupil.coordinates
-        along_y = np.exp(1j * radius * np.cos(angle)[:, None] * u)
-        along_x = np.exp(1j * radius * np.sin(angle)[:, None, None] * _SIDES[:, None] * u)
-        return along_y.astype(self._complex), along_x.astype(self._complex)
+        along_y = np.sqrt(weights)[:, None] * np.exp(1j * (radii * np.cos(angles))[:, None] * u)
+        x = (radii * np.sin(angles))[:, None, None] * _SIDES[:, None]
+        return along_y.astype(self._complex), np.exp(1j * x * u).astype(self._complex)
 
     def _fields(self, roof_y: _Roof, roof_x: _Roof) -> Array:
         """Return the fields at rest ``(M/2, 2, n, n_nodes, 2 of the pair, 2, n, n_nodes)``."""
@@ -183,7 +205,8 @@ class PyramidOptics:
     def _images(self, fields: Array, roof_y: _Roof, roof_x: _Roof) -> NDArray[np.float64]:
         power = (fields.real**2 + fields.imag**2).sum(axis=(0, 4), dtype=np.float64)
         images = np.einsum("yiaxjb,a,b->yixj", power, roof_y.weights, roof_x.weights)
-        return np.asarray(images / self.n_modulation)
+        # what the halo loses beyond the grid still falls on the detector, only without signal
+        return np.asarray(images / (2.0 * self._source()[2].sum()))
 
     def _modulated_x(self, roof_x: _Roof) -> Array:
         """Return the weighted x factors ``(M/2, 2, n, 2 of the pair * n_nodes, N)``."""
@@ -226,7 +249,7 @@ class PyramidOptics:
         x = factor_x.transpose(0, 2, 1, 3).reshape(-1, factor_x.shape[1] * n_u)
         y = factor_y.reshape(-1, n_u)
         product = np.concatenate([y.real, y.imag]).T @ np.concatenate([x.imag, x.real])
-        scale = (-2.0 / self.n_modulation * self.pupil.amplitude[lit]).astype(self.dtype)
+        scale = (-2.0 * self.pupil.amplitude[lit]).astype(self.dtype)
         return np.asarray(product.reshape(n_u, -1, n_u).transpose(1, 0, 2)[:, lit] * scale)
 
 

@@ -135,7 +135,8 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
             jump_times_s=jump_times_s,
             rng=noise_rng,
         )
-    identity = identity_of(instrument, plant.valid)
+    double_pass = options.sky.scene.passes == 2
+    identity = replace(identity_of(instrument, plant.valid), double_pass=double_pass)
     return Telescope(
         feed=feed,
         optics=optics,

@@ -44,6 +44,7 @@ class Telescope:
     """Everything but the computer: what feeds it and what is known of it beforehand."""
 
     feed: Feed
+    plant: Plant
     optics: MovingOptics
     detector: Detector
     identity: Identity
@@ -139,6 +140,7 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
     identity = replace(identity_of(instrument, plant.valid), double_pass=double_pass)
     return Telescope(
         feed=feed,
+        plant=plant,
         optics=optics,
         detector=detector,
         identity=identity,

@@ -20,10 +20,14 @@ from service.errors import ConfigurationError, PyrcalError
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.clock import FrameClock, Pace
 from sim_rtc.computer import Batch, RealTimeComputer
+from sim_rtc.faults import FaultPlan
 from sim_rtc.feed import BATCH_FRAMES, Ahead
 from sim_rtc.gains import Tuner
-from sim_rtc.link import Link
+from sim_rtc.link import Link, Rehearsal
 from sim_rtc.options import Options, parse_options
+from sim_rtc.record import Recorder, Recording
+from sim_rtc.replay import Replay
+from sim_rtc.sabotage import Sabotage
 from sim_rtc.truth import TruthRecorder
 
 _REPORT_PERIOD_S = 10.0
@@ -43,6 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, stop)
     try:
+        if options.rehearsal.replay is not None:
+            return _replay(options.rehearsal.replay, options, stopped)
         instrument = load_instrument(options.instrument)
         _check_writable(options.truth)
         # Nested threading makes small products slower, and the service needs the other core.
@@ -64,6 +70,10 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         computer = telescope.computer(iter(ahead))
         computer.prepare()
         clock = FrameClock(start_ns_utc=time.time_ns(), dt_ns=round(1e9 / options.frame_rate_hz))
+        plan, recorder = FaultPlan(options.rehearsal.faults), None
+        if options.rehearsal.record is not None:
+            system = computer.identity.system
+            recorder = stack.enter_context(Recorder(options.rehearsal.record, system=system))
         link = stack.enter_context(
             Link(
                 computer,
@@ -71,14 +81,16 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
                 clock=clock,
                 detector=telescope.detector,
                 magnitude=options.magnitude,
+                rehearsal=Rehearsal(plan=plan, recorder=recorder, seed=options.seed),
             )
         )
         truth = None
         if options.truth is not None:
-            recorder = TruthRecorder(
+            truth_recorder = TruthRecorder(
                 options.truth, weights=telescope.weights, clock=clock, options=options
             )
-            truth = stack.enter_context(recorder)
+            truth = stack.enter_context(truth_recorder)
+        sabotage = Sabotage(plan, computer, clock=clock, pace=pace, absence=link.absence)
         last_batch = float("inf")
         if options.seconds is not None:
             last_batch = round(options.seconds * options.frame_rate_hz / BATCH_FRAMES)
@@ -90,6 +102,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.snapshot().session)
         while not stopped.is_set() and n_batches < last_batch:
             pace.wait(stopped)
+            sabotage.before_batch(n_batches * BATCH_FRAMES / options.frame_rate_hz, stopped)
             batch = computer.next_batch()
             link.offer(batch)
             if truth is not None:
@@ -100,6 +113,12 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
             watch.look(batch)
             n_batches += 1
         watch.report()
+
+
+def _replay(path: Path, options: Options, stopped: threading.Event) -> int:
+    with Recording(path) as recording:
+        Replay(recording, endpoint=options.connect, speed=options.speed).run(stopped)
+    return 0
 
 
 class Watch:

@@ -7,9 +7,12 @@ import time
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class FrameClock:
-    """Timestamps of the frames: they follow the sequence, never the machine's clock."""
+    """Timestamps of the frames: they follow the sequence, never the machine's clock.
+
+    Only the loop's thread changes it, between two batches.
+    """
 
     start_ns_utc: int
     """Start of the exposure of frame 0."""
@@ -20,6 +23,14 @@ class FrameClock:
     def end_of_exposure_ns(self, seq: int) -> int:
         """Return the end of exposure of frame ``seq``, nanoseconds since the Unix epoch, UTC."""
         return self.start_ns_utc + (seq + 1) * self.dt_ns
+
+    def step(self, by_ns: int) -> None:
+        """Let all frames to come be later by this much."""
+        self.start_ns_utc += by_ns
+
+    def restart(self, now_ns_utc: int) -> None:
+        """Begin the exposure of frame 0 again, now."""
+        self.start_ns_utc = now_ns_utc
 
 
 class Pace:
@@ -45,6 +56,11 @@ class Pace:
             left_s = self._start_s + self._batches * self._batch_s - time.perf_counter()
             if left_s > 0.0:
                 stopped.wait(left_s)
+
+    def forgive(self, seconds: float) -> None:
+        """Make up for nothing of the last ``seconds``."""
+        if self._start_s is not None:
+            self._start_s += seconds
 
     def done(self) -> None:
         """Note that the batch is finished."""

@@ -157,7 +157,9 @@ class RealTimeComputer:
         self._lock = threading.Lock()
         self._session = new_session()
         self._seq = 0
-        self._active = reconstructor
+        self._first = self._active = reconstructor
+        self._stroke_m = stroke_m
+        self._late_dithers = 0
         self._staged: deque[Reconstructor] = deque()
         self._swaps: deque[tuple[str, int]] = deque(maxlen=16)
         self._dither: Dither | None = None
@@ -210,6 +212,26 @@ class RealTimeComputer:
         """Take a checked matrix; it is swapped in before the next batch."""
         with self._lock:
             self._staged.append(reconstructor)
+
+    def restart(self) -> None:
+        """Begin a session from frame 0 with the matrix of the start, as a new process would."""
+        with self._lock:
+            self._start_over()
+            self._seq, self._active, self._terms = 0, self._first, None
+            self._settings = replace(
+                self._settings, closed=True, n_controlled_next=len(self._first.matrix)
+            )
+            self._swaps.clear()
+
+    def limit_stroke(self, stroke_m: float | None) -> None:
+        """Clip commands at this, metres RMS of a mode; None: as at the start."""
+        with self._lock:
+            self._loop.limit(self._stroke_m if stroke_m is None else stroke_m)
+
+    def delay_dithers(self, n_frames: int) -> None:
+        """Let dithers to come begin so many frames after the announced one."""
+        with self._lock:
+            self._late_dithers = n_frames
 
     def take_swaps(self) -> list[tuple[str, int]]:
         """Return ids and first frames of the matrices swapped in since the last call."""
@@ -332,7 +354,11 @@ class RealTimeComputer:
                 return Reply(id=request.id, accepted=False, reason=reason, start_seq=None)
             start_seq = self._seq + _LEAD_BATCHES * BATCH_FRAMES
             self._dither = Dither(
-                request, start_seq=start_seq, n_modes=self._n_modes, frame_rate_hz=rate_hz
+                request,
+                start_seq=start_seq,
+                n_modes=self._n_modes,
+                frame_rate_hz=rate_hz,
+                late_frames=self._late_dithers,
             )
         return Reply(id=request.id, accepted=True, reason="", start_seq=start_seq)
 

@@ -30,9 +30,17 @@ class Dither:
     """One accepted dither, from its first frame to its last."""
 
     def __init__(
-        self, request: DitherRequest, *, start_seq: int, n_modes: int, frame_rate_hz: float
+        self,
+        request: DitherRequest,
+        *,
+        start_seq: int,
+        n_modes: int,
+        frame_rate_hz: float,
+        late_frames: int = 0,
     ) -> None:
+        """Take what was asked for; ``late_frames`` after ``start_seq`` it really begins."""
         self.request = request
+        self._late_frames = late_frames
         self.start_seq = start_seq
         self._n_modes = n_modes
         self._frame_rate_hz = frame_rate_hz
@@ -47,7 +55,7 @@ class Dither:
 
         Frames must be asked for in order: a binary sequence is drawn as it is played.
         """
-        seq = np.arange(seq0, seq0 + n_frames)
+        seq = np.arange(seq0, seq0 + n_frames) - self._late_frames
         playing = (seq >= self.start_seq) & (seq < self.stop_seq)
         if not playing.any():
             return None

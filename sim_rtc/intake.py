@@ -15,6 +15,7 @@ from service.errors import WireError
 from service.wire import (
     CHUNK_LIMIT,
     Acknowledgement,
+    AckState,
     Encodings,
     Keys,
     Manifest,
@@ -23,7 +24,9 @@ from service.wire import (
     encode_acknowledgement,
 )
 from sim_rtc.computer import RealTimeComputer
-from sim_rtc.reconstructors import Outcome, Staging, Verdict
+from sim_rtc.faults import Fault, FaultKind, FaultPlan
+from sim_rtc.reconstructors import Outcome, Reconstructor, Staging, Verdict
+from sim_rtc.record import Kind, Recorder
 
 _POLL_S: Final = 0.02
 _QUERY_TIMEOUT_S: Final = 2.0
@@ -38,7 +41,15 @@ Event = Callable[[], None]
 class Intake:
     """Looks after reconstructors in a thread of its own while its ``with`` block lasts."""
 
-    def __init__(self, session: zenoh.Session, keys: Keys, computer: RealTimeComputer) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        computer: RealTimeComputer,
+        *,
+        plan: FaultPlan | None = None,
+        recorder: Recorder | None = None,
+    ) -> None:
         self._session = session
         self._keys = keys
         self._computer = computer
@@ -47,6 +58,10 @@ class Intake:
         self._stopped = threading.Event()
         self._rtc_session = computer.snapshot().session
         self._asked_current = False
+        self._plan = plan or FaultPlan()
+        self._recorder = recorder
+        self._refused: dict[Fault, int] = {}
+        self._late: list[tuple[float, Reconstructor]] = []
         self._thread = threading.Thread(target=self._run, name="reconstructors", daemon=True)
 
     def __enter__(self) -> Intake:
@@ -94,6 +109,7 @@ class Intake:
             if event is not None:
                 event()
             self._carry_out(self._staging.poll(time.monotonic()))
+            self._swap_late()
             for matrix_id, seq in self._computer.take_swaps():
                 verdict = self._staging.applied(matrix_id, seq)
                 if verdict is not None:
@@ -105,6 +121,7 @@ class Intake:
         if current != self._rtc_session:
             self._rtc_session = current
             self._staging.void()
+            self._late.clear()
 
     def _chunk(self, key: str, data: bytes) -> None:
         try:
@@ -124,7 +141,24 @@ class Intake:
             # Without a readable manifest there is no id and checksum to acknowledge.
             _log.warning("reconstructor.refused", reason=str(error))
             return
+        if self._plan.active(FaultKind.DEAF):
+            return
+        if self._refuses():
+            reason = "range: refused as a fault asked for"
+            sha256 = manifest.layout.sha256
+            self._acknowledge(
+                Verdict(id=manifest.id, sha256=sha256, state=AckState.REJECTED, reason=reason)
+            )
+            return
         self._carry_out(self._staging.commit(manifest, time.monotonic()))
+
+    def _refuses(self) -> bool:
+        """Return whether a fault asks for one more refusal."""
+        fault = self._plan.active(FaultKind.REFUSE)
+        if fault is None or self._refused.get(fault, 0) >= fault.value("COUNT"):
+            return False
+        self._refused[fault] = self._refused.get(fault, 0) + 1
+        return True
 
     def _ask_current(self) -> None:
         """Ask what the service wants in use, once, and take it if it fits."""
@@ -171,9 +205,17 @@ class Intake:
         for verdict in outcome.verdicts:
             self._acknowledge(verdict)
         for reconstructor in outcome.staged:
-            self._computer.stage(reconstructor)
+            late = self._plan.active(FaultKind.LATE_SWAP)
+            if late is None:
+                self._computer.stage(reconstructor)
+            else:
+                self._late.append((self._plan.now_s + late.value("DELAY"), reconstructor))
         for matrix_id, chunks in outcome.missing:
             self._fetch(matrix_id, chunks)
+
+    def _swap_late(self) -> None:
+        while self._late and self._late[0][0] <= self._plan.now_s:
+            self._computer.stage(self._late.pop(0)[1])
 
     def _acknowledge(self, verdict: Verdict) -> None:
         _log.info(
@@ -190,9 +232,14 @@ class Intake:
             reason=verdict.reason,
             frame_seq=verdict.frame_seq,
         )
+        if self._plan.active(FaultKind.MUTE):
+            return
+        data = encode_acknowledgement(message)
+        if self._recorder is not None:
+            self._recorder.put(Kind.ACKNOWLEDGEMENT, data)
         self._session.put(
             self._keys.acknowledgement,
-            encode_acknowledgement(message),
+            data,
             encoding=Encodings.ACKNOWLEDGEMENT,
             congestion_control=zenoh.CongestionControl.BLOCK,
             priority=zenoh.Priority.DATA_HIGH,

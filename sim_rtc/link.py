@@ -11,7 +11,9 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import structlog
@@ -30,7 +32,6 @@ from service.wire import (
     Status,
     command_id,
     decode_command,
-    encode_frames,
     encode_manifest,
     encode_measured_manifest,
     encode_reply,
@@ -41,9 +42,12 @@ from sim_rtc.clock import FrameClock
 from sim_rtc.computer import Batch, RealTimeComputer
 from sim_rtc.desk import CommandDesk
 from sim_rtc.detector import Detector
+from sim_rtc.faults import FaultPlan
 from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.intake import Intake
 from sim_rtc.measure import Circumstances, Measured, product
+from sim_rtc.record import Kind, Recorder
+from sim_rtc.wire_faults import WireFaults
 
 _OPEN_TIMEOUT_MS = 1000
 _LEASE_MS = 2000
@@ -80,6 +84,86 @@ def client_config(endpoint: str) -> zenoh.Config:
     return config
 
 
+def frames_publisher(
+    session: zenoh.Session, keys: Keys, batches_per_s: float
+) -> zenoh.ext.AdvancedPublisher:
+    """Return the publisher of telemetry: what the service missed it can ask for again."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        keys.frames,
+        encoding=Encodings.FRAMES,
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=zenoh.Priority.DATA,
+        cache=zenoh.ext.CacheConfig(math.ceil(_CACHE_S * batches_per_s)),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(
+            heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
+        ),
+        publisher_detection=True,
+    )
+
+
+def status_publisher(session: zenoh.Session, keys: Keys) -> zenoh.Publisher:
+    """Return the publisher of status messages."""
+    return session.declare_publisher(
+        keys.status,
+        encoding=Encodings.STATUS,
+        congestion_control=zenoh.CongestionControl.DROP,
+    )
+
+
+class Token:
+    """The RTC's liveliness token, which may go and come back while the ``with`` block lasts."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, recorder: Recorder | None) -> None:
+        self._session = session
+        self._key = keys.alive(Role.RTC)
+        self._recorder = recorder
+        self._token: zenoh.LivelinessToken | None = None
+
+    def __enter__(self) -> Token:
+        self.show(visible=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.show(visible=False)
+
+    def show(self, *, visible: bool) -> None:
+        """Declare or withdraw the token, unless that is how it is."""
+        if visible is (self._token is not None):
+            return
+        if self._recorder is not None:
+            self._recorder.put(Kind.LIVELINESS, bytes([visible]))
+        if self._token is None:
+            self._token = self._session.liveliness().declare_token(self._key)
+        else:
+            self._token.undeclare()  # type: ignore[no-untyped-call]
+            self._token = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rehearsal:
+    """What is done to the link on request."""
+
+    plan: FaultPlan
+    """Faults."""
+
+    recorder: Recorder | None = None
+    """Where everything that is sent is written, too."""
+
+    seed: int | None = None
+    """Of the faults' randomness."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Outgoing:
+    """A batch that waits to be published."""
+
+    batch: Batch
+    t0_ns: int
+    time_s: float
+    """Loop time."""
+
+
 class Link:
     """Connects a computer to the service for as long as the ``with`` block lasts."""
 
@@ -91,7 +175,14 @@ class Link:
         clock: FrameClock,
         detector: Detector,
         magnitude: float,
+        rehearsal: Rehearsal | None = None,
     ) -> None:
+        rehearsal = rehearsal or Rehearsal(plan=FaultPlan())
+        self._plan = rehearsal.plan
+        self._recorder = rehearsal.recorder
+        self._faults = WireFaults(self._plan, np.random.default_rng(rehearsal.seed))
+        self._absent = threading.Event()
+        self._recorded_cm_id: str | None = None
         self._computer = computer
         self._endpoint = endpoint
         self._clock = clock
@@ -99,7 +190,7 @@ class Link:
         self._magnitude = magnitude
         self._keys = Keys(computer.identity.system)
         self._desk = CommandDesk(computer.execute)
-        self._backlog: deque[Batch] = deque()
+        self._backlog: deque[_Outgoing] = deque()
         self._ready = threading.Condition()
         self._stopped = threading.Event()
         self._dropped = 0
@@ -126,8 +217,23 @@ class Link:
             if len(self._backlog) >= _BACKLOG_BATCHES:
                 self._backlog.popleft()
                 self._dropped += 1
-            self._backlog.append(batch)
+            self._backlog.append(
+                _Outgoing(
+                    batch=batch,
+                    t0_ns=self._clock.end_of_exposure_ns(batch.seq0),
+                    time_s=self._plan.now_s,
+                )
+            )
             self._ready.notify()
+
+    @contextmanager
+    def absence(self) -> Iterator[None]:
+        """Withdraw the liveliness token and send no status while the ``with`` block lasts."""
+        self._absent.set()
+        try:
+            yield
+        finally:
+            self._absent.clear()
 
     def _run(self) -> None:
         session = self._open()
@@ -139,11 +245,17 @@ class Link:
                 # What has waited for a service is old: it would only arrive as a burst.
                 self._backlog.clear()
             with (
-                Intake(session, self._keys, self._computer),
-                session.liveliness().declare_token(self._keys.alive(Role.RTC)),
+                Intake(
+                    session,
+                    self._keys,
+                    self._computer,
+                    plan=self._plan,
+                    recorder=self._recorder,
+                ),
+                Token(session, self._keys, self._recorder) as token,
             ):
                 _log.info("link.open", endpoint=self._endpoint, system=self._keys.system)
-                self._publish(session)
+                self._publish(session, token)
 
     def _open(self) -> zenoh.Session | None:
         """Open the session, waiting for the service's router for as long as it takes."""
@@ -158,34 +270,25 @@ class Link:
                 self._stopped.wait(_RETRY["period_init_ms"] / 1000)
         return None
 
-    def _publish(self, session: zenoh.Session) -> None:
+    def _publish(self, session: zenoh.Session, token: Token) -> None:
         rate_hz = 1e9 / self._clock.dt_ns
-        frames = zenoh.ext.declare_advanced_publisher(
-            session,
-            self._keys.frames,
-            encoding=Encodings.FRAMES,
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA,
-            cache=zenoh.ext.CacheConfig(math.ceil(_CACHE_S * rate_hz / BATCH_FRAMES)),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(
-                heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
-            ),
-            publisher_detection=True,
-        )
-        status = session.declare_publisher(
-            self._keys.status,
-            encoding=Encodings.STATUS,
-            congestion_control=zenoh.CongestionControl.DROP,
-        )
+        frames = frames_publisher(session, self._keys, rate_hz / BATCH_FRAMES)
+        status = status_publisher(session, self._keys)
         next_status_s = 0.0
         while not self._stopped.is_set():
-            batch = self._next()
-            if batch is not None:
-                payload, attachment = encode_frames(*self._frames(batch))
-                frames.put(payload, attachment=attachment)
+            outgoing = self._next()
+            if outgoing is not None:
+                self._note_matrix(outgoing.batch.cm_id)
+                header, rows = self._frames(outgoing)
+                for payload, attachment in self._faults.messages(header, rows, outgoing.time_s):
+                    frames.put(payload, attachment=attachment)
+                    self._record(Kind.FRAMES, payload, attachment)
+            token.show(visible=not self._absent.is_set())
             now_s = time.monotonic()
-            if now_s >= next_status_s:
-                status.put(encode_status(self._status()))
+            if now_s >= next_status_s and not self._absent.is_set():
+                data = encode_status(self._status())
+                status.put(data)
+                self._record(Kind.STATUS, data)
                 next_status_s = now_s + _STATUS_PERIOD_S
                 for measured in self._computer.take_measured():
                     self._send_measured(session, measured)
@@ -225,13 +328,27 @@ class Link:
             reason=manifest.reason or "",
         )
 
-    def _next(self) -> Batch | None:
+    def _note_matrix(self, cm_id: str) -> None:
+        """Record a matrix when the first frames that it multiplies are sent."""
+        if self._recorder is None or cm_id == self._recorded_cm_id:
+            return
+        self._recorded_cm_id = cm_id
+        active = self._computer.snapshot().reconstructor
+        matrix = b"".join(split(active.matrix, active.manifest.layout.chunk_bytes))
+        self._record(Kind.MATRIX, matrix, encode_manifest(active.manifest))
+
+    def _record(self, kind: Kind, payload: bytes, attachment: bytes = b"") -> None:
+        if self._recorder is not None:
+            self._recorder.put(kind, payload, attachment)
+
+    def _next(self) -> _Outgoing | None:
         with self._ready:
             if not self._backlog:
                 self._ready.wait(_STATUS_PERIOD_S / 2)
             return self._backlog.popleft() if self._backlog else None
 
-    def _frames(self, batch: Batch) -> tuple[FrameHeader, NDArray[np.float32]]:
+    def _frames(self, outgoing: _Outgoing) -> tuple[FrameHeader, NDArray[np.float32]]:
+        batch = outgoing.batch
         columns = [batch.slopes, batch.commands_m]
         if batch.dither_m is not None:
             columns.append(batch.dither_m)
@@ -239,7 +356,7 @@ class Link:
             session=batch.session,
             seq0=batch.seq0,
             n=len(batch.slopes),
-            t0_ns=self._clock.end_of_exposure_ns(batch.seq0),
+            t0_ns=outgoing.t0_ns,
             dt_ns=self._clock.dt_ns,
             n_slopes=batch.slopes.shape[1],
             n_modes=batch.commands_m.shape[1],
@@ -266,7 +383,7 @@ class Link:
             n_modes=len(snapshot.gains),
             n_controlled=manifest.layout.shape[0],
             cm_id=manifest.id,
-            basis_id=self._computer.identity.basis_id,
+            basis_id=self._faults.basis_id(self._computer.identity.basis_id, self._plan.now_s),
             config_id=self._computer.identity.config_id,
             dither=snapshot.dither,
             max_dither_m=snapshot.limits.largest_m,

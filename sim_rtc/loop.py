@@ -80,6 +80,10 @@ class ModalLoop:
         self._drive = drive
         self._decided = np.zeros((delay_frames, n_modes), dtype=np.float32)
 
+    def limit(self, stroke_m: float) -> None:
+        """Clip commands at this from now on, metres RMS of a mode."""
+        self._stroke_m = np.float32(stroke_m)
+
     def reset(self) -> None:
         """Forget everything: the integrator starts from zero."""
         self._decided[:] = 0.0

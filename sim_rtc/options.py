@@ -22,6 +22,10 @@ from sim_rtc.options_device import (
     apply_preset,
     device_options,
 )
+from sim_rtc.options_rehearsal import (
+    EPILOG as REHEARSAL_EPILOG,
+)
+from sim_rtc.options_rehearsal import RehearsalOptions, add_rehearsal, rehearsal_options
 from sim_rtc.options_scene import (
     EPILOG as SCENE_EPILOG,
 )
@@ -75,6 +79,7 @@ truth file
   use; and one for each reconstructor swap with the peaks one second before and
   after it.
 
+{REHEARSAL_EPILOG}
 examples
   python -m sim_rtc --alpha 0.12,-0.08,0.2,1.003 --truth truth.jsonl
   python -m sim_rtc --seed 7 --mag 10 --jump 30:0.2,0,0,0 --seconds 60
@@ -128,6 +133,9 @@ class Options:
     speed: float
     """Loop time over wall-clock time; 0: as fast as it goes."""
 
+    rehearsal: RehearsalOptions
+    """Recording, replay, faults."""
+
     quiet: bool
 
 
@@ -139,6 +147,7 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         apply_scene(found)
         apply_preset(found)
         sky = scene_options(found)
+        rehearsal = rehearsal_options(found)
     except ConfigurationError as error:
         parser.error(str(error))
     return Options(
@@ -162,6 +171,7 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         drift=found.drift,
         seconds=found.seconds,
         speed=_USUAL_SPEED[found.plant] if found.speed is None else found.speed,
+        rehearsal=rehearsal,
         quiet=found.quiet,
     )
 
@@ -200,6 +210,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_loop(parser.add_argument_group("loop"))
     add_devices(parser)
     _add_run(parser.add_argument_group("run"))
+    add_rehearsal(parser.add_argument_group("rehearsal: recording, replay, faults"))
     return parser
 
 

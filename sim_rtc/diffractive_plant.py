@@ -45,6 +45,8 @@ _SOFTNESS = 0.002
 the service's thin plate, its size by 3 %."""
 
 _RENDER_ROWS = 512
+_FEW_MODES = 32
+"""Dithered modes beyond the controlled ones that are worth picking out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,7 +81,10 @@ class DiffractiveOptics:
     """Where the mirror truly lies on the sensor."""
 
     opd_per_command: Array32
-    """``(n_points, n_modes)`` OPD at the plant's pupil points per metre of command, as seen."""
+    """``(n_points, n_modes)`` OPD at the plant's pupil points per metre of command, as seen.
+
+    A mode is contiguous in memory: modes at rest then cost nothing.
+    """
 
     stuck_opd_m: Array32
     """``(n_points,)`` what stuck actuators add."""
@@ -129,6 +134,19 @@ class DiffractiveOptics:
             errors=self.errors,
             at_rest=AtRest.of(sensor, len(self.static_opd_m), self.valid),
         )
+
+    def mirror_opd_m(self, command_m: Array32) -> Array32:
+        """Return what the mirror adds ``(n_points,)`` at this command ``(n_modes,)``."""
+        modes = self.opd_per_command.T
+        at_rest = np.flatnonzero(command_m == 0.0)
+        n_first = int(at_rest[0]) if len(at_rest) else len(command_m)
+        others = n_first + np.flatnonzero(command_m[n_first:])
+        if len(others) > _FEW_MODES:
+            return np.asarray(command_m @ modes)
+        opd_m = command_m[:n_first] @ modes[:n_first]
+        for mode in others:
+            opd_m += command_m[mode] * modes[mode]
+        return np.asarray(opd_m)
 
     def slopes(
         self, opd_m: Array32, detector: PixelDetector | None, rng: np.random.Generator
@@ -223,7 +241,7 @@ class DiffractivePlant:
             for start in range(0, len(on_mirror), _RENDER_ROWS)
         ]
         shapes = np.concatenate([block.astype(np.float32) for block in blocks])
-        return np.ascontiguousarray(shapes[:, :-1]), np.ascontiguousarray(shapes[:, -1])
+        return np.asfortranarray(shapes[:, :-1]), np.ascontiguousarray(shapes[:, -1])
 
 
 def _blend(a: Array32, b: Array32, share: float) -> Array32:

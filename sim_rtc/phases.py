@@ -60,7 +60,7 @@ class PhaseBlock:
         """Run the batch that begins at ``row`` through the loop."""
 
         def sense(k: int, command_m: Array32) -> Array32:
-            opd_m = self.optics.opd_per_command @ command_m
+            opd_m = self.optics.mirror_opd_m(command_m)
             opd_m += self.phases_m[row + k]
             return self.optics.slopes(opd_m, self.detector, self.rng)
 

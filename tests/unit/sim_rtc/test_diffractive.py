@@ -162,6 +162,15 @@ def test_the_mirror_is_another_than_the_services(plant, small_basis):
     assert 0.005 < np.median(difference) < 0.2
 
 
+@pytest.mark.parametrize("moved", [[], [0, 1, 2], [0, 1, 2, 30, 39], [5], list(range(3, 40))])
+def test_the_mirror_adds_the_modes_that_are_commanded_and_no_others(plant, moved):
+    optics = plant.optics(TURNED)
+    command = np.zeros(40, dtype=np.float32)
+    command[moved] = np.random.default_rng(3).normal(0.0, 1e-7, len(moved))
+    expected = optics.opd_per_command.astype(float) @ command
+    np.testing.assert_allclose(optics.mirror_opd_m(command), expected, atol=1e-12)
+
+
 def test_a_turned_mirror_is_seen_turned(small_instrument, small_basis):
     plant = DiffractivePlant(
         small_instrument, small_basis, rng=np.random.default_rng(1), imperfections=PERFECT

@@ -73,7 +73,6 @@ def write_snapshot(telescope: Telescope, path: Path) -> None:
     rows = list(moments(telescope))
     figure = Figure(figsize=(4 * _INCHES, len(rows) * _INCHES), layout="constrained")
     axes = figure.subplots(len(rows), 4, squeeze=False)
-    residual_nm = 2.5 * rows[0].error_nm
     slope = 3.0 * float(np.nanstd(rows[0].slopes))
     for moment, (images, along_x, along_y, left) in zip(rows, axes, strict=True):
         images.set_ylabel(f"frame {moment.frame}")
@@ -81,7 +80,8 @@ def write_snapshot(telescope: Telescope, path: Path) -> None:
         for axis, values, name in zip((along_x, along_y), moment.slopes, "xy", strict=True):
             _show(axis, values, f"slopes along {name}", (-slope, slope), "RdBu_r")
         title = f"residual wavefront, {moment.error_nm:.0f} nm RMS"
-        _show(left, moment.residual_nm, title, (-residual_nm, residual_nm), "RdBu_r")
+        largest = 3.0 * moment.error_nm
+        _show(left, moment.residual_nm, title, (-largest, largest), "RdBu_r")
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:

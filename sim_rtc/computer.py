@@ -430,12 +430,12 @@ class RealTimeComputer:
 
     def _start_over(self) -> None:
         """Zero the integrator, which by the wire's rules begins a new session."""
+        reason = "the loop started over during the measurement"
+        self._measurements.end(self._session, self._n_slopes, reason)
         self._loop.reset()
         self._session = new_session()
         self._staged.clear()
         self._dither = None
-        reason = "the loop started over during the measurement"
-        self._measurements.end(self._session, self._n_slopes, reason)
 
 
 def new_session() -> str:

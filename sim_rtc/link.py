@@ -33,7 +33,6 @@ from service.wire import (
     command_id,
     decode_command,
     encode_manifest,
-    encode_measured_manifest,
     encode_reply,
     encode_status,
     split,
@@ -45,7 +44,7 @@ from sim_rtc.detector import Detector
 from sim_rtc.faults import FaultPlan
 from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.intake import Intake
-from sim_rtc.measure import Circumstances, Measured, product
+from sim_rtc.outlet import Outlet
 from sim_rtc.record import Kind, Recorder
 from sim_rtc.wire_faults import WireFaults
 
@@ -252,6 +251,7 @@ class Link:
                     plan=self._plan,
                     recorder=self._recorder,
                 ),
+                Outlet(session, self._keys, self._computer),
                 Token(session, self._keys, self._recorder) as token,
             ):
                 _log.info("link.open", endpoint=self._endpoint, system=self._keys.system)
@@ -290,43 +290,6 @@ class Link:
                 status.put(data)
                 self._record(Kind.STATUS, data)
                 next_status_s = now_s + _STATUS_PERIOD_S
-                for measured in self._computer.take_measured():
-                    self._send_measured(session, measured)
-
-    def _send_measured(self, session: zenoh.Session, measured: Measured) -> None:
-        """Send a measured matrix in parts, then its manifest, or why there is none."""
-        identity = self._computer.identity
-        circumstances = Circumstances(
-            system=identity.system,
-            basis_id=identity.basis_id,
-            config_id=identity.config_id,
-            double_pass=identity.double_pass,
-            created_ns=time.time_ns(),
-        )
-        manifest, matrix = product(measured, circumstances)
-        parts = [] if matrix is None else split(matrix, manifest.layout.chunk_bytes)
-        for index, part in enumerate(parts):
-            session.put(
-                self._keys.measured_chunk(manifest.id, index),
-                part,
-                encoding=Encodings.BYTES,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.DATA_LOW,
-            )
-        session.put(
-            self._keys.measured_commit(manifest.id),
-            encode_measured_manifest(manifest),
-            encoding=Encodings.MEASURED_COMMIT,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.DATA_HIGH,
-        )
-        _log.info(
-            "matrix.measured",
-            id=manifest.id,
-            pattern=str(manifest.pattern),
-            shape=manifest.layout.shape,
-            reason=manifest.reason or "",
-        )
 
     def _note_matrix(self, cm_id: str) -> None:
         """Record a matrix when the first frames that it multiplies are sent."""

@@ -347,6 +347,21 @@ def test_a_measurement_that_determines_nothing_says_why():
     assert decode_measured_manifest(encode_measured_manifest(manifest)) == manifest
 
 
+def test_a_restart_ends_the_measurement_and_says_so():
+    computer = computer_on(sky())
+    computer.execute(push_pull())
+    session = computer.snapshot().session
+    computer.next_batch()
+    computer.restart()
+    (ended,) = computer.take_measured()
+    manifest, matrix = product(ended, HERE)
+    assert matrix is None
+    assert manifest.reason == "the loop started over during the measurement"
+    assert manifest.session == session
+    assert computer.snapshot().loop is Loop.CLOSED
+    assert not computer.next_batch().commands_m[:2].any()
+
+
 def test_pushes_and_pulls_balance_for_constants_and_trends():
     shapes = np.array([[1e-8, 0.0], [0.0, 3e-8]], dtype=np.float32)
     strokes = PushPull(shapes_m=shapes, n_average=4)

@@ -28,6 +28,7 @@ from sim_rtc.options import Options, parse_options
 from sim_rtc.record import Recorder, Recording
 from sim_rtc.replay import Replay
 from sim_rtc.sabotage import Sabotage
+from sim_rtc.snapshot import write_snapshot
 from sim_rtc.truth import TruthRecorder
 
 _REPORT_PERIOD_S = 10.0
@@ -54,6 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Nested threading makes small products slower, and the service needs the other core.
         with threadpool_limits(1):
             telescope = build_telescope(options, instrument)
+            if options.snapshot is not None:
+                write_snapshot(telescope, options.snapshot)
+                return 0
             run(telescope, options, stopped)
     except PyrcalError as error:
         print(f"sim_rtc: {error}", file=sys.stderr)

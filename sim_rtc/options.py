@@ -15,20 +15,14 @@ from typing_extensions import override
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration
 from sim_rtc import arguments
+from sim_rtc.manual import DESCRIPTION, EPILOG, USAGE
 from sim_rtc.options_device import (
-    PRESETS,
     DeviceOptions,
     add_devices,
     apply_preset,
     device_options,
 )
-from sim_rtc.options_rehearsal import (
-    EPILOG as REHEARSAL_EPILOG,
-)
 from sim_rtc.options_rehearsal import RehearsalOptions, add_rehearsal, rehearsal_options
-from sim_rtc.options_scene import (
-    EPILOG as SCENE_EPILOG,
-)
 from sim_rtc.options_scene import (
     SceneOptions,
     add_imperfections,
@@ -41,54 +35,6 @@ from sim_rtc.schedule import Drift, Jump
 
 _USUAL_SPEED = {"linear": 1.0, "diffractive": 0.0}
 """The diffractive plant cannot keep up with a real loop: it takes the time it needs."""
-
-_DESCRIPTION = """\
-Simulated real-time computer of an adaptive telescope with a pyramid sensor. It closes the loop on
-frozen-flow turbulence at the frame rate, in real time, publishes telemetry over zenoh, and takes
-dithers, loop commands and reconstructors, as the service's wire contract says. Its mirror is
-mis-registered on the sensor by an amount that it tells nobody on the wire.
-"""
-
-_EPILOG = f"""\
-plants
-  linear       one matrix, real time at 1 kHz; an optical gain of its own invention.
-  diffractive  the field of the pyramid for every frame: the optical gain is what the residual
-               wavefront makes it. Other influence functions and pupil grid than the service's.
-               150 to 200 frames a second on one core; timestamps follow the loop's own time.
-
-presets
-  --preset flao looks at the magnitude:
-{PRESETS}
-
-registration
-  X,Y in subapertures, rotation in degrees from +x towards +y, magnification as a ratio. A jump
-  T:dx,dy,drot_deg,dmag happens at T seconds of loop time, at the next batch of 10 frames; its
-  optics take a few seconds to compute, so a jump in the first seconds comes late. A drift, a
-  flexure and a random walk move in linear steps of 2 s or less between exact optics 20 s or less
-  apart. All of them add up.
-
-{SCENE_EPILOG}
-light
-  A star of R = 0 gives 2.1e10 photons per second and square metre in the band (600 to 900 nm); a
-  quarter of them are detected. The linear plant adds their noise to its slopes, the diffractive one
-  counts electrons in every pixel.
-
-truth file
-  One JSON object a line. The first is the setup: all of the scene, imperfections and movements. Then
-  twice a second registration, seeing, wavefront error (RMS and peak, nm) over the pupil, matrix in
-  use; and one for each reconstructor swap with the peaks one second before and
-  after it.
-
-{REHEARSAL_EPILOG}
-examples
-  python -m sim_rtc --alpha 0.12,-0.08,0.2,1.003 --truth truth.jsonl
-  python -m sim_rtc --seed 7 --mag 10 --jump 30:0.2,0,0,0 --seconds 60
-  python -m sim_rtc --scene daytime --imperfections realistic
-  python -m sim_rtc --profile three-layer --seeing-at 60:1.5 --spiders 3:0.2 --vibration tip:13:50
-
-exit status
-  0 it ended as asked (time is up, SIGINT, SIGTERM); 2 an option that cannot be.
-"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,6 +82,9 @@ class Options:
     rehearsal: RehearsalOptions
     """Recording, replay, faults."""
 
+    snapshot: Path | None
+    """Picture to write instead of running the loop for a service."""
+
     quiet: bool
 
 
@@ -172,6 +121,7 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         seconds=found.seconds,
         speed=_USUAL_SPEED[found.plant] if found.speed is None else found.speed,
         rehearsal=rehearsal,
+        snapshot=found.snapshot,
         quiet=found.quiet,
     )
 
@@ -196,12 +146,20 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
+class _ManualFormatter(argparse.RawDescriptionHelpFormatter):
+    """As wide as the rest of the manual, whatever the terminal."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=34, width=100)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="sim_rtc",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        usage=USAGE,
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=_ManualFormatter,
         allow_abbrev=False,
     )
     _add_instrument(parser.add_argument_group("instrument and truth"))
@@ -354,5 +312,12 @@ def _add_run(group: argparse._ArgumentGroup) -> None:
         type=arguments.within(0.0, 100.0),
         metavar="X",
         help="loop time over wall-clock time, 0: as fast as it goes (default: 1; diffractive: 0)",
+    )
+    group.add_argument(
+        "--snapshot",
+        type=Path,
+        metavar="FILE",
+        help="close the loop for 300 frames without a service, write a contact sheet of pupil "
+        "images, slopes and residual wavefront, and end (needs the extra 'plots')",
     )
     group.add_argument("--quiet", action="store_true", help="say only what is wrong")

@@ -255,6 +255,24 @@ class MeasurementRecord:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DitherView:
+    """A sinusoidal dither, asked for or running."""
+
+    id: str
+    modes: tuple[int, ...]
+    amplitude_m: tuple[float, ...]
+    """RMS of each mode, metres OPD."""
+
+    frequency_hz: tuple[float, ...]
+    duration_s: float
+    start_seq: int | None
+    """First frame that contains it; None until the RTC has accepted."""
+
+    asked_ns_utc: int
+    """When the service asked for it, or adopted it; 0: it has done neither."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RtcView:
     """The RTC as its last status message shows it."""
 
@@ -283,23 +301,8 @@ class RtcView:
     t_ns_utc: int
     """The RTC's own timestamp of this status."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DitherView:
-    """The dither now requested of the RTC."""
-
-    id: str
-    modes: tuple[int, ...]
-    amplitude_m: tuple[float, ...]
-    """RMS of each mode, metres OPD."""
-
-    frequency_hz: tuple[float, ...]
-    duration_s: float
-    start_seq: int | None
-    """First frame that contains it; None until the RTC has accepted."""
-
-    asked_ns_utc: int
-    """When the service asked for it."""
+    dither: DitherView | None = None
+    """What is running, where it is a sine that has been announced to the frame; else None."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import ModelError
 from service.estimation.lockin import LockInPlan
 from service.events import AskDither, AskNoDither, Effect, FetchMatrix, JudgeMatrix, MakeMatrix
 from service.model.misregistration import BOUNDARY_SCALE
+from service.reactions.journal import logged, without_alarm
 from service.state import (
     DitherView,
     MatrixState,
@@ -102,16 +104,35 @@ def _fetch(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> _C
 
 
 def _dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> _Choice:
-    """Keep a dither running while the loop is closed and its matrix known."""
-    ready = rtc.loop == "closed" and state.in_use is not None and now_ns >= state.retry_ns_utc
+    """Keep a dither running while the loop is closed and its matrix known.
+
+    One that runs already, from before a restart of the service or in a replayed night, is as good
+    as a new one and the RTC plays no second one beside it.
+    """
     wanted = policy.dither_enabled and not state.dither_stopped and state.dither is None
-    if not ready or not wanted:
+    if rtc.loop != "closed" or not wanted:
+        return state, ()
+    if rtc.dither is not None and _usable(rtc.dither, rtc, policy):
+        state = replace(state, dither=replace(rtc.dither, asked_ns_utc=now_ns))
+        text = f"{rtc.dither.id} runs since frame {rtc.dither.start_seq}"
+        state = without_alarm(state, "dither", now_ns)
+        return logged(state, "dither.adopted", text, now_ns), ()
+    if state.in_use is None or now_ns < state.retry_ns_utc:
         return state, ()
     if rtc.dither_id is not None and rtc.dither_id.startswith(_OWN_DITHER):
-        # left behind by this service before it was restarted
+        # left behind by this service when its window had another length
         return replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS), (AskNoDither(),)
     dither = plan_dither(rtc, policy, now_ns)
     return replace(state, dither=dither), (AskDither(dither=dither),)
+
+
+def _usable(dither: DitherView, rtc: RtcView, policy: Policy) -> bool:
+    """Return whether the lines of a dither can be told apart in this policy's windows."""
+    try:
+        lock_in_plan(dither, rtc, policy.window_s)
+    except ModelError:
+        return False
+    return True
 
 
 def plan_dither(

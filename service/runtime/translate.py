@@ -6,6 +6,7 @@ from service import events as ev
 from service.link import events as heard
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.state import (
+    DitherView,
     Level,
     MatrixState,
     MeasurementRecord,
@@ -17,6 +18,7 @@ from service.state import (
 )
 from service.wire import (
     Acknowledgement,
+    DitherStatus,
     Manifest,
     MatrixLayout,
     MeasuredManifest,
@@ -83,7 +85,24 @@ def rtc_view(status: Status) -> RtcView:
         max_dither_m=status.max_dither_m,
         max_dither_modes=status.max_dither_modes,
         dither_id=status.dither.request.id if status.dither is not None else None,
+        dither=None if status.dither is None else _running(status.dither),
         t_ns_utc=status.t_ns,
+    )
+
+
+def _running(status: DitherStatus) -> DitherView | None:
+    """Return the dither that runs, if it is a sine."""
+    request = status.request
+    if request.modes is None or request.amplitude_m is None or request.frequency_hz is None:
+        return None
+    return DitherView(
+        id=request.id,
+        modes=request.modes,
+        amplitude_m=request.amplitude_m,
+        frequency_hz=request.frequency_hz,
+        duration_s=request.duration_s or 0.0,
+        start_seq=status.start_seq,
+        asked_ns_utc=0,
     )
 
 

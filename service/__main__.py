@@ -247,6 +247,7 @@ def _compute(settings: Settings) -> Compute:
         nice=table.nice,
         pupil_sampling=table.pupil_sampling,
         detector_nodes=table.detector_nodes,
+        working_point_modes=table.working_point_modes,
     )
 
 

@@ -206,6 +206,9 @@ class Acknowledged:
     """The RTC answered to a reconstructor."""
 
     id: str
+    session: str | None = None
+    """Of the RTC that answers; None: not known."""
+
     state: MatrixState
     reason: str
     frame_seq: int | None

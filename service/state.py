@@ -269,7 +269,7 @@ class DitherView:
     """First frame that contains it; None until the RTC has accepted."""
 
     asked_ns_utc: int
-    """When the service asked for it, or adopted it; 0: it has done neither."""
+    """When it was asked for, then when it was accepted or adopted; 0: none of these."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

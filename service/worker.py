@@ -30,6 +30,7 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
+from service.model.workingpoint import Halo, working_point
 
 SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
 """A step shorter than this (numeric units) leaves a linearisation error below 1e-4 of its unit."""
@@ -61,6 +62,9 @@ class Compute:
     nice: int = 10
     pupil_sampling: int = 3
     detector_nodes: int = 3
+    working_point_modes: int | None = None
+    """Telemetry is compared with the response of a loop that controls this many modes at the
+    instrument's r0; None: with that of a flat wavefront."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,25 +89,34 @@ class Made:
 
 
 class Workbench:
-    """The optical model and the last linearisation, kept between jobs."""
+    """The optical model and the last linearisation, kept between jobs.
+
+    Telemetry, and the stability of a loop, are of the sensor as it works; what is published is the
+    inverse of its response to a flat wavefront: the optical gain is never folded in.
+    """
 
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
         basis = karhunen_loeve_basis(instrument)
         self._threads = ThreadPoolExecutor(compute.threads)
-        self._model = InteractionModel(
-            instrument,
-            basis,
-            pupil_sampling=compute.pupil_sampling,
-            detector_nodes=compute.detector_nodes,
-            mapper=self._threads.map,
-        )
-        self._coarse = InteractionModel(
-            instrument,
-            basis,
-            pupil_sampling=COARSE_SAMPLING,
-            detector_nodes=COARSE_SAMPLING,
-            mapper=self._threads.map,
-        )
+
+        def model(sampling: int, nodes: int, halo: Halo | None) -> InteractionModel:
+            return InteractionModel(
+                instrument,
+                basis,
+                pupil_sampling=sampling,
+                detector_nodes=nodes,
+                halo=halo,
+                mapper=self._threads.map,
+            )
+
+        sampling, nodes = compute.pupil_sampling, compute.detector_nodes
+        self._model = self._sensor = model(sampling, nodes, None)
+        self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
+        if compute.working_point_modes is not None:
+            halo = working_point(
+                instrument, n_controlled=compute.working_point_modes, sampling=sampling
+            )
+            self._sensor = model(sampling, nodes, halo)
         self._linearisation: Linearisation | None = None
 
     def describe(self) -> Description:
@@ -130,6 +143,9 @@ class Workbench:
                 if near is None:
                     return _unsettled(spectra)
                 estimate = fit_window(spectra, self._linearise(near), loop)
+            if not _settled(estimate):
+                # the coarse model's own bias may be more than what counts as settled
+                estimate = fit_window(spectra, self._linearise(estimate.alpha), loop)
         except np.linalg.LinAlgError as error:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
         return estimate if _settled(estimate) else _unsettled(spectra)
@@ -189,7 +205,7 @@ class Workbench:
         return kept
 
     def _linearise(self, alpha: Misregistration) -> Linearisation:
-        self._linearisation = self._model.linearise(alpha)
+        self._linearisation = self._sensor.linearise(alpha)
         return self._linearisation
 
 

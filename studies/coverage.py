@@ -120,10 +120,11 @@ def main() -> None:
     parser.add_argument("--mag", type=float, default=8.0)
     parser.add_argument("--plant", default="linear")
     parser.add_argument("--gain", type=float, default=0.4)
+    parser.add_argument("--working-point-modes", type=int)
     given = parser.parse_args()
     threadpool_limits(1)
     instrument = load_instrument("flao-lbt")
-    bench = Workbench(instrument, Compute())
+    bench = Workbench(instrument, Compute(working_point_modes=given.working_point_modes))
     tracking = load_settings(None, {}).tracking
     floor = np.array(
         [

@@ -148,6 +148,10 @@ class ComputeTable(Table):
     detector_nodes: int = Field(default=3, ge=1, le=16)
     """Quadrature nodes per detector pixel and axis (nd of the model)."""
 
+    working_point_modes: int | None = Field(default=None, ge=1)
+    """Compare telemetry with the response of a loop that controls this many modes at the
+    instrument's r0, less biased on sky and slower; None: with that of a flat wavefront."""
+
 
 class Settings(Table):
     """Everything the user may decide about the service."""

@@ -73,7 +73,10 @@ def validated(schema: type[Schema], data: Mapping[str, Any], place: Place) -> Sc
     try:
         return schema.model_validate(data)
     except ValidationError as error:
-        problems = error.errors(include_url=False)
+        # a misspelt key is also a missing one: what was written says more
+        problems = sorted(
+            error.errors(include_url=False), key=lambda problem: problem["type"] == "missing"
+        )
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise ConfigurationError(_line(schema, problems[0], place) + more) from error
 

@@ -87,7 +87,7 @@ def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int)
     if record is None:
         text = f"an acknowledgement for {event.id}, which this service never sent"
         return logged(state, "acknowledgement.unknown", text, now_ns, Level.WARNING)
-    if event.state is MatrixState.STAGED and record.state is not MatrixState.PUBLISHED:
+    if _is_old(state, record, event):
         return state
     if event.state is MatrixState.APPLIED:
         record = replace(record, applied_frame_seq=event.frame_seq, reason=event.reason)
@@ -104,9 +104,19 @@ def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int)
     return state
 
 
+def _is_old(state: TrackerState, record: ReconstructorRecord, event: ev.Acknowledged) -> bool:
+    """Return whether an acknowledgement tells of something that has been overtaken."""
+    if state.rtc is not None and event.session not in {None, state.rtc.session}:
+        return True
+    if event.state is MatrixState.STAGED:
+        return record.state is not MatrixState.PUBLISHED
+    repeated = record.applied_frame_seq == event.frame_seq
+    return record.state is MatrixState.SUPERSEDED and repeated
+
+
 def on_fetched(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> TrackerState:
     """Shelve the matrix the RTC uses, which the service did not make."""
-    state = with_in_use(with_record(state, record), record.id)
+    state = replace(with_in_use(with_record(state, record), record.id), retry_ns_utc=0)
     text = f"the RTC uses {record.id}, {record.n_modes} modes"
     return logged(state, "reconstructor.adopted", text, now_ns)
 

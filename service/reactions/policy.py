@@ -11,7 +11,7 @@ from service.errors import ModelError
 from service.estimation.lockin import LockInPlan
 from service.events import AskDither, AskNoDither, Effect, FetchMatrix, JudgeMatrix, MakeMatrix
 from service.model.misregistration import BOUNDARY_SCALE
-from service.reactions.journal import logged, without_alarm
+from service.reactions.journal import logged, with_alarm, without_alarm
 from service.state import (
     DitherView,
     MatrixState,
@@ -123,6 +123,11 @@ def _dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> _
         # left behind by this service when its window had another length
         return replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS), (AskNoDither(),)
     dither = plan_dither(rtc, policy, now_ns)
+    try:
+        lock_in_plan(dither, rtc, policy.window_s)
+    except ModelError as error:
+        state = replace(state, retry_ns_utc=now_ns + 60 * SECOND_NS)
+        return with_alarm(state, "dither", f"no usable dither: {error}", now_ns), ()
     return replace(state, dither=dither), (AskDither(dither=dither),)
 
 
@@ -190,7 +195,7 @@ def _uncontrolled_modes(rtc: RtcView, policy: Policy) -> tuple[int, ...]:
     first = max(rtc.n_controlled, min(policy.n_modes_target, rtc.n_modes))
     spare = rtc.n_modes - first
     if spare < _N_LINES:
-        return tuple(range(rtc.n_modes - _N_LINES, rtc.n_modes))
+        return tuple(range(max(rtc.n_modes - _N_LINES, 0), rtc.n_modes))
     step = max(1, min(20, spare // (_N_LINES + 1)))
     return tuple(first + step // 2 + step * line for line in range(_N_LINES))
 

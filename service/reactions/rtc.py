@@ -54,9 +54,9 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
 def _watch_age(state: TrackerState, now_ns: int) -> TrackerState:
     """Raise an alarm when a dither runs and still nothing comes of it."""
     known, dither = state.registration, state.dither
-    if known is None or dither is None:
+    if dither is None:
         return without_alarm(state, "estimate-stale", now_ns)
-    since_ns = max(known.arrived_ns_utc, dither.asked_ns_utc)
+    since_ns = max(known.arrived_ns_utc if known else 0, dither.asked_ns_utc)
     if now_ns - since_ns < STALE_AFTER_S * SECOND_NS:
         return state
     text = (
@@ -115,7 +115,9 @@ def on_dither(state: TrackerState, event: ev.DitherAnswered, now_ns: int) -> Tra
     if state.dither is None or state.dither.id != event.id:
         return state
     if event.accepted:
-        state = replace(state, dither=replace(state.dither, start_seq=event.start_seq))
+        state = replace(
+            state, dither=replace(state.dither, start_seq=event.start_seq, asked_ns_utc=now_ns)
+        )
         text = f"{event.id} starts at frame {event.start_seq}"
         return logged(without_alarm(state, "dither", now_ns), "dither.started", text, now_ns)
     state = replace(state, dither=None, retry_ns_utc=now_ns + 10 * SECOND_NS)

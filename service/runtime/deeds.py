@@ -45,6 +45,9 @@ from service.worker import Workbench
 GAIN_SAFETY = 1.1
 """The gate assumes optical gains this much above the measured ones, for modes not dithered."""
 
+UNKNOWN_PARENT = "unknown"
+"""Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""
+
 MATRICES_KEPT = 16
 """In memory; older ones come from the archive."""
 
@@ -168,7 +171,8 @@ class Deeds:
             self._publishing.pole_radius_bound,
         )
         accepted = made.gate.accepted
-        record = self._record(effect.n_modes, effect.why, registration, state.in_use)
+        parent = state.in_use or UNKNOWN_PARENT
+        record = self._record(effect.n_modes, effect.why, registration, parent)
         record = replace(
             record,
             state=MatrixState.PROPOSED if accepted else MatrixState.REFUSED,

@@ -46,6 +46,8 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     if before is not None and _same_loop(before, rtc):
         return streams
     memory = Passive(n_modes=rtc.n_controlled, memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz)
+    if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
+        return replace(streams, passive=memory, lock_in=None, dither_id=None)
     lock_in = streams.lock_in and replace(streams.lock_in, window=None)
     return replace(streams, passive=memory, lock_in=lock_in)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service import events as ev
 from service.archive import Archive
-from service.errors import CommandError, LinkError, ModelError, PyrcalError
+from service.errors import CommandError, LinkError, ModelError, PyrcalError, WorkerError
 from service.estimation.instrumental import Loop
 from service.estimation.lockin import Spectra, WindowRefused
 from service.events import Command, Effect, Event
@@ -31,7 +31,7 @@ from service.runtime.streams import Streams, fed, shape_mismatch, with_dither, w
 from service.state import Level, LogEntry, MeasureState, RtcView, TrackerState
 from service.tracker import step
 from service.wire import AlarmMessage
-from service.worker import Workbench
+from service.worker import Description, Workbench
 
 POLL_S = 0.05
 """Longest time telemetry waits to be taken in: frames held for a hole ring no bell."""
@@ -41,6 +41,9 @@ WATCH_INTERVAL_S = 10.0
 
 WINDOWS_WAITING = 1
 """Windows that may wait for the worker; a newer one says more, so the older is given up."""
+
+DESCRIBE_ATTEMPTS = 3
+"""Workers that may die while the model is prepared before the service gives up."""
 
 _LEVELS = {Level.INFO: "info", Level.WARNING: "warning", Level.ALARM: "error"}
 
@@ -119,12 +122,21 @@ class Supervisor:
         """Work until cancelled: prepare the model, then listen, tick, fit, watch and record."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._record())
-            description = await self._crew.call(Workbench.describe)
+            description = await self._described()
             self._streams = Streams(description=description)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"
             self._post(ev.Noted(name="service.ready", text=text))
             for work in (self._listen, self._tick, self._fit, self._watch):
                 group.create_task(work())
+
+    async def _described(self) -> Description:
+        """Return what the model expects of telemetry; a worker that dies is replaced."""
+        for _ in range(DESCRIBE_ATTEMPTS - 1):
+            try:
+                return await self._crew.call(Workbench.describe)
+            except WorkerError as error:
+                self._note("worker.lost", str(error), Level.WARNING)
+        return await self._crew.call(Workbench.describe)
 
     async def _listen(self) -> None:
         """Take in what the link has: events first, for frames mean nothing without them."""

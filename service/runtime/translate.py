@@ -109,6 +109,7 @@ def _running(status: DitherStatus) -> DitherView | None:
 def _acknowledged(acknowledgement: Acknowledgement) -> ev.Acknowledged:
     return ev.Acknowledged(
         id=acknowledgement.id,
+        session=acknowledgement.session,
         state=MatrixState(acknowledgement.state.value),
         reason=acknowledgement.reason,
         frame_seq=acknowledgement.frame_seq,

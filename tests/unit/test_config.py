@@ -163,7 +163,10 @@ def test_values_that_ask_for_nothing_new_are_accepted(write):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (ABOUT.replace("diameter_m", "diamter_m") + WFS + MIRROR, "instrument.diameter_m: missing"),
+        (
+            ABOUT.replace("diameter_m", "diamter_m") + WFS + MIRROR,
+            "instrument.diamter_m: unknown key, did you mean diameter_m?",
+        ),
         (
             ABOUT + "obscuration = 0.1\n" + WFS + MIRROR,
             "instrument.obscuration: unknown key, did you mean obscuration_ratio?",

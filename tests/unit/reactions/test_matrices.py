@@ -4,8 +4,18 @@ import pytest
 
 from service import events as ev
 from service.reactions.matrices import extended_gains
-from service.state import Level, MatrixState, Mode
-from tests.unit.reactions.situations import Story, foreign, of_kind, rtc, verdict
+from service.state import Level, MatrixState, Mode, TrackerState
+from service.tracker import step
+from tests.unit.reactions.situations import (
+    POLICY,
+    START_NS,
+    Story,
+    foreign,
+    of_kind,
+    record,
+    rtc,
+    verdict,
+)
 
 
 @pytest.fixture
@@ -162,3 +172,31 @@ def test_a_matrix_made_while_the_rtc_was_away_is_not_sent_to_nobody():
     story = Story(Mode.AUTO).meet()
     story.state = replace(story.state, rtc=None)
     assert not of_kind(story.make("cm-1"), ev.SendMatrix)
+
+
+class TestOldAcknowledgements:
+    def test_one_of_another_session_changes_nothing(self):
+        state = TrackerState(
+            system="flao", rtc=rtc(), reconstructors=(record("cm-1", MatrixState.PUBLISHED),)
+        )
+        told = ev.Acknowledged(
+            id="cm-1", session="s0", state=MatrixState.APPLIED, reason="", frame_seq=5
+        )
+        after, _ = step(state, told, POLICY, START_NS)
+        assert after.reconstructor("cm-1").state is MatrixState.PUBLISHED
+
+    def test_one_repeated_for_a_matrix_since_replaced_does_not_bring_it_back(self):
+        state = TrackerState(
+            system="flao",
+            rtc=rtc(cm_id="cm-2"),
+            in_use="cm-2",
+            reconstructors=(
+                record("cm-1", MatrixState.SUPERSEDED, applied_frame_seq=5),
+                record("cm-2", MatrixState.APPLIED, applied_frame_seq=9),
+            ),
+        )
+        told = ev.Acknowledged(
+            id="cm-1", session="s1", state=MatrixState.APPLIED, reason="", frame_seq=5
+        )
+        after, _ = step(state, told, POLICY, START_NS)
+        assert after.in_use == "cm-2"

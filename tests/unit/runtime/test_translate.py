@@ -80,7 +80,9 @@ def test_an_acknowledgement_keeps_its_word(state, expected):
     event = translate.event_of(
         heard.AcknowledgementReceived(acknowledgement=acknowledgement, known=True)
     )
-    assert event == ev.Acknowledged(id="cm-1", state=expected, reason="why", frame_seq=9)
+    assert event == ev.Acknowledged(
+        id="cm-1", session="s1", state=expected, reason="why", frame_seq=9
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import ModelError
 from service.model.instrument import Instrument, Pyramid
 from service.model.pupil import PupilGrid
 
@@ -36,6 +37,19 @@ class Quadrature:
 
     dtype: type[np.complex64] | type[np.complex128] = np.complex64
     """Precision of the fields."""
+
+    def __post_init__(self) -> None:
+        """Refuse a modulation whose points do not pair up.
+
+        Raises
+        ------
+        ModelError
+            If the number of modulation points is odd or not positive.
+        """
+        if self.n_modulation < 2 or self.n_modulation % 2:
+            raise ModelError(
+                f"pyramid: found {self.n_modulation} modulation points; expected an even number"
+            )
 
 
 class DiffractivePyramid:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.instrument import Instrument, Stop
+from service.model.instrument import Instrument, Pyramid, Stop
 from service.model.interaction import reference_slopes, rotation, valid_subapertures
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
@@ -184,10 +184,11 @@ class DiffractivePlant:
         uneven_rng, position_rng, pixel_rng, path_rng = rng.spawn(4)
         pupil = centred_pupil(instrument, _SAMPLING * binning)
         pupil = scene.light(pupil, instrument.subaperture_m)
+        wfs = true_sensor(instrument.wfs, imperfections)
         self._sensor = DiffractivePyramid(
-            true_sensor(instrument.wfs, imperfections),
+            wfs,
             uneven(pupil, imperfections.unevenness, uneven_rng),
-            quadrature=quadrature or Quadrature(n_nodes=2 * binning),
+            quadrature=quadrature or _quadrature(wfs, binning),
         )
         mirror = misplaced(instrument.mirror, imperfections.position_error, position_rng)
         self._surface = TensionedPlate(
@@ -242,6 +243,14 @@ class DiffractivePlant:
         ]
         shapes = np.concatenate([block.astype(np.float32) for block in blocks])
         return np.asfortranarray(shapes[:, :-1]), np.ascontiguousarray(shapes[:, -1])
+
+
+def _quadrature(wfs: Pyramid, binning: int) -> Quadrature:
+    """Return 24 modulation points at 3 λ/D, more on a larger circle, and nodes for the binning."""
+    return Quadrature(
+        n_nodes=2 * binning,
+        n_modulation=max(24, 2 * int(np.ceil(4 * wfs.modulation_lambda_over_d))),
+    )
 
 
 def _blend(a: Array32, b: Array32, share: float) -> Array32:

@@ -5,6 +5,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from service.errors import ModelError
 from service.model.instrument import KarhunenLoeve, Stop
 from service.model.interaction import (
     normalised_jacobian,
@@ -133,6 +134,35 @@ def test_a_shift_by_a_whole_subaperture_moves_the_images_by_one_pixel(small_inst
     opd_m = phases(pupil, 60e-9)[0]
     at_rest, moved = sensor.images(opd_m), sensor.at((1.0, 0.0)).images(opd_m)
     np.testing.assert_allclose(moved[..., 1:], at_rest[..., :-1], atol=1e-5 * at_rest.max())
+
+
+def test_modulation_points_that_do_not_pair_up_are_refused():
+    with pytest.raises(ModelError, match="found 25 modulation points; expected an even number"):
+        Quadrature(n_modulation=25)
+
+
+def test_a_larger_modulation_gets_more_points(small_instrument, small_basis):
+    """The same wavefront on 24 points and on as many as the plant takes at 10 % more radius."""
+    wide = DiffractivePlant(
+        small_instrument,
+        small_basis,
+        rng=np.random.default_rng(1),
+        imperfections=replace(PERFECT, modulation_error=0.10),
+    )
+    converged = DiffractivePlant(
+        small_instrument,
+        small_basis,
+        rng=np.random.default_rng(1),
+        imperfections=replace(PERFECT, modulation_error=0.10),
+        quadrature=Quadrature(n_modulation=48),
+    )
+    tilt = 5e-9 * small_basis.render(wide.points_m / small_instrument.subaperture_m)[:, 0]
+    rng = np.random.default_rng(2)
+    found, expected = (
+        plant.optics(Misregistration()).slopes(tilt.astype(np.float32), None, rng)
+        for plant in (wide, converged)
+    )
+    assert np.linalg.norm(found - expected) < 2e-3 * np.linalg.norm(expected)
 
 
 def test_a_flat_wavefront_has_no_slopes(plant):

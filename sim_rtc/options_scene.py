@@ -71,7 +71,7 @@ def apply_scene(found: argparse.Namespace) -> None:
 
     By day a command counts twice: half the gain makes the same loop of the same matrix.
     """
-    by_day = found.scene is SceneKind.DAYTIME
+    by_day = found.scene == SceneKind.DAYTIME
     if found.mag is None:
         found.mag = _FIBRE_MAGNITUDE if by_day else _NIGHT_MAGNITUDE
     if found.gain is None:
@@ -86,7 +86,7 @@ def scene_options(found: argparse.Namespace) -> SceneOptions:
     ConfigurationError
         If they are not: one line that names the option.
     """
-    by_day = found.scene is SceneKind.DAYTIME
+    by_day = found.scene == SceneKind.DAYTIME
     files = [given for given in found.truth or () if isinstance(given, Path)]
     if len(files) > 1:
         raise ConfigurationError(f"--truth: found {len(files)} files; expected one")
@@ -100,7 +100,7 @@ def scene_options(found: argparse.Namespace) -> SceneOptions:
                 f"rate of {found.rate:g} Hz"
             )
     return SceneOptions(
-        scene=Scene(kind=found.scene, spiders=found.spiders),
+        scene=Scene(kind=SceneKind(found.scene), spiders=found.spiders),
         imperfections=_imperfections(found),
         seeing=SeeingSchedule(start_arcsec=found.seeing, later=tuple(found.seeing_at or ())),
         layers=_layers(found),
@@ -142,11 +142,9 @@ def add_scene(group: argparse._ArgumentGroup) -> None:
     """Add the options of the scene."""
     group.add_argument(
         "--scene",
-        type=SceneKind,
-        choices=list(SceneKind),
-        default=SceneKind.ONSKY,
-        metavar="onsky|daytime",
-        help="star and atmosphere, or fibre and retro-reflector (default: onsky)",
+        choices=[kind.value for kind in SceneKind],
+        default=SceneKind.ONSKY.value,
+        help="star and atmosphere, or fibre and retro-reflector (default: %(default)s)",
     )
     group.add_argument(
         "--spiders",

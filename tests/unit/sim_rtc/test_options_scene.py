@@ -79,7 +79,7 @@ def test_the_shares_of_a_profile_add_up(name):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--scene", "dusk"], "--scene: "),
+        (["--scene", "dusk"], "--scene: invalid choice: 'dusk' (choose from "),
         (["--scene", "daytime", "--spiders", "2:0.1"], "--spiders: the fibre by day"),
         (["--spiders", "2.5:0.1"], "--spiders: found '2.5:0.1'; expected N:WIDTH_M"),
         (["--profile", "single", "--wind", "8,0"], "--profile: found beside --wind"),

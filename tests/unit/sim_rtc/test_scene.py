@@ -4,6 +4,8 @@ import pytest
 from service.errors import ConfigurationError
 from service.model.interaction import instrument_pupil
 from service.model.misregistration import Misregistration
+from sim_rtc.assembly import build_telescope
+from sim_rtc.options import parse_options
 from sim_rtc.plant import LinearPlant
 from sim_rtc.scene import PlayedTurbulence, Scene, SceneKind, Spiders
 
@@ -60,3 +62,21 @@ def test_played_turbulence_looks_like_the_real_one_to_a_sensor_that_sees_it_twic
     wanted = rng.standard_normal(6)
     commands = PlayedTurbulence(modes, weights, passes=2).commands_per_phase @ (modes @ wanted)
     np.testing.assert_allclose(2 * commands, wanted, rtol=1e-4)
+
+
+@pytest.mark.parametrize("plant", ["linear", "diffractive"])
+def test_by_day_the_commands_explain_the_slopes_and_the_loop_closes(small_instrument, plant):
+    words = ["--scene", "daytime", "--plant", plant, "--imperfections", "ideal", "--mag", "-5"]
+    words += ["--vibration", "none", "--alpha", "0,0,0,1", "--n-controlled", "30", "--seed", "2"]
+    telescope = build_telescope(parse_options([*words, "--seeing", "0.15"]), small_instrument)
+    computer = telescope.computer(iter(telescope.feed.blocks()))
+    batches = [computer.next_batch() for _ in range(40)]
+    commands = np.concatenate([batch.commands_m for batch in batches])
+    # The mirror plays and corrects: what is left on it is small, nothing is in the air.
+    assert not any(batch.phase_m.any() for batch in batches)
+    assert commands[-100:, :30].std() < 0.2 * commands[:2, :30].std()
+    if plant == "linear":
+        slopes = np.concatenate([batch.slopes for batch in batches])
+        expected = commands @ batches[0].optics.slopes_per_command.T
+        # A star of R = -5 gives 3e10 electrons a frame.
+        np.testing.assert_allclose(slopes, expected, atol=2e-3 * expected.std())

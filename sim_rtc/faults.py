@@ -183,8 +183,8 @@ def manual() -> str:
     ]
     for kind, (form, text) in FORMS.items():
         arguments = ",".join(f"{a.name}={a.default:g}" for a in form)
-        head = f"    {kind + ' ' + arguments:<31}"
-        lines += textwrap.wrap(text, 96, initial_indent=head, subsequent_indent=" " * 35)
+        head = f"    {kind + ' ' + arguments:<35}"
+        lines += textwrap.wrap(text, 96, initial_indent=head, subsequent_indent=" " * 39)
     return "\n".join(lines) + "\n"
 
 

@@ -192,6 +192,15 @@ def gain_range(text: str) -> tuple[float, float]:
     return low, high
 
 
+def group_gains(text: str) -> tuple[float, float, float]:
+    """Read the loop gains of tip and tilt, of the modes to 100, and of the rest."""
+    expected = "TIP_TILT,TO_100,REST, each 0 to 2"
+    low, middle, high = _numbers(text, (3,), expected)
+    if not all(0.0 <= gain <= 2.0 for gain in (low, middle, high)):
+        raise _refusal(text, expected)
+    return low, middle, high
+
+
 def truth(text: str) -> Path | str:
     """Read the name of a set of imperfections, or else of a file."""
     return text if text in SETS else Path(text)

@@ -23,6 +23,7 @@ from sim_rtc.detector import Detector
 from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.dither import DitherLimits
 from sim_rtc.feed import Block, Feed, OpenLoopFeed
+from sim_rtc.gains import by_group
 from sim_rtc.mirror import MirrorDrive, MirrorFaults
 from sim_rtc.motion import MovingOptics, background_executor
 from sim_rtc.options import Options
@@ -148,7 +149,7 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
         settings=LoopSettings(
             frame_rate_hz=options.frame_rate_hz,
             delay_frames=options.delay_frames,
-            gains=(options.gain,) * n_modes,
+            gains=by_group(options.group_gains or (options.gain,) * 3, n_modes),
             leak=options.leak,
             n_controlled_next=options.n_controlled,
         ),

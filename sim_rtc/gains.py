@@ -59,6 +59,14 @@ def groups_of(n_controlled: int) -> tuple[slice, ...]:
     return tuple(slice(a, b) for a, b in pairwise(edges))
 
 
+def by_group(gains: tuple[float, ...], n_modes: int) -> tuple[float, ...]:
+    """Return one gain per mode from one per group; groups the basis does not reach are ignored."""
+    spread = np.empty(n_modes)
+    for group, gain in zip(groups_of(n_modes), gains, strict=False):
+        spread[group] = gain
+    return tuple(spread.tolist())
+
+
 class GainRamp:
     """The ramp itself: told the residual, it says which gains are to be tried next.
 

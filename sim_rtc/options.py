@@ -59,6 +59,9 @@ class Options:
 
     outer_scale_m: float
     gain: float
+    group_gains: tuple[float, float, float] | None
+    """Of tip and tilt, the modes to 100, the rest; None: ``gain`` for all."""
+
     gain_ramp_s: float | None
     """Seconds at each gain of a ramp at the start; None: no ramp."""
 
@@ -108,6 +111,7 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         sky=sky,
         outer_scale_m=found.outer_scale,
         gain=found.gain,
+        group_gains=found.gains,
         gain_ramp_s=found.gain_ramp,
         leak=found.leak,
         delay_frames=found.delay,
@@ -260,6 +264,12 @@ def _add_loop(group: argparse._ArgumentGroup) -> None:
         type=arguments.within(0.0, 2.0),
         metavar="G",
         help="integrator gain of every controlled mode (default: 0.4; by day 0.2)",
+    )
+    group.add_argument(
+        "--gains",
+        type=arguments.group_gains,
+        metavar="TIP_TILT,TO_100,REST",
+        help="gains by group of modes, instead of --gain",
     )
     group.add_argument(
         "--gain-ramp",

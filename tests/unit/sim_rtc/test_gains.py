@@ -7,7 +7,7 @@ from service.wire import Loop, LoopRequest
 from sim_rtc.computer import LoopSettings, RealTimeComputer
 from sim_rtc.dither import DitherLimits
 from sim_rtc.feed import OpenLoopBlock
-from sim_rtc.gains import FACTORS, GainRamp, Tuner, groups_of
+from sim_rtc.gains import FACTORS, GainRamp, Tuner, by_group, groups_of
 from sim_rtc.options import parse_options
 from tests.unit.sim_rtc.test_computer import IDENTITY, N_MODES, N_SLOPES, OPTICS, reconstructor
 
@@ -184,3 +184,18 @@ def test_modes_outside_the_loop_get_the_last_groups_gain():
         ramp.take(rng.standard_normal((10, 50)).astype(np.float32))
     assert len(ramp.gains_by_group) == 2
     assert set(ramp.gains[2:]) == {ramp.gains_by_group[1]}
+
+
+def test_gains_are_given_by_group():
+    assert by_group((0.5, 0.4, 0.3), 150) == (0.5,) * 2 + (0.4,) * 98 + (0.3,) * 50
+    assert by_group((0.5, 0.4, 0.3), 60) == (0.5,) * 2 + (0.4,) * 58
+    assert parse_options(["--gains", "0.5,0.4,0.3"]).group_gains == (0.5, 0.4, 0.3)
+    assert parse_options([]).group_gains is None
+
+
+@pytest.mark.parametrize("text", ["0.5", "0.5,0.4", "0.5,0.4,2.1", "0.5,0.4,-0.1", "a,b,c"])
+def test_gains_that_cannot_be_are_refused(text, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse_options([f"--gains={text}"])
+    assert ended.value.code == 2
+    assert "expected TIP_TILT,TO_100,REST, each 0 to 2" in capsys.readouterr().err

@@ -19,10 +19,12 @@ from service.wire import (
     encode_measured_manifest,
     layout_of,
 )
+from sim_rtc.assembly import build_telescope
 from sim_rtc.computer import Identity, LoopSettings, RealTimeComputer
 from sim_rtc.dither import DitherLimits
 from sim_rtc.feed import OpenLoopBlock
 from sim_rtc.measure import Bench, Circumstances, MeasureLimits, product
+from sim_rtc.options import parse_options
 from sim_rtc.plant import Optics
 from sim_rtc.reconstructors import Reconstructor
 from sim_rtc.strokes import PushPull, frames_per_shape, hadamard_shapes, pokes
@@ -389,3 +391,22 @@ def test_pokes_are_the_nearest_the_modes_can_come_to_single_actuators():
     for actuator, poke in enumerate(reached):
         wanted = projector[:, actuator]
         assert poke @ wanted / np.linalg.norm(poke) / np.linalg.norm(wanted) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("scene", "factor"), [("onsky", 1.0), ("daytime", 2.0)])
+def test_by_day_the_light_meets_the_mirror_twice_and_the_manifest_says_so(
+    small_instrument, scene, factor
+):
+    words = ["--n-controlled=30", "--seed=1", "--alpha=0,0,0,1", "--mag=0", "--vibration=none"]
+    telescope = build_telescope(parse_options([*words, f"--scene={scene}"]), small_instrument)
+    computer = telescope.computer(telescope.feed.blocks())
+    modes = (3, 8, 20)
+    request = push_pull(modes=modes, n_average=20)
+    assert computer.execute(request).accepted
+    while not (ended := computer.take_measured()):
+        computer.next_batch()
+    _, matrix = product(ended[0], HERE)
+    single = build_telescope(parse_options(words), small_instrument).optics.at(0.0)
+    expected = factor * single.slopes_per_command[:, list(modes)]
+    assert relative(matrix, expected) < 0.03
+    assert computer.identity.double_pass is (factor == 2.0)

@@ -118,11 +118,11 @@ def stuck_actuator(text: str) -> tuple[int, float]:
 
 def flexure(text: str) -> Flexure:
     """Read a sinusoid, ``dx,dy,drot_deg,dmag:period_s``."""
-    expected = "DX,DY,DROT_DEG,DMAG:PERIOD_S, 60 to 86400 seconds"
+    expected = "DX,DY,DROT_DEG,DMAG:PERIOD_S, 120 to 86400 seconds"
     amplitude, _, period = text.partition(":")
     dx, dy, rotation_deg, magnification = _numbers(amplitude, (4,), expected)
     (period_s,) = _numbers(period, (1,), expected)
-    if not 60.0 <= period_s <= 86400.0:
+    if not 120.0 <= period_s <= 86400.0:
         raise _refusal(text, expected)
     return Flexure(
         shift_x_subap=dx,

@@ -56,7 +56,7 @@ class MovingOptics:
         if segment.first is segment.last:
             return segment.first
         share = min(1.0, (time_s - segment.start_s) / (segment.stop_s - segment.start_s))
-        step = int(share * _STEPS_PER_SEGMENT)
+        step = round(share * _STEPS_PER_SEGMENT)
         if self._current is None or self._current[0] != step:
             blend = segment.first.towards(segment.last, step / _STEPS_PER_SEGMENT)
             self._current = (step, blend)

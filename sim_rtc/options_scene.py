@@ -180,7 +180,7 @@ def add_motion(group: argparse._ArgumentGroup) -> None:
         type=arguments.flexure,
         default=Flexure(),
         metavar="X,Y,ROT_DEG,MAG:PERIOD_S",
-        help="sinusoid around the registration, by these amplitudes, over a minute or longer",
+        help="sinusoid around the registration, by these amplitudes, period 120 s or longer",
     )
     group.add_argument(
         "--walk",

@@ -137,8 +137,8 @@ def test_a_drift_moves_in_steps_through_exact_optics(plant):
     optics.start()
     times = np.arange(0.0, 45.0, 0.5)
     truth = np.array([optics.at(t).alpha.shift_x_subap for t in times])
-    # Steps of 2 s at 0.005 subapertures per second.
-    assert np.abs(truth - 0.005 * times).max() <= 0.01 + 1e-12
+    # Steps of 2 s at 0.005 subapertures per second, half of it either way.
+    assert np.abs(truth - 0.005 * times).max() <= 0.005 + 1e-12
     assert optics.at(44.9) is optics.at(44.9)
 
 
@@ -220,5 +220,5 @@ def test_a_flexure_is_followed_through_exact_optics(plant):
     optics.start()
     times = np.arange(0.0, 60.0, 0.25)
     truth = np.array([optics.at(t).alpha.shift_x_subap for t in times])
-    # Twelve straight pieces of ten steps each: 3.4 % and half a degree of phase.
-    assert np.abs(truth - 0.1 * np.sin(2 * np.pi * times / 60.0)).max() < 0.1 * (0.034 + 0.06)
+    # Twelve straight pieces (3.4 %) of ten steps, half a step of 3 degrees (2.6 %) either way.
+    assert np.abs(truth - 0.1 * np.sin(2 * np.pi * times / 60.0)).max() < 0.1 * (0.034 + 0.027)

@@ -134,6 +134,11 @@ def _imperfections(found: argparse.Namespace) -> Imperfections:
         name: getattr(found, name) for name in _SINGLE if getattr(found, name) is not None
     }
     if found.optical_gain is not None:
+        if found.plant != "linear":
+            raise ConfigurationError(
+                f"--optical-gain: found --plant {found.plant}, whose own light decides it; "
+                "expected --plant linear"
+            )
         changes["lowest_optical_gain"], changes["highest_optical_gain"] = found.optical_gain
     return replace(SETS[named.pop() if named else "usual"], **changes)
 

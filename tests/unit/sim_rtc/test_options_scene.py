@@ -91,6 +91,10 @@ def test_the_shares_of_a_profile_add_up(name):
         (["--flexure", "0.1,0,0,0:5"], "--flexure: found '0.1,0,0,0:5'; expected DX,DY"),
         (["--walk=-0.1,0,0,0"], "--walk: found '-0.1,0,0,0'; expected X,Y,ROT_DEG,MAG"),
         (["--optical-gain", "0,1"], "--optical-gain: found '0,1'; expected LOW,HIGH"),
+        (
+            ["--optical-gain", "0.5,1", "--plant", "diffractive"],
+            "--optical-gain: found --plant diffractive",
+        ),
         (["--bad-pixels", "1.5"], "--bad-pixels: found '1.5'; expected a whole number"),
         (["--truth", "a", "--truth", "b"], "--truth: found 2 files; expected one"),
         (["--truth", "ideal", "--imperfections", "usual"], "found ideal and usual; expected one"),

@@ -26,8 +26,23 @@ HEADING_EVERY = 20
 STOP_WITHIN_S = 15.0
 LOG = "service.log"
 
-_FORWARDED = ("alpha", "mag", "gain", "plant")
-_REPEATED = ("jump", "wind")
+_FORWARDED = {
+    "alpha": ("X,Y,ROT_DEG,MAG", "true registration; default random"),
+    "mag": ("M", "magnitude of the star, default 8"),
+    "gain": ("G", "integrator gain, default 0.4"),
+    "plant": ("NAME", "simulated telescope: linear (default) or diffractive"),
+    "scene": ("NAME", "onsky (default) or daytime"),
+    "seeing": ("ARCSEC", "default 1"),
+    "profile": ("NAME", "layers of turbulence, default single"),
+    "imperfections": ("NAME", "ideal, usual (default) or realistic"),
+}
+_REPEATED = {
+    "jump": ("T:DX,DY,DROT_DEG,DMAG", "sudden change of the registration; repeatable"),
+    "drift": ("DX,DY,DROT_DEG,DMAG", "steady change, per minute"),
+    "wind": ("SPEED,DIR_DEG[,SHARE]", "a layer instead of a profile; repeatable"),
+    "fault": ("KIND@T[:ARGS]", "something goes wrong; repeatable, see pyrcal sim --help"),
+}
+"""Options of the simulator that the demo passes on."""
 
 
 def add_demo_arguments(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -40,15 +55,11 @@ def add_demo_arguments(commands: argparse._SubParsersAction[argparse.ArgumentPar
         "fell; 1: not so, and why is printed.",
     )
     demo.add_argument("--seconds", type=float, metavar="N", help="stop by itself after N seconds")
-    demo.add_argument(
-        "--alpha", metavar="X,Y,ROT_DEG,MAG", help="true registration; default random"
-    )
-    demo.add_argument("--mag", metavar="M", help="magnitude of the star, default 8")
+    for name, (metavar, text) in _FORWARDED.items():
+        demo.add_argument(f"--{name}", metavar=metavar, help=text)
+    for name, (metavar, text) in _REPEATED.items():
+        demo.add_argument(f"--{name}", action="append", metavar=metavar, help=text)
     demo.add_argument("--seed", type=int, default=1, metavar="S", help="of everything random")
-    demo.add_argument("--gain", metavar="G", help="integrator gain, default 0.4")
-    demo.add_argument("--plant", metavar="NAME", help="simulated telescope, default linear")
-    demo.add_argument("--jump", action="append", metavar="T:DX,DY,DROT_DEG,DMAG", help="repeatable")
-    demo.add_argument("--wind", action="append", metavar="SPEED,DIR_DEG[,SHARE]", help="repeatable")
     demo.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     demo.add_argument("--port", type=int, default=8080, help="of the REST API")
     demo.add_argument("--zenoh-port", type=int, default=7447, help="of the link to the RTC")

@@ -25,6 +25,7 @@ plants
 presets
   --preset flao looks at the magnitude:
 {PRESETS}
+  The larger the residual the lower the optical gain: a faint star wants --gain 1 or more.
 
 registration
   X,Y in subapertures, rotation in degrees from +x towards +y, magnification as a ratio. A jump

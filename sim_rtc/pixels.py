@@ -71,7 +71,7 @@ FLAO_PRESETS = (
     Preset(faintest=11.0, frame_rate_hz=800.0, binning=1, n_controlled=400),
     Preset(faintest=13.0, frame_rate_hz=800.0, binning=2, n_controlled=153),
     Preset(faintest=14.5, frame_rate_hz=500.0, binning=3, n_controlled=66),
-    Preset(faintest=17.5, frame_rate_hz=200.0, binning=5, n_controlled=36),
+    Preset(faintest=16.5, frame_rate_hz=200.0, binning=5, n_controlled=36),
 )
 """After FLAO's practice: 30, 15, 10 and few subapertures across as the star gets fainter."""
 

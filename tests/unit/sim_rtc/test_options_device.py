@@ -58,7 +58,7 @@ def test_a_preset_follows_the_magnitude():
         (["--stuck-actuators", "5:1"], "at most 1e-4 m"),
         (["--excess-noise", "0.5"], "expected a number from 1 to 4"),
         (["--rise-ms", "-1"], "expected a number from 0 to 100"),
-        (["--preset", "flao", "--mag", "19"], "expected a star of 17.5 or brighter"),
+        (["--preset", "flao", "--mag", "19"], "expected a star of 16.5 or brighter"),
     ],
 )
 def test_devices_that_cannot_be_are_refused_in_one_line(capsys, given, text):

@@ -59,7 +59,7 @@ def test_presets_get_slower_and_coarser_as_stars_get_fainter():
 def test_the_preset_is_the_first_that_reaches_the_star():
     assert preset_for(8.0).binning == 1
     assert preset_for(12.0).binning == 2
-    with pytest.raises(ConfigurationError, match=r"found magnitude 19; expected a star of 17\.5"):
+    with pytest.raises(ConfigurationError, match=r"found magnitude 19; expected a star of 16\.5"):
         preset_for(19.0)
 
 

@@ -1,0 +1,113 @@
+"""What a real RTC does at its worst, done on request: the service names it, keeps what it knows,
+and goes on."""
+
+import time
+
+import pytest
+
+from tests.system.night import ALPHA, N_START, N_TARGET, a_night, wait_for
+from tests.system.test_service import check_registration
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+
+TELEMETRY = (
+    "lost@18:0.3,0.6",
+    "nan@19.5:0.3,0.3",
+    "garbage@20.5:0.5,0.4",
+    "duplicated@21.5:1,0.2",
+    "reordered@22.3:1,0.2",
+    "shape@23:0.3",
+    "frozen@24.5:2.5",
+    "clock@28:0.4",
+    "pause@29.5:0.8",
+)
+
+
+@pytest.fixture
+def night(tmp_path):
+    with a_night(tmp_path) as night:
+        yield night
+
+
+def faults(*texts):
+    return [word for text in texts for word in ("--fault", text)]
+
+
+def wait_for_fault(rtc, text):
+    """Wait until the RTC has begun a fault."""
+    wait_for(lambda: f"fault='{text}" in rtc.log, 60.0, f"{text}; {rtc.log_path}")
+
+
+def accepts_windows_again(night):
+    before = night.state["windows_accepted"]
+    wait_for(lambda: night.state["windows_accepted"] > before + 1, 20.0, "windows are accepted")
+
+
+def test_damaged_telemetry_costs_windows_and_nothing_else(night):
+    service = night.service("auto")
+    rtc = night.rtc(*faults(*TELEMETRY))
+    night.wait_for_modes(N_TARGET)
+    kept, in_use = night.shelf, night.state["in_use"]
+    wait_for_fault(rtc, TELEMETRY[-1])
+    time.sleep(1.5)
+    assert service.popen.poll() is None, service.log
+    accepts_windows_again(night)
+    link = night.state["link"]
+    assert link["frames_lost"] > 50
+    assert link["frames_nonfinite"] > 20
+    assert link["frames_duplicate"] >= 100
+    assert link["frames_recovered"] + link["frames_late"] >= 50
+    assert link["messages_malformed"]["frames"] >= 5
+    assert "link.callback_failed" not in service.log
+    for named in ("frames missing", "message.malformed", "the RTC's clock stepped or it paused"):
+        assert named in service.log, named
+    # frozen slopes show no dither
+    assert "optical gains of" in service.log
+    state = night.state
+    assert state["in_use"] == in_use
+    assert {r["id"] for r in kept} <= {r["id"] for r in night.shelf}
+    check_registration(state["registration"])
+    assert set(night.alarms) <= {"watchdog"}
+    assert "Traceback" not in service.log
+
+
+def test_a_refusal_a_second_rtc_and_a_restart_are_named_and_survived(night):
+    service = night.service("auto")
+    words = faults("refuse@0:1", "dither-late@0:1,10", "second@28:2", "restart@50:1")
+    rtc = night.rtc(*words)
+    wait_for(lambda: night.ids("rejected"), 40.0, "a rejected reconstructor")
+    (rejected,) = [r for r in night.shelf if r["state"] == "rejected"]
+    assert rejected["reason"] == "range: refused as a fault asked for"
+    assert night.state["registration"] is not None
+    assert night.n_modes_in_use() == 0
+    night.post("/v1/refit", {"n_modes": N_START})
+    wait_for(lambda: night.n_modes_in_use() > 0, 20.0, "the next reconstructor")
+    in_use = night.state["in_use"]
+
+    wait_for_fault(rtc, "second@28")
+    wait_for(lambda: "second-rtc" in night.alarms, 10.0, "the alarm of a second RTC")
+    alpha = night.state["registration"]["alpha"]
+    assert alpha["shift_x_subap"] == pytest.approx(ALPHA["shift_x_subap"], abs=0.02)
+    wait_for(lambda: "second-rtc" not in night.alarms, 30.0, "the alarm is over")
+    accepts_windows_again(night)
+    assert in_use in {r["id"] for r in night.shelf}
+
+    session = night.state["rtc"]["session"]
+    wait_for_fault(rtc, "restart@50")
+    wait_for(lambda: "rtc-vanished" in service.log, 10.0, "the RTC's absence is named")
+    wait_for(lambda: (night.state["rtc"] or {}).get("session") not in {None, session}, 15.0)
+    assert night.state["registration"] is not None
+    night.wait_for_modes(N_TARGET)
+    check_registration(night.state["registration"])
+    assert {rejected["id"], in_use} <= {r["id"] for r in night.shelf}
+    assert "Traceback" not in service.log
+
+
+def test_a_swap_that_comes_late_is_an_alarm_until_it_comes(night):
+    service = night.service("auto")
+    night.rtc(*faults("late-swap@0:5,12"))
+    wait_for(lambda: "no-acknowledgement" in night.alarms, 40.0, "the alarm")
+    (late,) = night.ids("failed")
+    wait_for(lambda: night.state["in_use"] == late, 15.0, "the late swap is taken in")
+    wait_for(lambda: "no-acknowledgement" not in night.alarms, 5.0, "the alarm is over")
+    assert "Traceback" not in service.log

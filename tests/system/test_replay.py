@@ -1,0 +1,208 @@
+"""A recorded night gives the tracker the very same answers, however often it is played."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.config import load_instrument
+from service.estimation.instrumental import Loop as FitLoop
+from service.estimation.instrumental import WindowEstimate
+from service.estimation.lockin import Spectra
+from service.link.endpoint import Endpoint
+from service.link.intake import Intake
+from service.model.misregistration import PARAMETERS, Misregistration
+from service.reactions.policy import Policy
+from service.runtime import translate
+from service.runtime.streams import Streams, fed, with_dither, with_rtc
+from service.state import Mode, TrackerState
+from service.tracker import step
+from service.wire import decode_manifest
+from service.worker import Compute, Workbench
+from sim_rtc.record import Kind, Recording
+from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+
+WINDOW_S = 1.0
+POLICY = Policy(
+    window_s=WINDOW_S,
+    drift_rate=np.full(4, 1e-4),
+    floor=np.full(4, 1e-4),
+    update_threshold=np.full(4, 0.01),
+)
+
+
+class Tracker:
+    """The service without network, processes and clocks: time is that of the recording."""
+
+    def __init__(self, instrument):
+        self.bench = Workbench(instrument, Compute(threads=1))
+        self.streams = Streams(description=self.bench.describe())
+        self.state = TrackerState(system=instrument.name, mode=Mode.HOLD)
+        self.now_s = 0.0
+        self.intake = Intake(Endpoint(system=instrument.name), clock=lambda: self.now_s)
+        self.matrices = {}
+        self.estimates = []
+
+    def play(self, recording):
+        for message in recording.messages():
+            self.now_s = message.time_s
+            match message.kind:
+                case Kind.FRAMES:
+                    self.intake.frames(message.payload, message.attachment)
+                case Kind.STATUS:
+                    self.intake.status(message.payload)
+                case Kind.MATRIX:
+                    self.keep(message)
+            self.look()
+
+    def keep(self, message):
+        manifest = decode_manifest(message.attachment)
+        matrix = np.frombuffer(message.payload, "<f4").reshape(manifest.layout.shape)
+        self.matrices[manifest.id] = matrix
+        self.post(ev.MatrixFetched(record=translate.record_of(manifest)))
+
+    def look(self):
+        for heard in self.intake.events():
+            event = translate.event_of(heard)
+            if event is not None:
+                self.post(event)
+        for block in self.intake.drain():
+            self.streams, windows = fed(self.streams, block)
+            for window in windows:
+                if isinstance(window, Spectra):
+                    self.fit(window)
+
+    def fit(self, window):
+        rtc, known = self.state.rtc, self.state.registration
+        loop = FitLoop(
+            reconstructor=self.matrices[window.cm_id],
+            gains=np.array(rtc.gains),
+            leak=rtc.leak,
+            delay_frames=rtc.delay_frames,
+            frame_rate_hz=rtc.frame_rate_hz,
+        )
+        start = Misregistration() if known is None else known.alpha
+        estimate = self.bench.fit(window, loop, start)
+        if isinstance(estimate, WindowEstimate):
+            self.estimates.append((window.first_seq, *estimate.alpha.vector))
+            self.post(ev.WindowFitted(estimate=estimate))
+
+    def post(self, event):
+        now_ns = round(1e9 * self.now_s) + 1
+        self.state, effects = step(self.state, event, POLICY, now_ns)
+        self.streams = with_rtc(self.streams, self.state.rtc)
+        self.streams = with_dither(self.streams, self.state.dither, WINDOW_S)
+        for effect in effects:
+            if isinstance(effect, ev.AskDither):
+                self.post(
+                    ev.DitherAnswered(
+                        id=effect.dither.id,
+                        accepted=False,
+                        reason="unsupported: a replay",
+                        start_seq=None,
+                    )
+                )
+
+
+def replayed(path):
+    tracker = Tracker(load_instrument(str(INSTRUMENT)))
+    with Recording(path) as recording:
+        tracker.play(recording)
+    return tracker
+
+
+def lived(night):
+    """Return what the service measured that night, by the end of the window."""
+    answer = night.client.get("/v1/alpha/history")
+    answer.raise_for_status()
+    entries = answer.json()["entries"]
+    return {e["t_ns_utc"]: [e["measured"][name] for name in PARAMETERS] for e in entries}
+
+
+def assert_close(here, there, tolerance):
+    np.testing.assert_allclose(here, there, rtol=0.0, atol=tolerance)
+
+
+def test_a_recorded_night_gives_the_same_answers_every_time(tmp_path):
+    path = tmp_path / "night.h5"
+    with a_night(tmp_path) as night:
+        night.service("auto")
+        rtc = night.rtc("--record", str(path), "--seconds", "16")
+        assert rtc.popen.wait(60.0) == 0, rtc.log
+        there = lived(night)
+    first, second = replayed(path), replayed(path)
+    assert len(first.estimates) >= 6
+    assert first.estimates == second.estimates
+    np.testing.assert_array_equal(
+        first.state.registration.covariance, second.state.registration.covariance
+    )
+    assert first.state.registration.alpha == second.state.registration.alpha
+    assert first.state.dither.id.startswith("dither-")
+    here = {
+        entry.t_ns_utc: [entry.measured.to_boundary()[name] for name in PARAMETERS]
+        for entry in first.state.history
+    }
+    # That night's service cut a window short when a status with other gains came, and began the
+    # next at the frame it had reached by then: in a replay that is the same to a few frames.
+    pairs = [(t, min(here, key=lambda end: abs(end - t))) for t in sorted(there)]
+    same = [(t, end) for t, end in pairs if t == end]
+    close = [(t, end) for t, end in pairs if abs(t - end) < 100_000_000]
+    assert len(same) >= 2
+    assert len(close) >= 6
+    assert_close([here[end] for _, end in same], [there[t] for t, _ in same], 3e-4)
+    assert_close([here[end] for _, end in close], [there[t] for t, _ in close], 3e-3)
+
+
+def test_a_replay_over_zenoh_is_an_rtc_that_carries_out_nothing(tmp_path):
+    path = tmp_path / "night.h5"
+    (tmp_path / "recorded").mkdir()
+    with a_night(tmp_path / "recorded") as night:
+        night.service("auto")
+        rtc = night.rtc("--record", str(path), "--seconds", "14")
+        assert rtc.popen.wait(60.0) == 0, rtc.log
+        session = night.state["link"]["session"]
+        alpha = night.state["registration"]["alpha"]
+    (tmp_path / "replayed").mkdir()
+    with a_night(tmp_path / "replayed") as night:
+        service = night.service("hold")
+        words = ["sim_rtc", "--connect", night.zenoh, "--replay", str(path)]
+        replay = night.start("replay", words)
+        wait_for(lambda: night.state["windows_accepted"] >= 4, 60.0, "replayed windows")
+        state = night.state
+        assert state["link"]["session"] == session
+        assert state["registration"]["alpha"]["shift_x_subap"] == pytest.approx(
+            alpha["shift_x_subap"], abs=0.01
+        )
+        assert "dither.adopted" in service.log
+        wait_for(lambda: night.state["rtc"]["n_controlled"] == N_TARGET, 20.0, "its last matrix")
+        night.post("/v1/refit")
+        made = wait_for(lambda: night.ids("proposed"), 20.0, "a reconstructor")
+        night.post(f"/v1/reconstructors/{made[-1]}/approve")
+        wait_for(lambda: night.ids("rejected"), 10.0, "its refusal")
+        (refused,) = [r for r in night.shelf if r["state"] == "rejected"]
+        assert refused["reason"] == "unsupported: a replay"
+        assert replay.popen.wait(30.0) == 0, replay.log
+
+
+def test_a_replay_cannot_be_disturbed_or_found_nowhere(tmp_path):
+    def run(*words):
+        return subprocess.run(
+            [sys.executable, "-m", "sim_rtc", *words],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=60.0,
+            cwd=ROOT,
+        )
+
+    both = run("--replay", "night.h5", "--fault", "lost@1")
+    assert (both.returncode, both.stderr.count("\n")) == (2, 1)
+    assert "plays a file as it is" in both.stderr
+    missing = run("--replay", str(tmp_path / "none.h5"))
+    assert missing.returncode == 2
+    assert "--replay: cannot read" in missing.stderr
+    assert "Traceback" not in missing.stderr

@@ -111,3 +111,22 @@ def test_a_swap_that_comes_late_is_an_alarm_until_it_comes(night):
     wait_for(lambda: night.state["in_use"] == late, 15.0, "the late swap is taken in")
     wait_for(lambda: "no-acknowledgement" not in night.alarms, 5.0, "the alarm is over")
     assert "Traceback" not in service.log
+
+
+def test_an_open_loop_little_stroke_and_a_stall_pass(night):
+    service = night.service("hold")
+    words = faults("open@9:1.5", "saturation@15:30,2.5", "stall@21:1.5")
+    rtc = night.rtc(*words)
+    wait_for(lambda: night.state["windows_accepted"] >= 2, 30.0, "two windows")
+    alpha = night.state["registration"]["alpha"]
+    wait_for(lambda: "loop-open" in night.alarms, 20.0, "the alarm of an open loop")
+    assert night.state["registration"]["alpha"]["rotation_deg"] == pytest.approx(
+        alpha["rotation_deg"], abs=0.05
+    )
+    wait_for(lambda: "loop-open" not in night.alarms, 10.0, "the alarm is over")
+    wait_for_fault(rtc, "saturation@15")
+    wait_for_fault(rtc, "stall@21")
+    accepts_windows_again(night)
+    check_registration(night.state["registration"])
+    assert night.state["link"]["frames_lost"] == 0
+    assert "Traceback" not in service.log

@@ -57,6 +57,10 @@ examples
       a night that gets worse, behind a spider, on a telescope that shakes
   pyrcal sim --flexure 0.2,0,0.1,0:600 --walk 0.02,0.02,0.01,0
       a registration that follows the elevation and wanders
+  pyrcal sim --record night.h5 --fault lost@30:0.05,10 --fault restart@60:2
+      a link that loses one batch in twenty for 10 s, then a restart, all of it on file
+  pyrcal sim --replay night.h5 --speed 2
+      the same again, twice as fast
   pyrcal sim --plant diffractive --snapshot loop.png
       a picture of pupil images, slopes and residual wavefront as the loop closes
 

@@ -45,7 +45,7 @@ class LoopSettings:
     leak: float
     delay_frames: float
     optical_gain: float = 1.0
-    """How much of the model's response the sensor shows, 0..1; 1 is the cautious choice."""
+    """How much of the model's response the sensor shows: below 1 on sky, up to 2 in double pass."""
 
 
 def judge(

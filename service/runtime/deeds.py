@@ -355,5 +355,5 @@ def _loop_settings(
         gains=np.array(gains),
         leak=rtc.leak,
         delay_frames=rtc.delay_frames,
-        optical_gain=1.0 if measured is None else min(1.0, GAIN_SAFETY * measured),
+        optical_gain=1.0 if measured is None else GAIN_SAFETY * measured,
     )

@@ -80,7 +80,7 @@ def test_a_window_from_before_the_estimate_does_not_shrink_its_uncertainty_below
         ({"session": "s0"}, "the RTC has restarted since"),
         ({"lag_frames": np.full(4, 0.9)}, r"lag commands by \+0.90 frame"),
         ({"optical_gain": np.array([0.6, 0.6, 0.05, 0.6])}, "optical gains of 0.05 to 0.60"),
-        ({"optical_gain": np.array([0.6, 0.6, 2.0, 0.6])}, "optical gains of 0.60 to 2.00"),
+        ({"optical_gain": np.array([0.6, 0.6, 3.5, 0.6])}, "optical gains of 0.60 to 3.50"),
         ({"covariance": PRECISE * 1e4}, "too uncertain"),
         ({"alpha": moved(shift_y_subap=-0.8)}, "outside the capture range"),
         ({"alpha": moved(magnification=0.02)}, "outside the capture range"),
@@ -144,3 +144,10 @@ def test_the_watchdog_barks_while_it_disagrees(story):
     story.tell(ev.Watched(estimate=watched(moved(shift_x_subap=0.2)), t_ns_utc=START_NS))
     assert story.state.watchdog.consistent
     assert "watchdog" not in story.alarms
+
+
+def test_by_day_a_mirror_seen_twice_shows_twice_the_gain_and_the_window_counts():
+    story = Story(Mode.HOLD).meet()
+    story.tell(ev.WindowFitted(estimate=estimate(optical_gain=np.full(4, 1.8 + 0.0j))))
+    assert story.state.windows_accepted == 1
+    assert story.state.registration.optical_gain == pytest.approx(1.8)

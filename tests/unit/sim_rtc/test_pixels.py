@@ -1,3 +1,4 @@
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -49,7 +50,7 @@ def test_five_magnitudes_are_a_factor_of_a_hundred(small_instrument):
 
 
 def test_presets_get_slower_and_coarser_as_stars_get_fainter():
-    for brighter, fainter in zip(FLAO_PRESETS[:-1], FLAO_PRESETS[1:], strict=True):
+    for brighter, fainter in itertools.pairwise(FLAO_PRESETS):
         assert fainter.faintest > brighter.faintest
         assert fainter.binning >= brighter.binning
         assert fainter.frame_rate_hz <= brighter.frame_rate_hz

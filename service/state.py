@@ -301,6 +301,9 @@ class RtcView:
     t_ns_utc: int
     """The RTC's own timestamp of this status."""
 
+    seq: int = -1
+    """Last frame processed when it was made; -1: not known."""
+
     dither: DitherView | None = None
     """What is running, where it is a sine that has been announced to the frame; else None."""
 

@@ -9,7 +9,7 @@ from service.estimation.frames import FrameBlock
 from service.estimation.health import LoopHealth, observe
 from service.estimation.lockin import LockIn, Spectra, WindowRefused
 from service.estimation.passive import Passive
-from service.reactions.policy import lock_in_plan
+from service.reactions.policy import SETTLING_S, lock_in_plan
 from service.state import DitherView, RtcView
 from service.worker import Description
 
@@ -48,8 +48,20 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     memory = Passive(n_modes=rtc.n_controlled, memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz)
     if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
         return replace(streams, passive=memory, lock_in=None, dither_id=None)
-    lock_in = streams.lock_in and replace(streams.lock_in, window=None)
-    return replace(streams, passive=memory, lock_in=lock_in)
+    return replace(streams, passive=memory, lock_in=_cut(streams.lock_in, rtc))
+
+
+def _cut(lock_in: LockIn | None, rtc: RtcView) -> LockIn | None:
+    """Give up the open window; the next begins when the changed loop has settled.
+
+    Counted from the status' own frame, not from when it was read, so that a recorded night is cut
+    at the same frames again.
+    """
+    if lock_in is None:
+        return None
+    settled_seq = rtc.seq + round(SETTLING_S * rtc.frame_rate_hz)
+    plan = replace(lock_in.plan, first_seq=max(lock_in.plan.first_seq, settled_seq))
+    return LockIn(plan=plan)
 
 
 def _same_loop(before: RtcView, after: RtcView) -> bool:

@@ -87,6 +87,7 @@ def rtc_view(status: Status) -> RtcView:
         dither_id=status.dither.request.id if status.dither is not None else None,
         dither=None if status.dither is None else _running(status.dither),
         t_ns_utc=status.t_ns,
+        seq=status.seq,
     )
 
 

@@ -100,6 +100,17 @@ def test_another_loop_makes_the_open_window_void(streams, changes):
     assert [w.first_seq for w in windows] == [600]
 
 
+@pytest.mark.parametrize("read_late_by", [0, 100])
+def test_the_next_window_is_counted_from_the_status_not_from_when_it_was_read(
+    streams, read_late_by
+):
+    changed = replace(RTC, leak=0.99, seq=549)
+    streams, _ = play(streams, 0, (600 + read_late_by) // 100)
+    _, windows = play(with_rtc(streams, changed), 600 + read_late_by, 8)
+    # 0.3 s after frame 549, whichever block the status was read behind
+    assert [w.first_seq for w in windows] == [849]
+
+
 def test_the_same_loop_seen_again_keeps_everything(streams):
     streams, _ = play(streams, 0, 6)
     again = with_rtc(streams, replace(RTC, t_ns_utc=5, magnitude=9.0, cm_id="cm-1"))

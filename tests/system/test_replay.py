@@ -146,15 +146,11 @@ def test_a_recorded_night_gives_the_same_answers_every_time(tmp_path):
         entry.t_ns_utc: [entry.measured.to_boundary()[name] for name in PARAMETERS]
         for entry in first.state.history
     }
-    # That night's service cut a window short when a status with other gains came, and began the
-    # next at the frame it had reached by then: in a replay that is the same to a few frames.
-    pairs = [(t, min(here, key=lambda end: abs(end - t))) for t in sorted(there)]
-    same = [(t, end) for t, end in pairs if t == end]
-    close = [(t, end) for t, end in pairs if abs(t - end) < 100_000_000]
-    assert len(same) >= 2
-    assert len(close) >= 6
-    assert_close([here[end] for _, end in same], [there[t] for t, _ in same], 3e-4)
-    assert_close([here[end] for _, end in close], [there[t] for t, _ in close], 3e-3)
+    same = sorted(set(there) & set(here))
+    assert len(same) >= 6
+    assert len(same) >= len(there) - 1  # the night's last window may have had no time to be fitted
+    # the live worker's linearisation may be another one: both are within 0.01 subaperture of α
+    assert_close([here[t] for t in same], [there[t] for t in same], 3e-4)
 
 
 def test_a_replay_over_zenoh_is_an_rtc_that_carries_out_nothing(tmp_path):

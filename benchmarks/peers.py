@@ -49,6 +49,13 @@ def fft_reference(model: InteractionModel) -> Measured:
 
 def hcipy_pyramid(model: InteractionModel) -> Measured:
     """Run HCIPy's modulated pyramid, fast modulation, detector pixels binned to subapertures."""
+    return _push_pull(hcipy_slopes(model), model)
+
+
+def hcipy_slopes(
+    model: InteractionModel,
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return HCIPy's slopes as a function of the OPD ``(n, n)`` on the model's pupil grid."""
     import hcipy
 
     wfs, diameter_m = model.instrument.wfs, model.instrument.diameter_m
@@ -79,7 +86,7 @@ def hcipy_pyramid(model: InteractionModel) -> Measured:
         # A second forward transform: the images are turned by 180 degrees and change sides.
         return -_slopes(binned.sum(axis=(1, 3))[::-1, ::-1], model.valid)
 
-    return _push_pull(slopes, model)
+    return slopes
 
 
 def _slopes(detector: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -94,7 +94,9 @@ class Supervisor:
         now_ns, name = time.time_ns(), type(command).__name__
         await asyncio.to_thread(self._archive.audit, now_ns, "operator", name, str(command))
         if isinstance(command, ev.Measure):
-            await asyncio.wait(self._running - running)
+            asked = self._running - running
+            if asked:  # a quick refusal may be here before the audit trail is written
+                await asyncio.wait(asked)
             self._check_measuring(command.id)
         return f"{name}: {len(effects)} action(s) under way"
 

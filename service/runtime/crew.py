@@ -9,7 +9,7 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
-from service.errors import WorkerError
+from service.errors import PyrcalError, WorkerError
 from service.worker import Workbench, run_job
 
 P = ParamSpec("P")
@@ -32,7 +32,8 @@ class Crew:
         Raises
         ------
         WorkerError
-            If the worker process died; a new one is there for the next job.
+            If the worker process died, and a new one is there for the next job; or if the job
+            failed in a way nobody foresaw, which must not end the service.
         """
         if self._executor is None:
             self._executor = self._hire()
@@ -45,6 +46,10 @@ class Crew:
                 self._executor = None
                 self.n_lost += 1
             raise WorkerError(f"the worker process died during {job.__name__}") from error
+        except PyrcalError:
+            raise
+        except Exception as error:
+            raise WorkerError(f"{job.__name__} failed in the worker: {error!r}") from error
 
     def dismiss(self) -> None:
         """End the worker; jobs that wait are dropped."""

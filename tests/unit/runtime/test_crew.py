@@ -86,7 +86,7 @@ async def test_jobs_that_waited_for_a_killed_worker_are_lost_together(crew, hire
 
 async def test_a_job_that_raises_keeps_its_worker(crew, hired):
     before = await crew.call(process_id)
-    with pytest.raises(WorkerError, match="failing failed in the worker.*a bug in a job"):
+    with pytest.raises(WorkerError, match=r"failing failed in the worker.*a bug in a job"):
         await crew.call(failing)
     assert await crew.call(process_id) == before
     assert crew.n_lost == 0

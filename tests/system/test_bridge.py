@@ -71,6 +71,8 @@ def bridge(endpoint):
 @pytest.fixture
 def rtc(bridge, endpoint):
     with FakeRtc(endpoint.listen[0]) as rtc:
+        # its token comes after its subscriptions: what is sent now will reach it
+        wait_until(lambda: bridge.statistics().rtc_alive)
         yield rtc
 
 
@@ -87,7 +89,7 @@ def rtc_process(endpoint, session, n_slopes=6, n_modes=4, rate_hz=1000, per_batc
         process.wait(10)
 
 
-def wait_until(condition, timeout_s=5.0):
+def wait_until(condition, timeout_s=15.0):
     """Return what the condition returns once it is true."""
     end = time.monotonic() + timeout_s
     while not (found := condition()):
@@ -103,7 +105,7 @@ class Seen:
         self.bridge = bridge
         self.events = []
 
-    def first(self, event, timeout_s=5.0, **values):
+    def first(self, event, timeout_s=15.0, **values):
         def look():
             self.events += self.bridge.events()
             return [

@@ -122,7 +122,7 @@ class Registration:
     """Windows that entered the estimate."""
 
     optical_gain: float | None = None
-    """Mean modulus of the measured complex gain of the dithered modes, 0..1; None: not measured."""
+    """Mean modulus of the measured complex gain of the dithered modes; None: not measured."""
 
     @property
     def total_covariance(self) -> NDArray[np.float64]:

@@ -8,6 +8,9 @@ from service.state import Alarm, Level, LogEntry, TrackerState
 
 LOG_LENGTH = 500
 
+WRONG_RTC = ("second-rtc", "basis-mismatch", "instrument-mismatch")
+"""Alarms while which nobody knows whose telemetry comes, or whom a reconstructor would reach."""
+
 
 def logged(
     state: TrackerState, name: str, text: str, now_ns: int, level: Level = Level.INFO

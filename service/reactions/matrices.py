@@ -8,7 +8,7 @@ from service import events as ev
 from service.control.gate import GateVerdict
 from service.errors import CommandError
 from service.events import Effect
-from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.journal import WRONG_RTC, logged, with_alarm, without_alarm
 from service.reactions.shelf import (
     known_record,
     with_changed,
@@ -19,9 +19,6 @@ from service.reactions.shelf import (
 from service.state import Level, MatrixState, Mode, ReconstructorRecord, RtcView, TrackerState
 
 Step = tuple[TrackerState, tuple[Effect, ...]]
-
-_WRONG_RTC = ("second-rtc", "basis-mismatch", "instrument-mismatch")
-"""While one of these lasts, nobody knows whom a reconstructor would reach."""
 
 
 def on_matrix(
@@ -71,7 +68,7 @@ def why_unsendable(state: TrackerState) -> str | None:
     """Return why nothing may be published now, or None."""
     if state.rtc is None:
         return "no RTC is there"
-    return next((alarm.text for alarm in state.alarms if alarm.name in _WRONG_RTC), None)
+    return next((alarm.text for alarm in state.alarms if alarm.name in WRONG_RTC), None)
 
 
 def extended_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:

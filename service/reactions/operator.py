@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service import events as ev
-from service.errors import CommandError, ModelError
+from service.errors import CommandError
 from service.events import Event
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send
-from service.reactions.policy import Policy, lock_in_plan, moved, plan_dither
+from service.reactions.policy import Policy, moved, plan_dither, why_unusable
 from service.reactions.shelf import known_record, with_state
 from service.state import MatrixState, Mode, TrackerState
 
@@ -76,10 +76,9 @@ def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, no
         raise CommandError(
             f"dither: found mode {max(dither.modes)}; expected 0 to {rtc.n_modes - 1}"
         )
-    try:
-        lock_in_plan(dither, rtc, policy.window_s)
-    except ModelError as error:
-        raise CommandError(f"dither: {error}") from error
+    reason = why_unusable(dither, rtc, policy)
+    if reason is not None:
+        raise CommandError(f"dither: {reason}")
     state = replace(state, dither=dither, dither_stopped=False)
     return logged(state, "dither.asked", f"modes {dither.modes}", now_ns), (
         ev.AskDither(dither=dither),

@@ -11,7 +11,7 @@ from service.errors import ModelError
 from service.estimation.lockin import LockInPlan
 from service.events import AskDither, AskNoDither, Effect, FetchMatrix, JudgeMatrix, MakeMatrix
 from service.model.misregistration import BOUNDARY_SCALE
-from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.journal import WRONG_RTC, logged, with_alarm, without_alarm
 from service.state import (
     DitherView,
     MatrixState,
@@ -90,7 +90,7 @@ def decide(
     return state, tuple(effects)
 
 
-_PARALYSING = ("second-rtc", "basis-mismatch", "instrument-mismatch", "loop-diverging")
+_PARALYSING = (*WRONG_RTC, "loop-diverging")
 _Choice = tuple[TrackerState, tuple[Effect, ...]]
 
 
@@ -112,7 +112,7 @@ def _dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> _
     wanted = policy.dither_enabled and not state.dither_stopped and state.dither is None
     if rtc.loop != "closed" or not wanted:
         return state, ()
-    if rtc.dither is not None and _usable(rtc.dither, rtc, policy):
+    if rtc.dither is not None and why_unusable(rtc.dither, rtc, policy) is None:
         state = replace(state, dither=replace(rtc.dither, asked_ns_utc=now_ns))
         text = f"{rtc.dither.id} runs since frame {rtc.dither.start_seq}"
         state = without_alarm(state, "dither", now_ns)
@@ -123,21 +123,20 @@ def _dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> _
         # left behind by this service when its window had another length
         return replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS), (AskNoDither(),)
     dither = plan_dither(rtc, policy, now_ns)
-    try:
-        lock_in_plan(dither, rtc, policy.window_s)
-    except ModelError as error:
+    reason = why_unusable(dither, rtc, policy)
+    if reason is not None:
         state = replace(state, retry_ns_utc=now_ns + 60 * SECOND_NS)
-        return with_alarm(state, "dither", f"no usable dither: {error}", now_ns), ()
+        return with_alarm(state, "dither", f"no usable dither: {reason}", now_ns), ()
     return replace(state, dither=dither), (AskDither(dither=dither),)
 
 
-def _usable(dither: DitherView, rtc: RtcView, policy: Policy) -> bool:
-    """Return whether the lines of a dither can be told apart in this policy's windows."""
+def why_unusable(dither: DitherView, rtc: RtcView, policy: Policy) -> str | None:
+    """Return why the lines of a dither cannot be told apart in this policy's windows, or None."""
     try:
         lock_in_plan(dither, rtc, policy.window_s)
-    except ModelError:
-        return False
-    return True
+    except ModelError as error:
+        return str(error)
+    return None
 
 
 def plan_dither(

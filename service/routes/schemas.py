@@ -79,7 +79,7 @@ class AlphaView(View):
     """Windows that entered it."""
 
     optical_gain: Number
-    """Mean optical gain of the dithered modes, 0..1; null: not measured."""
+    """Mean optical gain of the dithered modes; null: not measured."""
 
     @classmethod
     def of(cls, registration: Registration, snapshot: Snapshot) -> AlphaView:

@@ -21,6 +21,7 @@ from service.estimation.lockin import Spectra, WindowRefused
 from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
 from service.model.misregistration import Misregistration
+from service.reactions.journal import WRONG_RTC
 from service.reactions.policy import Policy
 from service.routes.service import Snapshot
 from service.rtc_bridge import Bridge
@@ -281,7 +282,7 @@ class Supervisor:
         """Keep the streaming estimators in step with the RTC and the dither."""
         if self._streams is None:
             return
-        if any(alarm.name in _DEAF for alarm in self._state.alarms):
+        if any(alarm.name in WRONG_RTC for alarm in self._state.alarms):
             self._streams = with_rtc(self._streams, None)
             return
         self._streams = with_rtc(self._streams, self._state.rtc)
@@ -329,10 +330,6 @@ class Supervisor:
                 await asyncio.to_thread(_write, self._archive, before, recorded)
             except PyrcalError as error:
                 self._log.error("archive.failed", text=str(error))
-
-
-_DEAF = ("instrument-mismatch", "basis-mismatch", "second-rtc")
-"""While one of these lasts, no telemetry is used."""
 
 
 def _new_entries(before: TrackerState, after: TrackerState) -> list[LogEntry]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from service.model.instrument import Instrument, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
-from service.model.pupil import PupilGrid, annular_pupil
+from service.model.pupil import Illumination, PupilGrid, annular_pupil
 from service.model.pyramid import (
     Mapper,
     Nodes,
@@ -64,12 +64,14 @@ class InteractionModel:
         detector_nodes: int = 3,
         n_modulation: int | None = None,
         halo: Halo | None = None,
+        illumination: Illumination | None = None,
         dtype: type[np.float32] | type[np.float64] = np.float32,
         mapper: Mapper = map,
     ) -> None:
         self.instrument = instrument
         self.basis = basis
-        self.pupil = instrument_pupil(instrument, pupil_sampling)
+        pupil = instrument_pupil(instrument, pupil_sampling)
+        self.pupil = pupil if illumination is None else pupil.lit_by(illumination)
         self.optics = PyramidOptics(
             wfs=instrument.wfs,
             pupil=self.pupil,

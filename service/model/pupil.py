@@ -2,15 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 
 from service.errors import ModelError
 
 _EDGE_NODES = 32
 """Gauss-Legendre nodes across a cell: area fractions good to about 1e-4."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Illumination:
+    """How evenly the beam is lit, seen from its own centre: it moves with the pupil images."""
+
+    coordinates: NDArray[np.float64]
+    """``(n,)`` rising positions along either axis, in subapertures from the beam's centre."""
+
+    intensity: NDArray[np.float64]
+    """``(n, n)``, [y, x]: light over that of an even beam; smooth beyond the outline."""
+
+    def __post_init__(self) -> None:
+        """Refuse light that cannot be.
+
+        Raises
+        ------
+        ModelError
+            If the map is not square over its coordinates, not finite, negative or dark.
+        """
+        n = len(self.coordinates)
+        if self.intensity.shape != (n, n):
+            raise ModelError(f"illumination: found {self.intensity.shape}; expected {(n, n)}")
+        if not np.all(np.isfinite(self.intensity)) or self.intensity.min() < 0.0:
+            raise ModelError("illumination: found a negative or not finite intensity")
+        if not self.intensity.any():
+            raise ModelError("illumination: found no light at all")
+
+    def at(self, coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the intensity ``(m, m)`` on a grid; beyond the map that of its edge."""
+        low, high = self.coordinates[0], self.coordinates[-1]
+        clipped = np.clip(coordinates, low, high)
+        axes = (self.coordinates, self.coordinates)
+        points = np.stack(np.meshgrid(clipped, clipped, indexing="ij"), axis=-1)
+        return np.asarray(RegularGridInterpolator(axes, self.intensity)(points))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,6 +81,11 @@ class PupilGrid:
         """``(n_points,)`` share of the pupil's area at each lit point; sums to 1."""
         lit = self.amplitude[self.lit]
         return np.asarray(lit / lit.sum())
+
+    def lit_by(self, illumination: Illumination) -> PupilGrid:
+        """Return the same pupil under this light: its amplitude times the root of the intensity."""
+        root = np.sqrt(illumination.at(self.coordinates))
+        return replace(self, amplitude=self.amplitude * root)
 
 
 def annular_pupil(

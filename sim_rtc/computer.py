@@ -23,6 +23,7 @@ from service.wire import (
     Loop,
     LoopRequest,
     MeasureRequest,
+    RampRequest,
     Reply,
 )
 from sim_rtc.dither import Dither, DitherLimits, refusal
@@ -291,6 +292,9 @@ class RealTimeComputer:
                 return self._change_loop(command)
             case MeasureRequest():
                 return self._start_measurement(command)
+            case RampRequest():
+                reason = "unsupported: no gain ramp here"
+                return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
 
     def _next_rows(self) -> tuple[Block, int]:
         if self._block is None or self._row >= self._block.n_frames:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 from typing import Final, TypeVar
 
 from service.errors import WireError
@@ -12,6 +13,8 @@ from service.wire.fields import Fields, pack
 
 DURATION_LIMIT_S: Final = 86_400.0
 AVERAGE_LIMIT: Final = 10_000
+RAMP_LIMIT: Final = 1_000_000
+"""Most frames at one gain of a ramp."""
 
 _T = TypeVar("_T")
 
@@ -22,6 +25,7 @@ class CommandKind(StrEnum):
     DITHER = "dither"
     LOOP = "loop"
     MEASURE = "measure"
+    RAMP = "ramp"
 
 
 class Loop(StrEnum):
@@ -122,7 +126,26 @@ class MeasureRequest:
     """None unless the pattern is a sine."""
 
 
-Command = DitherRequest | LoopRequest | MeasureRequest
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RampRequest:
+    """Try gains on one group of modes after the other; keep those of least residual slopes.
+
+    While a group is tried the others keep the gains they have. What was chosen is seen in the
+    status' ``gains`` (Heritier et al. 2018: tip and tilt, then modes to 100, then to 400).
+    """
+
+    id: str
+    groups: tuple[tuple[int, int], ...]
+    """First and last mode of each group, 0-based basis indices, both included; none overlap."""
+
+    gains: tuple[float, ...]
+    """Loop gains, tried in this order on every group."""
+
+    frames_per_gain: int
+    """Frames each gain is tried for, settling included."""
+
+
+Command = DitherRequest | LoopRequest | MeasureRequest | RampRequest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,6 +172,8 @@ def command_kind(command: Command) -> CommandKind:
             return CommandKind.LOOP
         case MeasureRequest():
             return CommandKind.MEASURE
+        case RampRequest():
+            return CommandKind.RAMP
 
 
 def command_id(data: bytes) -> str | None:
@@ -190,6 +215,8 @@ def decode_command(kind: CommandKind, data: bytes) -> Command:
             return _read_loop(message)
         case CommandKind.MEASURE:
             return _read_measure(message)
+        case CommandKind.RAMP:
+            return _read_ramp(message)
 
 
 def read_dither(message: Fields) -> DitherRequest:
@@ -243,6 +270,23 @@ def _read_measure(message: Fields) -> MeasureRequest:
         ),
         frequency_hz=_where(sine, message, "frequency_hz", lambda key: _each(message, key, modes)),
         duration_s=_where(sine, message, "duration_s", lambda key: _duration(message, key)),
+    )
+
+
+def _read_ramp(message: Fields) -> RampRequest:
+    groups, gains = message.pairs("groups"), message.numbers("gains", above=0.0)
+    ordered = sorted(groups)
+    apart = all(before[1] < after[0] for before, after in pairwise(ordered))
+    if not groups or not apart or any(a > b for a, b in groups):
+        expected = "one or more [first, last], first <= last, none overlapping another"
+        raise message.refusal("groups", list(groups), expected)
+    if not gains:
+        raise message.refusal("gains", list(gains), "one or more gains to try")
+    return RampRequest(
+        id=message.identifier("id"),
+        groups=groups,
+        gains=gains,
+        frames_per_gain=message.integer("frames_per_gain", 1, RAMP_LIMIT),
     )
 
 

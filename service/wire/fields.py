@@ -189,6 +189,16 @@ class Fields:
         """Return a list of finite numbers from ``low`` on, and greater than ``above``."""
         return tuple(self._number(key, v, low, math.inf, above) for v in self._list(key))
 
+    def pairs(self, key: str) -> tuple[tuple[int, int], ...]:
+        """Return a list of pairs of integers from 0 on."""
+        found = []
+        for value in self._list(key):
+            if not isinstance(value, list) or len(value) != 2:
+                raise self.refusal(key, value, "pairs of integers")
+            first, last = (self._integer(key, v, 0, INTEGER_LIMIT) for v in value)
+            found.append((first, last))
+        return tuple(found)
+
     def child(self, key: str) -> Fields:
         """Return the map below a key."""
         return Fields(self.get(key), f"{key!r} of {self._where}")

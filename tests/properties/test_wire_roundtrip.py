@@ -19,6 +19,7 @@ from service.wire import (
     FrameHeader,
     LoopRequest,
     Manifest,
+    RampRequest,
     Status,
     command_id,
     decode_acknowledgement,
@@ -145,10 +146,27 @@ def test_loop_commands_come_out_as_they_went_in(name, gains, leak, n_controlled)
     assert decode_command(CommandKind.LOOP, encode_command(command)) == command
 
 
+@given(
+    name=IDS,
+    edges=st.lists(st.integers(0, 2**62), min_size=2, max_size=8, unique=True),
+    order=st.randoms(use_true_random=False),
+    gains=st.lists(st.floats(1e-6, 2.0), min_size=1, max_size=20).map(tuple),
+    frames_per_gain=st.integers(1, 1_000_000),
+)
+def test_ramp_commands_come_out_as_they_went_in(name, edges, order, gains, frames_per_gain):
+    edges = sorted(edges)[: len(edges) // 2 * 2]
+    groups = list(zip(edges[::2], edges[1::2], strict=True))
+    order.shuffle(groups)
+    command = RampRequest(
+        id=name, groups=tuple(groups), gains=gains, frames_per_gain=frames_per_gain
+    )
+    assert decode_command(CommandKind.RAMP, encode_command(command)) == command
+
+
 LEAVES = (
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text()
 ) | st.binary()
-RECORDS = (FrameHeader, Manifest, LoopRequest, Acknowledgement, Status)
+RECORDS = (FrameHeader, Manifest, LoopRequest, RampRequest, Acknowledgement, Status)
 KEYS = st.sampled_from(
     [f.name for record in RECORDS for f in fields(record)]
     + ["v", "shape", "dtype", "n_chunks", "chunk_bytes", "action", "kind", "modes", "accepted"]

@@ -25,6 +25,7 @@ from service.wire import (
     MeasuredManifest,
     MeasureRequest,
     Pattern,
+    RampRequest,
     Role,
     Status,
     checksum,
@@ -316,6 +317,9 @@ def test_a_reply_may_lack_the_id_it_could_not_read():
             frequency_hz=(100.0,),
             duration_s=2.0,
         ),
+        RampRequest(
+            id="r-1", groups=((0, 1), (2, 99), (100, 399)), gains=(0.2, 0.4), frames_per_gain=500
+        ),
     ],
 )
 def test_commands_arrive_as_they_were_meant(command):
@@ -345,6 +349,26 @@ def test_stopping_a_dither_needs_nothing_but_the_id():
 def test_the_refusal_of_a_command_begins_with_a_word_a_reply_may_use(changes, words):
     with pytest.raises(WireError, match=words):
         decode_command(CommandKind.DITHER, changed(encode_command(DITHER), **changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"groups": []}, "^range: groups is a list of 0 .*, expected one or more"),
+        ({"groups": [[0, 5], [5, 9]]}, "none overlapping another"),
+        ({"groups": [[9, 5]]}, "first <= last"),
+        ({"groups": [[0, 1, 2]]}, "expected pairs of integers"),
+        ({"groups": [[-1, 2]]}, "groups is -1 "),
+        ({"gains": []}, "^range: gains is a list of 0 .*, expected one or more gains"),
+        ({"gains": [0.0]}, "gains is 0.0"),
+        ({"frames_per_gain": 0}, "^range: frames_per_gain is 0"),
+        ({"groups": ...}, "^missing: key 'groups'"),
+    ],
+)
+def test_a_ramp_that_tries_nothing_or_one_mode_twice_is_refused(changes, words):
+    ramp = RampRequest(id="r-1", groups=((0, 1),), gains=(0.2,), frames_per_gain=5)
+    with pytest.raises(WireError, match=words):
+        decode_command(CommandKind.RAMP, changed(encode_command(ramp), **changes))
 
 
 def test_the_id_of_an_otherwise_useless_command_can_still_be_read():

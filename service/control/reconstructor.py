@@ -43,15 +43,7 @@ def invert(
     ----------
     Heritier et al. 2018, section 2.2.
     """
-    n_slopes, n_columns = interaction_matrix.shape
-    if not 0 < n_modes <= min(n_columns, n_slopes):
-        raise ModelError(
-            f"reconstructor: found {n_modes} modes to control; expected 1 to "
-            f"{min(n_columns, n_slopes)} ({n_columns} modes, {n_slopes} slopes)"
-        )
-    controlled = np.asarray(interaction_matrix[:, :n_modes], dtype=np.float64)
-    if not np.all(np.isfinite(controlled)):
-        raise ModelError("reconstructor: the interaction matrix holds NaN or Inf")
+    controlled = checked_columns(interaction_matrix, n_modes)
     left, singular, right = svd(controlled, full_matrices=False)
     kept = singular > singular[0] / max_condition
     inverse = (right[kept].T / singular[kept]) @ left[:, kept].T
@@ -60,3 +52,23 @@ def invert(
         condition_number=float(singular[0] / singular[-1]),
         n_truncated=int(np.count_nonzero(~kept)),
     )
+
+
+def checked_columns(interaction_matrix: NDArray[Any], n_modes: int) -> NDArray[np.float64]:
+    """Return the first ``n_modes`` columns, ``(n_slopes, n_modes)``, fit to be inverted.
+
+    Raises
+    ------
+    ModelError
+        If the matrix has fewer columns, fewer slopes than modes, or a number that is not finite.
+    """
+    n_slopes, n_columns = interaction_matrix.shape
+    if not 0 < n_modes <= min(n_columns, n_slopes):
+        raise ModelError(
+            f"reconstructor: found {n_modes} modes to control; expected 1 to "
+            f"{min(n_columns, n_slopes)} ({n_columns} modes, {n_slopes} slopes)"
+        )
+    columns = np.asarray(interaction_matrix[:, :n_modes], dtype=np.float64)
+    if not np.all(np.isfinite(columns)):
+        raise ModelError("reconstructor: the interaction matrix holds NaN or Inf")
+    return columns

@@ -5,6 +5,7 @@
     PyrcalError
     ├── ConfigurationError   a settings or instrument file that cannot be used
     ├── ModelError           numbers the optical model cannot work with
+    ├── MatrixError          a measured interaction matrix that cannot be used
     ├── WireError            bytes from the RTC that break the contract
     ├── LinkError            the zenoh session cannot be opened or an RTC does not answer
     ├── CommandError         an operator's request that cannot be carried out now
@@ -27,6 +28,10 @@ class ConfigurationError(PyrcalError):
 
 class ModelError(PyrcalError):
     """The optical model was given numbers it cannot work with."""
+
+
+class MatrixError(PyrcalError):
+    """A measured interaction matrix cannot be used; the message names the file and the array."""
 
 
 class WireError(PyrcalError):

@@ -1,0 +1,193 @@
+"""HDF5 and FITS files as one thing: named arrays that can be looked at before they are read."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import MatrixError
+
+MOST_BYTES = 4 << 30
+"""Largest array that is read: a cube of 400 full frames of 512 x 512 is a tenth of it."""
+
+_FITS_BEGINS = (b"SIMPLE  =", b"\x1f\x8b")
+"""First bytes of a FITS file, and of anything compressed with gzip, which FITS files often are."""
+
+_LISTED = 12
+"""Arrays of a file that a message names."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StoredArray:
+    """One array of a file, not read yet."""
+
+    where: str
+    """File and array, for messages."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    read: Callable[[], NDArray[Any]]
+    """Returns it as the file has it."""
+
+    def numbers(self) -> NDArray[np.float64]:
+        """Return it as native float64, whatever its byte order.
+
+        Raises
+        ------
+        MatrixError
+            If it holds no numbers, is too large, or the file is damaged there.
+        """
+        if self.dtype.kind not in "iuf":
+            raise MatrixError(f"{self.where}: found type {self.dtype}, expected real numbers")
+        size = int(np.prod(self.shape, dtype=np.int64)) * max(self.dtype.itemsize, 8)
+        if size > MOST_BYTES:
+            raise MatrixError(
+                f"{self.where}: found shape {self.shape}, {size / 1e9:.1f} GB in memory; "
+                f"expected at most {MOST_BYTES / 1e9:.1f} GB"
+            )
+        try:
+            return np.asarray(self.read(), dtype=np.float64)
+        except (OSError, RuntimeError, TypeError, ValueError) as error:
+            raise MatrixError(f"{self.where}: damaged: {error}") from error
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Container:
+    """The arrays of a file, and what it says about itself."""
+
+    path: Path
+    arrays: Mapping[str, StoredArray]
+    """By name: of HDF5 the path without its first slash, of FITS the EXTNAME or, where an image has
+    none, its number."""
+
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """HDF5 attributes of the file, or keywords of the primary FITS header in lower case."""
+
+    any_case: bool = False
+    """Whether names are the same in capitals: FITS."""
+
+    def find(self, name: str) -> StoredArray | None:
+        """Return the array of this name, or None."""
+        wanted = name.strip("/")
+        if not self.any_case:
+            return self.arrays.get(wanted)
+        return next((a for key, a in self.arrays.items() if key.lower() == wanted.lower()), None)
+
+    def listing(self) -> str:
+        """Return what is in the file, in words."""
+        if not self.arrays:
+            return "no array at all"
+        names = [f"{name} {a.shape}" for name, a in list(self.arrays.items())[:_LISTED]]
+        left = len(self.arrays) - len(names)
+        return ", ".join(names) + (f" and {left} more" if left else "")
+
+
+class _ImageHdu(Protocol):
+    """What is used of astropy's, which has no type information."""
+
+    shape: tuple[int, ...]
+    header: Mapping[str, Any]
+    data: NDArray[Any]
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Container]:
+    """Open an HDF5 or FITS file, known by its content and not by its name.
+
+    Raises
+    ------
+    MatrixError
+        If there is no such file, it is neither, or it is damaged.
+    """
+    try:
+        with path.open("rb") as file:
+            begins = file.read(9)
+    except OSError as error:
+        raise MatrixError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if h5py.is_hdf5(path):
+        with _hdf5(path) as container:
+            yield container
+    elif begins.startswith(_FITS_BEGINS):
+        with _fits(path) as container:
+            yield container
+    else:
+        raise MatrixError(f"{path}: found {_kind(begins)}, expected an HDF5 or a FITS file")
+
+
+def _kind(begins: bytes) -> str:
+    if not begins:
+        return "an empty file"
+    if begins.startswith(b"\x93NUMPY"):
+        return "a NumPy file"
+    if begins.startswith(b"MATLAB 5"):
+        return "a MATLAB file older than 7.3"
+    return "neither kind"
+
+
+@contextmanager
+def _hdf5(path: Path) -> Iterator[Container]:
+    try:
+        file = h5py.File(path, "r", locking=False)
+    except OSError as error:
+        raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error
+    arrays: dict[str, StoredArray] = {}
+
+    def visit(name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset) and item.shape is not None:
+            arrays[name] = StoredArray(
+                where=f"{path}:/{name}",
+                shape=item.shape,
+                dtype=item.dtype,
+                read=lambda item=item: item[()],
+            )
+
+    with file:
+        try:
+            file.visititems(visit)
+            facts = dict(file.attrs)
+        except (OSError, RuntimeError, KeyError) as error:
+            raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error
+        yield Container(path=path, arrays=arrays, facts=facts)
+
+
+@contextmanager
+def _fits(path: Path) -> Iterator[Container]:
+    try:
+        from astropy.io import fits  # an extra: HDF5 needs nothing
+    except ImportError as error:
+        raise MatrixError(
+            f"{path}: a FITS file needs astropy; expected pyrcal installed with its extra 'fits'"
+        ) from error
+    with warnings.catch_warnings():
+        # astropy warns of a truncated file and goes on; here that is an error like any other
+        warnings.simplefilter("error")
+        try:
+            file = fits.open(path, memmap=False, lazy_load_hdus=False)
+        except (OSError, ValueError, Warning) as error:
+            raise MatrixError(f"{path}: damaged FITS file: {error}") from error
+        with file:
+            arrays: dict[str, StoredArray] = {}
+            for number, hdu in enumerate(file):
+                if hdu.is_image and hdu.shape:
+                    name = str(hdu.header.get("EXTNAME", number))
+                    array = _image(hdu, f"{path}[{name}]")
+                    arrays[str(number) if name in arrays else name] = array
+            facts = {str(key).lower(): value for key, value in file[0].header.items()}
+            yield Container(path=path, arrays=arrays, facts=facts, any_case=True)
+
+
+def _image(hdu: _ImageHdu, where: str) -> StoredArray:
+    return StoredArray(
+        where=where,
+        shape=hdu.shape,
+        dtype=np.dtype(f"f{8 if abs(hdu.header['BITPIX']) > 32 else 4}"),
+        read=lambda: hdu.data,
+    )

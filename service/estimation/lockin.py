@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.estimation.frames import FrameBlock
+from service.estimation.span import Span, advanced, opened, why_broken, without_rest
 
 Array = NDArray[Any]
 
 SIDE_OFFSETS_HZ = np.concatenate([np.arange(-20.0, -2.0), np.arange(3.0, 21.0)])
 """Where the noise is measured, relative to each dither line: 36 bins; 6 were too few."""
-
-MAX_MISSING_FRACTION = 0.05
-"""A window with more frames missing than this is refused."""
 
 MIN_AMPLITUDE_RATIO = 0.5
 """A dither weaker than this share of its request was not applied as asked."""
@@ -122,12 +120,7 @@ class LockIn:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Window:
-    session: str
-    cm_id: str | None
-    first_seq: int
-    next_seq: int
-    n_missing: int
-    next_t_ns: int
+    span: Span
     slopes: Array
     commands: Array
     dither: Array
@@ -157,15 +150,15 @@ def _advance(
         if block.dither_m is None:
             return lock_in, block.n_frames - start, None
         window = _open(plan, block, start)
-    reason = _why_broken(plan, window, block, start)
+    reason = why_broken(window.span, plan.n_frames, block, start)
     if reason is not None:
-        refused = WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
+        refused = WindowRefused(reason=reason, t_ns_utc=window.span.next_t_ns)
         return replace(lock_in, window=None), 0, refused
-    end_seq = window.first_seq + plan.n_frames
+    end_seq = window.span.first_seq + plan.n_frames
     stop = min(block.n_frames, end_seq - block.first_seq)
     rows = slice(start, max(stop, start))
     window = _add(plan, window, block, rows)
-    if window.next_seq < end_seq:
+    if window.span.next_seq < end_seq:
         return replace(lock_in, window=window), rows.stop - rows.start, None
     return replace(lock_in, window=None), rows.stop - rows.start, _close(plan, window)
 
@@ -173,64 +166,28 @@ def _advance(
 def _open(plan: LockInPlan, block: FrameBlock, start: int) -> _Window:
     shape = plan.bins_hz.shape
     return _Window(
-        session=block.session,
-        cm_id=block.cm_id,
-        first_seq=block.first_seq + start,
-        next_seq=block.first_seq + start,
-        n_missing=0,
-        next_t_ns=block.t0_ns_utc + start * block.dt_ns,
+        span=opened(block, start),
         slopes=np.zeros((*shape, block.slopes.shape[1]), np.complex64),
         commands=np.zeros((*shape, block.commands_m.shape[1]), np.complex64),
         dither=np.zeros((shape[0], block.commands_m.shape[1]), np.complex64),
     )
 
 
-def _why_broken(plan: LockInPlan, window: _Window, block: FrameBlock, start: int) -> str | None:
-    """Return why the open window cannot take this block, or None."""
-    seq = block.first_seq + start
-    expected_ns = window.next_t_ns + (seq - window.next_seq) * block.dt_ns
-    if block.session != window.session:
-        return "the RTC started a new session inside the window"
-    if block.cm_id != window.cm_id:
-        return f"the reconstructor changed inside the window: {window.cm_id} -> {block.cm_id}"
-    if block.dither_m is None:
-        return "the dither ended inside the window"
-    if abs(block.t0_ns_utc + start * block.dt_ns - expected_ns) > block.dt_ns / 2:
-        return "the RTC's clock stepped or it paused inside the window"
-    missing = window.n_missing + min(seq, window.first_seq + plan.n_frames) - window.next_seq
-    if missing > MAX_MISSING_FRACTION * plan.n_frames:
-        return (
-            f"{missing} of {plan.n_frames} frames missing, more than "
-            f"{MAX_MISSING_FRACTION:.0%}: check the link to the RTC"
-        )
-    return None
-
-
 def _add(plan: LockInPlan, window: _Window, block: FrameBlock, rows: slice) -> _Window:
     n_rows = rows.stop - rows.start
-    seq = block.first_seq + rows.start
-    if n_rows == 0:
-        # the window's last frames never came: the block begins behind its end
-        lost = window.first_seq + plan.n_frames - window.next_seq
-        return replace(
-            window,
-            next_seq=window.next_seq + lost,
-            n_missing=window.n_missing + lost,
-            next_t_ns=window.next_t_ns + lost * block.dt_ns,
-        )
-    index = np.arange(n_rows) + (seq - window.first_seq)
+    if n_rows == 0:  # the block begins behind the window's end
+        return replace(window, span=without_rest(window.span, plan.n_frames, block.dt_ns))
+    index = np.arange(n_rows) + (block.first_seq + rows.start - window.span.first_seq)
     hann = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / plan.n_frames)
     turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, index)
     phasors = (hann * np.exp(-2j * np.pi * turns)).astype(np.complex64)
     lines = phasors.reshape(*plan.bins_hz.shape, n_rows)[:, 0]
-    # _why_broken lets no block without dither columns come this far
+    # why_broken lets no block without dither columns come this far
     dither = block.commands_m[:0] if block.dither_m is None else block.dither_m
     shape = plan.bins_hz.shape
     return replace(
         window,
-        next_seq=seq + n_rows,
-        n_missing=window.n_missing + seq - window.next_seq,
-        next_t_ns=block.t0_ns_utc + rows.stop * block.dt_ns,
+        span=advanced(window.span, block, rows),
         slopes=window.slopes + _project(phasors, block.slopes[rows]).reshape(*shape, -1),
         commands=window.commands + _project(phasors, block.commands_m[rows]).reshape(*shape, -1),
         dither=window.dither + _project(lines, dither[rows]),
@@ -253,15 +210,15 @@ def _close(plan: LockInPlan, window: _Window) -> Spectra | WindowRefused:
             reason=f"mode {plan.modes[weakest]} carries {applied[weakest] * 1e9:.2f} nm of dither "
             f"at {plan.frequencies_hz[weakest]} Hz, {plan.amplitude_m[weakest] * 1e9:.2f} nm were "
             "asked for: see whether the RTC clips it",
-            t_ns_utc=window.next_t_ns,
+            t_ns_utc=window.span.next_t_ns,
         )
     return Spectra(
         plan=plan,
-        session=window.session,
-        cm_id=window.cm_id,
-        first_seq=window.first_seq,
-        t_end_ns_utc=window.next_t_ns - round(1e9 / plan.frame_rate_hz),
-        n_missing=window.n_missing,
+        session=window.span.session,
+        cm_id=window.span.cm_id,
+        first_seq=window.span.first_seq,
+        t_end_ns_utc=window.span.next_t_ns - round(1e9 / plan.frame_rate_hz),
+        n_missing=window.span.n_missing,
         slopes=window.slopes,
         commands=window.commands,
         dither=window.dither,

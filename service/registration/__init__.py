@@ -1,0 +1,1 @@
+"""Registration of measured interaction matrices. Pure numerics: no clock, log, file or thread."""

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -146,7 +147,7 @@ def _hdf5(path: Path) -> Iterator[Container]:
                 where=f"{path}:/{name}",
                 shape=item.shape,
                 dtype=item.dtype,
-                read=lambda item=item: item[()],
+                read=partial(item.__getitem__, ()),
             )
 
     with file:

@@ -8,6 +8,7 @@ other plant is asked for its slopes frame by frame.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -151,7 +152,8 @@ class ModalLoop:
     ) -> int:
         """Complete the commands of ``added`` frame by frame; return how many were clipped.
 
-        ``estimate`` gives the modes ``(n_controlled,)`` that frame k shows.
+        ``estimate`` gives the modes ``(n_controlled,)`` that frame k shows; a frame in which one of
+        them is not finite corrects nothing.
         """
         applied, dither = added.applied, added.dither
         n_frames, delay = len(applied), len(self._decided)
@@ -170,7 +172,9 @@ class ModalLoop:
             correction *= terms.gains
             decided = integrator[k + delay]
             np.multiply(integrator[k + delay - 1], leak, out=decided)
-            decided[:n_controlled] -= correction
+            # a slope that is no number would stay in the integrator for ever, at a gain of 0, too
+            if math.isfinite(correction.sum()):
+                decided[:n_controlled] -= correction
             np.minimum(np.maximum(decided, -stroke, out=decided), stroke, out=decided)
         self._decided = integrator[n_frames:].copy()
         return n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))

@@ -117,6 +117,40 @@ def test_the_dither_is_applied_but_never_integrated():
     )
 
 
+@pytest.mark.parametrize("gain", [0.0, 0.4])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_slope_that_is_no_number_costs_its_frame_and_no_other(gain, bad):
+    """At gain 0 (the loop open) as at any other: 0 times NaN is NaN."""
+    chosen = terms(gain)
+    loop = ModalLoop(n_modes=N_MODES, delay_frames=2, stroke_m=STROKE_M)
+    controlled = np.arange(N_MODES) < 3
+    run(loop, np.tile(1e-7 * controlled, (20, 1)), chosen)
+    struck = np.zeros((10, 2 * N_MODES), np.float32)
+    struck[4, 1] = bad
+    with np.errstate(invalid="ignore"):
+        block = loop.run(struck, chosen, None)
+    assert np.isfinite(block.commands_m).all()
+    assert not np.isfinite(block.slopes[4]).all()
+    assert np.isfinite(np.delete(block.slopes, 4, axis=0)).all()
+    _, commands, _ = run(loop, np.tile(2e-7 * controlled, (200, 1)), chosen)
+    np.testing.assert_allclose(commands[-1], -2e-7 * controlled * (gain > 0), atol=1e-12)
+
+
+def test_in_a_loop_run_frame_by_frame_such_a_frame_corrects_nothing_either():
+    chosen = terms(0.4)
+    loop = ModalLoop(n_modes=N_MODES, delay_frames=2, stroke_m=STROKE_M)
+    wavefront_m = np.array([1e-7, 1e-7, 1e-7, 0.0], np.float32)
+
+    def sense(k, command):
+        slopes = chosen.slopes_per_command @ (command + wavefront_m)
+        return np.full_like(slopes, np.nan) if k == 3 else slopes
+
+    block = loop.run_frames(40, sense, chosen, None)
+    assert np.isnan(block.slopes[3]).all()
+    np.testing.assert_array_equal(block.commands_m[5, :3], block.commands_m[4, :3])
+    np.testing.assert_allclose(block.commands_m[-1, :3], -1e-7, rtol=1e-3)
+
+
 def test_reset_and_release_forget():
     loop = ModalLoop(n_modes=N_MODES, delay_frames=2, stroke_m=STROKE_M)
     run(loop, np.full((20, N_MODES), 1e-7), terms(0.4))

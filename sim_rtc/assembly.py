@@ -232,7 +232,7 @@ def build_drive(options: Options, instrument: Instrument, basis: ModalBasis) -> 
     if options.plant == "linear" and not devices.needs_drive:
         return None
     return MirrorDrive(
-        instrument.mirror,
+        instrument.analytic_mirror,
         basis.mode_to_actuator,
         frame_rate_hz=options.frame_rate_hz,
         rise_s=devices.rise_s,
@@ -247,7 +247,7 @@ def binned_basis(instrument: Instrument, basis: ModalBasis, binning: int) -> Mod
     """
     if binning == 1:
         return basis
-    surface = mirror_surface(instrument.mirror, binned(instrument, binning).subaperture_m)
+    surface = mirror_surface(instrument.analytic_mirror, binned(instrument, binning).subaperture_m)
     coefficients = surface.coefficients(basis.mode_to_actuator)
     return replace(basis, surface=surface, coefficients=coefficients)
 
@@ -277,7 +277,7 @@ def initial_reconstructor(
 
 def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:
     """Return the names of basis and sensor configuration: they change when either does."""
-    mirror, wfs = instrument.mirror, instrument.wfs
+    mirror, wfs = instrument.analytic_mirror, instrument.wfs
     basis = hashlib.sha256(np.round(mirror.positions_m, 6).tobytes())
     basis.update(repr((mirror.influence, mirror.coupling, instrument.modes)).encode())
     sensor = hashlib.sha256(np.packbits(valid).tobytes())

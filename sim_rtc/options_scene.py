@@ -204,7 +204,7 @@ _SINGLE: dict[str, tuple[str, float, float, str]] = {
     "modulation_error": ("RATIO", -0.5, 1.0, "true modulation over the nominal one, less 1"),
     "slope_rotation_deg": ("DEG", -45.0, 45.0, "turn of the slope axes, +x towards +y"),
     "ncpa_nm": ("NM", 0.0, 300.0, "static wavefront only the sensor sees, RMS"),
-    "bad_pixels": ("N", 0, 100, "dead pixels: their subapertures read slopes of 0"),
+    "bad_pixels": ("N", 0, 100, "dead pixels: dark, and their subapertures read slopes of 0"),
 }
 """Field of ``Imperfections``: unit, range and meaning of its option."""
 

@@ -105,7 +105,7 @@ def _moment(telescope: Telescope, batch: Batch, frame: int) -> Moment:
     opd_m = batch.phase_m + optics.opd_per_command @ batch.commands_m[0]
     light = optics.images
     if isinstance(optics, DiffractiveOptics):
-        light = optics.sensor.images(opd_m + optics.static_opd_m).astype(np.float64)
+        light = optics.light(opd_m.astype(np.float32)).astype(np.float64)
     n = len(plant.valid)
     share = light.sum(axis=(0, 2))[plant.valid].mean() / 4
     maps = np.full((2, n, n), np.nan)

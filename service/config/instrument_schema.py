@@ -10,6 +10,31 @@ from service.config.strict import Id, Table
 
 Positive = Annotated[float, Field(gt=0.0)]
 Count = Annotated[int, Field(ge=1)]
+Sign = Literal[-1, 1]
+Pixel = Annotated[float, Field(ge=0.0)]
+Centre = tuple[Pixel, Pixel]
+Centres = tuple[Centre, Centre, Centre, Centre]
+
+
+def _auto_is_none(value: object) -> object:
+    return None if value == "auto" else value
+
+
+def _signs(value: object) -> object:
+    pair = value if isinstance(value, list) else [value, value]
+    if len(pair) != 2 or not all(type(sign) is int and abs(sign) == 1 for sign in pair):
+        raise ValueError(f"found {value!r}, expected 1, -1 or two of them: [sign_x, sign_y]")
+    return tuple(pair)
+
+
+def _centres(value: object) -> object:
+    if value == "auto":
+        return None
+    points = value if isinstance(value, list) else []
+    pairs = [point for point in points if isinstance(point, list) and len(point) == 2]
+    if len(points) != 4 or len(pairs) != 4:
+        raise ValueError(f'found {value!r}, expected "auto" or four pairs [row, column]')
+    return tuple(tuple(point) for point in pairs)
 
 
 class AboutTable(Table):
@@ -66,8 +91,8 @@ class WfsTable(Table):
     input: Literal["slopes", "frames"] = "slopes"
     """What the RTC sends."""
 
-    pupil_centres_px: object = None
-    """Of the four pupil images, row and column; frames only."""
+    pupil_centres_px: Annotated[Centres | None, BeforeValidator(_centres)] = None
+    """Of the four pupil images, row and column; "auto": from a flux frame. Frames only."""
 
     pixels_per_subaperture: Count = 1
     """Frames only."""
@@ -104,16 +129,16 @@ class MirrorTable(Table):
     """Gaussian only: height at the neighbour."""
 
     mode_to_actuator: str | None = None
-    """``path:/dataset`` of the user's modes."""
+    """``path:/dataset`` of the user's modes, ``(n_actuators, n_modes)``."""
 
     basis: Literal["KL", "zonal"] = "KL"
     """Modes of an analytic mirror without ``mode_to_actuator``."""
 
-    nominal_rotation_deg: float = 0.0
-    """Where a fit starts."""
+    nominal_rotation_deg: float | None = None
+    """Where a fit starts; None: found from tip and tilt."""
 
-    parity: Literal[-1, 1] = 1
-    """-1: the mirror is seen from behind."""
+    parity: Sign | None = None
+    """-1: the mirror is seen from behind; None: found from tip and tilt."""
 
     stroke: Literal["known", "unknown"] = "known"
     """"unknown": only shapes are compared."""
@@ -125,10 +150,10 @@ class MirrorTable(Table):
     """Grid step of the measured modes."""
 
     modes_kind: Literal["opd", "surface"] = "opd"
-    """What the measured modes are."""
+    """What the user's own modes are heights of."""
 
     influence_functions: str | None = None
-    """``path:/dataset`` of measured influence functions."""
+    """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``."""
 
 
 class ModesTable(Table):
@@ -150,11 +175,8 @@ class OrientationTable(Table):
     swap_xy: bool = False
     flip_x: bool = False
     flip_y: bool = False
-    sign: Literal[-1, 1] = 1
-
-
-def _auto_is_none(value: object) -> object:
-    return None if value == "auto" else value
+    sign: Annotated[tuple[int, int], BeforeValidator(_signs)] = (1, 1)
+    """Of both components on the RTC's own grid, or of Sx and Sy each."""
 
 
 class SlopesTable(Table):

@@ -8,6 +8,10 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import ModelError
+from service.model.misregistration import Misregistration
+from service.model.slopes import SlopeRecipe
+
 
 class Stop(StrEnum):
     """The element that limits the beam."""
@@ -24,6 +28,16 @@ class Influence(StrEnum):
 
     THIN_PLATE = "thin-plate"
     GAUSSIAN = "gaussian"
+
+
+class BasisKind(StrEnum):
+    """Modes of a mirror whose user brings none."""
+
+    KARHUNEN_LOEVE = "KL"
+    """Karhunen-Loeve modes of von Karman turbulence."""
+
+    ZONAL = "zonal"
+    """The actuators themselves, in their order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,7 +63,8 @@ class Pyramid:
     """A subaperture is valid when its flux is at least this fraction of a full one."""
 
     valid_subapertures: NDArray[np.bool_] | None = None
-    """Mask ``(n_subapertures, n_subapertures)``, [y, x]; None: by ``flux_threshold`` at α = 0."""
+    """Mask ``(n_subapertures, n_subapertures)``, [y, x] in the RTC's own axes, as its slopes are
+    listed; None: by ``flux_threshold`` at α = 0."""
 
     @property
     def pupil_diameter(self) -> float:
@@ -58,7 +73,30 @@ class Pyramid:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Mirror:
+class Mount:
+    """How a mirror is built in, as far as its owner says.
+
+    A point ``p`` of the mirror's drawing lies at ``diag(1, parity) p`` before α acts on it.
+    """
+
+    nominal_rotation_rad: float | None = None
+    """Rotation at which a fit starts; None: not told. α always reports the whole rotation."""
+
+    parity: int | None = None
+    """-1: the mirror is seen from behind, its y axis points backwards; 1: it does not; None: not
+    told."""
+
+    stroke_known: bool = True
+    """Whether a unit command has a known height; if not, only shapes can be compared."""
+
+    @property
+    def y_sign(self) -> float:
+        """Sign of the mirror's y axis: 1 unless its owner says otherwise."""
+        return float(self.parity or 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Mirror(Mount):
     """An analytic deformable mirror: actuator positions and the shape of an influence function."""
 
     positions_m: NDArray[np.float64]
@@ -73,13 +111,62 @@ class Mirror:
     coupling: float = 0.35
     """Gaussian influence functions only: height at a distance of one pitch, 0..1."""
 
+    basis: BasisKind = BasisKind.KARHUNEN_LOEVE
+    """Modes where ``mode_to_actuator`` is None."""
+
+    mode_to_actuator: NDArray[np.float64] | None = None
+    """The user's own modes ``(n_actuators, n_modes)``: strokes in metres OPD per unit command."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TabulatedModes(Mount):
+    """Modes measured on a grid, centred on the pupil, in the units of their owner."""
+
+    cube: NDArray[np.floating]
+    """``(n_modes, ny, nx)``: metres of OPD per unit command, finite; float32 or float64."""
+
+    pitch_m: float
+    """Step of the grid along both axes, metres in the pupil plane."""
+
+    known: NDArray[np.bool_]
+    """``(ny, nx)``: where the table says something about the surface."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameWindows:
+    """Where the four pupil images lie on full detector frames."""
+
+    centres_px: NDArray[np.float64] | None = None
+    """``(4, 2)`` row and column of the images' centres, one in each quadrant of the four, in any
+    order; pixel centres are whole numbers. None: to be found in a flux frame."""
+
+    pixels_per_subaperture: int = 1
+    """Detector pixels along a side of a subaperture."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopFacts:
+    """What the RTC's status would say of the loop, for work without an RTC."""
+
+    frame_rate_hz: float | None = None
+    """Frames per second."""
+
+    delay_frames: float | None = None
+    """From a frame to the first one that sees its correction."""
+
+    n_controlled: int | None = None
+    """Modes in the loop, the first ones."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KarhunenLoeve:
-    """The modal basis: Karhunen-Loeve modes of von Karman turbulence in mirror space."""
+    """The modal basis: Karhunen-Loeve modes of von Karman turbulence in mirror space.
+
+    A basis of the user's own takes only the turbulence from here.
+    """
 
     n_modes: int = 594
-    """Modes of the basis, controlled or not."""
+    """Modes of the basis, controlled or not; of a user's own basis as many as it has."""
 
     r0_m: float = 0.10
     """Fried parameter at 500 nm, metres: sets the expected variance of each mode."""
@@ -110,11 +197,23 @@ class Instrument:
     wfs: Pyramid
     """The wavefront sensor."""
 
-    mirror: Mirror
+    mirror: Mirror | TabulatedModes
     """The deformable mirror."""
 
     modes: KarhunenLoeve = field(default_factory=KarhunenLoeve)
     """The modal basis."""
+
+    slopes: SlopeRecipe = field(default_factory=SlopeRecipe)
+    """How the RTC makes and lists its slopes."""
+
+    frames: FrameWindows | None = None
+    """The RTC delivers detector frames, cut like this; None: it delivers slopes."""
+
+    loop: LoopFacts | None = None
+    """What is known of the loop without an RTC."""
+
+    remarks: tuple[str, ...] = ()
+    """What whoever uses this description should be told: one sentence each, with the key."""
 
     basis_id: str | None = None
     """Pins the RTC's basis; None: the first seen is adopted."""
@@ -126,3 +225,24 @@ class Instrument:
     def subaperture_m(self) -> float:
         """Width of a subaperture in the pupil plane, metres."""
         return self.diameter_m / self.wfs.pupil_diameter
+
+    @property
+    def start(self) -> Misregistration:
+        """Where a fit starts: the mirror's nominal rotation, nothing else."""
+        return Misregistration(rotation_rad=self.mirror.nominal_rotation_rad or 0.0)
+
+    @property
+    def analytic_mirror(self) -> Mirror:
+        """The mirror, where actuators are needed and a table of shapes will not do.
+
+        Raises
+        ------
+        ModelError
+            If the modes are tabulated.
+        """
+        if isinstance(self.mirror, TabulatedModes):
+            raise ModelError(
+                f"{self.name}: found a table of measured modes; expected an analytic mirror "
+                "(mirror.layout), whose actuators are known"
+            )
+        return self.mirror

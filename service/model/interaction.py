@@ -20,6 +20,7 @@ from service.model.pyramid import (
     Response,
     enough_modulation_points,
 )
+from service.model.slopes import turned_mask
 from service.model.workingpoint import Halo
 
 Array = NDArray[Any]
@@ -206,13 +207,14 @@ def instrument_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
 
 
 def valid_subapertures(instrument: Instrument, optics: PyramidOptics) -> NDArray[np.bool_]:
-    """Return the mask ``(n, n)`` [y, x]: the instrument's own, or by flux at α = 0.
+    """Return the mask ``(n, n)`` [y, x] in our axes: the instrument's own, or by flux at α = 0.
 
     The flux is the pupil's light on each subaperture, so that the mask depends neither on the
     sampling nor on the light diffracted out of the images.
     """
     if instrument.wfs.valid_subapertures is not None:
-        return instrument.wfs.valid_subapertures
+        orientation = instrument.slopes.assumed_orientation
+        return turned_mask(instrument.wfs.valid_subapertures, orientation)
     fine = instrument_pupil(instrument, 8).amplitude
     n = instrument.wfs.n_subapertures
     margin = (len(fine) - 8 * n) // 2

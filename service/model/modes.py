@@ -84,8 +84,9 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
         If the mirror has fewer modes than were asked for.
     """
     turbulence = instrument.modes
-    surface = mirror_surface(instrument.mirror, instrument.subaperture_m)
-    n_actuators = len(instrument.mirror.positions_m)
+    mirror = instrument.analytic_mirror
+    surface = mirror_surface(mirror, instrument.subaperture_m)
+    n_actuators = len(mirror.positions_m)
     if not 2 <= turbulence.n_modes < n_actuators:
         raise ModelError(
             f"modes: found n_modes = {turbulence.n_modes}; expected at least tip and tilt, and "
@@ -94,11 +95,11 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
     influence = surface.coefficients(np.eye(n_actuators))
     gram, covariance = _pupil_statistics(instrument, surface, influence)
     strokes, variance = _diagonalise(
-        gram, covariance, _parity_sectors(instrument.mirror.positions_m), turbulence.n_modes
+        gram, covariance, _parity_sectors(mirror.positions_m), turbulence.n_modes
     )
     strokes = _unit_rms(strokes, surface, influence, _pupil(instrument, _NORM_SAMPLING))
-    strokes = _tilts_along_axes(strokes, instrument.mirror.positions_m)
-    strokes = _fix_signs(strokes, instrument.mirror.positions_m)
+    strokes = _tilts_along_axes(strokes, mirror.positions_m)
+    strokes = _fix_signs(strokes, mirror.positions_m)
     return ModalBasis(
         surface=surface,
         mode_to_actuator=strokes,

@@ -56,7 +56,7 @@ class Detector:
         camera: Camera | None = None,
         silent: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Take the share of the light in each pixel, ``images`` ``(2, n, 2, n)``, at the start.
+        """Take the share of the light that each pixel detects, ``images`` ``(2, n, 2, n)``.
 
         ``silent`` ``(n_valid,)`` are subapertures that read 0, noise included.
         """
@@ -64,7 +64,7 @@ class Detector:
         self.electrons_per_frame: float = camera.electrons_per_frame(
             instrument, magnitude=magnitude, frame_rate_hz=frame_rate_hz
         )
-        """Detected in all four images together."""
+        """Detected in all four images together while no pixel is dead."""
         own = images.sum(axis=(0, 2))[valid] * self.electrons_per_frame
         variance = camera.excess_noise * own + 4 * camera.read_noise_electrons**2
         variance /= own.mean() ** 2

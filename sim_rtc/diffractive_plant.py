@@ -54,20 +54,27 @@ class AtRest:
     """The sensor with a flat wavefront."""
 
     images: Array
-    """``(2, n, 2, n)`` share of the detected light in every pixel."""
+    """``(2, n, 2, n)`` share of the light that every pixel detects, 0 where it is dead."""
 
     light: float
-    """In all images together, in the sensor's unit."""
+    """In all images together, dead pixels included, in the sensor's unit."""
 
     slopes: Array32
     """``(n_slopes,)``, the reference: subtracted from all others."""
 
     @classmethod
-    def of(cls, sensor: DiffractivePyramid, n_points: int, valid: NDArray[np.bool_]) -> AtRest:
+    def of(
+        cls,
+        sensor: DiffractivePyramid,
+        n_points: int,
+        valid: NDArray[np.bool_],
+        errors: SlopeErrors,
+    ) -> AtRest:
         """Look at a flat wavefront."""
         light = sensor.images(np.zeros(n_points, dtype=np.float32))
-        slopes, _ = reference_slopes(light, valid)
         total = float(light.sum())
+        light = errors.read(light)
+        slopes, _ = reference_slopes(light, valid)
         return cls(
             images=light.astype(np.float64) / total, light=total, slopes=slopes.astype(np.float32)
         )
@@ -99,14 +106,14 @@ class DiffractiveOptics:
     """``(n, n)`` mask of the subapertures that give slopes."""
 
     errors: SlopeErrors
-    """What happens to slopes that were right."""
+    """What happens to light and slopes that were right."""
 
     at_rest: AtRest
     """What it shows with a flat wavefront."""
 
     @property
     def images(self) -> Array:
-        """``(2, n, 2, n)`` share of the detected light of a flat wavefront in every pixel."""
+        """``(2, n, 2, n)`` share of a flat wavefront's light that every pixel detects."""
         return self.at_rest.images
 
     @property
@@ -132,7 +139,7 @@ class DiffractiveOptics:
             static_opd_m=self.static_opd_m,
             valid=self.valid,
             errors=self.errors,
-            at_rest=AtRest.of(sensor, len(self.static_opd_m), self.valid),
+            at_rest=AtRest.of(sensor, len(self.static_opd_m), self.valid, self.errors),
         )
 
     def mirror_opd_m(self, command_m: Array32) -> Array32:
@@ -148,6 +155,13 @@ class DiffractiveOptics:
             opd_m += command_m[mode] * modes[mode]
         return np.asarray(opd_m)
 
+    def light(self, opd_m: Array32) -> Array32:
+        """Return what the pixels detect of this wavefront ``(2, n, 2, n)``, in the sensor's unit.
+
+        ``opd_m`` is ``(n_points,)``, the mirror's part in it, the non-common path not.
+        """
+        return self.errors.read(self.sensor.images(opd_m + self.static_opd_m))
+
     def slopes(
         self, opd_m: Array32, detector: PixelDetector | None, rng: np.random.Generator
     ) -> Array32:
@@ -156,7 +170,7 @@ class DiffractiveOptics:
         ``opd_m`` is ``(n_points,)``, the mirror's part in it. Without a detector they are free of
         noise.
         """
-        light = self.sensor.images(opd_m + self.static_opd_m)
+        light = self.light(opd_m)
         if detector is not None:
             light = detector.read(light / np.float32(self.at_rest.light), rng)
         slopes, _ = reference_slopes(light, self.valid)
@@ -190,7 +204,7 @@ class DiffractivePlant:
             uneven(pupil, imperfections.unevenness, uneven_rng),
             quadrature=quadrature or _quadrature(wfs, binning),
         )
-        mirror = misplaced(instrument.mirror, imperfections.position_error, position_rng)
+        mirror = misplaced(instrument.analytic_mirror, imperfections.position_error, position_rng)
         self._surface = TensionedPlate(
             mirror.positions_m / instrument.subaperture_m,
             tension=instrument.subaperture_m / (_TENSION_PITCHES * mirror.pitch_m),
@@ -205,7 +219,7 @@ class DiffractivePlant:
             instrument, PyramidOptics(wfs=instrument.wfs, pupil=pupil)
         )
         self.slope_errors = SlopeErrors(self.valid, imperfections, pixel_rng)
-        """What the sensor makes of correct slopes."""
+        """What the sensor makes of correct light and slopes."""
         self.sensor_opd_m: Array32 = non_common_path(
             self._points, self.weights, imperfections, path_rng
         )
@@ -223,7 +237,7 @@ class DiffractivePlant:
             static_opd_m=self.sensor_opd_m,
             valid=self.valid,
             errors=self.slope_errors,
-            at_rest=AtRest.of(sensor, len(self._points), self.valid),
+            at_rest=AtRest.of(sensor, len(self._points), self.valid, self.slope_errors),
         )
 
     def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:

@@ -7,6 +7,7 @@ default, and ``realistic`` is a mix of them all.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,8 @@ class Imperfections:
     """Optical gain of the last mode, 0..1."""
 
     bad_pixels: int = 0
-    """Dead detector pixels: known to the RTC, which reads slopes of 0 in their subapertures."""
+    """Dead detector pixels: no light is read there, and the RTC, which knows them, reads slopes of
+    0 in their subapertures."""
 
     distortion_subap: float = 0.0
     """Third-order radial distortion of the pupil image at its edge, in subapertures."""
@@ -79,7 +81,10 @@ SETS = {
 
 
 class SlopeErrors:
-    """What becomes of correct slopes: axes turned, subapertures with a dead pixel silent."""
+    """What becomes of light and slopes: dark pixels, silent subapertures, turned axes.
+
+    The flux that dead pixels lack is missing in the mean that normalises every other slope, too.
+    """
 
     def __init__(
         self, valid: NDArray[np.bool_], imperfections: Imperfections, rng: np.random.Generator
@@ -93,11 +98,20 @@ class SlopeErrors:
         self.silent: NDArray[np.bool_] = np.zeros(n_valid, dtype=np.bool_)
         """``(n_valid,)`` subapertures whose slopes read 0."""
         self.silent[pixels % n_valid] = True
+        self.dark: NDArray[np.bool_] = np.zeros((2, len(valid), 2, len(valid)), dtype=np.bool_)
+        """``(2, n, 2, n)`` dead pixels: side, row along y, side, column along x."""
+        side_y, side_x = np.divmod(pixels // n_valid, 2)
+        row, column = np.argwhere(valid)[pixels % n_valid].T
+        self.dark[side_y, row, side_x, column] = True
 
     @property
     def absent(self) -> bool:
         """Whether the slopes are left as they are."""
         return bool(self._sine == 0.0 and not self.silent.any())
+
+    def read(self, light: NDArray[Any]) -> NDArray[Any]:
+        """Return what reaches the detector's electronics of ``light`` ``(2, n, 2, n)``."""
+        return np.where(self.dark, 0, light) if self.silent.any() else light
 
     def applied(self, slopes: Array32) -> Array32:
         """Return what is read instead of ``slopes``, whose first axis is ``n_slopes``."""

@@ -59,7 +59,10 @@ class TelescopeOptics(Protocol):
 
     @property
     def images(self) -> Array:
-        """``(2, n, 2, n)`` share of the detected light: side, row along y, side, column along x."""
+        """``(2, n, 2, n)`` share of the light that every pixel detects, 0 where it is dead.
+
+        Side, row along y, side, column along x.
+        """
 
     @property
     def n_slopes(self) -> int:
@@ -89,7 +92,7 @@ class Optics:
     """``(n_points, n_modes)`` OPD at the plant's pupil points per metre of command."""
 
     images: Array
-    """``(2, n, 2, n)`` share of the detected light: side, row along y, side, column along x."""
+    """``(2, n, 2, n)`` share of the light that every pixel detects, 0 where it is dead."""
 
     @property
     def n_slopes(self) -> int:
@@ -147,7 +150,7 @@ class Plant(Protocol):
 
     @property
     def slope_errors(self) -> SlopeErrors:
-        """What the sensor makes of correct slopes."""
+        """What the sensor makes of correct light and slopes."""
 
     @property
     def sensor_opd_m(self) -> Array32:
@@ -182,7 +185,7 @@ class LinearPlant:
             n_nodes=_NODES,
             n_modulation=_modulation_points(wfs.modulation_lambda_over_d),
         )
-        mirror = misplaced(instrument.mirror, imperfections.position_error, position_rng)
+        mirror = misplaced(instrument.analytic_mirror, imperfections.position_error, position_rng)
         self._surface = mirror_surface(mirror, instrument.subaperture_m)
         self._coefficients = self._surface.coefficients(basis.mode_to_actuator)
         self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)
@@ -192,7 +195,7 @@ class LinearPlant:
         self.weights: Array = pupil.weights
         self.valid: NDArray[np.bool_] = valid_subapertures(instrument, self._pyramid)
         self.slope_errors = SlopeErrors(self.valid, imperfections, pixel_rng)
-        """What the sensor makes of correct slopes."""
+        """What the sensor makes of correct light and slopes."""
         self.sensor_opd_m: Array32 = non_common_path(
             self._points, self.weights, imperfections, path_rng
         )
@@ -203,9 +206,13 @@ class LinearPlant:
 
         The optical gain acts on the part of the turbulence the mirror can reproduce exactly as it
         acts on the mirror: ``K_eff = K + D (G - 1) P`` with P the projection of phase on modes.
+        Of dead pixels the lost flux counts; what the phase would have changed in it, some 1e-4 of
+        the flux's gradient, does not.
         """
         shift = self._image_shift(alpha)
         response = self._pyramid.response(self.valid, shift)
+        light = float(response.images.sum())
+        response = replace(response, images=self.slope_errors.read(response.images))
         jacobian = normalised_jacobian(response, self.valid)
         jacobian *= np.float32(2 * np.pi / self._instrument.wfs.wavelength_m)
         jacobian = self.slope_errors.applied(jacobian)
@@ -217,7 +224,7 @@ class LinearPlant:
             slopes_per_phase=jacobian,
             slopes_per_command=matrix * (self._gain * self._passes),
             opd_per_command=modes * self._passes,
-            images=response.images / response.images.sum(),
+            images=response.images / light,
         )
 
     def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:

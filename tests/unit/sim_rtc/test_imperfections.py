@@ -5,6 +5,7 @@ import pytest
 
 from service.model.interaction import instrument_pupil
 from service.model.misregistration import Misregistration
+from sim_rtc.diffractive_plant import DiffractiveOptics, DiffractivePlant
 from sim_rtc.imperfections import SETS, Imperfections, SlopeErrors, distorted, non_common_path
 from sim_rtc.plant import LinearPlant
 
@@ -59,6 +60,61 @@ def test_a_dead_pixel_silences_both_slopes_of_its_subaperture():
     assert not errors.absent
 
 
+def test_a_dead_pixel_is_dark_and_of_a_silent_subaperture():
+    valid = VALID.copy()
+    valid[0, :3] = False
+    errors = SlopeErrors(valid, replace(IDEAL, bad_pixels=4), np.random.default_rng(1))
+    assert errors.dark.sum() == 4
+    assert set(np.flatnonzero(errors.dark.any(axis=(0, 2))[valid])) == set(
+        np.flatnonzero(errors.silent)
+    )
+    assert not errors.dark.any(axis=(0, 2))[~valid].any()
+    light = np.ones((2, 5, 2, 5), dtype=np.float32)
+    read = errors.read(light)
+    assert read.dtype == np.float32
+    assert read.sum() == light.sum() - 4
+    assert not read[errors.dark].any()
+    assert light.all(), "what comes in is left alone"
+
+
+def test_light_on_pixels_that_live_is_left_alone():
+    light = np.ones((2, 5, 2, 5))
+    assert SlopeErrors(VALID, IDEAL, np.random.default_rng(1)).read(light) is light
+
+
+@pytest.mark.parametrize("kind", [LinearPlant, DiffractivePlant])
+def test_the_flux_of_dead_pixels_is_missing_from_images_and_from_the_mean(
+    small_instrument, small_basis, kind
+):
+    """Slopes are normalised by the mean flux: less of it makes those that are left larger."""
+
+    def optics(n_bad):
+        return kind(
+            small_instrument,
+            small_basis,
+            rng=np.random.default_rng(1),
+            imperfections=replace(IDEAL, bad_pixels=n_bad),
+        ).optics(ALIGNED)
+
+    def slopes(seen):
+        if isinstance(seen, DiffractiveOptics):
+            opd_m = 5e-9 * seen.opd_per_command[:, 0]
+            push, pull = (seen.slopes(sign * opd_m, None, None) for sign in (1, -1))
+            return (push - pull) / 1e-8
+        return seen.slopes_per_command[:, 0]
+
+    whole, flawed = optics(0), optics(8)
+    dark = (flawed.images == 0.0) & (whole.images > 0.0)
+    assert dark.sum() == 8
+    np.testing.assert_allclose(flawed.images[~dark], whole.images[~dark], rtol=1e-6)
+    heard = slopes(flawed) != 0.0
+    # a mean of about 60 subapertures of four pixels each; the aligned images are symmetric
+    lost = whole.images[dark].sum() / whole.images.sum()
+    ratio = slopes(flawed)[heard] @ slopes(whole)[heard] / (slopes(whole)[heard] ** 2).sum()
+    assert lost > 0.01
+    assert ratio == pytest.approx(1 / (1 - lost), rel=0.3 * lost)
+
+
 def test_more_dead_pixels_than_there_are_silence_everything():
     errors = SlopeErrors(VALID, replace(IDEAL, bad_pixels=1000), np.random.default_rng(1))
     assert errors.silent.all()
@@ -106,19 +162,25 @@ def test_a_wider_modulation_lowers_every_slope(small_instrument, small_basis):
     assert ratio.max() < 1.0
 
 
-def test_turned_axes_and_dead_pixels_reach_turbulence_and_mirror_alike(
-    small_instrument, small_basis
-):
-    flawed = plant(small_instrument, small_basis, slope_rotation_deg=2.0, bad_pixels=4)
+def test_dead_pixels_silence_turbulence_and_mirror_alike(small_instrument, small_basis):
+    flawed = plant(small_instrument, small_basis, bad_pixels=4)
     optics = flawed.optics(ALIGNED)
     silent = np.tile(flawed.slope_errors.silent, 2)
+    assert silent.any()
     assert not optics.slopes_per_phase[silent].any()
     assert not optics.slopes_per_command[silent].any()
-    along_x, along_y = np.split(matrix(small_instrument, small_basis), 2)
-    turned = np.cos(np.deg2rad(2.0)) * along_x - np.sin(np.deg2rad(2.0)) * along_y
-    heard = ~flawed.slope_errors.silent
-    read = np.split(optics.slopes_per_command, 2)[0]
-    np.testing.assert_allclose(read[heard], turned[heard], atol=1e-5 * np.abs(turned).max())
+    assert optics.slopes_per_phase[~silent].any(axis=1).all()
+
+
+def test_turned_axes_reach_turbulence_and_mirror_alike(small_instrument, small_basis):
+    straight = plant(small_instrument, small_basis).optics(ALIGNED)
+    turned = plant(small_instrument, small_basis, slope_rotation_deg=2.0).optics(ALIGNED)
+    angle = np.deg2rad(2.0)
+    for name in ("slopes_per_phase", "slopes_per_command"):
+        along_x, along_y = np.split(getattr(straight, name), 2)
+        expected = np.cos(angle) * along_x - np.sin(angle) * along_y
+        read = np.split(getattr(turned, name), 2)[0]
+        np.testing.assert_allclose(read, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_the_non_common_path_has_its_rms_and_no_tilt(pupil):

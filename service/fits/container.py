@@ -167,22 +167,22 @@ def _fits(path: Path) -> Iterator[Container]:
         raise MatrixError(
             f"{path}: a FITS file needs astropy; expected pyrcal installed with its extra 'fits'"
         ) from error
-    with warnings.catch_warnings():
-        # astropy warns of a truncated file and goes on; here that is an error like any other
-        warnings.simplefilter("error")
+    with path.open("rb") as raw, warnings.catch_warnings():
+        # astropy warns of a truncated file and goes on; what else it warns of does no harm
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message=".*truncated")
         try:
-            file = fits.open(path, memmap=False, lazy_load_hdus=False)
+            file = fits.open(raw, memmap=False, lazy_load_hdus=False)
         except (OSError, ValueError, Warning) as error:
             raise MatrixError(f"{path}: damaged FITS file: {error}") from error
-        with file:
-            arrays: dict[str, StoredArray] = {}
-            for number, hdu in enumerate(file):
-                if hdu.is_image and hdu.shape:
-                    name = str(hdu.header.get("EXTNAME", number))
-                    array = _image(hdu, f"{path}[{name}]")
-                    arrays[str(number) if name in arrays else name] = array
-            facts = {str(key).lower(): value for key, value in file[0].header.items()}
-            yield Container(path=path, arrays=arrays, facts=facts, any_case=True)
+        arrays: dict[str, StoredArray] = {}
+        for number, hdu in enumerate(file):
+            if hdu.is_image and hdu.shape:
+                name = str(hdu.header.get("EXTNAME", number))
+                array = _image(hdu, f"{path}[{name}]")
+                arrays[str(number) if name in arrays else name] = array
+        facts = {str(key).lower(): value for key, value in file[0].header.items()}
+        yield Container(path=path, arrays=arrays, facts=facts, any_case=True)
 
 
 def _image(hdu: _ImageHdu, where: str) -> StoredArray:

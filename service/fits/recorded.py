@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,6 @@ from service.errors import MatrixError
 from service.fits.container import Container, StoredArray, opened
 
 Array = NDArray[np.float64]
-ShapeCheck = Callable[[tuple[int, ...], str], None]
-"""Raises unless an array of this shape, found there, may be read."""
 
 DATASET = "interaction_matrix"
 """What is read unless another name is given; our own archive writes it."""
@@ -50,7 +47,7 @@ class Recorded:
     """Of the whole file, 64 lower-case hex digits."""
 
 
-def read_recorded(path: Path, dataset: str | None, check: ShapeCheck) -> Recorded:
+def read_recorded(path: Path, dataset: str | None = None) -> Recorded:
     """Read a measured matrix from an HDF5 or FITS file.
 
     Beside the matrix, in the same HDF5 group or as further FITS extensions, ``modes``
@@ -64,8 +61,6 @@ def read_recorded(path: Path, dataset: str | None, check: ShapeCheck) -> Recorde
         The file.
     dataset
         Name of the array; None: ``interaction_matrix``, or the only image of a FITS file.
-    check
-        Called with shape and place before anything large is read.
 
     Raises
     ------
@@ -74,7 +69,11 @@ def read_recorded(path: Path, dataset: str | None, check: ShapeCheck) -> Recorde
     """
     with opened(path) as container:
         stored = _matrix(container, dataset)
-        check(stored.shape, stored.where)
+        if len(stored.shape) not in {2, 3}:
+            raise MatrixError(
+                f"{stored.where}: found shape {stored.shape}, expected (n_slopes, n_modes), or "
+                '(n_modes, ny, nx) where wfs.input = "frames"'
+            )
         group = (dataset or DATASET).strip("/").rpartition("/")[0]
         n_modes = stored.shape[1 if len(stored.shape) == 2 else 0]
 

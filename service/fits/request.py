@@ -33,7 +33,9 @@ def parse_modes(text: str) -> NDArray[np.intp]:
         first, end, step = match.groups()
         last = int(end) if end is not None else int(first) + 1
         if last > MOST_MODES or step == "0":
-            raise ValueError(f"found {text!r}, expected modes below {MOST_MODES} and a step above 0")
+            raise ValueError(
+                f"found {text!r}, expected modes below {MOST_MODES} and a step above 0"
+            )
         indices.extend(range(int(first), last, int(step or 1)))
     if not indices:
         raise ValueError(f"found {text!r}, which is no mode at all; {expected}")

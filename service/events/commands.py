@@ -1,0 +1,99 @@
+"""What an operator can ask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.state import MeasurePattern, Mode
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetMode:
+    """An operator chooses how much the service may do by itself."""
+
+    mode: Mode
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refit:
+    """Compute a reconstructor for the current α now; it still passes the gate and the mode."""
+
+    n_modes: int | None = None
+    """Modes to control; None: as many as now."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartDither:
+    """Start a sinusoidal dither; None: the service's own choice."""
+
+    modes: tuple[int, ...] | None = None
+    """0-based basis indices."""
+
+    amplitude_m: float | None = None
+    """RMS of each mode, metres OPD."""
+
+    frequency_hz: tuple[float, ...] | None = None
+    """One for each mode."""
+
+    duration_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopDither:
+    """Stop the dither and do not start another until told to."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Approve:
+    """Publish a proposed reconstructor."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reject:
+    """Discard a proposed reconstructor."""
+
+    id: str
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Publish:
+    """Send a known reconstructor again, under a new id, after it has passed the gate anew."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rollback:
+    """Go back to the reconstructor that was in use before the present one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measure:
+    """Have the RTC measure an interaction matrix; None: the service's own choice."""
+
+    id: str
+    """Of the matrix to come; never used before."""
+
+    pattern: MeasurePattern
+    modes: tuple[int, ...] | None = None
+    """0-based basis indices."""
+
+    amplitude_m: float | None = None
+    """RMS of each mode's stroke, metres OPD."""
+
+    n_average: int | None = None
+    """Repetitions; None for a sine."""
+
+    frequency_hz: tuple[float, ...] | None = None
+    """One for each mode of a sine."""
+
+    duration_s: float | None = None
+    """Of a sine."""
+
+
+Command = (
+    SetMode | Refit | StartDither | StopDither | Approve | Reject | Publish | Rollback | Measure
+)

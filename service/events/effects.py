@@ -1,0 +1,78 @@
+"""What is to be done about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.state import DitherView, MeasurementRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MakeMatrix:
+    """Compute a reconstructor for the current α and judge it."""
+
+    n_modes: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CopyMatrix:
+    """Judge an earlier reconstructor at the current α and offer it under a new id."""
+
+    source: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgeMatrix:
+    """Judge the matrix in use at the current α."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SendMatrix:
+    """Publish a reconstructor; first tell the RTC how many modes it commands."""
+
+    id: str
+    n_modes: int
+    gains: tuple[float, ...] | None
+    """``(n_modes of the basis,)`` gains to go with it; None: those in force."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FetchMatrix:
+    """Ask the RTC for the matrix it uses."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskDither:
+    """Ask the RTC for a dither."""
+
+    dither: DitherView
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskNoDither:
+    """Ask the RTC to stop its dither."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskMeasurement:
+    """Ask the RTC to measure an interaction matrix."""
+
+    record: MeasurementRecord
+
+
+Effect = (
+    MakeMatrix
+    | CopyMatrix
+    | JudgeMatrix
+    | SendMatrix
+    | FetchMatrix
+    | AskDither
+    | AskNoDither
+    | AskMeasurement
+)

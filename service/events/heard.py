@@ -1,0 +1,161 @@
+"""What can happen to the service."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.control.gate import GateVerdict
+from service.estimation.instrumental import WindowEstimate
+from service.estimation.lockin import WindowRefused
+from service.estimation.passive import PassiveEstimate
+from service.events.commands import Command
+from service.events.effects import Effect
+from service.state import Level, MatrixState, MeasurementRecord, ReconstructorRecord, RtcView
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tick:
+    """Time has passed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusSeen:
+    """The RTC said how it is."""
+
+    rtc: RtcView
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionStarted:
+    """The RTC started anew: its windows, commands and staged matrices are void."""
+
+    session: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RtcVanished:
+    """The RTC's liveliness token went away."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trouble:
+    """A condition that must be seen while it lasts."""
+
+    name: str
+    text: str
+    over: bool = False
+    """The condition has ended."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noted:
+    """Something happened that changes nothing but should be on record."""
+
+    name: str
+    text: str
+    level: Level = Level.INFO
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WindowFitted:
+    """The worker estimated α from one window."""
+
+    estimate: WindowEstimate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowLost:
+    """A window gave no estimate."""
+
+    refused: WindowRefused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Watched:
+    """The watchdog estimated α from ordinary telemetry."""
+
+    estimate: PassiveEstimate
+    t_ns_utc: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatrixMade:
+    """A reconstructor has been computed, or copied, and judged."""
+
+    record: ReconstructorRecord
+    wanted: bool
+    """An operator asked for this very matrix: no further approval is needed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatrixFetched:
+    """The matrix the RTC uses, which the service did not make, is known now."""
+
+    record: ReconstructorRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarginJudged:
+    """The gate's verdict on the matrix in use, at the current α."""
+
+    id: str
+    verdict: GateVerdict
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acknowledged:
+    """The RTC answered to a reconstructor."""
+
+    id: str
+    session: str | None = None
+    """Of the RTC that answers; None: not known."""
+
+    state: MatrixState
+    reason: str
+    frame_seq: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DitherAnswered:
+    """The RTC accepted or refused a dither."""
+
+    id: str
+    accepted: bool
+    reason: str
+    start_seq: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatrixMeasured:
+    """A measured interaction matrix is one step further: begun, refused, failed or stored."""
+
+    record: MeasurementRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobFailed:
+    """Something that was to be done could not be."""
+
+    effect: Effect
+    text: str
+
+
+Event = (
+    Command
+    | Tick
+    | StatusSeen
+    | SessionStarted
+    | RtcVanished
+    | Trouble
+    | Noted
+    | WindowFitted
+    | WindowLost
+    | Watched
+    | MatrixMade
+    | MatrixFetched
+    | MarginJudged
+    | Acknowledged
+    | DitherAnswered
+    | MatrixMeasured
+    | JobFailed
+)

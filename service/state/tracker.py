@@ -1,0 +1,99 @@
+"""Everything together: what ``service.tracker.step`` replaces as a whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from service.control.gate import GateVerdict
+from service.state.journal import Alarm, LogEntry
+from service.state.measurements import MeasurementRecord, MeasureState
+from service.state.reconstructors import ReconstructorRecord
+from service.state.registration import HistoryEntry, Registration, Watchdog
+from service.state.rtc import DitherView, RtcView
+
+
+class Mode(StrEnum):
+    """How much the service may do by itself."""
+
+    AUTO = "auto"
+    """Estimate, compute and publish whatever passes the gate."""
+
+    PROPOSE = "propose"
+    """Estimate and compute; an operator approves each publication."""
+
+    HOLD = "hold"
+    """Estimate only: nothing is computed or published unless asked for."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackerState:
+    """Everything the service knows; ``service.tracker.step`` makes the next one."""
+
+    system: str
+    """The ``{system}`` of the wire."""
+
+    mode: Mode = Mode.PROPOSE
+    registration: Registration | None = None
+    """None until the first accepted window."""
+
+    history: tuple[HistoryEntry, ...] = ()
+    """Oldest first, bounded."""
+
+    reconstructors: tuple[ReconstructorRecord, ...] = ()
+    """Oldest first, bounded; the one in use is always among them once known."""
+
+    measurements: tuple[MeasurementRecord, ...] = ()
+    """Of interaction matrices, oldest first, bounded."""
+
+    in_use: str | None = None
+    """Id of the matrix the RTC multiplies with; None: unknown."""
+
+    margin: GateVerdict | None = None
+    """The gate's verdict on the matrix in use at the current α ± 3σ; None: not known yet."""
+
+    rtc: RtcView | None = None
+    """None until the first status, and again when the RTC has vanished."""
+
+    basis_id: str | None = None
+    """Pinned or adopted; frames of another basis are refused."""
+
+    config_id: str | None = None
+    """Pinned or adopted; frames of another configuration are refused."""
+
+    dither: DitherView | None = None
+    """Requested or running; None: none, and a new one may be asked for."""
+
+    dither_stopped: bool = False
+    """An operator stopped it: the service does not start another by itself."""
+
+    making_since_ns_utc: int | None = None
+    """When the reconstructor now being computed was asked for; None: none is."""
+
+    judged_ns_utc: int | None = None
+    """When ``margin`` was last asked for."""
+
+    retry_ns_utc: int = 0
+    """Nothing is asked of the RTC or computed by itself before this time."""
+
+    watchdog: Watchdog | None = None
+    alarms: tuple[Alarm, ...] = ()
+    log: tuple[LogEntry, ...] = ()
+    """Oldest first, bounded."""
+
+    windows_accepted: int = 0
+    windows_refused: int = 0
+
+    def reconstructor(self, matrix_id: str) -> ReconstructorRecord | None:
+        """Return the record of this id, or None."""
+        return next((r for r in reversed(self.reconstructors) if r.id == matrix_id), None)
+
+    def measurement(self, measurement_id: str) -> MeasurementRecord | None:
+        """Return the record of this measured matrix, or None."""
+        return next((r for r in reversed(self.measurements) if r.id == measurement_id), None)
+
+    @property
+    def measuring(self) -> MeasurementRecord | None:
+        """The measurement under way, or None."""
+        under_way = {MeasureState.ASKED, MeasureState.RUNNING}
+        return next((r for r in reversed(self.measurements) if r.state in under_way), None)

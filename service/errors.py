@@ -9,7 +9,9 @@
     ├── WireError            bytes from the RTC that break the contract
     ├── LinkError            the zenoh session cannot be opened or an RTC does not answer
     ├── CommandError         an operator's request that cannot be carried out now
-    │   └── UnknownIdError   a reconstructor, session or product nobody has heard of
+    │   ├── UnknownIdError   a reconstructor, session or product nobody has heard of
+    │   ├── TooLargeError    an upload beyond the limit
+    │   └── BusyError        too much under way already: try again later
     ├── WorkerError          the worker process died; the job is lost, the service is not
     └── ArchiveError         a product that cannot be written, read, or fails its checksum
 
@@ -48,6 +50,14 @@ class CommandError(PyrcalError):
 
 class UnknownIdError(CommandError):
     """The id names nothing this service knows."""
+
+
+class TooLargeError(CommandError):
+    """An upload is larger than this service takes."""
+
+
+class BusyError(CommandError):
+    """Too much of the same kind is under way; the same request may be granted later."""
 
 
 class WorkerError(PyrcalError):

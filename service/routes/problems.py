@@ -12,12 +12,24 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 
-from service.errors import ArchiveError, CommandError, LinkError, PyrcalError, UnknownIdError
+from service.errors import (
+    ArchiveError,
+    BusyError,
+    CommandError,
+    LinkError,
+    MatrixError,
+    PyrcalError,
+    TooLargeError,
+    UnknownIdError,
+)
 
 MEDIA_TYPE = "application/problem+json"
 
 _OF_ERROR: dict[type[PyrcalError], tuple[HTTPStatus, str]] = {
     UnknownIdError: (HTTPStatus.NOT_FOUND, "unknown-id"),
+    TooLargeError: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large"),
+    BusyError: (HTTPStatus.SERVICE_UNAVAILABLE, "busy"),
+    MatrixError: (HTTPStatus.UNPROCESSABLE_ENTITY, "unusable-matrix"),
     CommandError: (HTTPStatus.CONFLICT, "not-now"),
     LinkError: (HTTPStatus.GATEWAY_TIMEOUT, "rtc-silent"),
     ArchiveError: (HTTPStatus.INTERNAL_SERVER_ERROR, "archive"),

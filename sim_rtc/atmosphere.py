@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 
 from service.errors import ModelError
 from service.model.instrument import KarhunenLoeve
-from service.model.modes import von_karman_covariance
+from service.model.turbulence import von_karman_covariance
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

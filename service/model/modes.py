@@ -1,42 +1,80 @@
-"""Karhunen-Loeve modes of von Karman turbulence, in the space the mirror can reach."""
+"""The modes of a mirror: Karhunen-Loeve modes in the space it can reach, or its user's own."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.linalg import cholesky, eigh, solve_triangular
 from scipy.spatial import KDTree
-from scipy.special import gamma, kv
 
 from service.errors import ModelError
-from service.model.instrument import Instrument, KarhunenLoeve
+from service.model.instrument import BasisKind, Instrument, Mirror, TabulatedModes
 from service.model.mirror import Surface, mirror_surface
-from service.model.pupil import PupilGrid, annular_pupil
+from service.model.pupil import PupilGrid
+from service.model.tabulated import tabulated_basis
+from service.model.turbulence import (
+    expected_variance,
+    piston_free,
+    pupil_of,
+    pupil_statistics,
+)
 
 Array = NDArray[np.float64]
+Indices = Sequence[int] | NDArray[np.integer]
 
-REFERENCE_WAVELENGTH_M = 500e-9
-"""Wavelength at which r0 is quoted, metres."""
-
-_COVARIANCE_SAMPLING = 3
 _NORM_SAMPLING = 4
 _PISTON_RATIO = 1e-9
 _DEGENERATE = 1e-3
 """The square grid splits pairs that the mirror's symmetry makes equal by less than this."""
 
 
+class Basis(Protocol):
+    """Shapes of the mirror that can be evaluated wherever a registration puts them.
+
+    Points are ``(n_points, 2)``, x and y in subapertures, in the mirror's nominal place.
+    """
+
+    @property
+    def n_modes(self) -> int:
+        """Modes of the basis."""
+
+    @property
+    def variance_m2(self) -> Array:
+        """``(n_modes,)`` expected variance of each mode under the turbulence, metres² OPD."""
+
+    def render(self, points: Array) -> Array:
+        """Return the modes ``(n_points, n_modes)``."""
+
+    def render_slope(self, points: Array, direction: Array) -> Array:
+        """Return the derivative of the modes along ``direction``, ``(n_points, n_modes)``."""
+
+    def known(self, points: Array) -> NDArray[np.bool_]:
+        """Return whether the surface is known at every point, ``(n_points,)``."""
+
+    def subset(self, indices: Indices) -> Self:
+        """Return a basis of these modes only, in this order."""
+
+    def mirrored(self) -> Self:
+        """Return the same modes of the mirror seen from its other side: y runs backwards."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModalBasis:
-    """The modes the RTC commands. A unit command is 1 m RMS of OPD over the pupil."""
+    """Modes of an analytic mirror.
+
+    A unit command is 1 m RMS of OPD over the pupil for Karhunen-Loeve modes, and what its owner
+    says for others.
+    """
 
     surface: Surface
     """The mirror between its actuators, coordinates in subapertures."""
 
     mode_to_actuator: Array
-    """``(n_actuators, n_modes)`` actuator strokes of each mode, metres OPD per metre RMS."""
+    """``(n_actuators, n_modes)`` actuator strokes of each mode, metres OPD per unit command."""
 
     coefficients: Array
     """``(n_basis, n_modes)`` weights of the surface's basis functions for each mode."""
@@ -44,31 +82,85 @@ class ModalBasis:
     variance_m2: Array
     """``(n_modes,)`` expected variance of each mode under the turbulence, metres² OPD."""
 
+    y_sign: float = 1.0
+    """-1: the mirror is seen from behind."""
+
+    @property
+    def n_modes(self) -> int:
+        """Modes of the basis."""
+        return int(self.coefficients.shape[1])
+
     def render(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at mirror ``points`` ``(n_points, 2)``."""
-        return self.surface.basis(points) @ self.coefficients
+        return self.surface.basis(points * [1.0, self.y_sign]) @ self.coefficients
 
     def render_slope(self, points: Array, direction: Array) -> Array:
         """Return the derivative of the modes along ``direction``, ``(n_points, n_modes)``."""
-        return self.surface.slope(points, direction) @ self.coefficients
+        side = np.array([1.0, self.y_sign])
+        return self.surface.slope(points * side, direction * side) @ self.coefficients
+
+    def known(self, points: Array) -> NDArray[np.bool_]:
+        """Return that an analytic surface is known at every point, ``(n_points,)``."""
+        return np.ones(len(points), dtype=np.bool_)
+
+    def subset(self, indices: Indices) -> ModalBasis:
+        """Return a basis of these modes only, in this order."""
+        return replace(
+            self,
+            mode_to_actuator=np.ascontiguousarray(self.mode_to_actuator[:, indices]),
+            coefficients=np.ascontiguousarray(self.coefficients[:, indices]),
+            variance_m2=self.variance_m2[indices],
+        )
+
+    def mirrored(self) -> ModalBasis:
+        """Return the same modes of the mirror seen from its other side: y runs backwards."""
+        return replace(self, y_sign=-self.y_sign)
 
 
-def von_karman_covariance(separation_m: Array, turbulence: KarhunenLoeve) -> Array:
-    """Return the phase covariance of von Karman turbulence, in metres² of OPD.
+def modal_basis(instrument: Instrument) -> Basis:
+    """Return the modes of this instrument, whatever kind they are.
 
-    References
-    ----------
-    Conan 2000, PhD thesis; Heritier et al. 2018 use the same spectrum.
+    Raises
+    ------
+    ModelError
+        If the mirror has fewer modes than were asked for, or its table is too coarse.
     """
-    scale = (turbulence.outer_scale_m / turbulence.r0_m) ** (5 / 3)
-    shape = (24 / 5 * gamma(6 / 5)) ** (5 / 6) / np.pi ** (8 / 3) * gamma(11 / 6)
-    x = 2 * np.pi * np.asarray(separation_m, dtype=np.float64) / turbulence.outer_scale_m
-    at_zero = scale * shape * gamma(5 / 6) / 2
-    safe = np.maximum(x, 1e-12)
-    phase = np.where(
-        x > 1e-9, scale * shape / 2 ** (5 / 6) * safe ** (5 / 6) * kv(5 / 6, safe), at_zero
+    if isinstance(instrument.mirror, TabulatedModes):
+        return tabulated_basis(instrument, instrument.mirror)
+    return analytic_basis(instrument)
+
+
+def analytic_basis(instrument: Instrument) -> ModalBasis:
+    """Return the modes of an analytic mirror: the user's own, its actuators, or KL modes.
+
+    Raises
+    ------
+    ModelError
+        If the mirror has fewer modes than were asked for, or is a table of shapes.
+    """
+    mirror = instrument.analytic_mirror
+    if mirror.mode_to_actuator is not None:
+        return _given_basis(instrument, mirror, mirror.mode_to_actuator)
+    match mirror.basis:
+        case BasisKind.ZONAL:
+            return _given_basis(instrument, mirror, np.eye(len(mirror.positions_m)))
+        case BasisKind.KARHUNEN_LOEVE:
+            return karhunen_loeve_basis(instrument)
+
+
+def _given_basis(instrument: Instrument, mirror: Mirror, strokes: Array) -> ModalBasis:
+    """Return the modes with these actuator strokes ``(n_actuators, n_modes)``, as they are."""
+    surface = mirror_surface(mirror, instrument.subaperture_m)
+    coefficients = surface.coefficients(strokes)
+    return ModalBasis(
+        surface=surface,
+        mode_to_actuator=strokes,
+        coefficients=coefficients,
+        variance_m2=expected_variance(
+            instrument, lambda points: surface.basis(points) @ coefficients
+        ),
+        y_sign=mirror.y_sign,
     )
-    return np.asarray(phase * (REFERENCE_WAVELENGTH_M / (2 * np.pi)) ** 2)
 
 
 def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
@@ -93,11 +185,13 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
             f"fewer than the {n_actuators} actuators (piston is left out)"
         )
     influence = surface.coefficients(np.eye(n_actuators))
-    gram, covariance = _pupil_statistics(instrument, surface, influence)
+    gram, covariance = pupil_statistics(
+        instrument, lambda points: surface.basis(points) @ influence
+    )
     strokes, variance = _diagonalise(
         gram, covariance, _parity_sectors(mirror.positions_m), turbulence.n_modes
     )
-    strokes = _unit_rms(strokes, surface, influence, _pupil(instrument, _NORM_SAMPLING))
+    strokes = _unit_rms(strokes, surface, influence, pupil_of(instrument, _NORM_SAMPLING))
     strokes = _tilts_along_axes(strokes, mirror.positions_m)
     strokes = _fix_signs(strokes, mirror.positions_m)
     return ModalBasis(
@@ -105,46 +199,8 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
         mode_to_actuator=strokes,
         coefficients=influence @ strokes,
         variance_m2=variance,
+        y_sign=mirror.y_sign,
     )
-
-
-def _pupil(instrument: Instrument, sampling: int) -> PupilGrid:
-    return annular_pupil(
-        n_subapertures=instrument.wfs.n_subapertures,
-        diameter_subap=instrument.wfs.pupil_diameter,
-        obscuration_ratio=instrument.obscuration_ratio,
-        sampling=sampling,
-    )
-
-
-def _piston_free(shapes: Array, weights: Array) -> Array:
-    return shapes - weights @ shapes
-
-
-def _pupil_statistics(
-    instrument: Instrument, surface: Surface, influence: Array
-) -> tuple[Array, Array]:
-    """Return Gram matrix of the influence functions and covariance of their projections.
-
-    The covariance is a convolution of every weighted shape with B(r), done exactly on a padded
-    grid: the dense n_points² matrix is never formed.
-    """
-    pupil = _pupil(instrument, _COVARIANCE_SAMPLING)
-    weights = pupil.weights
-    shapes = _piston_free(surface.basis(pupil.points) @ influence, weights)
-    weighted = shapes * weights[:, None]
-    n = len(pupil.coordinates)
-    size = next_fast_len(2 * n, real=True)
-    lag = np.minimum(np.arange(size), size - np.arange(size))
-    separation = np.hypot(lag[:, None], lag) / pupil.sampling * instrument.subaperture_m
-    kernel = rfft2(von_karman_covariance(separation, instrument.modes))
-    convolved = np.empty_like(weighted)
-    plane = np.zeros((n, n))
-    for j in range(weighted.shape[1]):
-        plane[pupil.lit] = weighted[:, j]
-        spread = irfft2(rfft2(plane, (size, size)) * kernel, (size, size))
-        convolved[:, j] = spread[:n, :n][pupil.lit]
-    return shapes.T @ weighted, weighted.T @ convolved
 
 
 def _parity_sectors(positions_m: Array) -> list[Array]:
@@ -208,7 +264,7 @@ def _even_before_odd(found: list[tuple[float, int, Array]]) -> list[tuple[float,
 
 def _unit_rms(strokes: Array, surface: Surface, influence: Array, pupil: PupilGrid) -> Array:
     """Orthonormalise the modes over the pupil, in order, on a finer grid than they came from."""
-    shapes = _piston_free(surface.basis(pupil.points) @ (influence @ strokes), pupil.weights)
+    shapes = piston_free(surface.basis(pupil.points) @ (influence @ strokes), pupil.weights)
     gram = shapes.T @ (shapes * pupil.weights[:, None])
     upper = cholesky(gram)
     return np.asarray(solve_triangular(upper, strokes.T, trans="T").T)

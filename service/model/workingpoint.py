@@ -17,7 +17,7 @@ from scipy.special import j0
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
-from service.model.modes import REFERENCE_WAVELENGTH_M
+from service.model.turbulence import REFERENCE_WAVELENGTH_M
 
 Array = NDArray[np.float64]
 

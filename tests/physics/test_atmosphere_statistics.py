@@ -13,7 +13,7 @@ import pytest
 from scipy.signal import welch
 
 from service.model.instrument import KarhunenLoeve
-from service.model.modes import von_karman_covariance
+from service.model.turbulence import von_karman_covariance
 from sim_rtc.atmosphere import ExtrudedScreen, FrozenLayer, Layer
 from sim_rtc.shapes import FOCUS, TILT, TIP, low_orders
 

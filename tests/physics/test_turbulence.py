@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 from service.model.instrument import KarhunenLoeve
-from service.model.modes import (
-    REFERENCE_WAVELENGTH_M,
-    karhunen_loeve_basis,
-    von_karman_covariance,
-)
+from service.model.modes import karhunen_loeve_basis
+from service.model.turbulence import REFERENCE_WAVELENGTH_M, von_karman_covariance
 from tests.numerics import flao_basis, small_instrument
 
 TURBULENCE = KarhunenLoeve(r0_m=0.10, outer_scale_m=25.0)

@@ -96,7 +96,7 @@ def test_mode_slopes_agree_with_central_differences():
 
 def perturbed(monkeypatch, instrument):
     """The basis of this instrument when the covariance is off by one part in 1e12."""
-    exact = modes._pupil_statistics
+    exact = modes.pupil_statistics
 
     def noisy(*arguments):
         gram, covariance = exact(*arguments)
@@ -104,7 +104,7 @@ def perturbed(monkeypatch, instrument):
         return gram, covariance * (1 + 0.5e-12 * (noise + noise.T))
 
     with monkeypatch.context() as patch:
-        patch.setattr(modes, "_pupil_statistics", noisy)
+        patch.setattr(modes, "pupil_statistics", noisy)
         return karhunen_loeve_basis(instrument)
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from service.errors import ModelError
 from service.model.instrument import KarhunenLoeve
-from service.model.modes import von_karman_covariance
+from service.model.turbulence import von_karman_covariance
 from sim_rtc.atmosphere import (
     ExtrudedScreen,
     FrozenLayer,

@@ -1,0 +1,97 @@
+"""Has the outer ring of the mirror slipped? Watched on the commands.
+
+A segment at the edge of the pupil can slip by wavelengths and stay there: the sensor sees little
+light across it, its slopes look healthy, and only the command shows the step. On the diffractive
+telescope the slowly averaged position of the outermost actuators stays below 1.5 times what
+turbulence asks of them in every healthy loop tried, and a slip takes it to 3 to 8.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.frames import FrameBlock
+
+Array = NDArray[Any]
+
+SLIPPED_RATIO = 4.5
+"""Averaged position of an outer actuator, in σ of turbulence, that no healthy loop shows."""
+
+HEALED_RATIO = 2.5
+"""Below this a ring that had slipped counts as back."""
+
+LOW_MODES = 30
+"""Left out: tip, tilt and their like move the whole mirror by more than any slip."""
+
+_MEMORY_S = 0.25
+"""Turbulence of higher modes has forgotten itself after this; a slip has not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeWatch:
+    """Where the actuators of one mirror stand for a modal command, in σ of turbulence."""
+
+    outer: NDArray[np.float32]
+    """``(n_outer, n_modes)`` of the outermost ring; zero for modes left out."""
+
+    inner: NDArray[np.float32]
+    """``(n_inner, n_modes)`` of all others: they tell how strong the turbulence is tonight."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeHealth:
+    """Forgetting means of what the two parts of the mirror do."""
+
+    position: NDArray[np.float32] | None = None
+    """``(n_outer,)`` averaged position, in σ of the turbulence the basis was made for."""
+
+    turbulence: float = 1.0
+    """RMS of the inner actuators in the same unit."""
+
+    ratio: float = 0.0
+    """Largest averaged position of an outer actuator over ``turbulence``."""
+
+    slipped: bool = False
+
+
+def edge_watch(
+    positions: NDArray[np.float64],
+    mode_to_actuator: NDArray[np.float64],
+    mode_variance_m2: NDArray[np.float64],
+    n_controlled: int,
+) -> EdgeWatch | None:
+    """Return what to watch; None when the loop controls too few modes to say.
+
+    ``positions`` is ``(n_actuators, 2)`` in any unit; the outermost ring is whatever lies within
+    4 % of the largest radius, one ring of FLAO's fourteen.
+    """
+    if n_controlled <= 2 * LOW_MODES:
+        return None
+    used = np.zeros(len(mode_variance_m2))
+    used[LOW_MODES:n_controlled] = 1.0
+    expected = np.sqrt(mode_to_actuator**2 @ (used * mode_variance_m2))
+    shapes = (mode_to_actuator * used / expected[:, None]).astype(np.float32)
+    radius = np.hypot(*positions.T)
+    outer = radius > 0.96 * radius.max()
+    return EdgeWatch(outer=shapes[outer], inner=shapes[~outer])
+
+
+def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
+    """Return the health after one more block, of which the last frame is looked at."""
+    command = block.commands_m[-1]
+    outer, inner = watch.outer @ command, watch.inner @ command
+    fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / _MEMORY_S))
+    position = (1.0 - fade) * outer
+    if health.position is not None:
+        position += fade * health.position
+    power = fade * health.turbulence**2 + (1.0 - fade) * float(np.mean(inner**2))
+    turbulence = float(np.sqrt(power))
+    ratio = float(np.abs(position).max()) / max(turbulence, 1e-3)
+    limit = HEALED_RATIO if health.slipped else SLIPPED_RATIO
+    return replace(
+        health, position=position, turbulence=turbulence, ratio=ratio, slipped=ratio > limit
+    )

@@ -35,18 +35,9 @@ class Crew:
             If the worker process died, and a new one is there for the next job; or if the job
             failed in a way nobody foresaw, which must not end the service.
         """
-        return await self.run(partial(run_job, job, *args, **kwargs), job.__name__)
-
-    async def run(self, work: Callable[[], R], name: str) -> R:
-        """Run anything that can be pickled, known by ``name`` in what is said of it.
-
-        Raises
-        ------
-        WorkerError
-            As :meth:`call`.
-        """
         if self._executor is None:
             self._executor = self._hire()
+        work = partial(run_job, job, *args, **kwargs)
         executor = self._executor
         try:
             return await asyncio.get_running_loop().run_in_executor(executor, work)
@@ -54,11 +45,11 @@ class Crew:
             if self._executor is executor:
                 self._executor = None
                 self.n_lost += 1
-            raise WorkerError(f"the worker process died during {name}") from error
+            raise WorkerError(f"the worker process died during {job.__name__}") from error
         except PyrcalError:
             raise
         except Exception as error:
-            raise WorkerError(f"{name} failed in the worker: {error!r}") from error
+            raise WorkerError(f"{job.__name__} failed in the worker: {error!r}") from error
 
     def dismiss(self) -> None:
         """End the worker; jobs that wait are dropped."""

@@ -64,7 +64,7 @@ def main() -> None:
             "threads": arguments.threads,
             "pupil_sampling": arguments.sampling,
             "detector_nodes": arguments.nodes,
-            "n_modes": model.basis.coefficients.shape[1],
+            "n_modes": model.basis.n_modes,
             "n_slopes": model.n_slopes,
             "timings": [asdict(timing) for timing in timings],
         }

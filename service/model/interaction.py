@@ -8,10 +8,11 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from service.model.instrument import Instrument, Stop
 from service.model.misregistration import Misregistration
-from service.model.modes import ModalBasis
+from service.model.modes import Basis
 from service.model.pupil import Illumination, PupilGrid, annular_pupil
 from service.model.pyramid import (
     Mapper,
@@ -20,7 +21,7 @@ from service.model.pyramid import (
     Response,
     enough_modulation_points,
 )
-from service.model.slopes import turned_mask
+from service.model.slopes import Normalisation, turned_mask
 from service.model.workingpoint import Halo
 
 Array = NDArray[Any]
@@ -28,6 +29,9 @@ Value = TypeVar("Value")
 
 _ROW_CHUNK = 512
 """Rows of a product per task: large enough for BLAS, small enough to share between cores."""
+
+UNKNOWN_REACH_SUBAP = 1.0
+"""Slopes this near to surface that a table does not know are left out of comparisons."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,7 +63,7 @@ class InteractionModel:
     def __init__(
         self,
         instrument: Instrument,
-        basis: ModalBasis,
+        basis: Basis,
         *,
         pupil_sampling: int = 3,
         detector_nodes: int = 3,
@@ -80,10 +84,12 @@ class InteractionModel:
             n_modulation=n_modulation or enough_modulation_points(instrument.wfs),
             dtype=dtype,
             halo=halo,
+            normalisation=instrument.slopes.normalisation,
         )
         self.valid = valid_subapertures(instrument, self.optics)
         self._map = mapper
         self._dtype = dtype
+        self._response: _Last[Response] = _Last()
         self._jacobian: _Last[Array] = _Last()
         self._modes: _Last[Array] = _Last()
 
@@ -118,11 +124,28 @@ class InteractionModel:
         shift = self._image_shift(alpha)
         return self._jacobian.get(
             shift,
-            lambda: self._per_metre(
-                normalised_jacobian(
-                    self.optics.response(self.valid, shift, mapper=self._map), self.valid
-                )
-            ),
+            lambda: self._per_metre(normalised_jacobian(self._at_rest(shift), self.valid)),
+        )
+
+    def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
+        """Return which slopes lie within one subaperture of unknown surface, ``(n_slopes,)``.
+
+        What a table of modes does not know cannot be compared with a measurement. Surface that no
+        light falls on does not count.
+        """
+        unknown = ~self.basis.known(self._mirror_points(alpha))
+        if not unknown.any():
+            return np.zeros(self.n_slopes, dtype=np.bool_)
+        y, x = np.nonzero(self.valid)
+        centre = (len(self.valid) - 1) / 2
+        seen = np.column_stack([x, y]) - centre - self._image_shift(alpha)
+        distance, _ = cKDTree(self.pupil.points[unknown]).query(seen, p=np.inf)
+        return np.tile(distance <= 0.5 + UNKNOWN_REACH_SUBAP, 2)
+
+    def _at_rest(self, shift: tuple[float, float]) -> Response:
+        """Return the sensor's response with the images at ``shift``; derivatives use it again."""
+        return self._response.get(
+            shift, lambda: self.optics.response(self.valid, shift, mapper=self._map)
         )
 
     def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
@@ -164,7 +187,7 @@ class InteractionModel:
                 self._product(jacobian, self._moved(points, along_y)),
             )
         shift, modes = self._image_shift(alpha), self._rendered(alpha)
-        at_rest = self.optics.response(self.valid, shift, mapper=self._map)
+        at_rest = self._at_rest(shift)
         by_axis = (
             self.optics.response(self.valid, shift, nodes_x=Nodes.edges(), mapper=self._map),
             self.optics.response(self.valid, shift, nodes_y=Nodes.edges(), mapper=self._map),
@@ -223,43 +246,62 @@ def valid_subapertures(instrument: Instrument, optics: PyramidOptics) -> NDArray
     return np.asarray(flux >= instrument.wfs.flux_threshold)
 
 
-def reference_slopes(images: Array, valid: NDArray[np.bool_]) -> tuple[Array, float]:
+def reference_slopes(
+    images: Array,
+    valid: NDArray[np.bool_],
+    normalisation: Normalisation = Normalisation.GLOBAL,
+) -> tuple[Array, float]:
     """Return the slopes ``(n_slopes,)`` of four images and the mean flux per valid subaperture.
 
-    Global normalisation, signs of conventions.md. ``images`` is ``(2, n, 2, n)``.
+    Signs of conventions.md. ``images`` is ``(2, n, 2, n)``.
     """
-    differences, flux = _differences(images, valid)
-    return differences / flux, flux
+    differences, flux = _light(images, valid, normalisation)
+    return differences / flux, float(flux.mean())
 
 
-def _differences(images: Array, valid: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Return x then y differences of the four images, and the mean flux per valid subaperture."""
+def _light(
+    images: Array, valid: NDArray[np.bool_], normalisation: Normalisation
+) -> tuple[Array, Array]:
+    """Return x then y differences of the four images, and the flux that normalises them.
+
+    The flux is ``(1,)``, the mean per valid subaperture, or ``(n_slopes,)``, each one's own.
+    """
     by_x, by_y = images.sum(axis=0), images.sum(axis=2)
     x = (by_x[:, 0] - by_x[:, 1])[valid]
     y = (by_y[0] - by_y[1])[valid]
-    return np.concatenate([x, y]), float(by_y.sum(axis=0)[valid].mean())
+    flux = by_y.sum(axis=0)[valid]
+    local = normalisation is Normalisation.LOCAL
+    return np.concatenate([x, y]), np.tile(flux, 2) if local else flux.mean(keepdims=True)
 
 
 def normalised_jacobian(response: Response, valid: NDArray[np.bool_]) -> Array:
     """Return the gradient of the normalised slopes, ``(n_slopes, n_points)`` per radian."""
-    slopes, flux = reference_slopes(response.images, valid)
-    dtype = response.gradient.dtype
-    jacobian = response.gradient - np.outer(slopes, response.flux_gradient).astype(dtype)
-    jacobian /= np.asarray(flux, dtype=dtype)
+    differences, flux = _light(response.images, valid, response.normalisation)
+    jacobian = response.gradient - _times(differences / flux, response.flux_gradient)
+    jacobian /= flux[:, None].astype(jacobian.dtype)
     return np.asarray(jacobian)
 
 
 def normalised_derivative(at_rest: Response, moving: Response, valid: NDArray[np.bool_]) -> Array:
     """Return the rate of ``normalised_jacobian`` when the images move, by the product rule."""
-    slopes, flux = reference_slopes(at_rest.images, valid)
-    difference_rate, flux_rate = _differences(moving.images, valid)
+    differences, flux = _light(at_rest.images, valid, at_rest.normalisation)
+    difference_rate, flux_rate = _light(moving.images, valid, at_rest.normalisation)
+    slopes = differences / flux
     slope_rate = (difference_rate - slopes * flux_rate) / flux
-    dtype = at_rest.gradient.dtype
-    rate = moving.gradient - np.outer(slopes, moving.flux_gradient).astype(dtype)
-    rate -= np.outer(slope_rate, at_rest.flux_gradient).astype(dtype)
-    rate -= normalised_jacobian(at_rest, valid) * np.asarray(flux_rate, dtype=dtype)
-    rate /= np.asarray(flux, dtype=dtype)
+    rate = moving.gradient - _times(slopes, moving.flux_gradient)
+    rate -= _times(slope_rate, at_rest.flux_gradient)
+    rate -= normalised_jacobian(at_rest, valid) * flux_rate[:, None].astype(rate.dtype)
+    rate /= flux[:, None].astype(rate.dtype)
     return np.asarray(rate)
+
+
+def _times(slopes: Array, flux_gradient: Array) -> Array:
+    """Return each slope times the gradient of its flux, ``(n_slopes, n_points)``."""
+    column = slopes[:, None].astype(flux_gradient.dtype)
+    if flux_gradient.ndim == 1:
+        return np.asarray(column * flux_gradient)
+    both = column.reshape(2, -1, 1) * flux_gradient
+    return both.reshape(len(slopes), -1)
 
 
 def rotation(angle_rad: float) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Pyramid
 from service.model.pupil import PupilGrid
+from service.model.slopes import Normalisation
 from service.model.workingpoint import Halo
 
 Array = NDArray[Any]
@@ -61,7 +62,11 @@ class Response:
     """``(2 * n_valid, n_points)`` gradient of the x and y differences of the four images."""
 
     flux_gradient: Array
-    """``(n_points,)`` gradient of the mean flux per valid subaperture."""
+    """Gradient of what normalises the differences: ``(n_points,)`` of the mean flux per valid
+    subaperture; ``(n_valid, n_points)`` of each one's own flux with local normalisation."""
+
+    normalisation: Normalisation = Normalisation.GLOBAL
+    """What normalises the differences."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,6 +96,9 @@ class PyramidOptics:
 
     halo: Halo | None = None
     """What residual turbulence makes of the star; None: a flat wavefront."""
+
+    normalisation: Normalisation = Normalisation.GLOBAL
+    """Whose flux a response has the gradient of."""
 
     def __post_init__(self) -> None:
         """Refuse a modulation that the formulas cannot fold.
@@ -137,7 +145,8 @@ class PyramidOptics:
         return Response(
             images=self._images(fields, roof_y, roof_x),
             gradient=np.concatenate([b[0] for b in blocks] + [b[1] for b in blocks]),
-            flux_gradient=np.sum([b[2] for b in blocks], axis=0) / valid.sum(),
+            flux_gradient=self._flux_gradient([b[2] for b in blocks], int(valid.sum())),
+            normalisation=self.normalisation,
         )
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
@@ -145,6 +154,13 @@ class PyramidOptics:
         roof_y = self._roof(shift[1], Nodes.area(self.n_nodes))
         roof_x = self._roof(shift[0], Nodes.area(self.n_nodes))
         return self._images(self._fields(roof_y, roof_x), roof_y, roof_x)
+
+    def _flux_gradient(self, by_row: list[Array], n_valid: int) -> Array:
+        match self.normalisation:
+            case Normalisation.GLOBAL:
+                return np.asarray(np.sum(by_row, axis=(0, 1)) / n_valid)
+            case Normalisation.LOCAL:
+                return np.concatenate(by_row)
 
     @property
     def _complex(self) -> type[np.complex64] | type[np.complex128]:
@@ -218,7 +234,10 @@ class PyramidOptics:
     def _row_gradient(
         self, row: int, columns: Array, fields: Array, roof_y: _Roof, modulated_x: Array
     ) -> tuple[Array, Array, Array]:
-        """Return gradients of the x and y differences of one row, and of its total flux."""
+        """Return gradients of the x and y differences of one row, and of its flux.
+
+        With local normalisation the flux is that of every subaperture; else one line, their sum.
+        """
         along_y, _ = self._tilts()
         factor_y = (
             along_y[:, None, None]
@@ -234,10 +253,12 @@ class PyramidOptics:
         by_image_x = np.matmul(left, modulated_x[:, :, columns])
         total = by_image_x[:, 0] + by_image_x[:, 1]
         difference = by_image_x[:, 0] - by_image_x[:, 1]
+        local = self.normalisation is Normalisation.LOCAL
+        light = total if local else total.sum(axis=1, keepdims=True)
         return (
             self._fold(factor_y, difference),
             self._fold(signed_y, total),
-            self._fold(factor_y, total.sum(axis=1, keepdims=True))[0],
+            self._fold(factor_y, light),
         )
 
     def _fold(self, factor_y: Array, factor_x: Array) -> Array:

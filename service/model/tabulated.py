@@ -73,18 +73,16 @@ class TabulatedBasis:
 
     def known(self, points: Array) -> NDArray[np.bool_]:
         """Return whether the table knows the surface at every point, ``(n_points,)``."""
-        (row, _), (column, _) = self._cells(points)
-        ny, nx = self.surface_known.shape
-        inside = (row >= 0) & (row < ny - 1) & (column >= 0) & (column < nx - 1)
-        row, column = np.clip(row, 0, ny - 2), np.clip(column, 0, nx - 2)
-        corners = self.surface_known
-        return np.asarray(
-            inside
-            & corners[row, column]
-            & corners[row, column + 1]
-            & corners[row + 1, column]
-            & corners[row + 1, column + 1]
-        )
+        place = self._place(points)
+        # on a sample, within rounding, that sample is all that counts
+        low, high = np.floor(place + 1e-9).astype(int), np.ceil(place - 1e-9).astype(int)
+        last = np.array(self.surface_known.shape) - 1
+        inside = np.all((low >= 0) & (high <= last), axis=1)
+        corners = [np.clip(corner, 0, last).T for corner in (low, high)]
+        for row in (corners[0][0], corners[1][0]):
+            for column in (corners[0][1], corners[1][1]):
+                inside &= self.surface_known[row, column]
+        return np.asarray(inside)
 
     def subset(self, indices: Sequence[int] | NDArray[np.integer]) -> TabulatedBasis:
         """Return a basis of these modes only."""
@@ -94,24 +92,19 @@ class TabulatedBasis:
         """Return the same modes of the mirror seen from its other side."""
         return replace(self, y_sign=-self.y_sign)
 
-    def _cells(self, points: Array) -> tuple[tuple[NDArray[np.intp], Array], ...]:
-        """Return the table cell of every point along y and x, and where in it the point lies."""
-        ny, nx = self.surface_known.shape
-        place = points[:, ::-1] * [self.y_sign, 1.0] / self.step_subap
-        place += (np.array([ny, nx]) - 1) / 2
-        # a point on the last sample belongs to the cell before it
-        cell = np.floor(place - 1e-9).astype(np.intp)
-        return tuple((cell[:, axis], place[:, axis] - cell[:, axis]) for axis in (0, 1))
+    def _place(self, points: Array) -> Array:
+        """Return where points lie in the table, ``(n_points, 2)``: row and column."""
+        centre = (np.array(self.surface_known.shape) - 1) / 2
+        return np.asarray(points[:, ::-1] * [self.y_sign, 1.0] / self.step_subap + centre)
 
     def _splines(self, points: Array) -> tuple[tuple[NDArray[np.intp], tuple[Array, Array]], ...]:
         """Return for y and x the four table lines around every point, weights and their slopes."""
         found = []
-        for n, (cell, fraction) in zip(self.surface_known.shape, self._cells(points), strict=True):
-            within = np.clip(cell, 0, n - 2)
-            fraction = np.clip(fraction + (cell - within), 0.0, 1.0)
-            lines = within[:, None] + np.arange(-1, 3)
+        for n, place in zip(self.surface_known.shape, self._place(points).T, strict=True):
+            cell = np.clip(np.floor(place).astype(np.intp), 0, n - 2)
+            lines = cell[:, None] + np.arange(-1, 3)
             lines = np.where(lines < 0, -lines, np.where(lines > n - 1, 2 * (n - 1) - lines, lines))
-            found.append((lines, _cubic(fraction)))
+            found.append((lines, _cubic(np.clip(place - cell, 0.0, 1.0))))
         return tuple(found)
 
     def _combined(self, rows: NDArray[np.intp], columns: NDArray[np.intp], weights: Array) -> Array:

@@ -1,0 +1,142 @@
+"""How much dither, how often and where: as little as keeps α as well known as it must be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Demand:
+    """What is asked of the dither, and what it may cost."""
+
+    sigma: Array
+    """``(4,)`` 1 σ of α to be kept at all times, numeric units, model error not included."""
+
+    drift_rate: Array
+    """``(4,)`` random walk σ after one second, numeric units: the flexure."""
+
+    budget_m: float
+    """Largest RMS of all lines together on the mirror, metres OPD; never exceeded."""
+
+    window_s: float
+    """Telemetry in one estimate, seconds."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Schedule:
+    """A dither of one window every ``interval_s``."""
+
+    total_m: float
+    """RMS of all lines together, metres OPD."""
+
+    interval_s: float
+    """From the start of a window to the start of the next; ``window_s``: no pause."""
+
+    sigma: Array
+    """``(4,)`` 1 σ of α just before each window, which is when it is worst."""
+
+    sufficient: bool
+    """Whether that is what was asked for; otherwise the budget is spent and it is the best."""
+
+    mean_cost_m: float
+    """Quadratic mean of the dither over time, pauses included, metres OPD."""
+
+
+def schedule(precision: Array, demand: Demand) -> Schedule:
+    """Return the schedule that keeps ``demand.sigma`` at least cost and within the budget.
+
+    ``precision`` ``(4,)`` is κ of ``σ = κ / (A sqrt(T))``, in numeric units times m sqrt(s), as
+    measured on the last windows. A window of σ² = R every Δ seconds holds a random walk of rate q
+    at ``P² - q²Δ P - q²Δ R = 0`` before each update, so ``Δ = P² / (q² (P + R))``. Weak dither
+    often costs less than strong dither seldom; one whose window reaches just the σ asked for
+    (R = P) costs twice the least possible and leaves the longest pauses for that.
+    """
+    wanted = demand.sigma**2
+    amplitude = float(np.max(precision / (demand.sigma * np.sqrt(demand.window_s))))
+    total_m = min(amplitude, demand.budget_m)
+    interval_s = _longest_interval(precision, demand, total_m)
+    if interval_s < demand.window_s:
+        # not even without a pause: what the budget buys is the best there is
+        total_m, interval_s = demand.budget_m, demand.window_s
+        if _longest_interval(precision, demand, total_m) >= demand.window_s:
+            total_m = _least_amplitude(precision, demand)
+    walk = demand.drift_rate**2 * interval_s
+    noise = precision**2 / (total_m**2 * demand.window_s)
+    before = 0.5 * (walk + np.sqrt(walk**2 + 4.0 * walk * noise))
+    return Schedule(
+        total_m=total_m,
+        interval_s=interval_s,
+        sigma=np.sqrt(before),
+        sufficient=bool(np.all(before <= wanted * (1.0 + 1e-9))),
+        mean_cost_m=total_m * float(np.sqrt(demand.window_s / interval_s)),
+    )
+
+
+def _longest_interval(precision: Array, demand: Demand, total_m: float) -> float:
+    wanted = demand.sigma**2
+    noise = precision**2 / (total_m**2 * demand.window_s)
+    return float(np.min(wanted**2 / (demand.drift_rate**2 * (wanted + noise))))
+
+
+def _least_amplitude(precision: Array, demand: Demand) -> float:
+    """Return the weakest dither that, without pause, holds what is asked for."""
+    wanted = demand.sigma**2
+    noise = wanted**2 / (demand.drift_rate**2 * demand.window_s) - wanted
+    return float(np.max(precision / np.sqrt(noise * demand.window_s)))
+
+
+def clear_of(
+    wanted_hz: tuple[float, ...],
+    avoid_hz: tuple[float, ...],
+    *,
+    clearance_hz: float,
+    step_hz: float,
+    range_hz: tuple[float, float],
+) -> tuple[float, ...] | None:
+    """Return dither lines as near to the wanted ones as vibrations allow, or None.
+
+    Every line keeps ``clearance_hz`` from all of ``avoid_hz`` and from its fellows, no line is the
+    sum or difference of others (``f_i + f_j - f_k``, by ``step_hz`` times four), and each is a
+    multiple of ``step_hz`` so that a window holds whole periods.
+    """
+    low, high = (np.ceil(range_hz[0] / step_hz), np.floor(range_hz[1] / step_hz))
+    grid = step_hz * np.arange(low, high + 1)
+    chosen: list[float] = []
+    for wanted in wanted_hz:
+        by_distance = grid[np.argsort(np.abs(grid - wanted), kind="stable")]
+        taken = (*avoid_hz, *chosen)
+        free = (
+            float(f)
+            for f in by_distance
+            if all(abs(f - t) >= clearance_hz for t in taken)
+            and not _coincides(float(f), chosen, 4.0 * step_hz)
+        )
+        found = next(free, None)
+        if found is None:
+            return None
+        chosen.append(found)
+    return tuple(chosen)
+
+
+def _coincides(frequency: float, chosen: list[float], within_hz: float) -> bool:
+    """Return whether a line falls on a third-order product of those chosen, or makes one of them.
+
+    The pyramid is odd in the wavefront to lowest order, so products of three lines are what it
+    adds.
+    """
+    lines = [*chosen, frequency]
+    for i, first in enumerate(lines):
+        for second in lines[i:]:
+            for third in lines:
+                if third in (first, second):
+                    continue
+                product = first + second - third
+                others = [line for line in lines if line not in (first, second, third)]
+                if any(abs(product - line) < within_hz for line in others):
+                    return True
+    return False

@@ -1,0 +1,110 @@
+"""As little dither as keeps the registration as well known as it must be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.control.dithering import Demand, Schedule, clear_of, schedule
+
+KAPPA = np.array([0.02, 0.02, np.deg2rad(0.08), 0.004]) * 1e-9
+"""Magnitude 10 of the design study: 2 % of a subaperture in 1 s at 1 nm."""
+
+SLOW = np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005]) / np.sqrt(3600.0)
+
+
+def demand(sigma_subap: float = 0.005, budget_m: float = 10e-9, drift: np.ndarray = SLOW) -> Demand:
+    return Demand(
+        sigma=np.array([sigma_subap, sigma_subap, np.deg2rad(0.05), 0.002]),
+        drift_rate=drift,
+        budget_m=budget_m,
+        window_s=5.0,
+    )
+
+
+def worst_of_a_simulated_filter(found: Schedule, asked: Demand, kappa: np.ndarray) -> np.ndarray:
+    """σ before each window once a Kalman filter on this schedule has settled, ``(4,)``."""
+    noise = kappa**2 / (found.total_m**2 * asked.window_s)
+    before = np.full(4, 1.0)
+    for _ in range(20_000):
+        after = before * noise / (before + noise)
+        before = after + asked.drift_rate**2 * found.interval_s
+    return np.sqrt(before)
+
+
+@pytest.mark.parametrize("sigma_subap", [0.003, 0.005, 0.02])
+def test_a_schedule_holds_what_was_asked_for(sigma_subap):
+    asked = demand(sigma_subap)
+    found = schedule(KAPPA, asked)
+    assert found.sufficient
+    assert found.total_m <= asked.budget_m
+    assert found.interval_s >= asked.window_s
+    settled = worst_of_a_simulated_filter(found, asked, KAPPA)
+    np.testing.assert_allclose(found.sigma, settled, rtol=1e-3)
+    assert np.all(settled <= asked.sigma * 1.001)
+
+
+def test_a_dither_that_need_not_be_exact_is_weak_and_seldom():
+    strict, loose = schedule(KAPPA, demand(0.003)), schedule(KAPPA, demand(0.02))
+    assert loose.total_m < strict.total_m
+    assert loose.interval_s > 2 * strict.interval_s
+    assert loose.mean_cost_m < strict.mean_cost_m / 3
+
+
+def test_the_budget_is_never_exceeded_even_when_it_does_not_suffice():
+    asked = demand(0.003, budget_m=0.3e-9, drift=40 * SLOW)
+    found = schedule(KAPPA, asked)
+    assert not found.sufficient
+    assert (found.total_m, found.interval_s) == (asked.budget_m, asked.window_s)
+    assert found.sigma[0] > asked.sigma[0]
+
+
+def test_a_fast_flexure_is_followed_without_pause_by_no_more_than_it_needs():
+    asked = demand(0.02, budget_m=50e-9, drift=4 * SLOW)
+    found = schedule(KAPPA, asked)
+    assert found.sufficient
+    assert found.total_m < asked.budget_m
+
+
+def lines(avoid: tuple[float, ...]) -> tuple[float, ...] | None:
+    return clear_of(
+        (211.0, 239.0, 283.0, 331.0),
+        avoid,
+        clearance_hz=8.0,
+        step_hz=0.5,
+        range_hz=(200.0, 350.0),
+    )
+
+
+def test_lines_stay_where_no_vibration_is():
+    assert lines(()) == (211.0, 239.0, 283.0, 331.0)
+    assert lines((50.0, 120.0)) == (211.0, 239.0, 283.0, 331.0)
+
+
+def test_a_line_moves_away_from_a_vibration_by_the_clearance_and_no_further():
+    moved = lines((240.0,))
+    assert moved is not None
+    assert moved[1] in (232.0, 248.0)
+    assert (moved[0], *moved[2:]) == (211.0, 283.0, 331.0)
+
+
+def test_lines_on_the_products_of_others_are_moved():
+    """260 = 220 + 240 - 200: the pyramid's cubic term puts power there."""
+    moved = clear_of(
+        (200.0, 220.0, 240.0, 260.0),
+        (),
+        clearance_hz=8.0,
+        step_hz=0.5,
+        range_hz=(190.0, 350.0),
+    )
+    assert moved is not None
+    assert moved != (200.0, 220.0, 240.0, 260.0)
+    for i, a in enumerate(moved):
+        for b in moved[i:]:
+            for c in set(moved) - {a, b}:
+                others = set(moved) - {a, b, c}
+                assert all(abs(a + b - c - d) >= 2.0 for d in others)
+
+
+def test_a_spectrum_full_of_vibrations_leaves_no_room():
+    assert lines(tuple(np.arange(195.0, 360.0, 10.0))) is None

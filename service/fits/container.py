@@ -75,9 +75,13 @@ class Container:
     any_case: bool = False
     """Whether names are the same in capitals: FITS."""
 
+    numbers: Mapping[str, str] = field(default_factory=dict)
+    """Names of FITS images by their number in the file."""
+
     def find(self, name: str) -> StoredArray | None:
         """Return the array of this name, or None."""
         wanted = name.strip("/")
+        wanted = self.numbers.get(wanted, wanted)
         if not self.any_case:
             return self.arrays.get(wanted)
         return next((a for key, a in self.arrays.items() if key.lower() == wanted.lower()), None)
@@ -176,13 +180,15 @@ def _fits(path: Path) -> Iterator[Container]:
         except (OSError, ValueError, Warning) as error:
             raise MatrixError(f"{path}: damaged FITS file: {error}") from error
         arrays: dict[str, StoredArray] = {}
+        numbers: dict[str, str] = {}
         for number, hdu in enumerate(file):
             if hdu.is_image and hdu.shape:
                 name = str(hdu.header.get("EXTNAME", number))
                 array = _image(hdu, f"{path}[{name}]")
-                arrays[str(number) if name in arrays else name] = array
+                numbers[str(number)] = str(number) if name in arrays else name
+                arrays[numbers[str(number)]] = array
         facts = {str(key).lower(): value for key, value in file[0].header.items()}
-        yield Container(path=path, arrays=arrays, facts=facts, any_case=True)
+        yield Container(path=path, arrays=arrays, facts=facts, any_case=True, numbers=numbers)
 
 
 def _image(hdu: _ImageHdu, where: str) -> StoredArray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from service import events as ev
 from service.events import Command, Event
 from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.loop import close_again, on_loop
 from service.reactions.matrices import (
     Step,
     on_acknowledgement,
@@ -55,7 +56,7 @@ def _react(  # noqa: C901 - one line for each event
 ) -> Step:
     match event:
         case ev.Tick():
-            return on_tick(state, now_ns), ()
+            return close_again(on_tick(state, now_ns), now_ns)
         case ev.StatusSeen(rtc=rtc):
             return on_status(state, rtc, now_ns), ()
         case ev.SessionStarted(session=session):
@@ -68,8 +69,14 @@ def _react(  # noqa: C901 - one line for each event
             return with_alarm(state, name, text, now_ns), ()
         case ev.Noted(name=name, text=text, level=level):
             return logged(state, name, text, now_ns, level), ()
-        case ev.Measure() | ev.MatrixMeasured() | ev.JobFailed(effect=ev.AskMeasurement()):
+        case ev.Measure() | ev.GiveUp() | ev.MatrixMeasured():
             return on_measurement(state, event, policy, now_ns)
+        case ev.JobFailed(effect=ev.AskMeasurement()):
+            return on_measurement(state, event, policy, now_ns)
+        case ev.SetLoop() | ev.Ramp() | ev.LoopAnswered():
+            return on_loop(state, event, now_ns)
+        case ev.JobFailed(effect=ev.AskLoop() | ev.AskRamp()):
+            return on_loop(state, event, now_ns)
         case ev.WindowFitted() if state.measuring is not None:
             return refuse_window(state, MEASURING, now_ns), ()
         case ev.WindowFitted(estimate=estimate):

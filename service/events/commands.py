@@ -94,6 +94,68 @@ class Measure:
     """Of a sine."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GiveUp:
+    """Wait no longer for an interaction matrix; the wire has no way to stop the RTC's work."""
+
+    id: str
+    """Of the measurement."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GainGroup:
+    """One gain for a range of modes."""
+
+    first: int
+    last: int
+    """0-based basis indices, both included."""
+
+    gain: float
+    """Loop gain; 0 leaves these modes alone."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetLoop:
+    """Change the loop; what is None stays as it is."""
+
+    closed: bool | None = None
+    """False: open it."""
+
+    gains: tuple[GainGroup, ...] | None = None
+    """Modes in no group keep their gain."""
+
+    leak: float | None = None
+    """Per frame; 1 forgets nothing."""
+
+    n_controlled: int | None = None
+    """Takes effect with the next reconstructor of that many modes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ramp:
+    """Have the RTC try gains on groups of modes; None: the service's own choice."""
+
+    groups: tuple[tuple[int, int], ...] | None = None
+    """First and last mode of each, both included."""
+
+    gains: tuple[float, ...] | None = None
+    """Tried in this order."""
+
+    step_s: float | None = None
+    """How long each is tried, settling included."""
+
+
 Command = (
-    SetMode | Refit | StartDither | StopDither | Approve | Reject | Publish | Rollback | Measure
+    SetMode
+    | Refit
+    | StartDither
+    | StopDither
+    | Approve
+    | Reject
+    | Publish
+    | Rollback
+    | Measure
+    | GiveUp
+    | SetLoop
+    | Ramp
 )

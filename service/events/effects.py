@@ -66,6 +66,31 @@ class AskMeasurement:
     record: MeasurementRecord
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskLoop:
+    """Ask the RTC to change its loop; None leaves a value as it is."""
+
+    id: str
+    closed: bool | None = None
+    gains: tuple[float, ...] | None = None
+    """One for each mode of the basis."""
+
+    leak: float | None = None
+    n_controlled: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskRamp:
+    """Ask the RTC to try gains on groups of modes."""
+
+    id: str
+    groups: tuple[tuple[int, int], ...]
+    """First and last mode of each, both included."""
+
+    gains: tuple[float, ...]
+    frames_per_gain: int
+
+
 Effect = (
     MakeMatrix
     | CopyMatrix
@@ -75,4 +100,6 @@ Effect = (
     | AskDither
     | AskNoDither
     | AskMeasurement
+    | AskLoop
+    | AskRamp
 )

@@ -126,6 +126,15 @@ class DitherAnswered:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LoopAnswered:
+    """The RTC accepted or refused a change of its loop, or a gain ramp."""
+
+    id: str
+    accepted: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MatrixMeasured:
     """A measured interaction matrix is one step further: begun, refused, failed or stored."""
 
@@ -156,6 +165,7 @@ Event = (
     | MarginJudged
     | Acknowledged
     | DitherAnswered
+    | LoopAnswered
     | MatrixMeasured
     | JobFailed
 )

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from service import events as ev
-from service.errors import CommandError
+from service.errors import CommandError, UnknownIdError
 from service.events import Event
 from service.reactions.journal import logged
+from service.reactions.loop import close_again
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import (
@@ -45,8 +46,21 @@ LONGEST_S = 3600.0
 MEASURING = "an interaction matrix is being measured: these frames are no ordinary telemetry"
 
 _SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
-_OVER = (MeasureState.REFUSED, MeasureState.FAILED, MeasureState.STORED)
-_WAIT_FOR_IT = (ev.StartDither, ev.Refit, ev.Approve, ev.Publish, ev.Rollback)
+_OVER = (
+    MeasureState.REFUSED,
+    MeasureState.FAILED,
+    MeasureState.STORED,
+    MeasureState.GIVEN_UP,
+)
+_WAIT_FOR_IT = (
+    ev.StartDither,
+    ev.Refit,
+    ev.Approve,
+    ev.Publish,
+    ev.Rollback,
+    ev.SetLoop,
+    ev.Ramp,
+)
 
 
 def meanwhile(state: TrackerState, event: Event, now_ns: int) -> TrackerState:
@@ -64,7 +78,7 @@ def meanwhile(state: TrackerState, event: Event, now_ns: int) -> TrackerState:
         case _ if isinstance(event, _WAIT_FOR_IT):
             raise CommandError(
                 f"{type(event).__name__}: interaction matrix {current.id} is being measured; "
-                "wait for it"
+                "wait for it, or give it up"
             )
         case ev.RtcVanished():
             return _failed(state, current, "the RTC vanished", now_ns)
@@ -75,16 +89,20 @@ def meanwhile(state: TrackerState, event: Event, now_ns: int) -> TrackerState:
 
 
 def on_measurement(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
-    """Ask for a matrix, or note how far one is.
+    """Ask for a matrix, note how far one is, or wait for it no longer.
 
     Raises
     ------
     CommandError
-        If none can be measured now.
+        If none can be measured now, or the one to be given up is over.
+    UnknownIdError
+        If nobody has heard of the one to be given up.
     """
     match event:
         case ev.Measure():
             return _ask(state, event, policy, now_ns)
+        case ev.GiveUp(id=measurement_id):
+            return _give_up(state, measurement_id, now_ns)
         case ev.MatrixMeasured(record=record):
             return _heard(state, record, now_ns), ()
         case ev.JobFailed(effect=ev.AskMeasurement(record=record), text=text):
@@ -110,6 +128,26 @@ def _ask(state: TrackerState, command: ev.Measure, policy: Policy, now_ns: int) 
     text = f"{record.id}: {record.pattern} of {len(record.modes)} modes"
     state = logged(_with(state, record), "measurement.asked", text, now_ns)
     return state, (ev.AskMeasurement(record=record),)
+
+
+def _give_up(state: TrackerState, measurement_id: str, now_ns: int) -> Step:
+    """Wait no longer; close the loop again if the measurement has opened it.
+
+    The wire has no way to end a measurement: the RTC may go on, and until it is done refuse.
+    """
+    record = state.measurement(measurement_id)
+    if record is None:
+        raise UnknownIdError(f"measurement {measurement_id}: nobody has heard of it")
+    if not record.under_way:
+        raise CommandError(f"{measurement_id} is {record.state}: there is nothing to give up")
+    text = "given up by the operator; the RTC may go on with it, what it sends is ignored"
+    state = _with(state, replace(record, state=MeasureState.GIVEN_UP, reason=text))
+    state = logged(state, "measurement.given-up", f"{measurement_id}: {text}", now_ns)
+    if record.opens_loop and record.closed_before:
+        return close_again(replace(state, close_since_ns_utc=now_ns), now_ns)
+    lasts_ns = round((record.duration_s or 0.0) * SECOND_NS)
+    until_ns = (record.asked_ns_utc or now_ns) + lasts_ns
+    return replace(state, retry_ns_utc=max(state.retry_ns_utc, until_ns)), ()
 
 
 def _occupied(state: TrackerState) -> str:
@@ -147,6 +185,7 @@ def _planned(command: ev.Measure, rtc: RtcView, policy: Policy, now_ns: int) -> 
         frequency_hz=lines,
         duration_s=duration_s,
         asked_ns_utc=now_ns,
+        closed_before=rtc.loop != "open",
     )
 
 
@@ -154,13 +193,15 @@ def _heard(state: TrackerState, record: MeasurementRecord, now_ns: int) -> Track
     """Take over how far a measurement is; one that is over does not begin again."""
     known = state.measurement(record.id)
     if known is not None:
-        if known.state in _OVER and record.state not in _OVER:
+        given_up = known.state is MeasureState.GIVEN_UP
+        if given_up or (known.state in _OVER and record.state not in _OVER):
             return state
         record = replace(
             record,
             frequency_hz=known.frequency_hz,
             duration_s=known.duration_s,
             asked_ns_utc=known.asked_ns_utc,
+            closed_before=known.closed_before,
             start_seq=known.start_seq if record.start_seq is None else record.start_seq,
         )
     if record.state is MeasureState.FAILED:
@@ -179,8 +220,12 @@ def _watched(state: TrackerState, record: MeasurementRecord, now_ns: int) -> Tra
     asked_ns, rtc = record.asked_ns_utc or now_ns, state.rtc
     if now_ns - asked_ns > LONGEST_S * SECOND_NS:
         return _failed(state, record, f"no matrix came within {LONGEST_S:.0f} s", now_ns)
-    opened = record.pattern is not MeasurePattern.SINE
-    over = opened and rtc is not None and rtc.loop == "closed" and record.start_seq is not None
+    over = (
+        record.opens_loop
+        and rtc is not None
+        and rtc.loop == "closed"
+        and record.start_seq is not None
+    )
     if not over:
         return _with(state, replace(record, overdue_since_ns_utc=None))
     since_ns = record.overdue_since_ns_utc or now_ns
@@ -191,6 +236,9 @@ def _watched(state: TrackerState, record: MeasurementRecord, now_ns: int) -> Tra
 
 
 def _failed(state: TrackerState, record: MeasurementRecord, text: str, now_ns: int) -> TrackerState:
+    known = state.measurement(record.id)
+    if known is not None and known.state is MeasureState.GIVEN_UP:
+        return state
     state = _with(state, replace(record, state=MeasureState.FAILED, reason=text))
     return logged(state, "measurement.failed", f"{record.id}: {text}", now_ns, Level.WARNING)
 

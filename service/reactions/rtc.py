@@ -77,7 +77,8 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     )
     if rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None:
         state = with_in_use(state, rtc.cm_id)
-    if rtc.loop == "open":
+    measuring = state.measuring
+    if rtc.loop == "open" and not (measuring is not None and measuring.opens_loop):
         state = with_alarm(state, "loop-open", "the loop is open: close it to calibrate", now_ns)
     else:
         state = without_alarm(state, "loop-open", now_ns)

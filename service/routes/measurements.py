@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.errors import UnknownIdError
-from service.events import Measure
-from service.routes.operating import AcceptedView, Positive, Request
+from service.events import GiveUp, Measure
+from service.routes.operating import AcceptedView, Positive, Request, accepted
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.schemas import View
 from service.routes.service import ServiceDep
@@ -79,7 +79,7 @@ class MeasurementView(View):
 
     id: str
     state: MeasureState
-    """"asked", "running", "refused", "failed" or "stored"."""
+    """"asked", "running", "refused", "failed", "stored" or "given-up"."""
 
     reason: str
     """Why there is no matrix."""
@@ -186,6 +186,19 @@ async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Mea
     if record is None:
         raise UnknownIdError(f"measurement {measurement_id}: nobody has heard of it")
     return MeasurementView.model_validate(record)
+
+
+@router.delete("/measurements/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
+async def give_up(service: ServiceDep, measurement_id: MeasurementId) -> AcceptedView:
+    """Wait no longer for a matrix under way; one that is stored stays.
+
+    Nothing on the wire ends the RTC's own work: it may go on to the end, and refuse other commands
+    until then. The service ignores what comes of it and asks, as often as it takes, for the loop
+    to be closed again if it was closed before.
+    """
+    return await accepted(
+        service, GiveUp(id=measurement_id), measurement=f"{_ALL}/{measurement_id}"
+    )
 
 
 @router.get(

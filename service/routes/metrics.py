@@ -15,7 +15,7 @@ from service import __version__
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.routes.schemas import age_s
 from service.routes.service import Link, Snapshot
-from service.state import MatrixState, Mode, TrackerState
+from service.state import MatrixState, MeasurePattern, Mode, TrackerState
 
 _LINK_COUNTERS = {
     "batches_received": "Telemetry batches taken in",
@@ -56,6 +56,7 @@ class SnapshotCollector(Collector):
         yield from _of_link(snapshot.link)
         yield from _of_registration(snapshot)
         yield from _of_reconstructors(snapshot.tracker)
+        yield from _of_measurement(snapshot)
         alarms = {alarm.name: 1 for alarm in snapshot.tracker.alarms}
         yield _gauge("alarms", "Alarms that last", len(alarms))
         yield _labelled_gauge("alarm", "1 for each alarm that lasts", "name", alarms)
@@ -106,6 +107,19 @@ def _of_reconstructors(tracker: TrackerState) -> Iterator[Metric]:
     yield _gauge("worst_pole_radius", "Of the reconstructor in use, 1 is unstable", worst)
     yield _gauge("pole_radius_bound", "Largest radius that is accepted", tracker.margin.bound)
     yield _gauge("stability_margin", "1 minus the worst pole radius", 1.0 - worst)
+
+
+def _of_measurement(snapshot: Snapshot) -> Iterator[Metric]:
+    current = snapshot.tracker.measuring
+    patterns = {
+        str(pattern): current is not None and current.pattern is pattern
+        for pattern in MeasurePattern
+    }
+    text = "1 for the pattern of the interaction matrix being measured"
+    yield _labelled_gauge("measuring", text, "pattern", patterns)
+    if current is not None and current.asked_ns_utc is not None:
+        age_s = (snapshot.now_ns - current.asked_ns_utc) / 1e9
+        yield _gauge("measuring_seconds", "Since it was asked for", age_s)
 
 
 def _four(prefix: str, text: str, vector: NDArray[np.float64]) -> Iterator[Metric]:

@@ -117,7 +117,8 @@ class AcceptedView(View):
     """Where to look for what becomes of it."""
 
 
-async def _accepted(service: Service, command: Command, **links: str) -> AcceptedView:
+async def accepted(service: Service, command: Command, **links: str) -> AcceptedView:
+    """Hand a command on; say what was set in motion and where to look for what becomes of it."""
     text = await service.submit(command)
     return AcceptedView(text=text, links={"state": "/v1/state", "events": "/v1/events", **links})
 
@@ -133,7 +134,7 @@ _ALL = "/v1/reconstructors"
 async def refit(service: ServiceDep, body: RefitRequest | None = None) -> AcceptedView:
     """Compute a reconstructor for the current registration; gate and mode apply as always."""
     n_modes = None if body is None else body.n_modes
-    return await _accepted(service, Refit(n_modes=n_modes), reconstructors=_ALL)
+    return await accepted(service, Refit(n_modes=n_modes), reconstructors=_ALL)
 
 
 @router.post("/dither", status_code=202)
@@ -143,14 +144,14 @@ async def dither(
 ) -> AcceptedView:
     """Start or stop the dither."""
     if isinstance(body, StopDitherRequest):
-        return await _accepted(service, StopDither())
+        return await accepted(service, StopDither())
     command = StartDither(
         modes=None if body.modes is None else tuple(body.modes),
         amplitude_m=body.amplitude_m,
         frequency_hz=None if body.frequency_hz is None else tuple(body.frequency_hz),
         duration_s=body.duration_s,
     )
-    return await _accepted(service, command)
+    return await accepted(service, command)
 
 
 @router.post("/reconstructors/{id}/approve", status_code=202, responses={**UNKNOWN})
@@ -158,7 +159,7 @@ async def approve(
     service: ServiceDep, matrix_id: MatrixId, _body: NoFields | None = None
 ) -> AcceptedView:
     """Publish a proposed reconstructor."""
-    return await _accepted(service, Approve(id=matrix_id), reconstructor=_link(matrix_id))
+    return await accepted(service, Approve(id=matrix_id), reconstructor=_link(matrix_id))
 
 
 @router.post("/reconstructors/{id}/reject", status_code=202, responses={**UNKNOWN})
@@ -167,7 +168,7 @@ async def reject(
 ) -> AcceptedView:
     """Discard a proposed reconstructor."""
     command = Reject(id=matrix_id, reason="" if body is None else body.reason)
-    return await _accepted(service, command, reconstructor=_link(matrix_id))
+    return await accepted(service, command, reconstructor=_link(matrix_id))
 
 
 @router.post("/reconstructors/{id}/publish", status_code=202, responses={**UNKNOWN})
@@ -175,16 +176,16 @@ async def publish(
     service: ServiceDep, matrix_id: MatrixId, _body: NoFields | None = None
 ) -> AcceptedView:
     """Send a known reconstructor again, under a new id, after it has passed the gate anew."""
-    return await _accepted(service, Publish(id=matrix_id), reconstructors=_ALL)
+    return await accepted(service, Publish(id=matrix_id), reconstructors=_ALL)
 
 
 @router.post("/rollback", status_code=202)
 async def rollback(service: ServiceDep, _body: NoFields | None = None) -> AcceptedView:
     """Go back to the reconstructor that was in use before the present one."""
-    return await _accepted(service, Rollback(), reconstructors=_ALL)
+    return await accepted(service, Rollback(), reconstructors=_ALL)
 
 
 @router.put("/mode", status_code=202)
 async def mode(service: ServiceDep, body: ModeRequest) -> AcceptedView:
     """Choose how much the service may do by itself."""
-    return await _accepted(service, SetMode(mode=body.mode))
+    return await accepted(service, SetMode(mode=body.mode))

@@ -11,7 +11,15 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.routes.service import Snapshot
-from service.state import Level, MatrixState, Mode, Registration
+from service.state import (
+    CommandState,
+    Level,
+    MatrixState,
+    MeasurePattern,
+    MeasureState,
+    Mode,
+    Registration,
+)
 
 
 def _finite_or_none(value: float | None) -> float | None:
@@ -210,6 +218,28 @@ class ReconstructorsView(View):
     """Oldest first."""
 
 
+class GainGroupView(View):
+    """Neighbouring modes with the same loop gain."""
+
+    first: int
+    """0-based basis index of the first mode."""
+
+    last: int
+    """Of the last one; it belongs to the group."""
+
+    gain: Number
+
+
+def _by_group(gains: tuple[float, ...]) -> list[dict[str, float]]:
+    groups: list[dict[str, float]] = []
+    for mode, gain in enumerate(gains):
+        if groups and groups[-1]["gain"] == gain:
+            groups[-1]["last"] = mode
+        else:
+            groups.append({"first": mode, "last": mode, "gain": gain})
+    return groups
+
+
 class RtcView(View):
     """The RTC as its last status message shows it."""
 
@@ -221,6 +251,9 @@ class RtcView(View):
     delay_frames: Number
     leak: Number
     """Per frame."""
+
+    gains: Annotated[tuple[GainGroupView, ...], BeforeValidator(_by_group)]
+    """Of all modes of the basis, 0 where uncontrolled."""
 
     n_controlled: int
     n_modes: int
@@ -255,6 +288,44 @@ class DitherView(View):
     duration_s: Number
     start_seq: int | None
     """First frame that contains it; null until the RTC has accepted."""
+
+
+class MeasuringView(View):
+    """The interaction matrix being measured."""
+
+    id: str
+    """Of the matrix to come: ``/v1/measurements/{id}`` says more."""
+
+    state: MeasureState
+    """"asked" or "running"."""
+
+    pattern: MeasurePattern
+    modes: tuple[int, ...]
+    """0-based basis indices."""
+
+    asked_ns_utc: int | None
+    """Since when."""
+
+    opens_loop: bool
+    """Whether the loop is open meanwhile."""
+
+
+class LoopCommandView(View):
+    """The last change of the loop, or gain ramp, asked of the RTC."""
+
+    id: str
+    text: str
+    """What was asked for."""
+
+    state: CommandState
+    """"asked", "accepted", "refused" or "failed"."""
+
+    reason: str
+    """Why it was refused, or has failed."""
+
+    asked_ns_utc: int
+    lasts_s: float
+    """How long the RTC is busy with it, at its nominal rate; 0: it changes at once."""
 
 
 class WatchdogView(View):
@@ -355,6 +426,12 @@ class StateView(View):
     basis_id: str | None
     config_id: str | None
     dither: DitherView | None
+    measuring: MeasuringView | None
+    """Null: none is."""
+
+    loop_command: LoopCommandView | None
+    """Null: none was asked for."""
+
     watchdog: WatchdogView | None
     alarms: tuple[AlarmView, ...]
     windows_accepted: int

@@ -22,24 +22,16 @@ from service.model.instrument import Instrument
 from service.reactions.matrices import extended_gains
 from service.rtc_bridge import Bridge
 from service.runtime import translate
+from service.runtime.asking import Question, ask
 from service.runtime.crew import Crew
 from service.state import (
     MatrixState,
-    MeasurementRecord,
-    MeasureState,
     ReconstructorRecord,
     Registration,
     RtcView,
     TrackerState,
 )
-from service.wire import (
-    DitherAction,
-    DitherKind,
-    DitherRequest,
-    LoopRequest,
-    checksum,
-    layout_of,
-)
+from service.wire import LoopRequest, checksum, layout_of
 from service.worker import Workbench
 
 GAIN_SAFETY = 1.1
@@ -103,10 +95,8 @@ class Deeds:
                 return await self._fetch(matrix_id)
             case ev.SendMatrix():
                 return await self._send(effect, state)
-            case ev.AskDither() | ev.AskNoDither():
-                return await self._dither(effect)
-            case ev.AskMeasurement(record=record):
-                return await self._measure(record)
+            case _:
+                return await self._ask(effect)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)`` from memory or the archive.
@@ -153,12 +143,12 @@ class Deeds:
             await asyncio.to_thread(store, record, heard.matrix, instrument)
         return ev.MatrixMeasured(record=record)
 
-    async def _measure(self, record: MeasurementRecord) -> Event:
-        reply = await self._bridge.command(translate.measure_request(record))
-        state = MeasureState.RUNNING if reply.accepted else MeasureState.REFUSED
-        return ev.MatrixMeasured(
-            record=replace(record, state=state, reason=reply.reason, start_seq=reply.start_seq)
-        )
+    async def _ask(self, question: Question) -> Event | None:
+        answer = await ask(self._bridge, question, self._clock_ns)
+        if isinstance(question, ev.AskLoop) and isinstance(answer, ev.LoopAnswered):
+            n_modes = question.n_controlled if answer.accepted else None
+            self._commanded_modes = n_modes or self._commanded_modes
+        return answer
 
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
@@ -256,31 +246,6 @@ class Deeds:
         if not reply.accepted:
             raise CommandError(f"the RTC will not control {effect.n_modes} modes: {reply.reason}")
         self._commanded_modes = effect.n_modes
-
-    async def _dither(self, effect: ev.AskDither | ev.AskNoDither) -> Event | None:
-        if isinstance(effect, ev.AskNoDither):
-            stop = DitherRequest(id=f"stop-{self._clock_ns()}", action=DitherAction.STOP)
-            reply = await self._bridge.command(stop)
-            if not reply.accepted:
-                raise CommandError(f"the RTC did not stop the dither: {reply.reason}")
-            return None
-        dither = effect.dither
-        request = DitherRequest(
-            id=dither.id,
-            action=DitherAction.START,
-            kind=DitherKind.SINE,
-            modes=dither.modes,
-            amplitude_m=dither.amplitude_m,
-            frequency_hz=dither.frequency_hz,
-            duration_s=dither.duration_s,
-        )
-        reply = await self._bridge.command(request)
-        return ev.DitherAnswered(
-            id=dither.id,
-            accepted=reply.accepted,
-            reason=reply.reason,
-            start_seq=reply.start_seq,
-        )
 
     def _record(
         self, n_modes: int, why: str, registration: Registration | None, parent: str | None

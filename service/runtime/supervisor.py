@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service import events as ev
 from service.archive import Archive
-from service.errors import CommandError, LinkError, ModelError, PyrcalError, WorkerError
+from service.errors import ModelError, PyrcalError, WorkerError
 from service.estimation.instrumental import Loop
 from service.estimation.lockin import Spectra, WindowRefused
 from service.events import Command, Effect, Event
@@ -26,6 +26,7 @@ from service.reactions.policy import Policy
 from service.routes.service import Snapshot
 from service.rtc_bridge import Bridge
 from service.runtime import translate
+from service.runtime.asking import why_not
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.runtime.streams import Streams, fed, shape_mismatch, with_dither, with_rtc
@@ -94,20 +95,14 @@ class Supervisor:
         effects = self._post(command)
         now_ns, name = time.time_ns(), type(command).__name__
         await asyncio.to_thread(self._archive.audit, now_ns, "operator", name, str(command))
-        if isinstance(command, ev.Measure):
+        if isinstance(command, ev.Measure | ev.SetLoop | ev.Ramp):
             asked = self._running - running
             if asked:  # a quick refusal may be here before the audit trail is written
                 await asyncio.wait(asked)
-            self._check_measuring(command.id)
+            refusal = why_not(effects, self._state)
+            if refusal is not None:
+                raise refusal
         return f"{name}: {len(effects)} action(s) under way"
-
-    def _check_measuring(self, measurement_id: str) -> None:
-        """Let whoever asked for a matrix know why there will be none."""
-        record = self._state.measurement(measurement_id)
-        if record is not None and record.state is MeasureState.REFUSED:
-            raise CommandError(f"the RTC refused: {record.reason}")
-        if record is not None and record.state is MeasureState.FAILED:
-            raise LinkError(record.reason)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)``."""
@@ -306,6 +301,11 @@ class Supervisor:
             self._post(event)
 
     async def _keep_measured(self, heard: MeasuredMatrix) -> None:
+        known = self._state.measurement(heard.manifest.id)
+        if known is not None and known.state is MeasureState.GIVEN_UP:
+            text = f"{known.id} came after it had been given up: it is not kept"
+            self._note("measurement.ignored", text, Level.INFO)
+            return
         try:
             self._post(await self._deeds.keep_measured(heard))
         except PyrcalError as error:

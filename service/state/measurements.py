@@ -40,6 +40,9 @@ class MeasureState(StrEnum):
     STORED = "stored"
     """The matrix is in the archive."""
 
+    GIVEN_UP = "given-up"
+    """An operator waits for it no longer; the RTC may go on, what it sends is ignored."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasurementRecord:
@@ -71,6 +74,9 @@ class MeasurementRecord:
     start_seq: int | None = None
     """First frame that contained a stroke; None: not known."""
 
+    closed_before: bool = False
+    """Whether the loop was closed when it was asked for."""
+
     overdue_since_ns_utc: int | None = None
     """Since when everything looks as if it were over, but no matrix has come."""
 
@@ -91,3 +97,13 @@ class MeasurementRecord:
     config_id: str | None = None
     sha256: str = ""
     """Of the matrix as it travels, 64 lower-case hex digits."""
+
+    @property
+    def opens_loop(self) -> bool:
+        """Whether the loop is open while it is measured."""
+        return self.pattern is not MeasurePattern.SINE
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the service waits for the matrix."""
+        return self.state in {MeasureState.ASKED, MeasureState.RUNNING}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,3 +58,34 @@ class RtcView:
 
     dither: DitherView | None = None
     """What is running, where it is a sine that has been announced to the frame; else None."""
+
+
+class CommandState(StrEnum):
+    """What has become of a command to the RTC."""
+
+    ASKED = "asked"
+    """The RTC has not answered yet."""
+
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+    """The RTC would not; the reason is the RTC's."""
+
+    FAILED = "failed"
+    """No answer: whether it was carried out is unknown."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopCommand:
+    """A change of the loop, or a gain ramp, asked of the RTC."""
+
+    id: str
+    text: str
+    """What was asked for."""
+
+    state: CommandState
+    asked_ns_utc: int
+    lasts_s: float = 0.0
+    """How long the RTC is busy with it, at its nominal rate; 0: it changes at once."""
+
+    reason: str = ""
+    """Why it was refused, or has failed."""

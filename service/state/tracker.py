@@ -7,10 +7,10 @@ from enum import StrEnum
 
 from service.control.gate import GateVerdict
 from service.state.journal import Alarm, LogEntry
-from service.state.measurements import MeasurementRecord, MeasureState
+from service.state.measurements import MeasurementRecord
 from service.state.reconstructors import ReconstructorRecord
 from service.state.registration import HistoryEntry, Registration, Watchdog
-from service.state.rtc import DitherView, RtcView
+from service.state.rtc import DitherView, LoopCommand, RtcView
 
 
 class Mode(StrEnum):
@@ -67,6 +67,12 @@ class TrackerState:
     dither_stopped: bool = False
     """An operator stopped it: the service does not start another by itself."""
 
+    loop_command: LoopCommand | None = None
+    """The last change of the loop that was asked of the RTC; None: none was."""
+
+    close_since_ns_utc: int | None = None
+    """Since when the loop should close again after a measurement that was given up; None: no."""
+
     making_since_ns_utc: int | None = None
     """When the reconstructor now being computed was asked for; None: none is."""
 
@@ -95,5 +101,4 @@ class TrackerState:
     @property
     def measuring(self) -> MeasurementRecord | None:
         """The measurement under way, or None."""
-        under_way = {MeasureState.ASKED, MeasureState.RUNNING}
-        return next((r for r in reversed(self.measurements) if r.state in under_way), None)
+        return next((r for r in reversed(self.measurements) if r.under_way), None)

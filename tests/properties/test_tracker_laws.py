@@ -10,9 +10,17 @@ from service import events as ev
 from service.errors import CommandError
 from service.estimation.lockin import WindowRefused
 from service.reactions.journal import LOG_LENGTH
+from service.reactions.measurements import MEASUREMENTS_KEPT
 from service.reactions.shelf import RECONSTRUCTORS_KEPT
 from service.reactions.windows import HISTORY_LENGTH
-from service.state import MatrixState, Mode, TrackerState
+from service.state import (
+    MatrixState,
+    MeasurementRecord,
+    MeasurePattern,
+    MeasureState,
+    Mode,
+    TrackerState,
+)
 from service.tracker import step
 from tests.unit.reactions.situations import (
     ALPHA,
@@ -26,6 +34,7 @@ from tests.unit.reactions.situations import (
     verdict,
 )
 
+MEASURED = ["im-1", "im-2", "im-3", "im-4"]
 IDS = ["initial", "cm-1", "cm-2", "cm-3", "cm-4"]
 SESSIONS = ["s1", "s2"]
 TROUBLES = ["second-rtc", "basis-mismatch", "instrument-mismatch", "loop-diverging", "other"]
@@ -38,6 +47,10 @@ COMMANDS = (
     ev.Reject,
     ev.Publish,
     ev.Rollback,
+    ev.Measure,
+    ev.GiveUp,
+    ev.SetLoop,
+    ev.Ramp,
 )
 
 ids = st.sampled_from(IDS)
@@ -76,6 +89,20 @@ commands = st.one_of(
     st.builds(ev.Reject, id=ids),
     st.builds(ev.Publish, id=ids),
     st.just(ev.Rollback()),
+    st.builds(
+        ev.Measure,
+        id=st.sampled_from(MEASURED),
+        pattern=st.sampled_from([MeasurePattern.PUSH_PULL_MODAL, MeasurePattern.SINE]),
+        modes=st.sampled_from([None, (3, 9), (594,)]),
+    ),
+    st.builds(ev.GiveUp, id=st.sampled_from(MEASURED)),
+    st.builds(
+        ev.SetLoop,
+        closed=st.sampled_from([None, True, False]),
+        gains=st.sampled_from([None, (ev.GainGroup(first=0, last=299, gain=0.3),)]),
+        n_controlled=st.sampled_from([None, 300, 595]),
+    ),
+    st.builds(ev.Ramp, groups=st.sampled_from([None, ((0, 400),)])),
 )
 heard = st.one_of(
     st.just(ev.Tick()),
@@ -103,6 +130,22 @@ heard = st.one_of(
         frame_seq=st.none() | st.integers(0, 10**6),
     ),
     st.builds(lambda name: ev.MatrixFetched(record=foreign(name)), ids),
+    st.builds(
+        lambda name, state, reason: ev.MatrixMeasured(
+            record=MeasurementRecord(
+                id=name,
+                state=state,
+                pattern=MeasurePattern.PUSH_PULL_MODAL,
+                modes=(0, 1),
+                amplitude_m=(1e-8, 1e-8),
+                n_average=1,
+                reason=reason,
+            )
+        ),
+        st.sampled_from([*MEASURED, "im-other"]),
+        st.sampled_from([MeasureState.STORED, MeasureState.STORED, MeasureState.FAILED]),
+        st.just("r"),
+    ),
 )
 answers = [st.just(how) for how in ("done",) * 9 + ("refused",) * 2 + ("failed",) * 2]
 # one_of counts the innermost alternatives: the answers need their own weight
@@ -155,6 +198,24 @@ class Night:
         effect = self.open.pop(0)
         if how == "failed":
             return ev.JobFailed(effect=effect, text="it could not be done")
+        return self.of_the_rtc(effect, how) or self.of_matrices(effect, how)
+
+    def of_the_rtc(self, effect, how):
+        accepted = how == "done"
+        match effect:
+            case ev.AskDither(dither=dither):
+                return ev.DitherAnswered(
+                    id=dither.id, accepted=accepted, reason="r", start_seq=5 if accepted else None
+                )
+            case ev.AskMeasurement(record=asked):
+                state = MeasureState.RUNNING if accepted else MeasureState.REFUSED
+                return ev.MatrixMeasured(record=replace(asked, state=state, start_seq=9))
+            case ev.AskLoop(id=command) | ev.AskRamp(id=command):
+                return ev.LoopAnswered(id=command, accepted=accepted, reason="r")
+            case _:
+                return None
+
+    def of_matrices(self, effect, how):
         match effect:
             case ev.MakeMatrix() | ev.CopyMatrix() as asked:
                 self.n_made += 1
@@ -162,11 +223,6 @@ class Night:
                 n = asked.n_modes if isinstance(asked, ev.MakeMatrix) else 400
                 made = record(f"made-{self.n_made}", state, n_modes=n, created_ns_utc=self.now_ns)
                 return ev.MatrixMade(record=made, wanted=isinstance(asked, ev.CopyMatrix))
-            case ev.AskDither(dither=dither):
-                accepted = how == "done"
-                return ev.DitherAnswered(
-                    id=dither.id, accepted=accepted, reason="r", start_seq=5 if accepted else None
-                )
             case ev.FetchMatrix(id=matrix_id):
                 return ev.MatrixFetched(record=foreign(matrix_id))
             case ev.JudgeMatrix(id=matrix_id):
@@ -192,6 +248,7 @@ def check_bounds(state):
     assert len(state.log) <= LOG_LENGTH
     assert len(state.history) <= HISTORY_LENGTH
     assert len(state.reconstructors) <= RECONSTRUCTORS_KEPT
+    assert len(state.measurements) <= MEASUREMENTS_KEPT
     assert len({alarm.name for alarm in state.alarms}) == len(state.alarms)
 
 
@@ -287,6 +344,55 @@ def test_an_uncertainty_is_never_nothing_nor_negative(story):
         if known is not None:
             assert np.all(np.linalg.eigvalsh(known.covariance) > 0.0)
             assert np.all(known.sigma >= known.floor)
+
+
+@LAWS
+@given(stories)
+def test_while_a_matrix_is_measured_nothing_else_is_asked_of_the_rtc_or_learnt(story):
+    night = Night()
+    for event, after_s in story:
+        measuring, accepted = night.state.measuring, night.state.windows_accepted
+        night.tell(event, after_s)
+        if measuring is not None and night.state.measuring is not None:
+            assert night.state.measuring.id == measuring.id
+            assert night.state.windows_accepted == accepted
+            sent_before = {r.id for r in night.state.reconstructors if r.id.startswith("made")}
+            for effect in night.last:
+                assert isinstance(effect, ev.AskNoDither | ev.SendMatrix)
+                if isinstance(effect, ev.SendMatrix):
+                    assert effect.id in sent_before
+
+
+@LAWS
+@given(stories)
+def test_a_measurement_that_is_over_stays_over_and_given_up_stays_given_up(story):
+    over = {
+        MeasureState.REFUSED,
+        MeasureState.FAILED,
+        MeasureState.STORED,
+        MeasureState.GIVEN_UP,
+    }
+    night = Night()
+    for event, after_s in story:
+        before = {r.id: r.state for r in night.state.measurements}
+        night.tell(event, after_s)
+        after = {r.id: r.state for r in night.state.measurements}
+        for name, state in before.items():
+            assert state not in over or after[name] in over
+            if state is MeasureState.GIVEN_UP:
+                assert after[name] is MeasureState.GIVEN_UP
+
+
+@LAWS
+@given(stories)
+def test_an_open_loop_is_an_alarm_unless_a_measurement_has_opened_it(story):
+    night = Night()
+    for event, after_s in story:
+        night.tell(event, after_s)
+        if isinstance(event, ev.StatusSeen) and night.state.rtc.loop == "open":
+            measuring = night.state.measuring
+            expected = measuring is None or not measuring.opens_loop
+            assert ("loop-open" in {a.name for a in night.state.alarms}) is expected
 
 
 @LAWS

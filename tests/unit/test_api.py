@@ -32,11 +32,16 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.state import (
     Alarm,
+    CommandState,
     DitherView,
     HistoryEntry,
     Level,
     LogEntry,
+    LoopCommand,
     MatrixState,
+    MeasurementRecord,
+    MeasurePattern,
+    MeasureState,
     Mode,
     ReconstructorRecord,
     Registration,
@@ -584,6 +589,54 @@ async def test_metrics_show_what_the_service_knows(client):
     assert (found["ready",], found["uptime_seconds",]) == (1, 60.0)
 
 
+MEASURING = MeasurementRecord(
+    id="im-1",
+    state=MeasureState.RUNNING,
+    pattern=MeasurePattern.HADAMARD,
+    modes=(0, 1),
+    amplitude_m=(2e-8, 2e-8),
+    n_average=3,
+    asked_ns_utc=70 * SECOND,
+)
+
+
+async def test_a_measurement_under_way_is_seen_in_the_state_and_the_metrics(client, service):
+    assert (await body_of(client, "/v1/state"))["measuring"] is None
+    found = await metrics_of(client)
+    assert {found["measuring", pattern] for pattern in MeasurePattern} == {0}
+    service.change(measurements=(MEASURING,))
+    assert (await body_of(client, "/v1/state"))["measuring"] == {
+        "id": "im-1",
+        "state": "running",
+        "pattern": "hadamard",
+        "modes": [0, 1],
+        "asked_ns_utc": 70 * SECOND,
+        "opens_loop": True,
+    }
+    found = await metrics_of(client)
+    assert found["measuring", "hadamard"] == 1
+    assert found["measuring", "sine"] == 0
+    assert found["measuring_seconds",] == 30.0
+
+
+async def test_the_loop_is_shown_by_groups_of_modes_with_what_was_last_asked_of_it(client, service):
+    gains = (0.5, 0.5, 0.3, 0.0, 0.0)
+    asked = LoopCommand(
+        id="loop-1", text="open", state=CommandState.REFUSED, asked_ns_utc=7, reason="busy: im-1"
+    )
+    service.change(rtc=replace(STATE.rtc, gains=gains), loop_command=asked)
+    body = await body_of(client, "/v1/state")
+    assert body["rtc"]["gains"] == [
+        {"first": 0, "last": 1, "gain": 0.5},
+        {"first": 2, "last": 2, "gain": 0.3},
+        {"first": 3, "last": 4, "gain": 0.0},
+    ]
+    assert (body["loop_command"]["state"], body["loop_command"]["reason"]) == (
+        "refused",
+        "busy: im-1",
+    )
+
+
 async def test_metrics_leave_as_openmetrics_for_those_who_ask(client):
     accept = {"Accept": "application/openmetrics-text; version=1.0.0"}
     response = await client.get("/metrics", headers=accept)
@@ -610,6 +663,9 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
     }
     assert set(operations) == {
         "GET /v1/state",
+        "POST /v1/loop",
+        "POST /v1/loop/ramp",
+        "DELETE /v1/measurements/{id}",
         "GET /v1/alpha",
         "GET /v1/alpha/history",
         "GET /v1/reconstructors",
@@ -667,7 +723,10 @@ UNITS = ("_s", "_m", "_hz", "_ns", "_ns_utc", "_deg", "_subap", "_frames", "_seq
 DIMENSIONLESS = {
     "bound",
     "condition_number",
+    "first",
+    "gain",
     "innovation",
+    "last",
     "leak",
     "magnification",
     "magnitude",

@@ -10,7 +10,7 @@ import pytest
 
 from service.api import Snapshot, create_app
 from service.errors import CommandError, LinkError, UnknownIdError
-from service.events import Measure
+from service.events import GiveUp, Measure
 from service.state import MeasurementRecord, MeasurePattern, MeasureState, TrackerState
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3)
@@ -154,6 +154,26 @@ async def test_a_refusal_arrives_in_its_own_words(client, service, refusal, stat
     response = await client.post("/v1/measurements", json={})
     assert response.status_code == status
     assert response.json()["detail"] == str(refusal)
+
+
+async def test_a_measurement_can_be_given_up(client, service):
+    response = await client.delete("/v1/measurements/im-2")
+    assert response.status_code == 202, response.text
+    assert response.json()["links"]["measurement"] == "/v1/measurements/im-2"
+    assert service.commands == [GiveUp(id="im-2")]
+
+
+@pytest.mark.parametrize(
+    ("refusal", "status"),
+    [
+        (UnknownIdError("measurement im-2: nobody has heard of it"), 404),
+        (CommandError("im-2 is stored: there is nothing to give up"), 409),
+    ],
+)
+async def test_what_cannot_be_given_up_is_told(client, service, refusal, status):
+    service.refusal = refusal
+    response = await client.delete("/v1/measurements/im-2")
+    assert (response.status_code, response.json()["detail"]) == (status, str(refusal))
 
 
 async def test_measurements_are_listed_oldest_first(client):

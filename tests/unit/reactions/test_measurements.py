@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service import events as ev
-from service.errors import CommandError
+from service.errors import CommandError, UnknownIdError
 from service.reactions.measurements import LONGEST_S, OVERDUE_S
 from service.state import MatrixState, MeasurePattern, MeasureState, Mode
 from tests.unit.reactions.situations import Story, of_kind, rtc
@@ -106,7 +106,15 @@ def test_a_mode_the_basis_does_not_have_is_refused(story):
 
 @pytest.mark.parametrize(
     "command",
-    [ev.StartDither(), ev.Refit(), ev.Approve(id="x"), ev.Publish(id="x"), ev.Rollback()],
+    [
+        ev.StartDither(),
+        ev.Refit(),
+        ev.Approve(id="x"),
+        ev.Publish(id="x"),
+        ev.Rollback(),
+        ev.SetLoop(closed=True),
+        ev.Ramp(),
+    ],
 )
 def test_what_would_disturb_it_has_to_wait(story, command):
     begin(story)
@@ -213,3 +221,47 @@ def test_reconstructors_are_left_as_they_are(story):
     begin(story)
     answer(story, MeasureState.STORED)
     assert story.matrix_state("cm-1") is MatrixState.PROPOSED
+
+
+def test_an_open_loop_is_no_alarm_while_the_service_has_asked_for_it(story):
+    begin(story)
+    assert "loop-open" not in story.alarms
+    answer(story, MeasureState.STORED)
+    story.tell(ev.StatusSeen(rtc=rtc(session="s2", loop="open")))
+    assert "loop-open" in story.alarms, "the measurement is over"
+
+
+def test_a_loop_that_opens_under_a_measurement_with_sines_is_an_alarm(story):
+    begin(story, pattern=MeasurePattern.SINE)
+    assert "loop-open" in story.alarms
+
+
+def test_what_is_given_up_is_over_whatever_comes(story):
+    begin(story)
+    late = story.state.measurement("im-1")
+    story.tell(ev.GiveUp(id="im-1"))
+    assert story.state.measuring is None
+    for state in (MeasureState.RUNNING, MeasureState.STORED, MeasureState.FAILED):
+        story.tell(ev.MatrixMeasured(record=replace(late, state=state)))
+        assert story.state.measurement("im-1").state is MeasureState.GIVEN_UP
+    story.tell(ev.JobFailed(effect=ev.AskMeasurement(record=late), text="no answer"))
+    assert story.state.measurement("im-1").state is MeasureState.GIVEN_UP
+
+
+def test_only_what_is_under_way_can_be_given_up(story):
+    with pytest.raises(UnknownIdError, match="im-1: nobody has heard of it"):
+        story.tell(ev.GiveUp(id="im-1"))
+    begin(story)
+    answer(story, MeasureState.STORED)
+    with pytest.raises(CommandError, match="im-1 is stored: there is nothing to give up"):
+        story.tell(ev.GiveUp(id="im-1"))
+
+
+def test_nothing_is_asked_while_tones_given_up_still_play(story):
+    begin(story, pattern=MeasurePattern.SINE, duration_s=30.0)
+    close(story)
+    story.tell(ev.GiveUp(id="im-1"))
+    story.tell(ev.SetMode(mode=Mode.AUTO))
+    story.state = replace(story.state, dither_stopped=False, in_use="initial")
+    assert not of_kind(story.wait(20), ev.AskDither)
+    assert of_kind(story.wait(15), ev.AskDither)

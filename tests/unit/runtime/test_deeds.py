@@ -12,8 +12,8 @@ from service.model.misregistration import Misregistration
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds, Publishing
 from service.runtime.translate import manifest_of
-from service.state import MatrixState, Registration, TrackerState
-from service.wire import DitherAction, LoopRequest, Reply, checksum, layout_of
+from service.state import DitherView, MatrixState, Registration, TrackerState
+from service.wire import DitherAction, Loop, LoopRequest, RampRequest, Reply, checksum, layout_of
 from service.worker import start_worker
 from tests.unit.reactions.situations import START_NS, foreign, record, rtc
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
@@ -283,8 +283,29 @@ async def test_nothing_is_offered_while_none_is_in_use(deeds, bridge):
     assert not bridge.offered
 
 
+async def test_the_loop_is_changed_as_asked_and_the_answer_is_the_event(deeds, bridge):
+    asked = ev.AskLoop(id="loop-1", closed=False, gains=(0.1,) * N_MODES, leak=0.9)
+    event = await deeds.carry_out(asked, STATE)
+    assert event == ev.LoopAnswered(id="loop-1", accepted=True, reason="")
+    assert bridge.commands == [
+        LoopRequest(id="loop-1", loop=Loop.OPEN, gains=(0.1,) * N_MODES, leak=0.9)
+    ]
+    bridge.refusal = "busy: im-1"
+    event = await deeds.carry_out(ev.AskLoop(id="loop-2", closed=True), STATE)
+    assert (event.accepted, event.reason) == (False, "busy: im-1")
+
+
+async def test_a_ramp_is_asked_for_as_it_is(deeds, bridge):
+    ramp = ev.AskRamp(id="ramp-1", groups=((0, 1), (2, 9)), gains=(0.2, 0.4), frames_per_gain=50)
+    event = await deeds.carry_out(ramp, STATE)
+    assert event == ev.LoopAnswered(id="ramp-1", accepted=True, reason="")
+    assert bridge.commands == [
+        RampRequest(id="ramp-1", groups=((0, 1), (2, 9)), gains=(0.2, 0.4), frames_per_gain=50)
+    ]
+
+
 class TestDither:
-    DITHER = ev.DitherView(
+    DITHER = DitherView(
         id="dither-1",
         modes=(63, 69),
         amplitude_m=(5e-9, 5e-9),

@@ -201,6 +201,14 @@ def group_gains(text: str) -> tuple[float, float, float]:
     return low, middle, high
 
 
+def dataset(text: str) -> str:
+    """Read the place of an array in an HDF5 file."""
+    name, colon, inside = text.rpartition(":/")
+    if not (name and colon and inside):
+        raise _refusal(text, "FILE:/DATASET of an HDF5 file")
+    return text
+
+
 def truth(text: str) -> Path | str:
     """Read the name of a set of imperfections, or else of a file."""
     return text if text in SETS else Path(text)

@@ -22,9 +22,11 @@ from sim_rtc.computer import Identity, LoopSettings, RealTimeComputer
 from sim_rtc.detector import Detector
 from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.dither import DitherLimits
+from sim_rtc.drive import MirrorDrive
 from sim_rtc.feed import Block, Feed, OpenLoopFeed
 from sim_rtc.gains import by_group
-from sim_rtc.mirror import MirrorDrive, MirrorFaults
+from sim_rtc.influence import read_influence
+from sim_rtc.mirror import MirrorFaults
 from sim_rtc.motion import MovingOptics, background_executor
 from sim_rtc.options import Options
 from sim_rtc.phases import PhaseFeed
@@ -167,9 +169,13 @@ def build_plant(
     Raises
     ------
     ConfigurationError
-        If actuators are to fail, or pixels to be binned, on a plant that cannot show it.
+        If actuators are to fail, or pixels to be binned, on a plant that cannot show it, or the
+        influence functions are not of this mirror.
     """
     faults, binning = options.devices.faults, options.devices.binning
+    influence = None
+    if options.devices.influence is not None:
+        influence = read_influence(options.devices.influence, instrument)
     if options.plant == "diffractive":
         return DiffractivePlant(
             instrument,
@@ -178,6 +184,7 @@ def build_plant(
             imperfections=options.sky.imperfections,
             scene=options.sky.scene,
             faults=faults,
+            influence=influence,
             binning=binning,
         )
     if faults != MirrorFaults() or binning > 1:
@@ -191,6 +198,7 @@ def build_plant(
         rng=rng,
         imperfections=options.sky.imperfections,
         scene=options.sky.scene,
+        influence=influence,
     )
 
 

@@ -27,10 +27,10 @@ from service.wire import (
     Reply,
 )
 from sim_rtc.dither import Dither, DitherLimits, refusal
+from sim_rtc.drive import MirrorDrive
 from sim_rtc.feed import BATCH_FRAMES, Block
 from sim_rtc.loop import ControlTerms, ModalLoop
 from sim_rtc.measure import Bench, Measured, Measurements
-from sim_rtc.mirror import MirrorDrive
 from sim_rtc.plant import TelescopeOptics
 from sim_rtc.reconstructors import Reconstructor, Terms
 

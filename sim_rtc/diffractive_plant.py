@@ -25,8 +25,16 @@ from sim_rtc.imperfections import (
     non_common_path,
     true_sensor,
 )
+from sim_rtc.influence import InfluenceCube
 from sim_rtc.loop import ControlTerms
-from sim_rtc.mirror import MirrorFaults, TensionedPlate, disobedient, misplaced
+from sim_rtc.mirror import (
+    MirrorFaults,
+    PlantSurface,
+    TensionedPlate,
+    disobedient,
+    heights,
+    misplaced,
+)
 from sim_rtc.pixels import PixelDetector
 from sim_rtc.plant import uneven
 from sim_rtc.scene import Scene
@@ -189,10 +197,14 @@ class DiffractivePlant:
         imperfections: Imperfections | None = None,
         scene: Scene | None = None,
         faults: MirrorFaults | None = None,
+        influence: InfluenceCube | None = None,
         binning: int = 1,
         quadrature: Quadrature | None = None,
     ) -> None:
-        """Take the instrument as it is binned: the finest pixels set how finely it is computed."""
+        """Take the instrument as it is binned: the finest pixels set how finely it is computed.
+
+        Without influence functions the mirror is a plate under tension.
+        """
         imperfections, scene = imperfections or Imperfections(), scene or Scene()
         self._instrument, self._scene = instrument, scene
         uneven_rng, position_rng, pixel_rng, path_rng = rng.spawn(4)
@@ -204,13 +216,21 @@ class DiffractivePlant:
             uneven(pupil, imperfections.unevenness, uneven_rng),
             quadrature=quadrature or _quadrature(wfs, binning),
         )
-        mirror = misplaced(instrument.analytic_mirror, imperfections.position_error, position_rng)
-        self._surface = TensionedPlate(
-            mirror.positions_m / instrument.subaperture_m,
-            tension=instrument.subaperture_m / (_TENSION_PITCHES * mirror.pitch_m),
-            softness=_SOFTNESS,
-        )
-        self._weights = disobedient(self._surface, basis.mode_to_actuator, faults or MirrorFaults())
+        drawn = instrument.analytic_mirror
+        mirror = misplaced(drawn, imperfections.position_error, position_rng)
+        strokes = basis.mode_to_actuator
+        if influence is None:
+            self._surface: PlantSurface = TensionedPlate(
+                mirror.positions_m / instrument.subaperture_m,
+                tension=instrument.subaperture_m / (_TENSION_PITCHES * mirror.pitch_m),
+                softness=_SOFTNESS,
+            )
+            strokes = heights(drawn, strokes)
+        else:
+            self._surface = influence.surface(
+                drawn.positions_m, mirror.positions_m, instrument.subaperture_m
+            )
+        self._weights = disobedient(self._surface, strokes, faults or MirrorFaults())
         self._points = distorted(pupil.points, pupil.weights, imperfections)
         self.points_m: Array = self._points * instrument.subaperture_m
         self.pitch_m: float = instrument.subaperture_m / pupil.sampling

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_rtc.mirror import MirrorDrive
+from sim_rtc.drive import MirrorDrive
 
 Array32 = NDArray[np.float32]
 

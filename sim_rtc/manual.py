@@ -34,6 +34,13 @@ registration
   flexure and a random walk move in linear steps of 2 s or less between exact optics 20 s or less
   apart. All of them add up.
 
+mirror
+  The diffractive plant has a plate under tension, the linear one the drawing's influence functions.
+  --influence replaces either by those of a file: maps of OPD per OPD asked of the actuator, in the
+  order of the instrument's actuators, a row along +x, the middle of the arrays the middle of the
+  mirror, gone on smoothly past its edge. Modes are the strokes of the commands matrix on them.
+  --position-error moves each function; a dead actuator goes where the surface bends least.
+
 {SCENES}
 light
   A star of R = 0 gives 2.1e10 photons per second and square metre in the band (600 to 900 nm); a
@@ -61,6 +68,8 @@ examples
       a link that loses one batch in twenty for 10 s, then a restart, all of it on file
   pyrcal sim --replay night.h5 --speed 2
       the same again, twice as fast
+  pyrcal sim --plant diffractive --influence p45.h5:/influence --dead-actuators 14,222
+      the mirror as the laboratory has measured it, two of its actuators off
   pyrcal sim --plant diffractive --snapshot loop.png
       a picture of pupil images, slopes and residual wavefront as the loop closes
 

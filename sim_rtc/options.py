@@ -99,6 +99,7 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         apply_scene(found)
         apply_preset(found)
         sky = scene_options(found)
+        devices = device_options(found)
         rehearsal = rehearsal_options(found)
     except ConfigurationError as error:
         parser.error(str(error))
@@ -118,7 +119,7 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
         n_controlled=found.n_controlled,
         frame_rate_hz=found.rate,
         plant=found.plant,
-        devices=device_options(found),
+        devices=devices,
         truth=sky.truth,
         jumps=tuple(found.jump or ()),
         drift=found.drift,

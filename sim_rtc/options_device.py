@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, field
 
+from service.errors import ConfigurationError
 from sim_rtc import arguments
 from sim_rtc.detector import Camera
-from sim_rtc.mirror import MirrorFaults, MirrorLimits
+from sim_rtc.drive import MirrorLimits
+from sim_rtc.influence import InfluenceFile
+from sim_rtc.mirror import MirrorFaults
 from sim_rtc.pixels import FLAO_PRESETS, preset_for
 
 _MICROMETRE = 1e-6
@@ -25,6 +28,9 @@ class DeviceOptions:
     """How mirror and detector are made."""
 
     faults: MirrorFaults = field(default_factory=MirrorFaults)
+    influence: InfluenceFile | None = None
+    """Measured influence functions; None: those of the plant."""
+
     limits: MirrorLimits = field(default_factory=MirrorLimits)
     rise_s: float = 0.0
     """From 10 to 90 % of a step of the mirror."""
@@ -61,8 +67,20 @@ def apply_preset(found: argparse.Namespace) -> None:
 
 
 def device_options(found: argparse.Namespace) -> DeviceOptions:
-    """Return the options of the devices."""
+    """Return the options of the devices.
+
+    Raises
+    ------
+    ConfigurationError
+        If a pitch is given of influence functions that are not.
+    """
+    influence = None
+    if found.influence is not None:
+        influence = InfluenceFile(reference=found.influence, pitch_m=found.influence_pitch)
+    elif found.influence_pitch is not None:
+        raise ConfigurationError("--influence-pitch: found alone; expected --influence beside it")
     return DeviceOptions(
+        influence=influence,
         faults=MirrorFaults(dead=found.dead_actuators, stuck=tuple(found.stuck_actuators or ())),
         limits=MirrorLimits(
             stroke_m=found.actuator_stroke * _MICROMETRE,
@@ -78,6 +96,18 @@ def device_options(found: argparse.Namespace) -> DeviceOptions:
 
 
 def _add_mirror(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--influence",
+        type=arguments.dataset,
+        metavar="FILE:/DATASET",
+        help="influence functions (n_actuators, ny, nx) in HDF5, instead of the plant's own",
+    )
+    group.add_argument(
+        "--influence-pitch",
+        type=arguments.within(1e-5, 10.0),
+        metavar="M",
+        help="distance of their points in the pupil (default: the dataset's attribute pitch_m)",
+    )
     group.add_argument(
         "--rise-ms",
         type=arguments.within(0.0, 100.0),

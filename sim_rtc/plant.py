@@ -21,7 +21,7 @@ from service.model.interaction import (
     rotation,
     valid_subapertures,
 )
-from service.model.mirror import mirror_surface
+from service.model.mirror import Surface, mirror_surface
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
@@ -33,6 +33,7 @@ from sim_rtc.imperfections import (
     non_common_path,
     true_sensor,
 )
+from sim_rtc.influence import InfluenceCube, TabulatedSurface
 from sim_rtc.loop import ControlTerms, LoopTerms
 from sim_rtc.mirror import misplaced
 from sim_rtc.scene import Scene
@@ -171,7 +172,9 @@ class LinearPlant:
         rng: np.random.Generator,
         imperfections: Imperfections | None = None,
         scene: Scene | None = None,
+        influence: InfluenceCube | None = None,
     ) -> None:
+        """Take influence functions to use instead of the drawing's."""
         imperfections, scene = imperfections or Imperfections(), scene or Scene()
         self._instrument = instrument
         self._passes = np.float32(scene.passes)
@@ -185,8 +188,13 @@ class LinearPlant:
             n_nodes=_NODES,
             n_modulation=_modulation_points(wfs.modulation_lambda_over_d),
         )
-        mirror = misplaced(instrument.analytic_mirror, imperfections.position_error, position_rng)
-        self._surface = mirror_surface(mirror, instrument.subaperture_m)
+        drawn, width_m = instrument.analytic_mirror, instrument.subaperture_m
+        mirror = misplaced(drawn, imperfections.position_error, position_rng)
+        self._surface: Surface | TabulatedSurface = (
+            mirror_surface(mirror, width_m)
+            if influence is None
+            else influence.surface(drawn.positions_m, mirror.positions_m, width_m)
+        )
         self._coefficients = self._surface.coefficients(basis.mode_to_actuator)
         self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)
         self._points = distorted(pupil.points, pupil.weights, imperfections)

@@ -191,8 +191,10 @@ def setup_of(options: Options) -> dict[str, Any]:
     """Return what stays as it is for the run, as JSON can hold it."""
     sky = asdict(options.sky)
     del sky["truth"]
+    influence = options.devices.influence
     return {
         "plant": options.plant,
+        "influence": None if influence is None else influence.reference,
         "instrument": options.instrument,
         "seed": options.seed,
         "magnitude": options.magnitude,

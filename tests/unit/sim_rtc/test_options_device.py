@@ -6,7 +6,8 @@ import pytest
 from service.errors import ConfigurationError
 from sim_rtc.assembly import binned_basis, build_drive, build_plant
 from sim_rtc.diffractive_plant import DiffractivePlant
-from sim_rtc.mirror import MirrorFaults, MirrorLimits
+from sim_rtc.drive import MirrorLimits
+from sim_rtc.mirror import MirrorFaults
 from sim_rtc.options import parse_options
 from sim_rtc.pixels import binned
 

@@ -1,25 +1,31 @@
-"""Arrays that an instrument file refers to: ``file.h5:/dataset``, relative to the file itself."""
+"""Arrays that an instrument file refers to, relative to the file itself.
+
+``file.h5:/dataset``, ``file.fits:EXTNAME``, ``file.fits:2`` or ``file.fits`` (its first image).
+"""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
-import h5py
-import numpy as np
 from numpy.typing import NDArray
 
 from service.config.strict import refuse
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, MatrixError
+from service.fits.container import Container, StoredArray, opened
+
+_HDF5 = re.compile(r"(?P<path>.+):/(?P<name>.+)")
+_FITS = re.compile(r"(?P<path>.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::/?(?P<name>.+))?", re.IGNORECASE)
 
 
 def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
-    """Return the numeric array behind ``reference``.
+    """Return the numeric array behind ``reference``, in this machine's byte order.
 
     Parameters
     ----------
     reference
-        ``path:/dataset``; a relative path starts at ``folder``.
+        ``path:/dataset``, ``path.fits:EXTNAME``; a relative path starts at ``folder``.
     folder
         Where the instrument file lies.
     where
@@ -31,21 +37,25 @@ def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
         If the reference has another form, or the file or dataset is missing, damaged or not
         numeric.
     """
-    name, separator, dataset = reference.rpartition(":/")
-    if not separator or not name or not dataset:
-        refuse(where, repr(reference), "path:/dataset of an HDF5 file")
-    path = folder / name
-    if not path.is_file():
-        raise ConfigurationError(f"{where}: {path}: no such file")
+    parts = _FITS.fullmatch(reference) or _HDF5.fullmatch(reference)
+    if parts is None:
+        refuse(where, repr(reference), "path:/dataset of an HDF5 file, or path.fits:EXTNAME")
     try:
-        with h5py.File(path, "r") as file:
-            item = file.get(dataset)
-            if not isinstance(item, h5py.Dataset):
-                held = ", ".join(sorted(file)) or "nothing"
-                refuse(where, f"no dataset /{dataset} in {path} (it holds {held})", "one")
-            values = np.asarray(item[()])
-    except OSError as error:
-        raise ConfigurationError(f"{where}: {path}: not a readable HDF5 file: {error}") from error
-    if values.dtype.kind not in "biuf":
-        refuse(where, f"type {values.dtype} in {path}:/{dataset}", "numbers")
-    return values
+        with opened(folder / parts["path"]) as container:
+            stored = _named(container, parts["name"], where)
+            if stored.dtype.kind not in "biuf":
+                refuse(where, f"type {stored.dtype} in {stored.where}", "numbers")
+            values = stored.read()
+    except MatrixError as error:
+        raise ConfigurationError(f"{where}: {error}") from error
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        raise ConfigurationError(f"{where}: {folder / parts['path']}: damaged: {error}") from error
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+def _named(container: Container, name: str | None, where: str) -> StoredArray:
+    found = container.find(name) if name else next(iter(container.arrays.values()), None)
+    if found is None:
+        missing = f"no dataset /{name.strip('/')}" if name else "no image"
+        refuse(where, f"{missing} in {container.path}", f"one; it holds {container.listing()}")
+    return found

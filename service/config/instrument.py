@@ -2,59 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import layouts
 from service.config.datasets import read_dataset
-from service.config.instrument_schema import (
-    InstrumentFile,
-    MirrorTable,
-    OrientationTable,
-    WfsTable,
-)
+from service.config.instrument_schema import InstrumentFile, LoopTable, ModesTable, WfsTable
+from service.config.mirrors import MirrorFile, own_modes, read_mirror
 from service.config.strict import Place, in_file, read_toml, refuse, validated
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, ModelError
 from service.model.instrument import (
-    Influence,
+    FrameWindows,
     Instrument,
     KarhunenLoeve,
+    LoopFacts,
     Mirror,
     Pyramid,
     Stop,
+    TabulatedModes,
 )
+from service.model.slopes import Normalisation, Orientation, SlopeOrder, SlopeRecipe
+from service.model.windows import by_quadrant
 
-_NOT_YET: dict[tuple[str, str], tuple[object, ...]] = {
-    ("wfs", "input"): ("slopes",),
-    ("wfs", "pupil_centres_px"): (),
-    ("wfs", "pixels_per_subaperture"): (1,),
-    ("mirror", "mode_to_actuator"): (),
-    ("mirror", "basis"): ("KL",),
-    ("mirror", "nominal_rotation_deg"): (0.0,),
-    ("mirror", "parity"): (1,),
-    ("mirror", "stroke"): ("known",),
-    ("mirror", "modes"): (),
-    ("mirror", "modes_pitch_m"): (),
-    ("mirror", "modes_kind"): (),
-    ("mirror", "influence_functions"): (),
-    ("slopes", "order"): ("xy",),
-    ("slopes", "orientation"): (None, OrientationTable()),
-    ("slopes", "normalisation"): ("global",),
-    ("loop", "frame_rate_hz"): (),
-    ("loop", "delay_frames"): (),
-    ("loop", "n_controlled"): (),
-}
-"""Keys of the format that are not honoured yet, and the values that ask for nothing more."""
-
-_LAYOUT_KEYS = {
-    "rings": {"first_ring", "last_ring", "pitch_m"},
-    "grid": {"n_across", "pitch_m", "diameter_m"},
-    "positions": {"positions", "pitch_m"},
-}
+_FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
 
 
 class _Source(NamedTuple):
@@ -67,14 +41,14 @@ class _Source(NamedTuple):
 def load_instrument(name_or_path: str | Path) -> Instrument:
     """Return the instrument that a packaged name (``flao-lbt``) or a TOML file describes.
 
-    Anything that has a folder or ends in ``.toml`` is a path; references to HDF5 datasets in it
+    Anything that has a folder or ends in ``.toml`` is a path; references to datasets in it
     (``mask.h5:/valid_subapertures``) are relative to the file.
 
     Raises
     ------
     ConfigurationError
         One line with the file and the key: unknown, missing, of the wrong type, out of range, or
-        not supported by this version.
+        in contradiction to another.
     """
     path = Path(name_or_path)
     if path.suffix == ".toml" or path.name != str(name_or_path):
@@ -95,39 +69,103 @@ def _read(path: Path) -> Instrument:
     source = _Source(path.parent, in_file(path))
     data = read_toml(path)
     tables = validated(InstrumentFile, data, source.place)
-    _refuse_unsupported(tables, source)
-    mirror = _mirror(tables.mirror, source)
-    n_max = len(mirror.positions_m) - 1
-    if tables.modes.n_modes > n_max:
-        refuse(
-            source.place(("modes", "n_modes")),
-            str(tables.modes.n_modes),
-            f"at most {n_max}: {n_max + 1} actuators make {n_max} modes without piston",
-        )
     about = tables.instrument
+    wfs = _pyramid(tables.wfs, source)
+    mirror, remarks = read_mirror(
+        MirrorFile(
+            table=tables.mirror,
+            folder=source.folder,
+            place=source.place,
+            diameter_m=about.diameter_m,
+            subaperture_m=about.diameter_m / wfs.pupil_diameter,
+        )
+    )
+    modes = _modes(tables.modes, mirror, source)
     return Instrument(
         name=about.name,
         diameter_m=about.diameter_m,
         obscuration_ratio=about.obscuration_ratio,
         stop=Stop(about.stop),
         double_pass=about.double_pass,
-        wfs=_pyramid(tables.wfs, source),
+        wfs=wfs,
         mirror=mirror,
-        modes=KarhunenLoeve(**tables.modes.model_dump()),
+        modes=modes,
+        slopes=_slopes(tables, source),
+        frames=_frames(tables.wfs, source),
+        loop=_loop(tables.loop, modes.n_modes, source),
+        remarks=remarks,
         basis_id=about.basis_id,
         config_id=about.config_id,
     )
 
 
-def _refuse_unsupported(tables: InstrumentFile, source: _Source) -> None:
-    for (section, key), harmless in _NOT_YET.items():
-        table = getattr(tables, section)
-        if key not in table.model_fields_set or getattr(table, key) in harmless:
-            continue
-        only = f" (only {harmless[0]!r})" if harmless and harmless[0] is not None else ""
-        raise ConfigurationError(
-            f"{source.place((section, key))}: not supported by this version{only}"
+def _modes(table: ModesTable, mirror: Mirror | TabulatedModes, source: _Source) -> KarhunenLoeve:
+    """Return the turbulence, and as many modes as the user's basis or ``[modes]`` has."""
+    where, own = source.place(("modes", "n_modes")), own_modes(mirror)
+    if own is not None:
+        if "n_modes" in table.model_fields_set:
+            refuse(where, f"it beside a basis of its own {own} modes", "it for KL modes only")
+        return replace(KarhunenLoeve(**table.model_dump()), n_modes=own)
+    n_max = len(mirror.positions_m) - 1 if isinstance(mirror, Mirror) else 0
+    if table.n_modes > n_max:
+        refuse(
+            where,
+            str(table.n_modes),
+            f"at most {n_max}: {n_max + 1} actuators make {n_max} modes without piston",
         )
+    return KarhunenLoeve(**table.model_dump())
+
+
+def _slopes(tables: InstrumentFile, source: _Source) -> SlopeRecipe:
+    table = tables.slopes
+    if tables.wfs.input == "frames" and "order" in table.model_fields_set:
+        raise ConfigurationError(
+            f'{source.place(("slopes", "order"))}: has no meaning beside wfs.input = "frames", '
+            "whose slopes are made here"
+        )
+    orientation = None
+    if table.orientation is not None:
+        flips = table.orientation.model_dump(exclude={"sign"})
+        sign_x, sign_y = table.orientation.sign
+        orientation = Orientation(**flips, sign_x=sign_x, sign_y=sign_y)
+    return SlopeRecipe(
+        order=SlopeOrder(table.order),
+        orientation=orientation,
+        normalisation=Normalisation(table.normalisation),
+    )
+
+
+def _frames(table: WfsTable, source: _Source) -> FrameWindows | None:
+    if table.input == "slopes":
+        for key in _FRAME_KEYS:
+            if key in table.model_fields_set and getattr(table, key) != 1:
+                raise ConfigurationError(
+                    f'{source.place(("wfs", key))}: belongs to input = "frames", '
+                    'found input = "slopes"'
+                )
+        return None
+    centres = None
+    if table.pupil_centres_px is not None:
+        centres = np.array(table.pupil_centres_px)
+        try:
+            by_quadrant(centres)
+        except ModelError as error:
+            raise ConfigurationError(
+                f"{source.place(('wfs', 'pupil_centres_px'))}: {error}"
+            ) from error
+    return FrameWindows(centres_px=centres, pixels_per_subaperture=table.pixels_per_subaperture)
+
+
+def _loop(table: LoopTable, n_modes: int, source: _Source) -> LoopFacts | None:
+    if not table.model_fields_set:
+        return None
+    if table.n_controlled is not None and table.n_controlled > n_modes:
+        refuse(
+            source.place(("loop", "n_controlled")),
+            str(table.n_controlled),
+            f"at most the {n_modes} modes of the basis",
+        )
+    return LoopFacts(**table.model_dump())
 
 
 def _pyramid(table: WfsTable, source: _Source) -> Pyramid:
@@ -168,87 +206,3 @@ def _mask(table: WfsTable, source: _Source) -> NDArray[np.bool_]:
     if not values.any():
         refuse(where, "no valid subaperture", "at least one")
     return values.astype(bool)
-
-
-def _mirror(table: MirrorTable, source: _Source) -> Mirror:
-    _check_mirror_keys(table, source)
-    positions = _positions(table, source)
-    pair = layouts.coincident(positions)
-    if pair is not None:
-        refuse(
-            source.place(("mirror",)),
-            f"actuators {pair[0]} and {pair[1]} in the same place",
-            "every actuator in a place of its own",
-        )
-    return Mirror(
-        positions_m=positions,
-        pitch_m=table.pitch_m or layouts.typical_pitch(positions),
-        influence=Influence(table.influence),
-        coupling=table.coupling,
-    )
-
-
-def _check_mirror_keys(table: MirrorTable, source: _Source) -> None:
-    if table.layout is None:
-        refuse(
-            source.place(("mirror",)), "none of them", "one of layout, modes, influence_functions"
-        )
-    foreign = set().union(*_LAYOUT_KEYS.values()) - _LAYOUT_KEYS[table.layout]
-    for key in sorted(foreign & table.model_fields_set):
-        owners = [f'"{name}"' for name, keys in _LAYOUT_KEYS.items() if key in keys]
-        raise ConfigurationError(
-            f"{source.place(('mirror', key))}: belongs to layout = {' or '.join(owners)}, "
-            f'found layout = "{table.layout}"'
-        )
-    if "coupling" in table.model_fields_set and table.influence != "gaussian":
-        raise ConfigurationError(
-            f"{source.place(('mirror', 'coupling'))}: belongs to influence = "
-            f'"gaussian", found influence = "{table.influence}"'
-        )
-
-
-def _positions(table: MirrorTable, source: _Source) -> NDArray[np.float64]:
-    if table.layout == "positions":
-        return _listed_positions(table, source)
-    if table.layout == "grid":
-        n_across, pitch_m, diameter_m = _mandatory(
-            table, ("n_across", "pitch_m", "diameter_m"), source
-        )
-        positions = layouts.grid(n_across, pitch_m, diameter_m)
-    else:
-        if table.last_ring < table.first_ring:
-            refuse(
-                source.place(("mirror", "last_ring")),
-                str(table.last_ring),
-                f"at least first_ring = {table.first_ring}",
-            )
-        positions = layouts.rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
-    _check_number(len(positions), source.place(("mirror",)))
-    return positions
-
-
-def _listed_positions(table: MirrorTable, source: _Source) -> NDArray[np.float64]:
-    where = source.place(("mirror", "positions"))
-    (reference,) = _mandatory(table, ("positions",), source)
-    values = read_dataset(reference, source.folder, where)
-    if values.ndim != 2 or values.shape[1] != 2:
-        refuse(where, f"shape {values.shape}", "(n_actuators, 2), x and y in metres")
-    if not np.isfinite(values).all():
-        refuse(where, "a position that is not finite", "metres in the pupil plane")
-    _check_number(len(values), where)
-    return values.astype(np.float64)
-
-
-def _mandatory(table: MirrorTable, keys: tuple[str, ...], source: _Source) -> tuple[Any, ...]:
-    for key in keys:
-        if getattr(table, key) is None:
-            raise ConfigurationError(
-                f"{source.place(('mirror', key))}: missing, "
-                f'layout = "{table.layout}" needs {", ".join(keys)}'
-            )
-    return tuple(getattr(table, key) for key in keys)
-
-
-def _check_number(n_actuators: int, where: str) -> None:
-    if n_actuators < 4:
-        refuse(where, f"{n_actuators} actuators", "at least 4: tip, tilt and something to correct")

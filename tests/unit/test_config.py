@@ -225,48 +225,18 @@ def test_a_wrong_instrument_file_is_refused_in_one_line_with_file_and_key(write,
 
 
 @pytest.mark.parametrize(
-    ("section", "line"),
-    [
-        ("wfs", 'input = "frames"'),
-        ("wfs", 'pupil_centres_px = "auto"'),
-        ("wfs", "pixels_per_subaperture = 2"),
-        ("mirror", 'mode_to_actuator = "m2c.h5:/m2c"'),
-        ("mirror", 'basis = "zonal"'),
-        ("mirror", "nominal_rotation_deg = 65.08"),
-        ("mirror", "parity = -1"),
-        ("mirror", 'stroke = "unknown"'),
-        ("mirror", 'modes = "modes.h5:/modes"'),
-        ("mirror", "modes_pitch_m = 0.07"),
-        ("mirror", 'modes_kind = "surface"'),
-        ("mirror", 'influence_functions = "ifs.h5:/cube"'),
-        ("slopes", 'order = "yx"'),
-        ("slopes", "orientation = { flip_x = true }"),
-        ("slopes", 'normalisation = "local"'),
-        ("loop", "frame_rate_hz = 1000"),
-        ("loop", "delay_frames = 2"),
-        ("loop", "n_controlled = 400"),
-    ],
-)
-def test_a_key_that_cannot_be_honoured_yet_is_refused_by_name(write, section, line):
-    tables = {"wfs": WFS, "mirror": MIRROR, "slopes": "[slopes]\n", "loop": "[loop]\n"}
-    tables[section] += line + "\n"
-    message = refusal(load_instrument, write(ABOUT + "".join(tables.values()) + MODES))
-    key = line.split(" ", maxsplit=1)[0]
-    assert f"{section}.{key}: not supported by this version" in message
-
-
-@pytest.mark.parametrize(
     ("reference", "expected"),
     [
         ("mask.h5", "found 'mask.h5', expected path:/dataset"),
-        ("absent.h5:/valid", "no such file"),
+        ("absent.h5:/valid", "cannot be read: No such file"),
+        ("mask.h5:/vlid", "it holds empty (20, 20), grey (20, 20)"),
         ("mask.h5:/vlid", "no dataset /vlid in"),
         ("mask.h5:/group", "no dataset /group in"),
         ("mask.h5:/small", "shape (3, 3), expected (n_subapertures, n_subapertures) = (20, 20)"),
         ("mask.h5:/grey", "values other than 0 and 1"),
         ("mask.h5:/empty", "no valid subaperture"),
         ("mask.h5:/text", "expected numbers"),
-        ("text.h5:/valid", "not a readable HDF5 file"),
+        ("text.h5:/valid", "expected an HDF5 or a FITS file"),
     ],
 )
 def test_a_mask_that_cannot_be_used_is_refused(write, tmp_path, reference, expected):

@@ -1,0 +1,321 @@
+"""The mirror of an instrument file: analytic or measured, with modes of its own or of its user."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import layouts
+from service.config.datasets import read_dataset
+from service.config.instrument_schema import MirrorTable
+from service.config.strict import Place, refuse
+from service.errors import ConfigurationError
+from service.model.filling import known_samples
+from service.model.instrument import BasisKind, Influence, Mirror, TabulatedModes
+from service.model.tabulated import (
+    ENOUGH_POINTS_PER_SUBAPERTURE,
+    LEAST_POINTS_PER_SUBAPERTURE,
+)
+
+_KINDS = ("layout", "modes", "influence_functions")
+
+_LAYOUT_KEYS = {
+    "rings": {"first_ring", "last_ring", "pitch_m"},
+    "grid": {"n_across", "pitch_m", "diameter_m"},
+    "positions": {"positions", "pitch_m"},
+}
+
+_MEASURED = {"modes_pitch_m"}
+_ANALYTIC = set().union(*_LAYOUT_KEYS.values()) | {"influence", "coupling"}
+
+_FOREIGN = {
+    "layout": _MEASURED,
+    "modes": _ANALYTIC | {"mode_to_actuator", "basis"},
+    "influence_functions": _ANALYTIC,
+}
+"""Keys that mean nothing to a mirror of each kind."""
+
+_LARGEST_TABLE = 5.0
+"""Width of a table in pupil diameters, beyond which its pitch is in another unit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MirrorFile:
+    """The ``[mirror]`` table and what is needed to understand it."""
+
+    table: MirrorTable
+    folder: Path
+    """What file references are relative to."""
+
+    place: Place
+    diameter_m: float
+    """Of the pupil."""
+
+    subaperture_m: float
+    """Width of a subaperture in the pupil plane."""
+
+    def where(self, key: str) -> str:
+        """Return the file and key, for messages."""
+        return self.place(("mirror", key))
+
+    def read(self, key: str) -> NDArray[np.floating]:
+        """Return the array this key refers to: floating point, of at least single precision."""
+        values = read_dataset(getattr(self.table, key), self.folder, self.where(key))
+        kind = np.result_type(values.dtype, np.float32) if values.dtype.kind == "f" else np.float64
+        return values.astype(kind, copy=False)
+
+
+def read_mirror(file: MirrorFile) -> tuple[Mirror | TabulatedModes, tuple[str, ...]]:
+    """Return the mirror, and what its owner should be told about it.
+
+    Raises
+    ------
+    ConfigurationError
+        One line: a key that contradicts another, is missing, or whose array cannot be used.
+    """
+    _check_keys(file)
+    if file.table.layout is not None:
+        return _analytic(file), ()
+    return _tabulated(file)
+
+
+def own_modes(mirror: Mirror | TabulatedModes) -> int | None:
+    """Return how many modes the user's own basis has; None where ``[modes]`` decides."""
+    if isinstance(mirror, TabulatedModes):
+        return len(mirror.cube)
+    if mirror.mode_to_actuator is not None:
+        return int(mirror.mode_to_actuator.shape[1])
+    return len(mirror.positions_m) if mirror.basis is BasisKind.ZONAL else None
+
+
+def _check_keys(file: MirrorFile) -> None:
+    table, given = file.table, file.table.model_fields_set
+    kinds = [kind for kind in _KINDS if getattr(table, kind) is not None]
+    if len(kinds) != 1:
+        refuse(
+            file.place(("mirror",)), " and ".join(kinds) or "none of them", f"one of {_listed()}"
+        )
+    for key in sorted(_FOREIGN[kinds[0]] & given):
+        raise ConfigurationError(f"{file.where(key)}: has no meaning beside mirror.{kinds[0]}")
+    if table.mode_to_actuator is not None and "basis" in given:
+        refuse(file.where("basis"), "it beside mirror.mode_to_actuator", "only one of the two")
+    if "modes_kind" in given and table.layout is not None and table.mode_to_actuator is None:
+        refuse(file.where("modes_kind"), "it", "it beside modes of one's own only")
+
+
+def _listed() -> str:
+    return ", ".join(_KINDS)
+
+
+def _mount(table: MirrorTable) -> dict[str, Any]:
+    degrees = table.nominal_rotation_deg
+    return {
+        "nominal_rotation_rad": None if degrees is None else float(np.deg2rad(degrees)),
+        "parity": table.parity,
+        "stroke_known": table.stroke == "known",
+    }
+
+
+def _opd(file: MirrorFile, heights: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return what a wavefront sees of these heights: twice a surface."""
+    return heights * heights.dtype.type(2) if file.table.modes_kind == "surface" else heights
+
+
+# --- analytic
+
+
+def _analytic(file: MirrorFile) -> Mirror:
+    table = file.table
+    _check_layout_keys(file)
+    positions = _LAYOUTS[str(table.layout)](file)
+    pair = layouts.coincident(positions)
+    if pair is not None:
+        refuse(
+            file.place(("mirror",)),
+            f"actuators {pair[0]} and {pair[1]} in the same place",
+            "every actuator in a place of its own",
+        )
+    return Mirror(
+        positions_m=positions,
+        pitch_m=table.pitch_m or layouts.typical_pitch(positions),
+        influence=Influence(table.influence),
+        coupling=table.coupling,
+        basis=BasisKind(table.basis),
+        mode_to_actuator=_mode_to_actuator(file, len(positions)),
+        **_mount(table),
+    )
+
+
+def _check_layout_keys(file: MirrorFile) -> None:
+    table = file.table
+    foreign = set().union(*_LAYOUT_KEYS.values()) - _LAYOUT_KEYS[str(table.layout)]
+    for key in sorted(foreign & table.model_fields_set):
+        owners = [f'"{name}"' for name, keys in _LAYOUT_KEYS.items() if key in keys]
+        raise ConfigurationError(
+            f"{file.where(key)}: belongs to layout = {' or '.join(owners)}, "
+            f'found layout = "{table.layout}"'
+        )
+    if "coupling" in table.model_fields_set and table.influence != "gaussian":
+        raise ConfigurationError(
+            f"{file.where('coupling')}: belongs to influence = "
+            f'"gaussian", found influence = "{table.influence}"'
+        )
+
+
+def _rings(file: MirrorFile) -> NDArray[np.float64]:
+    table = file.table
+    if table.last_ring < table.first_ring:
+        refuse(
+            file.where("last_ring"),
+            str(table.last_ring),
+            f"at least first_ring = {table.first_ring}",
+        )
+    positions = layouts.rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
+    _check_number(len(positions), file.place(("mirror",)))
+    return positions
+
+
+def _grid(file: MirrorFile) -> NDArray[np.float64]:
+    n_across, pitch_m, diameter_m = _mandatory(file, ("n_across", "pitch_m", "diameter_m"))
+    positions = layouts.grid(n_across, pitch_m, diameter_m)
+    _check_number(len(positions), file.place(("mirror",)))
+    return positions
+
+
+def _listed_positions(file: MirrorFile) -> NDArray[np.float64]:
+    where = file.where("positions")
+    _mandatory(file, ("positions",))
+    values = file.read("positions")
+    if values.ndim != 2 or values.shape[1] != 2:
+        turned = " (it looks transposed)" if values.ndim == 2 and len(values) == 2 else ""
+        refuse(where, f"shape {values.shape}{turned}", "(n_actuators, 2), x and y in metres")
+    if not np.isfinite(values).all():
+        refuse(where, "a position that is not finite", "metres in the pupil plane")
+    _check_number(len(values), where)
+    return values.astype(np.float64)
+
+
+_LAYOUTS: dict[str, Callable[[MirrorFile], NDArray[np.float64]]] = {
+    "rings": _rings,
+    "grid": _grid,
+    "positions": _listed_positions,
+}
+
+
+def _mandatory(file: MirrorFile, keys: tuple[str, ...]) -> tuple[Any, ...]:
+    for key in keys:
+        if getattr(file.table, key) is None:
+            raise ConfigurationError(
+                f"{file.where(key)}: missing, "
+                f'layout = "{file.table.layout}" needs {", ".join(keys)}'
+            )
+    return tuple(getattr(file.table, key) for key in keys)
+
+
+def _check_number(n_actuators: int, where: str) -> None:
+    if n_actuators < 4:
+        refuse(where, f"{n_actuators} actuators", "at least 4: tip, tilt and something to correct")
+
+
+def _mode_to_actuator(file: MirrorFile, n_actuators: int) -> NDArray[np.float64] | None:
+    if file.table.mode_to_actuator is None:
+        return None
+    where = file.where("mode_to_actuator")
+    values = file.read("mode_to_actuator")
+    expected = f"({n_actuators} actuators, n_modes)"
+    if values.ndim != 2 or len(values) != n_actuators:
+        turned = values.ndim == 2 and values.shape[1] == n_actuators
+        hint = " (it looks transposed)" if turned else ""
+        refuse(where, f"shape {values.shape}{hint}", expected)
+    if values.shape[1] == 0 or not np.isfinite(values).all():
+        refuse(where, "no mode, or strokes that are not finite", f"{expected} finite strokes")
+    return _opd(file, values).astype(np.float64)
+
+
+# --- measured
+
+
+def _tabulated(file: MirrorFile) -> tuple[TabulatedModes, tuple[str, ...]]:
+    key = "modes" if file.table.modes is not None else "influence_functions"
+    if file.table.modes_pitch_m is None:
+        raise ConfigurationError(
+            f"{file.where('modes_pitch_m')}: missing, mirror.{key} needs the step of its grid"
+        )
+    cube = file.read(key)
+    if cube.ndim != 3 or min(cube.shape) < 1:
+        refuse(file.where(key), f"shape {cube.shape}", "(n, ny, nx), one table for each")
+    known = known_samples(cube)
+    _check_table(file, key, known, file.table.modes_pitch_m)
+    remarks = _remarks(file, key, known, file.table.modes_pitch_m)
+    cube = np.where(known, cube, cube.dtype.type(0))
+    if key == "influence_functions":
+        cube = _combined(file, cube)
+    modes = TabulatedModes(
+        cube=_opd(file, cube),
+        pitch_m=file.table.modes_pitch_m,
+        known=known,
+        **_mount(file.table),
+    )
+    return modes, remarks
+
+
+def _combined(file: MirrorFile, cube: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the modes that influence functions make."""
+    if file.table.basis == "zonal":
+        return cube
+    strokes = _mode_to_actuator(file, len(cube))
+    if strokes is None:
+        raise ConfigurationError(
+            f"{file.where('mode_to_actuator')}: missing, mirror.influence_functions needs it, or "
+            'basis = "zonal" for the actuators themselves'
+        )
+    return np.tensordot(strokes.T.astype(cube.dtype), cube, axes=1)
+
+
+def _check_table(file: MirrorFile, key: str, known: NDArray[np.bool_], pitch_m: float) -> None:
+    density = file.subaperture_m / pitch_m
+    if density < LEAST_POINTS_PER_SUBAPERTURE:
+        refuse(
+            file.where("modes_pitch_m"),
+            f"{pitch_m:g} m, {density:.2g} table points per subaperture",
+            f"at least {LEAST_POINTS_PER_SUBAPERTURE:g}, "
+            f"{ENOUGH_POINTS_PER_SUBAPERTURE:g} for 0.5 %",
+        )
+    width = max(known.shape) * pitch_m / file.diameter_m
+    if width > _LARGEST_TABLE:
+        refuse(
+            file.where("modes_pitch_m"),
+            f"{pitch_m:g} m, a table of {width:.3g} pupil diameters",
+            f"at most {_LARGEST_TABLE:g}: is it in metres of the pupil plane?",
+        )
+    covered = known.sum() * pitch_m**2 / (np.pi / 4 * file.diameter_m**2)
+    if covered < 0.5:
+        refuse(
+            file.where(key),
+            f"a surface known over {covered:.0%} of the pupil's area "
+            f"(table of {known.shape[0]} x {known.shape[1]} points, {pitch_m:g} m apart)",
+            "at least half of it",
+        )
+
+
+def _remarks(
+    file: MirrorFile, key: str, known: NDArray[np.bool_], pitch_m: float
+) -> tuple[str, ...]:
+    remarks = []
+    density = file.subaperture_m / pitch_m
+    if density < ENOUGH_POINTS_PER_SUBAPERTURE:
+        remarks.append(
+            f"{file.where('modes_pitch_m')}: {density:.2g} table points per subaperture; below "
+            f"{ENOUGH_POINTS_PER_SUBAPERTURE:g} the high modes come out wrong by per cents"
+        )
+    if not known.all():
+        remarks.append(
+            f"{file.where(key)}: {1 - known.mean():.0%} of the table is zero in every mode or not "
+            "finite: taken as unknown; slopes within one subaperture of it are left out"
+        )
+    return tuple(remarks)

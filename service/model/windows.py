@@ -1,0 +1,221 @@
+"""Four windows cut out of full detector frames, at sub-pixel places, and the slopes they give.
+
+The four pupil images of a real pyramid are whole pixels wide by accident and seldom sit on a
+rectangle. A window that starts between two pixels is cut from the running sum of the light, with a
+spline through it: what falls on neighbouring subapertures is then neither lost nor counted twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes
+
+from service.errors import ModelError
+from service.model.instrument import Instrument
+from service.model.slopes import Normalisation
+
+Array = NDArray[np.float64]
+
+_SPLINE_DEGREE = 5
+_REACH_PX = 16
+"""Pixels around a window that its spline is made of: further ones weigh less than 1e-5."""
+
+_DARK = 0.25
+_LIT = 0.75
+"""Shares of the typical light between which a pixel counts in part when images are looked for."""
+
+_DIAMETER_TOLERANCE = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Window:
+    """One pupil image: which pixels it is made of, and how."""
+
+    rows: slice
+    columns: slice
+    along_y: Array
+    """``(n, n_rows)`` share of every pixel row in every subaperture row."""
+
+    along_x: Array
+    """``(n, n_columns)``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Windows:
+    """Cuts frames of one shape into the four pupil images."""
+
+    centres_px: Array
+    """``(2, 2, 2)``: of the image at this side along y and x its row and column."""
+
+    shape: tuple[int, int]
+    """Of a frame: rows, columns."""
+
+    windows: tuple[_Window, ...]
+    """At -y -x, -y +x, +y -x, +y +x."""
+
+    def cut(self, frames: NDArray[np.floating]) -> Array:
+        """Return the images ``(..., 2, n, 2, n)`` of ``frames`` ``(..., rows, columns)``.
+
+        Side along y, row of subapertures, side along x, column of subapertures.
+
+        Raises
+        ------
+        ModelError
+            If the frames have another shape.
+        """
+        if frames.shape[-2:] != self.shape:
+            raise ModelError(f"frames: found {frames.shape[-2:]} pixels, expected {self.shape}")
+        images = [
+            window.along_y @ frames[..., window.rows, window.columns] @ window.along_x.T
+            for window in self.windows
+        ]
+        upper, lower = (np.stack(pair, axis=-2) for pair in (images[:2], images[2:]))
+        return np.stack([upper, lower], axis=-4)
+
+
+def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
+    """Return the windows of an instrument that delivers frames.
+
+    ``flux_frame`` is ``(rows, columns)``, a mean frame; where the instrument does not tell where
+    the pupil images lie, they are found in it.
+
+    Raises
+    ------
+    ModelError
+        If the images cannot be found, or a window leaves the frame.
+    """
+    if instrument.frames is None:
+        raise ModelError(f"{instrument.name}: found wfs.input = slopes, expected frames")
+    pixels = instrument.frames.pixels_per_subaperture
+    if instrument.frames.centres_px is None:
+        centres = found_centres(flux_frame, instrument.wfs.pupil_diameter * pixels)
+    else:
+        centres = by_quadrant(instrument.frames.centres_px)
+    n = instrument.wfs.n_subapertures
+    shape = (flux_frame.shape[0], flux_frame.shape[1])
+    windows = []
+    for row, column in centres.reshape(4, 2):
+        rows, along_y = _axis(row, n, pixels, shape[0], "rows")
+        columns, along_x = _axis(column, n, pixels, shape[1], "columns")
+        windows.append(_Window(rows=rows, columns=columns, along_y=along_y, along_x=along_x))
+    return Windows(centres_px=centres, shape=shape, windows=tuple(windows))
+
+
+def slopes_per_metre(
+    rest: Array, images: Array, valid: NDArray[np.bool_], normalisation: Normalisation
+) -> Array:
+    """Return what the slopes do ``(n_slopes, n_modes)`` when the light changes.
+
+    ``rest`` is ``(2, n, 2, n)`` the mean light, ``images`` ``(n_modes, 2, n, 2, n)`` its change
+    per unit of every mode. All Sx, then all Sy, of the subapertures ``valid`` ``(n, n)`` [y, x],
+    on the detector's own axes: a wavefront that moves light to lower columns has a positive Sx.
+    The normalisation's own change is part of it.
+
+    Raises
+    ------
+    ModelError
+        If a valid subaperture, or all of them together, sees no light.
+    """
+    differences, flux = _light(rest[None], valid)
+    changes, flux_changes = _light(images, valid)
+    if normalisation is Normalisation.GLOBAL:
+        flux, flux_changes = (f.mean(axis=1, keepdims=True) for f in (flux, flux_changes))
+    if flux.min() <= 0.0:
+        raise ModelError(
+            f"flux frame: found {flux.min():g} counts in a valid subaperture, expected light in all"
+        )
+    slopes = differences / flux
+    return np.asarray(((changes - slopes * flux_changes) / flux).T)
+
+
+def by_quadrant(centres_px: Array) -> Array:
+    """Return four centres ``(4, 2)`` as ``(2, 2, 2)``: side along y, side along x, (row, column).
+
+    Raises
+    ------
+    ModelError
+        If they do not lie in the four quadrants around their middle, one in each.
+    """
+    side = (centres_px > centres_px.mean(axis=0)).astype(int)
+    place = 2 * side[:, 0] + side[:, 1]
+    if sorted(place) != [0, 1, 2, 3]:
+        raise ModelError(
+            f"found pupil images at {centres_px.tolist()}, expected one in each quadrant"
+        )
+    return np.asarray(centres_px[np.argsort(place)].reshape(2, 2, 2))
+
+
+def found_centres(flux_frame: Array, diameter_px: float) -> Array:
+    """Return the centres of the four pupil images in a mean frame, ``(2, 2, 2)``.
+
+    The middle of what is lit at all, however unevenly: only the outline counts.
+
+    Raises
+    ------
+    ModelError
+        If the lit areas are not four discs of this diameter.
+    """
+    light = np.nan_to_num(flux_frame)
+    row, column = _darkest(light.sum(axis=1)), _darkest(light.sum(axis=0))
+    centres = np.empty((2, 2, 2))
+    for y, rows in enumerate((slice(None, row), slice(row, None))):
+        for x, columns in enumerate((slice(None, column), slice(column, None))):
+            disc = _disc(light[rows, columns])
+            middle = [axis @ np.arange(len(axis)) for axis in _profiles(disc)]
+            centres[y, x] = np.add(middle, [y * row, x * column])
+            found_px = float(np.sqrt(4 / np.pi * disc.sum()))
+            if abs(found_px / diameter_px - 1.0) > _DIAMETER_TOLERANCE:
+                raise ModelError(
+                    f"flux frame: found a lit area as large as a disc of {found_px:.1f} pixels "
+                    f"near row {centres[y, x, 0]:.0f}, column {centres[y, x, 1]:.0f}; expected "
+                    f"four pupil images of {diameter_px:g}"
+                )
+    return centres
+
+
+def _darkest(profile: Array) -> int:
+    """Return the darkest line in the middle half of a profile: it parts the images."""
+    quarter = len(profile) // 4
+    return quarter + int(np.argmin(profile[quarter : len(profile) - quarter]))
+
+
+def _disc(light: Array) -> Array:
+    """Return the lit disc of one quadrant: 1 inside, holes filled, the lit share on the edge."""
+    bright = light[light > np.percentile(light, 98) / 3]
+    typical = np.median(bright) if bright.size else 1.0
+    lit = np.clip((light / typical - _DARK) / (_LIT - _DARK), 0.0, 1.0)
+    solid = binary_fill_holes(lit > 0.5)
+    return np.where(binary_erosion(solid), 1.0, lit * binary_dilation(solid))
+
+
+def _profiles(disc: Array) -> tuple[Array, Array]:
+    """Return how a disc is spread over rows and columns; each sums to 1."""
+    total = max(float(disc.sum()), 1e-300)
+    return disc.sum(axis=1) / total, disc.sum(axis=0) / total
+
+
+def _axis(centre_px: float, n: int, pixels: int, length: int, name: str) -> tuple[slice, Array]:
+    """Return which pixels of an axis a window needs, and their shares ``(n, n_pixels)``."""
+    edges = centre_px + 0.5 + (np.arange(n + 1) - n / 2) * pixels
+    if edges[0] < -1e-9 or edges[-1] > length + 1e-9:
+        raise ModelError(
+            f"frames: found a window of {n * pixels} {name} around {centre_px:g}, which leaves "
+            f"the frame of {length}"
+        )
+    first = max(int(np.floor(edges[0])) - _REACH_PX, 0)
+    last = min(int(np.ceil(edges[-1])) + _REACH_PX, length)
+    running = np.tri(last - first + 1, last - first, -1)
+    spline = make_interp_spline(np.arange(first, last + 1), running, k=_SPLINE_DEGREE)
+    return slice(first, last), np.diff(spline(np.clip(edges, first, last)), axis=0)
+
+
+def _light(images: Array, valid: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return differences ``(m, 2 * n_valid)`` of images ``(m, 2, n, 2, n)``, and fluxes twice."""
+    by_x, by_y = images.sum(axis=1), images.sum(axis=3)
+    differences = [by_x[:, :, 0] - by_x[:, :, 1], by_y[:, 0] - by_y[:, 1]]
+    flux = by_y.sum(axis=1)[:, valid]
+    return np.concatenate([d[:, valid] for d in differences], axis=1), np.tile(flux, (1, 2))

@@ -1,0 +1,97 @@
+"""From rows to the tables of a campaign: bias, scatter, coverage, refusals, wavefront error."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+Array = NDArray[np.float64]
+Row = dict[str, Any]
+
+GROUPED_BY = (
+    "plant", "truth", "estimator", "trouble", "magnitude", "profile", "wind_m_s", "gain",
+    "n_controlled", "amplitude_nm", "window_s", "working_point_modes",
+)  # fmt: skip
+"""Nights that differ in nothing but the seed make one line of the table."""
+
+UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
+"""Printed in % of a subaperture, thousandths of a degree, %."""
+
+HEADER = (
+    "| night | windows (refused) | bias x, y % / mdeg / % | scatter | scatter/σ | chi2/4 "
+    "| inside 95 % | error RMS | wavefront nm |\n|---|---|---|---|---|---|---|---|---|\n"
+)
+
+
+def table(rows: list[Row], floor: Array) -> str:
+    """Return the campaign as a Markdown table; ``floor`` ``(4,)`` in boundary units."""
+    groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
+    for row in rows:
+        groups[tuple(row[name] for name in GROUPED_BY)].append(row)
+    return HEADER + "".join(line(key, group, floor) for key, group in groups.items())
+
+
+def line(key: tuple[Any, ...], rows: list[Row], floor: Array) -> str:
+    """Return one line of the table."""
+    good = [row for row in rows if row["refused"] is None]
+    wavefront = np.array([row["wavefront_nm"] for row in rows if row["wavefront_nm"] is not None])
+    name = _name(dict(zip(GROUPED_BY, key, strict=True)))
+    counted = f"{len(rows)} ({len(rows) - len(good)})"
+    error_nm = f"{np.sqrt(np.mean(wavefront**2)):.1f}" if wavefront.size else "-"
+    if not good:
+        return f"| {name} | {counted} | - | - | - | - | - | - | {error_nm} |\n"
+    errors = np.array([row["error"] for row in good])
+    covariances = np.array([row["covariance"] for row in good])
+    seeds = np.array([row["seed"] for row in good])
+    sigma = np.sqrt(np.mean(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
+    scatter = _within(errors, seeds)
+    squares = distances(errors, covariances, floor)
+    inside = np.mean(squares < chi2.ppf(0.95, 4))
+    cells = (
+        _four(errors.mean(axis=0) * UNITS),
+        _four(scatter * UNITS),
+        _four(scatter / sigma),
+        f"{squares.mean() / 4:.2f}",
+        f"{inside:.0%}",
+        _four(np.sqrt(np.mean(errors**2, axis=0)) * UNITS),
+        error_nm,
+    )
+    return f"| {name} | {counted} | " + " | ".join(cells) + " |\n"
+
+
+def distances(errors: Array, covariances: Array, floor: Array) -> Array:
+    """Return ``(n,)`` normalised squared errors, floor included: four degrees of freedom."""
+    total = covariances + np.diag(floor**2)
+    return np.array([e @ np.linalg.solve(c, e) for e, c in zip(errors, total, strict=True)])
+
+
+def _within(errors: Array, seeds: NDArray[np.int_]) -> Array:
+    """Return the RMS scatter about each telescope's own mean, ``(4,)``."""
+    squares, freedom = np.zeros(4), 0
+    for seed in np.unique(seeds):
+        own = errors[seeds == seed]
+        squares += np.sum((own - own.mean(axis=0)) ** 2, axis=0)
+        freedom += len(own) - 1
+    return np.asarray(np.sqrt(squares / freedom)) if freedom else np.full(4, np.nan)
+
+
+def _four(values: Array) -> str:
+    return " ".join(f"{value:.2f}" for value in values)
+
+
+def _name(key: dict[str, Any]) -> str:
+    sky = key["profile"] or f"{key['wind_m_s']:g} m/s"
+    words = [
+        f"{key['estimator']}, {key['plant']} {key['truth']}, mag {key['magnitude']:g}, {sky}",
+        f"{key['n_controlled']} modes g {key['gain']:g}",
+        f"4 x {key['amplitude_nm']:g} nm, {key['window_s']:g} s",
+    ]
+    if key["working_point_modes"]:
+        words.append("working point")
+    if key["trouble"] != "none":
+        words.append(f"**{key['trouble']}**")
+    return ", ".join(words)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -69,22 +69,15 @@ class Container:
     """By name: of HDF5 the path without its first slash, of FITS the EXTNAME or, where an image has
     none, its number."""
 
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    find: Callable[[str], StoredArray | None]
+    """Returns the array of a name, or None: in HDF5 links are followed, in FITS any case and the
+    number of an image will do."""
+
+    facts: Mapping[str, Any]
     """HDF5 attributes of the file, or keywords of the primary FITS header in lower case."""
 
-    any_case: bool = False
-    """Whether names are the same in capitals: FITS."""
-
-    numbers: Mapping[str, str] = field(default_factory=dict)
-    """Names of FITS images by their number in the file."""
-
-    def find(self, name: str) -> StoredArray | None:
-        """Return the array of this name, or None."""
-        wanted = name.strip("/")
-        wanted = self.numbers.get(wanted, wanted)
-        if not self.any_case:
-            return self.arrays.get(wanted)
-        return next((a for key, a in self.arrays.items() if key.lower() == wanted.lower()), None)
+    is_fits: bool = False
+    """Whether images may have no name."""
 
     def listing(self) -> str:
         """Return what is in the file, in words."""
@@ -145,14 +138,14 @@ def _hdf5(path: Path) -> Iterator[Container]:
         raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error
     arrays: dict[str, StoredArray] = {}
 
+    def find(name: str) -> StoredArray | None:
+        item = file.get(name.strip("/") or "/")
+        return _dataset(item, f"{path}:/{name.strip('/')}")
+
     def visit(name: str, item: object) -> None:
-        if isinstance(item, h5py.Dataset) and item.shape is not None:
-            arrays[name] = StoredArray(
-                where=f"{path}:/{name}",
-                shape=item.shape,
-                dtype=item.dtype,
-                read=partial(item.__getitem__, ()),
-            )
+        array = _dataset(item, f"{path}:/{name}")
+        if array is not None:
+            arrays[name] = array
 
     with file:
         try:
@@ -160,7 +153,15 @@ def _hdf5(path: Path) -> Iterator[Container]:
             facts = dict(file.attrs)
         except (OSError, RuntimeError, KeyError) as error:
             raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error
-        yield Container(path=path, arrays=arrays, facts=facts)
+        yield Container(path=path, arrays=arrays, find=find, facts=facts)
+
+
+def _dataset(item: object, where: str) -> StoredArray | None:
+    if not isinstance(item, h5py.Dataset) or item.shape is None:
+        return None
+    return StoredArray(
+        where=where, shape=item.shape, dtype=item.dtype, read=partial(item.__getitem__, ())
+    )
 
 
 @contextmanager
@@ -180,15 +181,21 @@ def _fits(path: Path) -> Iterator[Container]:
         except (OSError, ValueError, Warning) as error:
             raise MatrixError(f"{path}: damaged FITS file: {error}") from error
         arrays: dict[str, StoredArray] = {}
-        numbers: dict[str, str] = {}
+        known: dict[str, StoredArray] = {}
         for number, hdu in enumerate(file):
             if hdu.is_image and hdu.shape:
                 name = str(hdu.header.get("EXTNAME", number))
                 array = _image(hdu, f"{path}[{name}]")
-                numbers[str(number)] = str(number) if name in arrays else name
-                arrays[numbers[str(number)]] = array
-        facts = {str(key).lower(): value for key, value in file[0].header.items()}
-        yield Container(path=path, arrays=arrays, facts=facts, any_case=True, numbers=numbers)
+                arrays[str(number) if name in arrays else name] = array
+                known.setdefault(name.lower(), array)
+                known[str(number)] = array
+        yield Container(
+            path=path,
+            arrays=arrays,
+            find=lambda name: known.get(name.strip("/").lower()),
+            facts={str(key).lower(): value for key, value in file[0].header.items()},
+            is_fits=True,
+        )
 
 
 def _image(hdu: _ImageHdu, where: str) -> StoredArray:

@@ -94,6 +94,9 @@ class KnownFit:
     order: SlopeOrder | None = None
     """Of the components."""
 
+    double_pass: bool | None = None
+    """Whether light met the mirror twice in the measured matrix; None: not in the file."""
+
     accepted: bool | None = None
     """The verdict; None: α was given by hand."""
 
@@ -153,6 +156,7 @@ def _of_product(file: h5py.File, path: Path) -> KnownFit:
         known,
         modes=np.asarray(file["modes"][()], dtype=np.intp),
         gains=np.asarray(file["gains"][()], dtype=np.float64),
+        double_pass=bool(file.attrs["double_pass"]),
         accepted=bool(file.attrs["accepted"]),
         instrument_sha256=str(file.attrs["instrument_sha256"]),
         reference_sha256=str(file.attrs["reference_sha256"]),

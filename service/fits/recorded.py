@@ -108,7 +108,7 @@ def file_sha256(path: Path) -> str:
 
 def _matrix(container: Container, dataset: str | None) -> StoredArray:
     found = container.find(dataset or DATASET)
-    if found is None and dataset is None and container.any_case and len(container.arrays) == 1:
+    if found is None and dataset is None and container.is_fits and len(container.arrays) == 1:
         (found,) = container.arrays.values()
     if found is None:
         raise MatrixError(

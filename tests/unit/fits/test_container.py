@@ -57,6 +57,12 @@ def test_what_is_in_a_file_is_listed_with_its_shape(hdf5):
         assert file.facts["double_pass"]
 
 
+def test_a_link_is_followed(hdf5):
+    with h5py.File(hdf5, "a") as file:
+        file["interaction_matrix"] = h5py.SoftLink("/measured/D")
+    assert np.array_equal(numbers(hdf5, "interaction_matrix"), VALUES)
+
+
 def test_text_is_no_matrix(hdf5):
     assert "expected real numbers" in refused(hdf5, "name")
 

@@ -1,0 +1,266 @@
+"""Fits of measured matrices that are uploaded: ask for one, see how far it is, take it away."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from http import HTTPStatus
+from typing import Annotated, Any, Protocol
+
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from starlette.requests import ClientDisconnect
+
+from service.errors import MatrixError
+from service.fits.jobs import FitAsked, FitJob, FitState
+from service.fits.request import parse_alpha, parse_modes
+from service.registration.options import FitOptions, Method
+from service.routes.problems import INVALID, UNKNOWN, problem_response
+from service.routes.schemas import Number, View
+
+router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
+
+FitId = Annotated[str, Path(alias="id", description="Id of a fit")]
+
+_TEXT = 200
+"""Longest name of an array or a file."""
+
+
+class Fits(Protocol):
+    """The desk where fits are asked for, as REST sees it."""
+
+    async def take(
+        self, asked: FitAsked, body: AsyncIterator[bytes], n_bytes: int | None
+    ) -> FitJob:
+        """Keep an upload and put its fit in the queue.
+
+        Raises
+        ------
+        TooLargeError
+            If it is beyond the limit; before it is read where its length ``n_bytes`` is told.
+        BusyError
+            If too many wait already.
+        MatrixError
+            If it stops half-way, or is no file a matrix could be in.
+        """
+
+    def jobs(self) -> Sequence[FitJob]:
+        """Return the fits that are remembered, oldest first."""
+
+    def job(self, fit_id: str) -> FitJob:
+        """Return one.
+
+        Raises
+        ------
+        UnknownIdError
+            If none has this id.
+        """
+
+
+def _fits_of(request: Request) -> Fits:
+    fits: Fits = request.app.state.fits
+    return fits
+
+
+FitsDep = Annotated[Fits, Depends(_fits_of)]
+
+
+class FitParameters(BaseModel):
+    """What is asked for; the same words as of ``pyrcal fit``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    dataset: str | None = Field(default=None, min_length=1, max_length=_TEXT)
+    """Name of the matrix in its file; default interaction_matrix."""
+
+    method: Method = Method.JOINT
+    """"joint", "paper" or "sensitivity"."""
+
+    modes: str | None = Field(default=None, max_length=10_000)
+    """Basis indices, like 0:400 or 3,5,9; default all."""
+
+    start: str | None = Field(default=None, max_length=_TEXT)
+    """X,Y,ROT,MAG: subapertures, degrees, ratio."""
+
+    gain_map: bool = False
+    """Whether a gain over the pupil, common to all modes, is unknown too."""
+
+    anamorphosis: bool = False
+    """Whether the mirror's image may be stretched."""
+
+    instrument: str | None = Field(default=None, pattern=r"^[A-Za-z0-9._-]{1,64}$")
+    """A packaged instrument; default: the service's own, or the one in the upload."""
+
+    reference: str | None = Field(default=None, min_length=1, max_length=_TEXT)
+    """Name of the measured file in an uploaded zip."""
+
+    @field_validator("modes")
+    @classmethod
+    def _modes_are_modes(cls, text: str | None) -> str | None:
+        if text is not None:
+            parse_modes(text)
+        return text
+
+    @field_validator("start")
+    @classmethod
+    def _start_is_a_registration(cls, text: str | None) -> str | None:
+        if text is not None:
+            parse_alpha(text)
+        return text
+
+    def asked(self) -> FitAsked:
+        """Return this as the fit understands it."""
+        return FitAsked(
+            options=FitOptions(
+                method=self.method,
+                modes=None if self.modes is None else parse_modes(self.modes),
+                start=None if self.start is None else parse_alpha(self.start),
+                gain_map=self.gain_map,
+                anamorphosis=self.anamorphosis,
+            ),
+            dataset=self.dataset,
+            instrument=self.instrument,
+            reference=self.reference,
+        )
+
+
+class FitDocument(View):
+    """What a fit has found: the object that ``pyrcal fit --json`` prints."""
+
+    shift_x_subap: Number
+    """Along sensor +x, subapertures."""
+
+    shift_y_subap: Number
+    """Along sensor +y, subapertures."""
+
+    rotation_deg: Number
+    """From sensor +x towards +y, degrees."""
+
+    magnification: Number
+    """Ratio; 1 is nominal."""
+
+    sigma: dict[str, Number]
+    """1 σ of the four, by name; noise, disagreement of subsets and model error together."""
+
+    covariance: list[list[Number]]
+    """4 x 4, in the units of the names."""
+
+    gains: list[Number]
+    """Measured column over the model's, one for each mode used, passes divided out."""
+
+    residual_fraction: Number
+    """RMS of what is left over RMS of the measurement."""
+
+    condition_number: Number
+    """Of the synthetic matrix, modes used."""
+
+    n_modes_used: int
+    orientation: dict[str, Any]
+    """Of the slopes, as the instrument file would say it."""
+
+    subset_scatter: dict[str, Number]
+    """1 σ scatter of disjoint sets of modes, by name."""
+
+    converged: bool
+    verdict: str
+    """Begins with "accepted" or "refused"; names what was left out."""
+
+    seconds: Number
+
+
+class FitJobView(View):
+    """A fit, and how far it is."""
+
+    id: str
+    state: FitState
+    """"receiving", "waiting", "running", "done" or "failed"."""
+
+    asked_ns_utc: int
+    n_bytes: int
+    """Of the upload."""
+
+    sha256: str
+    """Of the upload; empty until it is whole."""
+
+    reason: str
+    """Why it failed."""
+
+
+class FitJobsView(View):
+    """The fits the service remembers until it ends."""
+
+    fits: tuple[FitJobView, ...]
+    """Oldest first."""
+
+
+class FitAcceptedView(View):
+    """A fit in the queue."""
+
+    id: str
+    """Of the fit."""
+
+    links: dict[str, str]
+    """Where to look for what becomes of it."""
+
+
+_UPLOAD: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "An HDF5 or FITS file, or a zip of one, an instrument file and its data",
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+
+@router.post(
+    "/fits",
+    status_code=202,
+    openapi_extra=_UPLOAD,
+    responses={
+        413: problem_response("The upload is larger than this service takes"),
+        503: problem_response("Too many fits wait already"),
+    },
+)
+async def fit(
+    request: Request,
+    fits: FitsDep,
+    parameters: Annotated[FitParameters, Query()],
+    content_length: Annotated[int | None, Header(ge=0)] = None,
+) -> FitAcceptedView:
+    """Fit the registration to the measured interaction matrix that is the body of this request.
+
+    `curl --data-binary @im.h5 ...`. The answer comes as soon as the file is here; the fit runs in
+    a process of its own, one after the other.
+    """
+    job = await fits.take(parameters.asked(), _body(request), content_length)
+    return FitAcceptedView(id=job.id, links={"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"})
+
+
+@router.get("/fits")
+async def fits_known(fits: FitsDep) -> FitJobsView:
+    """Return the fits the service remembers, oldest first."""
+    return FitJobsView.model_validate({"fits": tuple(fits.jobs())})
+
+
+@router.get(
+    "/fits/{id}",
+    response_model=FitDocument,
+    responses={202: {"model": FitJobView, "description": "Not finished yet"}, **UNKNOWN},
+)
+async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
+    """Return what a fit has found; 202 while it has not, 422 with the reason where it could not."""
+    job = fits.job(fit_id)
+    if job.document is not None:
+        return JSONResponse(dict(job.document))
+    if job.state is FitState.FAILED:
+        raise MatrixError(job.reason)
+    view = FitJobView.model_validate(job)
+    return JSONResponse(view.model_dump(mode="json"), status_code=HTTPStatus.ACCEPTED)
+
+
+async def _body(request: Request) -> AsyncIterator[bytes]:
+    try:
+        async for chunk in request.stream():
+            yield chunk
+    except ClientDisconnect as error:
+        raise MatrixError("upload: the client went away half-way") from error

@@ -1,0 +1,82 @@
+import asyncio
+import os
+import signal
+import time
+from functools import partial
+
+import pytest
+
+from service.errors import MatrixError, WorkerError
+from service.runtime.errand import run_apart
+
+pytestmark = pytest.mark.timeout(60)
+
+
+def process_id(folder=None):
+    if folder is not None:
+        (folder / "pid").write_text(str(os.getpid()))
+        time.sleep(60.0)
+    return os.getpid()
+
+
+def niceness():
+    return os.nice(0)
+
+
+def refusing():
+    raise MatrixError("transposed")
+
+
+def failing():
+    raise ValueError("a bug in a job")
+
+
+def killed():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+async def gone(folder):
+    """Whether the process of the job, which waits for a minute, is there no more."""
+    pid = int((folder / "pid").read_text())
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+async def test_every_job_has_a_process_of_its_own():
+    first, second = [await run_apart(process_id, nice=0, limit_s=30.0) for _ in range(2)]
+    assert len({first, second, os.getpid()}) == 3
+
+
+async def test_the_process_is_nice():
+    assert await run_apart(niceness, nice=4, limit_s=30.0) == os.nice(0) + 4
+
+
+async def test_what_a_job_refuses_is_said_as_it_said_it():
+    with pytest.raises(MatrixError, match="^transposed$"):
+        await run_apart(refusing, nice=0, limit_s=30.0)
+
+
+async def test_an_unforeseen_failure_is_a_lost_job():
+    with pytest.raises(WorkerError, match="a bug in a job"):
+        await run_apart(failing, nice=0, limit_s=30.0)
+
+
+async def test_a_killed_process_is_a_lost_job():
+    with pytest.raises(WorkerError, match="died"):
+        await run_apart(killed, nice=0, limit_s=30.0)
+
+
+async def test_a_job_that_takes_too_long_is_stopped(tmp_path):
+    with pytest.raises(WorkerError, match="longer than 3 s"):
+        await run_apart(partial(process_id, tmp_path), nice=0, limit_s=3.0)
+    await gone(tmp_path)
+
+
+async def test_a_job_nobody_waits_for_is_stopped(tmp_path):
+    waiting = asyncio.create_task(run_apart(partial(process_id, tmp_path), nice=0, limit_s=60.0))
+    while not (tmp_path / "pid").exists():
+        await asyncio.sleep(0.05)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    await gone(tmp_path)

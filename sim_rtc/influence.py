@@ -171,8 +171,10 @@ def _pitch_m(file: InfluenceFile) -> float:
     if file.pitch_m is not None:
         return file.pitch_m
     name, _, dataset = file.reference.rpartition(":/")
-    with h5py.File(name, "r") as opened:
-        found = opened[dataset].attrs.get("pitch_m")
+    found = None
+    if h5py.is_hdf5(name):
+        with h5py.File(name, "r") as opened:
+            found = opened[dataset].attrs.get("pitch_m")
     try:
         pitch_m = float(np.asarray(found).item())
     except (TypeError, ValueError):

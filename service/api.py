@@ -6,7 +6,9 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 
 from service import __version__
-from service.routes import health, measurements, operating, problems, reading
+from service.routes import fits as fits_of_uploads
+from service.routes import health, loop, measurements, operating, problems, reading
+from service.routes.fits import Fits
 from service.routes.service import Link, Service, Snapshot
 
 __all__ = ["Link", "Service", "Snapshot", "create_app"]
@@ -20,8 +22,8 @@ finite is `null`. Errors are `application/problem+json` (RFC 9457).
 """
 
 
-def create_app(service: Service) -> FastAPI:
-    """Return the REST application of a service.
+def create_app(service: Service, fits: Fits | None = None) -> FastAPI:
+    """Return the REST application of a service, and of a desk for fits where there is one.
 
     Swagger and ReDoc pages are left out: they load their scripts from the internet, which an
     observatory's network need not reach. ``/openapi.json`` is there.
@@ -36,8 +38,11 @@ def create_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     problems.install(app)
-    for router in (reading.router, operating.router, measurements.router, health.router):
-        app.include_router(router)
+    for routes in (reading, operating, loop, measurements, health):
+        app.include_router(routes.router)
+    if fits is not None:
+        app.state.fits = fits
+        app.include_router(fits_of_uploads.router)
     return app
 
 

@@ -16,7 +16,6 @@ from service.model.instrument import Instrument, Pyramid, Stop
 from service.model.interaction import reference_slopes, rotation, valid_subapertures
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
-from service.model.pyramid import PyramidOptics
 from sim_rtc.diffractive import DiffractivePyramid, Quadrature, centred_pupil
 from sim_rtc.imperfections import (
     Imperfections,
@@ -235,9 +234,7 @@ class DiffractivePlant:
         self.points_m: Array = self._points * instrument.subaperture_m
         self.pitch_m: float = instrument.subaperture_m / pupil.sampling
         self.weights: Array = pupil.weights
-        self.valid: NDArray[np.bool_] = valid_subapertures(
-            instrument, PyramidOptics(wfs=instrument.wfs, pupil=pupil)
-        )
+        self.valid: NDArray[np.bool_] = valid_subapertures(instrument)
         self.slope_errors = SlopeErrors(self.valid, imperfections, pixel_rng)
         """What the sensor makes of correct light and slopes."""
         self.sensor_opd_m: Array32 = non_common_path(

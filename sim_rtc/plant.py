@@ -201,7 +201,7 @@ class LinearPlant:
         self.points_m: Array = self._points * instrument.subaperture_m
         self.pitch_m: float = instrument.subaperture_m / _SAMPLING
         self.weights: Array = pupil.weights
-        self.valid: NDArray[np.bool_] = valid_subapertures(instrument, self._pyramid)
+        self.valid: NDArray[np.bool_] = valid_subapertures(instrument)
         self.slope_errors = SlopeErrors(self.valid, imperfections, pixel_rng)
         """What the sensor makes of correct light and slopes."""
         self.sensor_opd_m: Array32 = non_common_path(

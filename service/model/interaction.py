@@ -21,7 +21,7 @@ from service.model.pyramid import (
     Response,
     enough_modulation_points,
 )
-from service.model.slopes import Normalisation, turned_mask
+from service.model.slopes import Normalisation, rtc_mask, turned_mask
 from service.model.workingpoint import Halo
 
 Array = NDArray[Any]
@@ -86,7 +86,7 @@ class InteractionModel:
             halo=halo,
             normalisation=instrument.slopes.normalisation,
         )
-        self.valid = valid_subapertures(instrument, self.optics)
+        self.valid = valid_subapertures(instrument)
         self._map = mapper
         self._dtype = dtype
         self._response: _Last[Response] = _Last()
@@ -229,15 +229,27 @@ def instrument_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
     )
 
 
-def valid_subapertures(instrument: Instrument, optics: PyramidOptics) -> NDArray[np.bool_]:
-    """Return the mask ``(n, n)`` [y, x] in our axes: the instrument's own, or by flux at α = 0.
+def valid_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
+    """Return the mask ``(n, n)`` [y, x] in our axes: the instrument's own, or by flux at α = 0."""
+    own = instrument.wfs.valid_subapertures
+    if own is None:
+        return lit_subapertures(instrument)
+    return turned_mask(own, instrument.slopes.assumed_orientation)
+
+
+def rtc_valid_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
+    """Return the mask ``(n, n)`` [y, x] in the RTC's own axes, in which its slopes are listed."""
+    if instrument.wfs.valid_subapertures is not None:
+        return instrument.wfs.valid_subapertures
+    return rtc_mask(lit_subapertures(instrument), instrument.slopes.assumed_orientation)
+
+
+def lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
+    """Return which subapertures ``(n, n)`` have enough of the pupil's area at α = 0.
 
     The flux is the pupil's light on each subaperture, so that the mask depends neither on the
     sampling nor on the light diffracted out of the images.
     """
-    if instrument.wfs.valid_subapertures is not None:
-        orientation = instrument.slopes.assumed_orientation
-        return turned_mask(instrument.wfs.valid_subapertures, orientation)
     fine = instrument_pupil(instrument, 8).amplitude
     n = instrument.wfs.n_subapertures
     margin = (len(fine) - 8 * n) // 2

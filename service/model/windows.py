@@ -16,6 +16,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
+from service.model.interaction import rtc_valid_subapertures
 from service.model.slopes import Normalisation
 
 Array = NDArray[np.float64]
@@ -23,6 +24,9 @@ Array = NDArray[np.float64]
 _SPLINE_DEGREE = 5
 _REACH_PX = 16
 """Pixels around a window that its spline is made of: further ones weigh less than 1e-5."""
+
+_AT_ONCE = 32
+"""Frames that are cut together: more only need memory."""
 
 _DARK = 0.25
 _LIT = 0.75
@@ -105,7 +109,52 @@ def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
     return Windows(centres_px=centres, shape=shape, windows=tuple(windows))
 
 
-def slopes_per_metre(
+def slopes_from_frames(
+    instrument: Instrument, frames: NDArray[np.floating], flux_frame: NDArray[np.floating]
+) -> Array:
+    """Return the slopes ``(n_slopes, n_modes)`` that differential frames stand for.
+
+    Parameters
+    ----------
+    instrument
+        One that delivers frames.
+    frames
+        ``(n_modes, rows, columns)`` change of every pixel per unit of each mode.
+    flux_frame
+        ``(rows, columns)`` mean frame in the same counts.
+
+    Returns
+    -------
+    slopes
+        All Sx, then all Sy, on the detector's own axes, by ``rtc_valid_subapertures``.
+
+    Raises
+    ------
+    ModelError
+        If the frames do not fit one another, the pupil images are not found in them, or a valid
+        subaperture is dark.
+    """
+    if flux_frame.ndim != 2 or frames.ndim != 3 or frames.shape[1:] != flux_frame.shape:
+        raise ModelError(
+            f"frames: found shape {frames.shape} and a flux frame of {flux_frame.shape}; "
+            "expected (n_modes, rows, columns) and (rows, columns)"
+        )
+    windows = frame_windows(instrument, flux_frame.astype(np.float64))
+    valid = rtc_valid_subapertures(instrument)
+    rest = windows.cut(flux_frame)
+    slopes = [
+        slopes_per_unit(
+            rest,
+            windows.cut(frames[start : start + _AT_ONCE]),
+            valid,
+            instrument.slopes.normalisation,
+        )
+        for start in range(0, len(frames), _AT_ONCE)
+    ]
+    return np.concatenate(slopes, axis=1)
+
+
+def slopes_per_unit(
     rest: Array, images: Array, valid: NDArray[np.bool_], normalisation: Normalisation
 ) -> Array:
     """Return what the slopes do ``(n_slopes, n_modes)`` when the light changes.

@@ -35,7 +35,7 @@ def pupil(instrument):
 
 @pytest.fixture(scope="module")
 def valid(instrument, pupil):
-    return valid_subapertures(instrument, PyramidOptics(wfs=instrument.wfs, pupil=pupil))
+    return valid_subapertures(instrument)
 
 
 @pytest.fixture(scope="module")

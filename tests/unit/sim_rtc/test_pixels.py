@@ -6,9 +6,7 @@ import pytest
 
 from service.errors import ConfigurationError
 from service.model.interaction import valid_subapertures
-from service.model.pyramid import PyramidOptics
 from sim_rtc.detector import Camera
-from sim_rtc.diffractive import centred_pupil
 from sim_rtc.pixels import FLAO_PRESETS, PixelDetector, binned, preset_for
 
 N_DRAWS = 40_000
@@ -80,10 +78,7 @@ def test_a_binning_that_does_not_divide_is_refused(small_instrument):
 
 
 def test_binning_a_mask_of_valid_subapertures_is_refused(small_instrument):
-    pupil = centred_pupil(small_instrument, 2)
-    mask = valid_subapertures(
-        small_instrument, PyramidOptics(wfs=small_instrument.wfs, pupil=pupil)
-    )
+    mask = valid_subapertures(small_instrument)
     wfs = replace(small_instrument.wfs, valid_subapertures=mask)
     with pytest.raises(ConfigurationError, match="their mask must be found by flux"):
         binned(replace(small_instrument, wfs=wfs), 2)

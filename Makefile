@@ -1,7 +1,7 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test check clean FORCE
+.PHONY: help setup demo test check paper clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -31,6 +31,12 @@ check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff format --check .
 	@$(PY) -m mypy
 	@.venv/bin/lint-imports --no-logo
+
+paper: $(STAMP) ## the seed paper, figure by figure, as one HTML report; ARGS=--quick rehearses
+	@$(PY) -c 'import matplotlib' 2>/dev/null || { \
+	    echo "paper: installing the extra 'plots'"; \
+	    $(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plots]'; }
+	@$(PY) -m studies.heritier2018 $(ARGS)
 
 clean: ## remove what make made; never var/, which holds calibration products
 	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \

@@ -1,0 +1,157 @@
+"""Reconstructors of the study: from the model, from a measurement, from a fit to one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.reconstructor import Inversion, invert
+from service.control.regularised import Prior, invert_with_prior
+from service.model.interaction import InteractionModel
+from service.model.misregistration import Misregistration
+from studies.heritier2018 import telescope
+from studies.heritier2018.calibration import Measurement
+from studies.heritier2018.registration import FitRun, fitted_alpha, fitted_gains
+from studies.heritier2018.store import Record, Store, Task
+from studies.heritier2018.telescope import Occasion
+
+INVERSION_COST_S = 6.0
+
+
+class Kind(StrEnum):
+    """How a matrix is inverted."""
+
+    TRUNCATED = "truncated SVD"
+    MAP = "MAP"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelReconstructor:
+    """Inverse of the model's matrix at a registration that is taken for granted."""
+
+    occasion: Occasion
+    """Whose noise the prior knows."""
+
+    alpha: Misregistration
+    n_modes: int
+    kind: Kind = Kind.TRUNCATED
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        return f"reconstructor of the model, {self.n_modes} modes, {self.kind}"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return INVERSION_COST_S
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """Nothing but the model."""
+        return ()
+
+    def compute(self, store: Store) -> Record:
+        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
+        matrix = synthetic_matrix(self.alpha) * self.occasion.passes
+        if self.kind is Kind.TRUNCATED:
+            return _record(invert(matrix, self.n_modes))
+        seen = telescope.optics(self.occasion, self.alpha)
+        prior = Prior(
+            variance_m2=telescope.basis().variance_m2,
+            slope_noise=telescope.detector(self.occasion, seen).sigma.astype(np.float64),
+        )
+        return _record(invert_with_prior(matrix, self.n_modes, prior))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredReconstructor:
+    """Inverse of the measured matrix itself, its noise included."""
+
+    measurement: Measurement
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        return "reconstructor of the measured matrix"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return 1.0
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """The measurement."""
+        return self.measurement.parts
+
+    @property
+    def n_modes(self) -> int:
+        """Modes it controls."""
+        return self.measurement.n_modes
+
+    def compute(self, store: Store) -> Record:
+        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
+        return _record(invert(self.measurement.matrix(store), self.n_modes))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FittedReconstructor:
+    """Inverse of the model's matrix at the registration that a fit found."""
+
+    fit: FitRun
+    n_modes: int
+    tuned: bool
+    """Whether columns have the gains of the measurement; modes beyond it the mean of its last."""
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        tuned = ", gains tuned" if self.tuned else ""
+        return f"synthetic reconstructor, {self.n_modes} modes{tuned}"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return INVERSION_COST_S
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """The fit."""
+        return (self.fit,)
+
+    def compute(self, store: Store) -> Record:
+        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
+        matrix = synthetic_matrix(fitted_alpha(store.read(self.fit)))
+        matrix = matrix * self.fit.measurement.occasion.passes
+        if self.tuned:
+            gains = fitted_gains(store.read(self.fit))
+            matrix = matrix * extended(gains, matrix.shape[1])
+        return _record(invert(matrix, self.n_modes))
+
+
+AnyReconstructor = ModelReconstructor | MeasuredReconstructor | FittedReconstructor
+
+_LAST = 20
+
+
+def extended(gains: NDArray[np.float64], n_modes: int) -> NDArray[np.float64]:
+    """Return the gains of ``n_modes`` modes: beyond those measured the mean of the last ones."""
+    return np.append(gains, np.full(n_modes - len(gains), gains[-_LAST:].mean()))
+
+
+def synthetic_matrix(alpha: Misregistration) -> NDArray[np.float64]:
+    """Return the model's matrix ``(n_slopes, n_modes)`` for light that meets the mirror once."""
+    model = InteractionModel(telescope.instrument(), telescope.basis())
+    return np.asarray(model.interaction_matrix(alpha), dtype=np.float64)
+
+
+def _record(inversion: Inversion) -> Record:
+    return {
+        "matrix": inversion.matrix,
+        "condition_number": np.array(inversion.condition_number),
+        "n_truncated": np.array(inversion.n_truncated),
+    }

@@ -9,6 +9,9 @@ from typing import Any
 
 from service.registration.options import FitOptions
 
+UPLOAD = "upload"
+"""Name of what was uploaded, in the folder of its fit."""
+
 
 class FitState(StrEnum):
     """How far a fit is."""

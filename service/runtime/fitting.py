@@ -1,0 +1,243 @@
+"""The desk where fits of uploaded matrices are asked for: it keeps, queues, and remembers them."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import itertools
+import shutil
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+import structlog
+
+from service.errors import (
+    ArchiveError,
+    BusyError,
+    MatrixError,
+    PyrcalError,
+    TooLargeError,
+    UnknownIdError,
+)
+from service.fits.jobs import UNFINISHED, UPLOAD, FitAsked, FitJob, FitState
+from service.runtime.errand import run_apart
+
+FITS_KEPT = 50
+"""Finished fits that are remembered."""
+
+STALL_S = 30.0
+"""Longest time an upload may stand still."""
+
+_BLOCK = 1 << 20
+"""Bytes written to the disk at once."""
+
+_BEGINS = (b"\x89HDF\r\n\x1a\n", b"SIMPLE  =", b"\x1f\x8b", b"PK\x03\x04")
+"""First bytes of HDF5, FITS, anything gzipped, and zip."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitLimits:
+    """What fits of uploads may take."""
+
+    most_bytes: int
+    """Of one upload."""
+
+    waiting: int
+    """Fits that may be unfinished at once, uploads under way included."""
+
+    seconds: float
+    """Of one fit."""
+
+    nice: int
+    """Of its process: the telescope goes first."""
+
+
+class FitDesk:
+    """Takes uploads in, has them fitted one after the other, and forgets them when it ends.
+
+    Belongs to the event loop. ``folder`` is emptied when the desk opens; an upload stays there
+    until its fit is finished. ``fit`` runs in a process of its own, so it must be picklable.
+    """
+
+    def __init__(
+        self,
+        *,
+        folder: Path,
+        fit: Callable[[Path, FitAsked], Mapping[str, Any]],
+        limits: FitLimits,
+        clock_ns: Callable[[], int],
+    ) -> None:
+        self._folder = folder
+        self._fit = fit
+        self._limits = limits
+        self._clock_ns = clock_ns
+        self._numbers = itertools.count(1)
+        self._jobs: OrderedDict[str, FitJob] = OrderedDict()
+        self._turn = asyncio.Lock()
+        self._running: set[asyncio.Task[None]] = set()
+        self._log = structlog.get_logger()
+
+    def open(self) -> None:
+        """Remove what an earlier service has left.
+
+        Raises
+        ------
+        ArchiveError
+            If the disk refuses.
+        """
+        shutil.rmtree(self._folder, ignore_errors=True)
+        try:
+            self._folder.mkdir(parents=True)
+        except OSError as error:
+            raise ArchiveError(f"{self._folder}: cannot be made: {error.strerror}") from error
+
+    async def close(self) -> None:
+        """End the fit that runs, drop those that wait, and remove their files."""
+        for task in self._running:
+            task.cancel()
+        await asyncio.gather(*self._running, return_exceptions=True)
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def jobs(self) -> Sequence[FitJob]:
+        """Return the fits that are remembered, oldest first."""
+        return tuple(self._jobs.values())
+
+    def job(self, fit_id: str) -> FitJob:
+        """Return one of them.
+
+        Raises
+        ------
+        UnknownIdError
+            If none has this id.
+        """
+        found = self._jobs.get(fit_id)
+        if found is None:
+            raise UnknownIdError(f"fit {fit_id}: nobody has heard of it since the service started")
+        return found
+
+    async def take(
+        self, asked: FitAsked, body: AsyncIterator[bytes], n_bytes: int | None
+    ) -> FitJob:
+        """Keep an upload and put its fit in the queue; see :class:`service.routes.fits.Fits`."""
+        self._check_room(n_bytes)
+        job = self._remember(asked)
+        folder = self._folder / job.id
+        try:
+            await asyncio.to_thread(folder.mkdir)
+            with (folder / UPLOAD).open("wb") as file:
+                await self._receive(job.id, file, body)
+        except OSError as error:
+            await self._forget(job.id)
+            raise ArchiveError(f"fit: the upload cannot be kept: {error.strerror}") from error
+        except BaseException:
+            await self._forget(job.id)
+            raise
+        self._put(replace(self._jobs[job.id], state=FitState.WAITING))
+        self._start(self._carry_out(job.id, asked))
+        return self.job(job.id)
+
+    def _check_room(self, n_bytes: int | None) -> None:
+        most = self._limits.most_bytes
+        if n_bytes is not None and n_bytes > most:
+            raise _too_large(n_bytes, most)
+        unfinished = sum(job.state in UNFINISHED for job in self._jobs.values())
+        if unfinished >= self._limits.waiting:
+            raise BusyError(f"found {unfinished} fits unfinished, the most there may be: try later")
+
+    def _remember(self, asked: FitAsked) -> FitJob:
+        now_ns = self._clock_ns()
+        stamp = datetime.fromtimestamp(now_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S")
+        job = FitJob(
+            id=f"fit-{stamp}-{next(self._numbers)}",
+            state=FitState.RECEIVING,
+            asked_ns_utc=now_ns,
+        )
+        self._jobs[job.id] = job
+        finished = [j.id for j in self._jobs.values() if j.state not in UNFINISHED]
+        for old in finished[: max(len(finished) - FITS_KEPT, 0)]:
+            del self._jobs[old]
+        return job
+
+    async def _receive(self, fit_id: str, file: IO[bytes], body: AsyncIterator[bytes]) -> None:
+        """Write the body to the disk, block by block."""
+        digest, n_bytes, block = hashlib.sha256(), 0, bytearray()
+
+        async def flush() -> None:
+            written = bytes(block)
+            block.clear()
+            digest.update(written)
+            await asyncio.to_thread(file.write, written)
+
+        async for chunk in _unstalled(body):
+            if n_bytes == 0 and chunk:
+                _check_kind(chunk)
+            n_bytes += len(chunk)
+            if n_bytes > self._limits.most_bytes:
+                raise _too_large(n_bytes, self._limits.most_bytes)
+            block += chunk
+            if len(block) >= _BLOCK:
+                await flush()
+        await flush()
+        if n_bytes == 0:
+            raise MatrixError("upload: found an empty body, expected an HDF5, FITS or zip file")
+        self._put(replace(self._jobs[fit_id], n_bytes=n_bytes, sha256=digest.hexdigest()))
+
+    async def _carry_out(self, fit_id: str, asked: FitAsked) -> None:
+        folder = self._folder / fit_id
+        work = partial(self._fit, folder, asked)
+        try:
+            async with self._turn:
+                self._put(replace(self._jobs[fit_id], state=FitState.RUNNING))
+                found = await run_apart(work, nice=self._limits.nice, limit_s=self._limits.seconds)
+            self._put(replace(self._jobs[fit_id], state=FitState.DONE, document=found))
+            self._log.info("fit.done", id=fit_id, verdict=found["verdict"])
+        except PyrcalError as error:
+            self._put(replace(self._jobs[fit_id], state=FitState.FAILED, reason=str(error)))
+            self._log.warning("fit.failed", id=fit_id, text=str(error))
+        finally:
+            await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
+
+    def _put(self, job: FitJob) -> None:
+        self._jobs[job.id] = job
+
+    async def _forget(self, fit_id: str) -> None:
+        del self._jobs[fit_id]
+        await asyncio.to_thread(shutil.rmtree, self._folder / fit_id, ignore_errors=True)
+
+
+async def _unstalled(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """Yield the chunks of a body for as long as they keep coming."""
+    while True:
+        try:
+            async with asyncio.timeout(STALL_S):
+                chunk = await anext(body)
+        except StopAsyncIteration:
+            return
+        except TimeoutError as error:
+            raise MatrixError(f"upload: nothing came for {STALL_S:.0f} s") from error
+        yield chunk
+
+
+def _check_kind(first: bytes) -> None:
+    if not first.startswith(_BEGINS):
+        raise MatrixError(
+            f"upload: found a body that begins with {first[:8]!r}, expected an HDF5, FITS or zip "
+            "file (curl --data-binary @FILE)"
+        )
+
+
+def _too_large(found: int, most: int) -> TooLargeError:
+    return TooLargeError(
+        f"upload: found {found / 1e6:.0f} MB or more, expected at most {most / 1e6:.0f} MB "
+        "(fits.upload_limit_mb)"
+    )

@@ -1,0 +1,180 @@
+"""Fits over real HTTP messages, with a hand-written desk behind them."""
+
+from dataclasses import replace
+
+import httpx
+import numpy as np
+import pytest
+
+from service.api import create_app
+from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
+from service.fits.jobs import FitJob, FitState
+from service.fits.report import document
+from service.registration.options import Method
+from tests.unit.fits.made import a_report
+
+JOB = FitJob(id="fit-1", state=FitState.WAITING, asked_ns_utc=7, n_bytes=4, sha256="ab")
+
+
+class FakeDesk:
+    """Remembers what it was asked."""
+
+    def __init__(self):
+        self.asked = None
+        self.body = b""
+        self.length = None
+        self.refusal = None
+        self.known = {JOB.id: JOB}
+
+    async def take(self, asked, body, n_bytes):
+        if self.refusal is not None:
+            raise self.refusal
+        self.asked, self.length = asked, n_bytes
+        self.body = b"".join([chunk async for chunk in body])
+        return JOB
+
+    def jobs(self):
+        return tuple(self.known.values())
+
+    def job(self, fit_id):
+        if fit_id not in self.known:
+            raise UnknownIdError(f"fit {fit_id}: nobody has heard of it")
+        return self.known[fit_id]
+
+
+@pytest.fixture
+def desk():
+    return FakeDesk()
+
+
+@pytest.fixture
+async def client(desk):
+    transport = httpx.ASGITransport(create_app(object(), desk), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
+        yield client
+
+
+def assert_problem(response, status, kind, *words):
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    assert response.json()["type"] == f"urn:pyrcal:problem:{kind}"
+    for word in words:
+        assert word in response.json()["detail"]
+
+
+async def test_the_body_is_the_file_and_the_parameters_are_those_of_the_command(client, desk):
+    parameters = {
+        "dataset": "D",
+        "method": "paper",
+        "modes": "0:4",
+        "start": "0.1,0,65,0.98",
+        "gain_map": "true",
+        "anamorphosis": "true",
+        "instrument": "flao-lbt",
+        "reference": "im.h5",
+    }
+    response = await client.post("/v1/fits", params=parameters, content=b"file")
+    assert response.status_code == 202, response.text
+    assert response.json() == {
+        "id": "fit-1",
+        "links": {"fit": "/v1/fits/fit-1", "fits": "/v1/fits"},
+    }
+    assert (desk.body, desk.length) == (b"file", 4)
+    asked, options = desk.asked, desk.asked.options
+    assert (asked.dataset, asked.instrument, asked.reference) == ("D", "flao-lbt", "im.h5")
+    assert options.method is Method.PAPER
+    assert options.modes.tolist() == [0, 1, 2, 3]
+    assert options.start.vector == pytest.approx([0.1, 0.0, np.deg2rad(65.0), 0.98])
+    assert (options.gain_map, options.anamorphosis) == (True, True)
+
+
+async def test_without_parameters_the_defaults_of_the_command_hold(client, desk):
+    assert (await client.post("/v1/fits", content=b"file")).status_code == 202
+    options = desk.asked.options
+    assert options.method is Method.JOINT
+    assert options.modes is None
+    assert options.start is None
+    assert desk.asked.dataset is None
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"method": "guess"},
+        {"modes": "4:1"},
+        {"start": "1,2,3"},
+        {"instrument": "/etc/passwd"},
+        {"instrument": "a/b.toml"},
+        {"datset": "D"},
+    ],
+)
+async def test_a_parameter_that_means_nothing_is_named(client, desk, parameters):
+    response = await client.post("/v1/fits", params=parameters, content=b"file")
+    assert_problem(response, 422, "invalid", *parameters)
+    assert desk.asked is None
+
+
+@pytest.mark.parametrize(
+    ("refusal", "status", "kind"),
+    [
+        (TooLargeError("found 2000 MB, expected at most 512 MB"), 413, "too-large"),
+        (BusyError("found 4 fits unfinished"), 503, "busy"),
+        (MatrixError("found an empty body"), 422, "unusable-matrix"),
+    ],
+)
+async def test_an_upload_that_is_not_taken_says_why(client, desk, refusal, status, kind):
+    desk.refusal = refusal
+    assert_problem(await client.post("/v1/fits", content=b"x"), status, kind, str(refusal))
+
+
+async def test_fits_are_listed_with_their_state(client):
+    body = (await client.get("/v1/fits")).json()
+    assert body == {
+        "fits": [
+            {
+                "id": "fit-1",
+                "state": "waiting",
+                "asked_ns_utc": 7,
+                "n_bytes": 4,
+                "sha256": "ab",
+                "reason": "",
+            }
+        ]
+    }
+
+
+async def test_an_unfinished_fit_is_202_with_its_state(client):
+    response = await client.get("/v1/fits/fit-1")
+    assert response.status_code == 202
+    assert response.json()["state"] == "waiting"
+
+
+async def test_a_finished_fit_is_the_document_and_nothing_else(client, desk):
+    found = document(a_report())
+    desk.known["fit-1"] = replace(JOB, state=FitState.DONE, document=found)
+    response = await client.get("/v1/fits/fit-1")
+    assert response.status_code == 200
+    assert response.json() == found
+
+
+async def test_a_fit_that_could_not_be_made_is_a_problem(client, desk):
+    desk.known["fit-1"] = replace(JOB, state=FitState.FAILED, reason="it is transposed")
+    assert_problem(await client.get("/v1/fits/fit-1"), 422, "unusable-matrix", "it is transposed")
+
+
+async def test_an_unknown_fit_is_404(client):
+    assert_problem(await client.get("/v1/fits/fit-9"), 404, "unknown-id", "fit-9")
+
+
+async def test_the_document_is_described(client):
+    described = (await client.get("/openapi.json")).json()
+    schema = described["components"]["schemas"]["FitDocument"]
+    assert set(schema["properties"]) == set(document(a_report()))
+    upload = described["paths"]["/v1/fits"]["post"]["requestBody"]["content"]
+    assert "application/octet-stream" in upload
+
+
+async def test_without_a_desk_there_are_no_fits():
+    transport = httpx.ASGITransport(create_app(object()))
+    async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
+        assert (await client.get("/v1/fits")).status_code == 404

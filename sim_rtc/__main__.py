@@ -19,16 +19,16 @@ from service.config import load_instrument
 from service.errors import ConfigurationError, PyrcalError
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.clock import FrameClock, Pace
-from sim_rtc.computer import Batch, RealTimeComputer
+from sim_rtc.computer import RealTimeComputer
 from sim_rtc.faults import FaultPlan
 from sim_rtc.feed import BATCH_FRAMES, Ahead
-from sim_rtc.gains import Tuner
 from sim_rtc.link import Link, Rehearsal
 from sim_rtc.options import Options, parse_options
 from sim_rtc.record import Recorder, Recording
 from sim_rtc.replay import Replay
 from sim_rtc.sabotage import Sabotage
 from sim_rtc.snapshot import write_snapshot
+from sim_rtc.telemetry import Batch
 from sim_rtc.truth import TruthRecorder
 
 _REPORT_PERIOD_S = 10.0
@@ -98,9 +98,8 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         last_batch = float("inf")
         if options.seconds is not None:
             last_batch = round(options.seconds * options.frame_rate_hz / BATCH_FRAMES)
-        tuner = None
         if options.gain_ramp_s is not None:
-            tuner = Tuner(computer, step_s=options.gain_ramp_s)
+            computer.ramp_up(options.gain_ramp_s)
         watch = Watch(computer, pace, link)
         n_batches = 0
         _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.snapshot().session)
@@ -111,8 +110,6 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
             link.offer(batch)
             if truth is not None:
                 truth.offer(batch, pace.late_batches * BATCH_FRAMES)
-            if tuner is not None:
-                tuner.look(batch)
             pace.done()
             watch.look(batch)
             n_batches += 1

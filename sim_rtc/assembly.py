@@ -18,7 +18,7 @@ from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.wire import CHUNK_LIMIT, Manifest, layout_of
 from sim_rtc.atmosphere import fried_parameter_m, frozen_layers
-from sim_rtc.computer import Identity, LoopSettings, RealTimeComputer
+from sim_rtc.computer import RealTimeComputer
 from sim_rtc.detector import Detector
 from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.dither import DitherLimits
@@ -36,6 +36,7 @@ from sim_rtc.reconstructors import Reconstructor, truncated_inverse
 from sim_rtc.scene import PlayedTurbulence, SceneKind
 from sim_rtc.schedule import Schedule, random_registration
 from sim_rtc.sky import Sky, Turbulence
+from sim_rtc.telemetry import Identity, LoopSettings
 from sim_rtc.vibration import Vibrations
 
 STROKE_M = 10e-6

@@ -38,7 +38,7 @@ from service.wire import (
     split,
 )
 from sim_rtc.clock import FrameClock
-from sim_rtc.computer import Batch, RealTimeComputer
+from sim_rtc.computer import RealTimeComputer
 from sim_rtc.desk import CommandDesk
 from sim_rtc.detector import Detector
 from sim_rtc.faults import FaultPlan
@@ -46,6 +46,7 @@ from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.intake import Intake
 from sim_rtc.outlet import Outlet
 from sim_rtc.record import Kind, Recorder
+from sim_rtc.telemetry import Batch
 from sim_rtc.wire_faults import WireFaults
 
 _OPEN_TIMEOUT_MS = 1000

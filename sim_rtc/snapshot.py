@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from sim_rtc.assembly import Telescope
-from sim_rtc.computer import Batch
 from sim_rtc.diffractive_plant import DiffractiveOptics
 from sim_rtc.feed import BATCH_FRAMES
+from sim_rtc.telemetry import Batch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

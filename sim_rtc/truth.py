@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_rtc.clock import FrameClock
-from sim_rtc.computer import Batch
 from sim_rtc.options import Options
+from sim_rtc.telemetry import Batch
 
 _LINE_S = 0.5
 _SWAP_S = 1.0

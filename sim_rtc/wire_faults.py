@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.wire import FrameHeader, encode_frames
-from sim_rtc.computer import new_session
 from sim_rtc.faults import FaultKind, FaultPlan
+from sim_rtc.telemetry import new_session
 
 Array32 = NDArray[np.float32]
 Sendable = tuple[bytes, bytes]

@@ -2,8 +2,9 @@
 
 Closes the loop twice: once with one gain for all modes, to measure the optical gain on snapshots
 of its residual wavefront; then with every mode's gain divided by its optical gain. Prints the
-wavefront error and its budget; ``--plot`` draws the optical gain against the mode.
-Run: ``python -m studies.optical_gain --seconds 1``.
+wavefront error and its budget; ``--plot`` draws the optical gain against the mode, beside what a
+prototype saw, and needs the extra ``plots``.
+Run: ``python -m studies.optical_gain --seconds 1 --plot optical_gain.png``.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ SETTLING_FRAMES = 200
 SNAPSHOT_FRAMES = 50
 RUN_GAIN = 0.8
 """Of all modes in the first run, before the optical gain is known: about 0.45 in effect."""
+
+PROTOTYPE = {0: 0.48, 20: 0.44, 150: 0.57, 501: 0.67}
+"""Optical gains a prototype of the simulator had, at 1" and with some 125 nm left."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -151,7 +155,8 @@ def main() -> None:
         telescope = telescope_of(options)
         n_modes, n_controlled = len(telescope.settings.gains), options.n_controlled
         first = closed_loop(telescope, np.full(n_controlled, RUN_GAIN, np.float32), n_frames)
-        modes = np.unique(np.append(np.geomspace(1, n_modes - 1, 24).astype(np.intp), [0, 150]))
+        spread = np.geomspace(1, n_modes - 1, 24).astype(np.intp)
+        modes = np.unique(np.append(spread, [mode for mode in PROTOTYPE if mode < n_modes]))
         gains = optical_gains(first, modes)
         everywhere = np.interp(np.arange(n_controlled), modes, gains)
         second = closed_loop(
@@ -163,15 +168,33 @@ def main() -> None:
     for name, value in budget.items():
         sys.stdout.write(f"{name:32s} {value:7.1f} nm\n")
     if given.plot is not None:
-        _plot(given.plot, modes, gains, f'seeing {given.seeing}", magnitude {given.mag}')
+        title = (
+            f'seeing {given.seeing}", magnitude {given.mag}: '
+            f"{budget['wavefront error']:.0f} nm left with compensated gains"
+        )
+        plot(given.plot, modes, gains, title)
 
 
-def _plot(path: Path, modes: NDArray[np.intp], gains: NDArray[np.float64], title: str) -> None:
-    import matplotlib.pyplot as plt
+def plot(path: Path, modes: NDArray[np.intp], gains: NDArray[np.float64], title: str) -> None:
+    """Draw the optical gain against the mode, the prototype's figures beside it."""
+    from matplotlib.figure import Figure
 
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
-    axes.semilogx(modes + 1, gains, ".-")
-    axes.set(xlabel="mode, from 1", ylabel="optical gain", title=title, ylim=(0, 1))
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    # tip is mode 0, which a logarithm does not show
+    axes.semilogx(modes + 1, gains, ".-", label="measured here, loop closed")
+    axes.semilogx(
+        np.array(list(PROTOTYPE)) + 1,
+        list(PROTOTYPE.values()),
+        "D",
+        color="tab:red",
+        fillstyle="none",
+        label="a prototype, loop closed at 125 nm",
+    )
+    axes.set(xlabel="mode, counted from 1", ylabel="optical gain", ylim=(0, 1))
+    axes.set_title(title, fontsize="medium")
+    axes.grid(which="both", alpha=0.25)
+    axes.legend(loc="lower right")
     figure.savefig(path, dpi=150)
 
 

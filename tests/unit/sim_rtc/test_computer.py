@@ -13,12 +13,13 @@ from service.wire import (
     Manifest,
     layout_of,
 )
-from sim_rtc.computer import Identity, LoopSettings, RealTimeComputer
+from sim_rtc.computer import RealTimeComputer
 from sim_rtc.desk import CommandDesk
 from sim_rtc.dither import DitherLimits
 from sim_rtc.feed import OpenLoopBlock
 from sim_rtc.plant import Optics
 from sim_rtc.reconstructors import Reconstructor
+from sim_rtc.telemetry import Identity, LoopSettings
 
 N_MODES, N_SLOPES = 4, 8
 # Orthogonal modes: what is not controlled does not alias into what is.

@@ -1,15 +1,12 @@
-from itertools import count, pairwise
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from service.wire import Loop, LoopRequest
-from sim_rtc.computer import LoopSettings, RealTimeComputer
-from sim_rtc.dither import DitherLimits
-from sim_rtc.feed import OpenLoopBlock
-from sim_rtc.gains import FACTORS, GainRamp, Tuner, by_group, groups_of
+from service.wire import RampRequest
+from sim_rtc.gains import FACTORS, GainRamp, Plan, by_group, groups_of
 from sim_rtc.options import parse_options
-from tests.unit.sim_rtc.test_computer import IDENTITY, N_MODES, N_SLOPES, OPTICS, reconstructor
 
 START = (0.4,) * 300
 BEST = (0.7, 0.4, 0.2)
@@ -35,8 +32,13 @@ def run(ramp, rng, n_batches=2000):
     return tried
 
 
+def plan_of(gains=START, n_controlled=300):
+    plan = Plan.at_start(gains, n_controlled=n_controlled, frame_rate_hz=1000.0, step_s=0.3)
+    return replace(plan, settling_frames=20)
+
+
 def ramp_of(gains=START):
-    return GainRamp(gains, n_controlled=300, settling_frames=20, judged_frames=300)
+    return GainRamp(gains, plan_of(gains))
 
 
 @pytest.mark.parametrize(
@@ -110,64 +112,45 @@ def test_a_group_begins_again_when_the_loop_has_changed():
     assert ramp.gains[0] == pytest.approx(FACTORS[0] * 0.4)
 
 
-def tuned(computer, step_s=0.05, n_batches=3000):
-    tuner = Tuner(computer, step_s=step_s)
-    for _ in range(n_batches):
-        tuner.look(computer.next_batch())
-        if tuner.done:
-            break
-    return tuner
+def asked(gains, groups=((2, 99), (0, 1)), frames_per_gain=320):
+    request = RampRequest(id="r", groups=groups, gains=gains, frames_per_gain=frames_per_gain)
+    return GainRamp(START, Plan.asked(request, frame_rate_hz=1000.0))
 
 
-def test_in_a_real_loop_the_result_is_in_the_status(noisy_computer):
-    before = noisy_computer.snapshot().gains
-    assert tuned(noisy_computer).done
-    gains = noisy_computer.snapshot().gains
-    assert gains[0] == gains[1]
-    assert gains[:3] != before[:3]
-    assert gains[3] == 0.0, "not controlled"
+def test_groups_and_gains_are_those_asked_for_in_their_order():
+    ramp, rng = asked((0.2, 0.7, 0.4)), np.random.default_rng(10)
+    tried = run(ramp, rng)
+    assert [(s.group, s.gain) for s in ramp.steps] == [
+        (group, gain) for group in (0, 1) for gain in (0.2, 0.7, 0.4)
+    ]
+    # BEST of the modes to 100 and of tip and tilt, in the order of the groups
+    assert ramp.gains_by_group == (0.4, 0.7)
+    assert {gains[100:] for gains in tried} == {START[100:]}, "the others keep theirs"
 
 
-def test_noise_alone_wants_the_lowest_gain(noisy_computer):
-    """Nothing to correct: whatever the loop does, it does to the noise."""
-    tuned(noisy_computer, step_s=0.5)
-    assert noisy_computer.snapshot().gains[0] == pytest.approx(FACTORS[0] * 0.4)
-
-
-def test_an_open_loop_is_not_tuned(noisy_computer):
-    noisy_computer.execute(LoopRequest(id="open", loop=Loop.OPEN))
-    settings = noisy_computer.snapshot().settings
-    assert not tuned(noisy_computer, n_batches=300).done
-    assert noisy_computer.snapshot().settings == settings
-
-
-@pytest.fixture
-def noisy_computer():
-    def noise():
-        rng = np.random.default_rng(8)
-        for first in count(0, 30):
-            yield OpenLoopBlock(
-                first_frame=first,
-                optics=OPTICS,
-                slopes=rng.normal(0.0, 1e-8, (30, N_SLOPES)).astype(np.float32),
-                phases_m=np.zeros((3, 5), np.float32),
-            )
-
-    return RealTimeComputer(
-        noise(),
-        identity=IDENTITY,
-        settings=LoopSettings(
+def test_what_settles_is_part_of_the_frames_of_a_gain_and_at_most_half_of_them():
+    long, short = (
+        Plan.asked(
+            RampRequest(id="r", groups=((0, 1),), gains=(0.5,), frames_per_gain=n),
             frame_rate_hz=1000.0,
-            delay_frames=2,
-            gains=(0.4,) * N_MODES,
-            leak=1.0,
-            n_controlled_next=3,
-        ),
-        reconstructor=reconstructor("first", 3),
-        optics=OPTICS,
-        stroke_m=1e-5,
-        limits=DitherLimits(),
+        )
+        for n in (1000, 100)
     )
+    assert (long.settling_frames, long.judged_frames) == (200, 800)
+    assert (short.settling_frames, short.judged_frames) == (50, 50)
+
+
+def test_after_a_clearly_worse_gain_only_lower_ones_are_tried():
+    ramp = asked((0.4, 1.8, 2.0, 0.3), groups=((2, 99),))
+    run(ramp, np.random.default_rng(11))
+    assert [step.gain for step in ramp.steps] == [0.4, 1.8, 0.3]
+
+
+def test_a_ramp_that_ends_early_leaves_what_it_has_chosen_and_what_was_there():
+    ramp, rng = asked((0.2, 0.7, 0.4)), np.random.default_rng(12)
+    while len(ramp.steps) < 4:
+        ramp.take(residual_with(ramp.gains, rng))
+    assert ramp.settled == START[:2] + (0.4,) * 98 + START[100:]
 
 
 @pytest.mark.parametrize(
@@ -178,7 +161,7 @@ def test_the_ramp_runs_on_request_only(words, step_s):
 
 
 def test_modes_outside_the_loop_get_the_last_groups_gain():
-    ramp = GainRamp((0.4,) * 300, n_controlled=60, settling_frames=0, judged_frames=10)
+    ramp = GainRamp(START, plan_of(n_controlled=60))
     rng = np.random.default_rng(9)
     while not ramp.done:
         ramp.take(rng.standard_normal((10, 50)).astype(np.float32))

@@ -20,7 +20,7 @@ from service.wire import (
     layout_of,
 )
 from sim_rtc.assembly import build_telescope
-from sim_rtc.computer import Identity, LoopSettings, RealTimeComputer
+from sim_rtc.computer import RealTimeComputer
 from sim_rtc.dither import DitherLimits
 from sim_rtc.feed import OpenLoopBlock
 from sim_rtc.measure import Bench, Circumstances, MeasureLimits, product
@@ -28,6 +28,7 @@ from sim_rtc.options import parse_options
 from sim_rtc.plant import Optics
 from sim_rtc.reconstructors import Reconstructor
 from sim_rtc.strokes import PushPull, frames_per_shape, hadamard_shapes, pokes
+from sim_rtc.telemetry import Identity, LoopSettings
 
 N_MODES, N_SLOPES, N_ACTUATORS = 6, 16, 9
 RNG = np.random.default_rng(3)

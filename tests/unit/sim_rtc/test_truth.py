@@ -5,9 +5,9 @@ import pytest
 
 from service.model.misregistration import Misregistration
 from sim_rtc.clock import FrameClock
-from sim_rtc.computer import Batch
 from sim_rtc.options import parse_options
 from sim_rtc.plant import Optics
+from sim_rtc.telemetry import Batch
 from sim_rtc.truth import TruthRecorder, WavefrontError
 
 N_POINTS = 50

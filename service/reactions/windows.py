@@ -10,7 +10,7 @@ from service import events as ev
 from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
 from service.estimation.kalman import begin, update
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.journal import OFF_LOOP, logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import HistoryEntry, Level, Registration, TrackerState, Watchdog
 
@@ -91,6 +91,8 @@ def _why_useless(state: TrackerState, estimate: WindowEstimate) -> str | None:
         return "the RTC has restarted since"
     if any(alarm.name == "loop-diverging" for alarm in state.alarms):
         return "the loop was diverging: its telemetry is no measurement"
+    if any(alarm.name == OFF_LOOP for alarm in state.alarms):
+        return "the commands were off the loop equation: see the alarm"
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
         return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from service.estimation import lockin, passive
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation import lockin, loopcheck, passive
 from service.estimation.frames import FrameBlock
 from service.estimation.health import LoopHealth, observe
 from service.estimation.lockin import LockIn, Spectra, WindowRefused
+from service.estimation.loopcheck import LoopCheck, LoopTerms, Obedience
 from service.estimation.passive import Passive
 from service.reactions.policy import SETTLING_S, lock_in_plan
 from service.state import DitherView, RtcView
 from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0
+
+WINDOW_SAMPLES = 5
+"""Frames of a window that must have been looked at before it can be said to be off the loop."""
+
+MATRICES_KEPT = 2
+"""The reconstructor in use, and the one before: frames of it may still come."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,6 +42,12 @@ class Streams:
     dither_id: str | None = None
     passive: Passive | None = None
     health: LoopHealth = field(default_factory=LoopHealth)
+    matrices: tuple[tuple[str, NDArray[np.float32]], ...] = ()
+    """Reconstructors by id, oldest first, bounded."""
+
+    check: LoopCheck = field(default_factory=LoopCheck)
+    off: Obedience | None = None
+    """How the commands fail to obey the loop; None: they obey, or nobody knows."""
 
 
 Window = Spectra | WindowRefused
@@ -42,9 +58,13 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     before = streams.rtc
     streams = replace(streams, rtc=rtc)
     if rtc is None:
-        return replace(streams, passive=None, lock_in=None, dither_id=None)
+        return replace(
+            streams, passive=None, lock_in=None, dither_id=None, check=LoopCheck(), off=None
+        )
     if before is not None and _same_loop(before, rtc):
-        return streams
+        return streams if before.seq == rtc.seq else _confirmed(streams, rtc)
+    # frames that are on their way may have been made by the loop as it was
+    streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None)
     memory = Passive(n_modes=rtc.n_controlled, memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz)
     if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
         return replace(streams, passive=memory, lock_in=None, dither_id=None)
@@ -76,6 +96,39 @@ def _same_loop(before: RtcView, after: RtcView) -> bool:
     )
 
 
+def with_matrix(streams: Streams, cm_id: str, matrix: NDArray[np.float32]) -> Streams:
+    """Know the numbers of one more reconstructor."""
+    others = tuple(known for known in streams.matrices if known[0] != cm_id)
+    return replace(streams, matrices=(*others, (cm_id, matrix))[-MATRICES_KEPT:])
+
+
+def _terms(streams: Streams, cm_id: str | None) -> LoopTerms | None:
+    """Return the loop that a reconstructor closes; None: it is open, or not known."""
+    rtc = streams.rtc
+    matrix = next((matrix for known, matrix in streams.matrices if known == cm_id), None)
+    if rtc is None or cm_id is None or matrix is None or rtc.loop == "open":
+        return None
+    if matrix.shape[1] != rtc.n_slopes or len(matrix) > rtc.n_modes:
+        return None
+    return LoopTerms(
+        cm_id=cm_id,
+        reconstructor=matrix,
+        gains=np.array(rtc.gains[: len(matrix)], np.float32),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        frame_rate_hz=rtc.frame_rate_hz,
+    )
+
+
+def _confirmed(streams: Streams, rtc: RtcView) -> Streams:
+    """Judge the frames up to a status that shows the same loop as the one before."""
+    span, terms = loopcheck.last_samples(streams.check, rtc.seq), _terms(streams, rtc.cm_id)
+    if span is None or terms is None:
+        return streams
+    check, found = loopcheck.obedience(streams.check, terms, *span)
+    return replace(streams, check=check, off=None if found is None or found.holds else found)
+
+
 def with_dither(streams: Streams, dither: DitherView | None, window_s: float) -> Streams:
     """Follow the dither: a new one that has begun starts a new series of windows.
 
@@ -98,15 +151,31 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     rtc = streams.rtc
     if rtc is None or block.session != rtc.session or not _fits(rtc, block):
         return streams, []
+    terms = _terms(streams, block.cm_id)
+    if terms is not None:
+        streams = replace(streams, check=loopcheck.observe(streams.check, block, terms))
     windows: list[Window] = []
     if streams.lock_in is not None:
-        lock_in, windows = lockin.accumulate(streams.lock_in, block)
+        lock_in, ended = lockin.accumulate(streams.lock_in, block)
+        windows = [_obeying(streams, window) for window in ended]
         streams = replace(streams, lock_in=lock_in)
     if streams.passive is not None and rtc.loop == "closed":
         streams = replace(streams, passive=passive.accumulate(streams.passive, block))
     variance = streams.description.mode_variance_m2
     health = observe(streams.health, block, variance, rtc.n_controlled)
     return replace(streams, health=health), windows
+
+
+def _obeying(streams: Streams, window: Window) -> Window:
+    """Return a window, or why its commands are not what the loop makes of its slopes."""
+    terms = _terms(streams, window.cm_id) if isinstance(window, Spectra) else None
+    if terms is None or isinstance(window, WindowRefused):
+        return window
+    last_seq = window.first_seq + window.plan.n_frames - 1
+    _, found = loopcheck.obedience(streams.check, terms, window.first_seq, last_seq, WINDOW_SAMPLES)
+    if found is None or found.holds:
+        return window
+    return WindowRefused(reason=found.text, t_ns_utc=window.t_end_ns_utc)
 
 
 def _fits(rtc: RtcView, block: FrameBlock) -> bool:

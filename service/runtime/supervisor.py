@@ -21,7 +21,7 @@ from service.estimation.lockin import Spectra, WindowRefused
 from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
 from service.model.misregistration import Misregistration
-from service.reactions.journal import WRONG_RTC
+from service.reactions.journal import OFF_LOOP, WRONG_RTC
 from service.reactions.policy import Policy
 from service.routes.service import Snapshot
 from service.rtc_bridge import Bridge
@@ -29,7 +29,14 @@ from service.runtime import translate
 from service.runtime.asking import why_not
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
-from service.runtime.streams import Streams, fed, shape_mismatch, with_dither, with_rtc
+from service.runtime.streams import (
+    Streams,
+    fed,
+    shape_mismatch,
+    with_dither,
+    with_matrix,
+    with_rtc,
+)
 from service.state import Level, LogEntry, MeasureState, RtcView, TrackerState
 from service.tracker import step
 from service.wire import AlarmMessage
@@ -171,6 +178,11 @@ class Supervisor:
                 "turbulence asks of them; open the loop, lower the gain or control fewer modes"
             )
             self._post(ev.Trouble(name="loop-diverging", text=text, over=was_diverging))
+        off = self._streams.off
+        known = any(alarm.name == OFF_LOOP for alarm in self._state.alarms)
+        if (off is not None) is not known:
+            text = "commands obey the loop equation again" if off is None else off.text
+            self._post(ev.Trouble(name=OFF_LOOP, text=text, over=known))
 
     def _take(self, window: Spectra | WindowRefused) -> None:
         if isinstance(window, WindowRefused):
@@ -267,9 +279,13 @@ class Supervisor:
         task.add_done_callback(self._running.discard)
 
     async def _offer(self) -> None:
-        """Offer the matrix in use to an RTC that comes late or asks again."""
+        """Offer the matrix in use to an RTC that comes late or asks again; watch what it does."""
+        in_use = self._state.in_use
         try:
             await asyncio.to_thread(self._deeds.offer, self._state)
+            if in_use is not None and self._streams is not None:
+                matrix = await asyncio.to_thread(self._deeds.matrix, in_use)
+                self._streams = with_matrix(self._streams, in_use, matrix)
         except PyrcalError as error:
             self._note("reconstructor.not-offered", str(error), Level.WARNING)
 

@@ -37,7 +37,14 @@ from tests.unit.reactions.situations import (
 MEASURED = ["im-1", "im-2", "im-3", "im-4"]
 IDS = ["initial", "cm-1", "cm-2", "cm-3", "cm-4"]
 SESSIONS = ["s1", "s2"]
-TROUBLES = ["second-rtc", "basis-mismatch", "instrument-mismatch", "loop-diverging", "other"]
+TROUBLES = [
+    "second-rtc",
+    "basis-mismatch",
+    "instrument-mismatch",
+    "loop-diverging",
+    "commands-off-loop",
+    "other",
+]
 COMMANDS = (
     ev.SetMode,
     ev.Refit,

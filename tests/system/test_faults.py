@@ -125,6 +125,11 @@ def test_an_open_loop_little_stroke_and_a_stall_pass(night):
     )
     wait_for(lambda: "loop-open" not in night.alarms, 10.0, "the alarm is over")
     wait_for_fault(rtc, "saturation@15")
+    wait_for(lambda: "commands-off-loop" in night.alarms, 4.0, "the alarm of a saturated mirror")
+    accepted = night.state["windows_accepted"]
+    wait_for(lambda: "commands-off-loop" not in night.alarms, 6.0, "the alarm is over")
+    assert night.state["windows_accepted"] == accepted
+    assert "of 45 modes (" in service.log
     wait_for_fault(rtc, "stall@21")
     accepts_windows_again(night)
     check_registration(night.state["registration"])

@@ -151,3 +151,14 @@ def test_by_day_a_mirror_seen_twice_shows_twice_the_gain_and_the_window_counts()
     story.tell(ev.WindowFitted(estimate=estimate(optical_gain=np.full(4, 1.8 + 0.0j))))
     assert story.state.windows_accepted == 1
     assert story.state.registration.optical_gain == pytest.approx(1.8)
+
+
+def test_a_window_in_flight_when_the_commands_go_off_the_loop_is_not_good():
+    story = Story().meet()
+    story.tell(ev.Trouble(name="commands-off-loop", text="saturated"))
+    story.see()
+    assert story.state.registration is None
+    assert "off the loop equation" in story.state.log[-1].text
+    story.tell(ev.Trouble(name="commands-off-loop", text="again", over=True))
+    story.see()
+    assert story.state.registration is not None

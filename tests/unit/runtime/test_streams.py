@@ -6,7 +6,14 @@ import pytest
 from service.errors import ModelError
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra, WindowRefused
-from service.runtime.streams import Streams, fed, shape_mismatch, with_dither, with_rtc
+from service.runtime.streams import (
+    Streams,
+    fed,
+    shape_mismatch,
+    with_dither,
+    with_matrix,
+    with_rtc,
+)
 from service.state import DitherView
 from service.worker import Description
 from tests.unit.reactions.situations import rtc
@@ -181,3 +188,71 @@ def test_an_rtc_of_another_shape_is_described_with_both_shapes():
     assert text == (
         "the RTC has 10 slopes and 8 modes, the instrument file 6 and 8: wrong instrument file?"
     )
+
+
+class TestCommandsOffTheLoop:
+    R = np.random.default_rng(5).standard_normal((4, N_SLOPES)).astype(np.float32) * 1e-9
+
+    def telemetry(self, n_blocks, *, stroke_m=1.0):
+        """Blocks whose commands follow from their slopes, up to a stroke."""
+        blocks = [block(100 * index) for index in range(n_blocks)]
+        slopes = np.concatenate([b.slopes for b in blocks])
+        own = np.zeros((len(slopes) + 2, N_MODES), np.float32)
+        for k in range(len(slopes)):
+            own[k + 2] = np.float32(RTC.leak) * own[k + 1]
+            own[k + 2, :4] -= np.float32(0.4) * (self.R @ slopes[k])
+            np.clip(own[k + 2], -stroke_m, stroke_m, out=own[k + 2])
+        return [
+            replace(b, commands_m=own[100 * i : 100 * i + 100] + b.dither_m)
+            for i, b in enumerate(blocks)
+        ]
+
+    def play(self, streams, blocks, *, status_every=2):
+        windows, off = [], []
+        for number, frames in enumerate(blocks):
+            streams, ended = fed(streams, frames)
+            windows += ended
+            if number % status_every == 0:
+                seq = frames.first_seq + frames.n_frames - 1
+                streams = with_rtc(streams, replace(streams.rtc, seq=seq))
+                off.append(streams.off is not None)
+        return streams, windows, off
+
+    def test_a_loop_that_obeys_gives_its_windows(self, streams):
+        streams = with_matrix(streams, "initial", self.R)
+        _, windows, off = self.play(streams, self.telemetry(30))
+        assert [type(w) for w in windows] == [Spectra] * 5
+        assert not any(off)
+
+    def test_a_saturated_mirror_gives_none_and_is_named_within_two_seconds(self, streams):
+        streams = with_matrix(streams, "initial", self.R)
+        streams, windows, off = self.play(streams, self.telemetry(30, stroke_m=5e-10))
+        assert [type(w) for w in windows] == [WindowRefused] * 5
+        assert "off the loop equation" in windows[0].reason
+        assert off.index(True) * 0.2 < 2.0
+        assert "4 of 4 modes (0-3)" in streams.off.text
+
+    def test_nobody_is_blamed_for_a_matrix_that_is_not_known(self, streams):
+        blocks = self.telemetry(30, stroke_m=5e-10)
+        _, windows, off = self.play(with_matrix(streams, "other", self.R), blocks)
+        assert [type(w) for w in windows] == [Spectra] * 5
+        assert not any(off)
+
+    def test_frames_before_a_changed_loop_was_told_are_not_held_against_it(self, streams):
+        blocks = self.telemetry(40)
+        streams = with_matrix(with_rtc(streams, replace(RTC, leak=0.5)), "initial", self.R)
+        for number, frames in enumerate(blocks):
+            streams, _ = fed(streams, frames)
+            told = replace(streams.rtc, leak=RTC.leak, seq=frames.first_seq + 99)
+            if number == 4:
+                told_before = replace(told, leak=0.5, seq=0)
+                streams = with_rtc(streams, told_before)
+            if number >= 10:
+                streams = with_rtc(streams, told)
+                assert streams.off is None
+        assert streams.check.from_seq == 1100
+
+    def test_only_the_matrices_that_may_still_come_are_kept(self, streams):
+        for name in ("a", "b", "c", "b"):
+            streams = with_matrix(streams, name, self.R)
+        assert [name for name, _ in streams.matrices] == ["c", "b"]

@@ -11,8 +11,8 @@ USAGE = "pyrcal sim [options]    (or: python -m sim_rtc [options])"
 DESCRIPTION = """\
 Simulated real-time computer of an adaptive telescope with a pyramid sensor. It closes the loop on
 frozen-flow turbulence at the frame rate, publishes telemetry over zenoh, and takes dithers, loop
-commands, gain ramps, measurements and reconstructors, as the service's wire contract says. Its mirror is
-mis-registered on the sensor by an amount that it tells nobody on the wire.
+commands, gain ramps, measurements and reconstructors, as the service's wire contract says. Its
+mirror is mis-registered on the sensor by an amount that it tells nobody on the wire.
 """
 
 EPILOG = f"""\

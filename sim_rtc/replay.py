@@ -32,8 +32,8 @@ from service.wire import (
     encode_acknowledgement,
     encode_reply,
 )
-from sim_rtc.link import Token, client_config, frames_publisher, status_publisher
 from sim_rtc.record import Kind, Message, Recording
+from sim_rtc.session import Token, client_config, frames_publisher, status_publisher
 
 REFUSAL: Final = "unsupported: a replay"
 SERVICE_WITHIN_S: Final = 20.0

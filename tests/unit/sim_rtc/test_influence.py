@@ -9,7 +9,7 @@ from service.model.instrument import Influence
 from service.model.mirror import ThinPlate, mirror_surface
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
-from sim_rtc.assembly import build_plant
+from sim_rtc.devices import build_plant
 from sim_rtc.influence import InfluenceCube, InfluenceFile, read_influence
 from sim_rtc.mirror import MirrorFaults, TensionedPlate, disobedient
 from sim_rtc.options import parse_options

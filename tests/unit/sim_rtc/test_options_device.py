@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
-from sim_rtc.assembly import binned_basis, build_drive, build_plant
+from sim_rtc.devices import binned_basis, build_drive, build_plant
 from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.drive import MirrorLimits
 from sim_rtc.mirror import MirrorFaults

@@ -1,0 +1,72 @@
+"""The edge term of the gate: how strongly slope noise moves the outer ring in closed loop.
+
+Poles say whether a loop is stable; they do not see that the outermost actuators, half in the dark,
+are driven by noise. Where an excursion reaches a quarter of the wavelength the pyramid may lose
+the edge to the next fringe, and a loop without leak never brings it back. On the diffractive
+telescope every loop slipped above 200 nm per unit of slope noise and none below 190 nm
+(docs/results/edge_slip.md), while pole radii said nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LIMIT_M = 195e-9
+"""Largest motion of an outer actuator per unit of slope noise that a loop without leak bears."""
+
+FORGIVING_LEAK = 0.99
+"""A leak as strong as this brings a slipped segment back within a tenth of a second."""
+
+_N_FREQUENCIES = 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outer:
+    """The outermost ring of the mirror."""
+
+    actuators: NDArray[np.float64]
+    """``(n_outer, n_modes)`` position of each, metres, for a unit command of each mode."""
+
+
+def edge_motion_m(
+    reconstructor: NDArray[np.float32],
+    coupling: NDArray[np.float32],
+    gains: Array,
+    outer: Outer,
+    *,
+    leak: float,
+    delay_frames: float,
+) -> float:
+    """Return the largest RMS motion of an outer actuator for white slope noise of 1, metres.
+
+    ``coupling`` ``(n, n)`` is R D(α); ``gains`` ``(n,)`` is integrator times optical gain. In the
+    eigenbasis of ``g R D = V Λ V^-1`` the command answers noise by
+    ``H_i = z^-d / (1 - leak z^-1 + λ_i z^-d)``, so that its covariance is ``V (N o <H H*>) V*``
+    with ``N`` that of ``V^-1 g R n`` and the mean taken over the unit circle.
+    """
+    eigenvalues, vectors = np.linalg.eig(gains[:, None] * coupling.astype(float))
+    driven = np.linalg.solve(vectors, gains[:, None] * reconstructor.astype(float))
+    turns = np.pi * (np.arange(_N_FREQUENCIES) + 0.5) / _N_FREQUENCIES
+    delayed = np.exp(-1j * turns * delay_frames)[:, None]
+    response = delayed / (1.0 - leak * np.exp(-1j * turns)[:, None] + eigenvalues * delayed)
+    # conjugate pairs of eigenvalues make the other half of the circle the conjugate of this one
+    covariance = (driven @ driven.conj().T) * (response.T @ response.conj() / _N_FREQUENCIES)
+    seen = outer.actuators[:, : len(gains)] @ vectors
+    power = np.einsum("ai,ij,aj->a", seen, covariance, seen.conj()).real
+    return float(np.sqrt(power.max()))
+
+
+def why_slippery(motion_m: float, leak: float) -> str | None:
+    """Return why a loop with this motion of its edge must not be closed, or None."""
+    if motion_m <= LIMIT_M or leak <= FORGIVING_LEAK:
+        return None
+    return (
+        f"its outer ring would slip: {motion_m * 1e9:.0f} nm of motion per unit of slope noise, "
+        f"{LIMIT_M * 1e9:.0f} at most without a leak of {FORGIVING_LEAK}; use fewer modes, a lower "
+        "gain or more leak"
+    )

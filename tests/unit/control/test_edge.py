@@ -1,0 +1,69 @@
+"""How strongly slope noise moves the outer ring of the mirror in closed loop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.control.edge import FORGIVING_LEAK, LIMIT_M, Outer, edge_motion_m, why_slippery
+
+N = 6
+
+
+def outer(seed: int = 1) -> Outer:
+    return Outer(actuators=np.random.default_rng(seed).normal(size=(4, N)))
+
+
+def reconstructor(seed: int = 2) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(N, 20)).astype(np.float32) * 1e-7
+
+
+def simulated(matrix, coupling, gain, ring, leak, delay) -> float:
+    """The same loop played for 200 000 frames of white noise."""
+    rng = np.random.default_rng(3)
+    n_frames = 200_000
+    noise = rng.normal(size=(n_frames, matrix.shape[1])) @ matrix.T
+    command = np.zeros((n_frames + delay, N))
+    for k in range(n_frames):
+        reply = noise[k] + coupling @ command[k]
+        command[k + delay] = leak * command[k + delay - 1] - gain * reply
+    return float((command[1000:] @ ring.actuators.T).std(axis=0).max())
+
+
+@pytest.mark.parametrize(("leak", "delay"), [(0.999, 2), (0.95, 1), (1.0, 3)])
+def test_the_motion_is_that_of_a_loop_played_in_time(leak, delay):
+    """1.5 %: the scatter of a variance over 200 000 correlated frames, and 256 frequencies."""
+    matrix, ring, gain = reconstructor(), outer(), 0.3
+    coupling = np.eye(N) + 0.15 * np.random.default_rng(5).normal(size=(N, N))
+    found = edge_motion_m(
+        matrix,
+        coupling.astype(np.float32),
+        np.full(N, gain),
+        ring,
+        leak=leak,
+        delay_frames=float(delay),
+    )
+    played = simulated(matrix, coupling, gain, ring, leak, delay)
+    assert found == pytest.approx(played, rel=0.015)
+
+
+def test_one_aligned_mode_without_delay_to_speak_of_has_the_textbook_variance():
+    """One frame of delay, no leak: variance of the command is g / (2 - g) times that of R n."""
+    matrix = np.full((1, 1), 1e-7, np.float32)
+    found = edge_motion_m(
+        matrix,
+        np.eye(1, dtype=np.float32),
+        np.array([0.5]),
+        Outer(actuators=np.ones((1, 1))),
+        leak=1.0,
+        delay_frames=1.0,
+    )
+    assert found == pytest.approx(1e-7 * np.sqrt(0.5 / 1.5), rel=1e-4)
+
+
+def test_a_slippery_loop_is_named_with_what_to_do_and_a_leak_forgives_it():
+    assert why_slippery(0.99 * LIMIT_M, 1.0) is None
+    assert why_slippery(2.0 * LIMIT_M, FORGIVING_LEAK) is None
+    reason = why_slippery(2.0 * LIMIT_M, 0.999)
+    assert reason is not None
+    assert "fewer modes, a lower gain or more leak" in reason

@@ -1,8 +1,9 @@
 """When the outer ring of the mirror slips, and whether the service's watch sees it.
 
 Runs mis-registered loops on the diffractive telescope, prints the wavefront error of every half
-second, and when the watch on the outer ring speaks. A case is modes:registration:leak; without one
-all of docs/results/edge_slip.md are run.
+second, when the watch on the outer ring speaks, and what the gate knew beforehand: the worst pole
+radius and the motion of the outer ring per unit of slope noise. A case is modes:registration:leak;
+without one all of docs/results/edge_slip.md are run.
 Run: ``python -m studies.edge_slip --case 594:0,0,0,1.025:1.0 --case 400:0.3,0,0,1:1.0``.
 """
 
@@ -17,8 +18,13 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
+from service.control.edge import Outer, edge_motion_m
+from service.control.reconstructor import invert
+from service.control.stability import pole_radius
 from service.estimation.edge import EdgeHealth, edge_watch, observe_edge
 from service.estimation.frames import FrameBlock
+from service.model.interaction import InteractionModel
+from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from sim_rtc.assembly import build_telescope
 from sim_rtc.feed import BATCH_FRAMES
@@ -28,6 +34,9 @@ from sim_rtc.options import parse_options
 CASES = (
     "400:0,0,0,1:1.0",
     "400:0.3,0,0,1:1.0",
+    "400:0,0,0,1.035:1.0",
+    "500:0,0,0,1:0.999",
+    "500:0,0,0,1.02:0.999",
     "594:0,0,0,1:1.0",
     "594:0,0,0,1.015:1.0",
     "594:0,0,0,1.025:1.0",
@@ -36,6 +45,8 @@ CASES = (
     "594:0,0,0,1.025:0.99",
 )
 STROKE_M = 3e-5
+OPTICAL_GAIN = 0.6
+"""Of the residual wavefront of these loops, on average over the modes."""
 
 
 class Case(NamedTuple):
@@ -63,6 +74,27 @@ def parse_case(text: str) -> Case:
     """Return the case that ``modes:registration:leak`` means."""
     n_controlled, alpha, leak = text.split(":")
     return Case(int(n_controlled), alpha, float(leak))
+
+
+def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, float]:
+    """Return the worst pole radius and the motion of the outer ring, metres per unit of slope."""
+    x, y, rotation_deg, magnification = (float(word) for word in case.alpha.split(","))
+    alpha = Misregistration(
+        shift_x_subap=x,
+        shift_y_subap=y,
+        rotation_rad=np.deg2rad(rotation_deg),
+        magnification=magnification,
+    )
+    n = case.n_controlled
+    matrix = invert(model.interaction_matrix(Misregistration()), n).matrix
+    coupling = matrix @ model.interaction_matrix(alpha)[:, :n]
+    gains = np.full(n, gain * OPTICAL_GAIN)
+    eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
+    positions = model.instrument.mirror.positions_m
+    radius = np.hypot(*positions.T)
+    outer = Outer(actuators=model.basis.mode_to_actuator[radius > 0.96 * radius.max()])
+    motion = edge_motion_m(matrix, coupling, gains, outer, leak=case.leak, delay_frames=2.0)
+    return float(pole_radius(eigenvalues, leak=case.leak).max()), motion
 
 
 def run(case: Case, given: argparse.Namespace) -> Outcome:
@@ -132,16 +164,20 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=3)
     given = parser.parse_args()
     sys.stdout.write(
-        "modes registration leak | slip seen, highest ratio | nm RMS per half second\n"
+        "| modes, registration, leak | pole radius | edge, nm | slip seen | highest ratio "
+        "| nm RMS per half second |\n|---|---|---|---|---|---|\n"
     )
     with threadpool_limits(1):
+        instrument = load_instrument("flao-lbt")
+        model = InteractionModel(instrument, karhunen_loeve_basis(instrument))
         for case in given.case or [parse_case(text) for text in CASES]:
+            radius, motion = foreseen(case, given.gain, model)
             found = run(case, given)
             when = "no slip" if found.first_slip_s is None else f"{found.first_slip_s:.2f} s"
             errors = " ".join(f"{error:.0f}" for error in found.wavefront_nm)
             sys.stdout.write(
-                f"{case.n_controlled} {case.alpha} {case.leak:g} | {when}, "
-                f"{found.highest_ratio:.1f} | {errors}\n"
+                f"| {case.n_controlled}, {case.alpha}, {case.leak:g} | {radius:.3f} "
+                f"| {motion * 1e9:.0f} | {when} | {found.highest_ratio:.1f} | {errors} |\n"
             )
             sys.stdout.flush()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ def instrument_sha256(instrument: Instrument) -> str:
     Two files that describe the same instrument, one with the defaults spelt out, are the same.
     """
     digest = hashlib.sha256()
-    _add(digest, instrument)
+    _add(digest, replace(instrument, remarks=()))
     return digest.hexdigest()
 
 

@@ -56,7 +56,7 @@ def parse_alpha(text: str) -> Misregistration:
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(f"found {text!r}, {expected}") from None
+        raise ValueError(f"found {text.strip()!r}, {expected}") from None
     if len(values) != len(PARAMETERS) or not np.all(np.isfinite(values)) or values[3] <= 0.0:
-        raise ValueError(f"found {text!r}, {expected}")
+        raise ValueError(f"found {text.strip()!r}, {expected}")
     return Misregistration.from_boundary(dict(zip(PARAMETERS, values, strict=True)))

@@ -9,7 +9,11 @@ import pytest
 from service.config import Settings, load_instrument, load_settings
 from service.config.layouts import coincident, grid, rings, typical_pitch
 from service.errors import ConfigurationError
-from service.model.instrument import Influence, Stop
+from service.model.instrument import Influence, LoopFacts, Stop
+from service.model.interaction import rtc_valid_subapertures, valid_subapertures
+from service.model.misregistration import Misregistration
+from service.model.modes import modal_basis
+from service.model.slopes import Normalisation, Orientation, SlopeOrder
 from service.state import Mode
 
 ABOUT = '[instrument]\nname = "bench"\ndiameter_m = 8.0\nstop = "telescope"\n'
@@ -284,6 +288,293 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
     assert "no.toml: cannot be read: No such file" in refusal(load_instrument, tmp_path / "no.toml")
     (tmp_path / "latin.toml").write_bytes(b'name = "\xe9"\n')
     assert "not UTF-8" in refusal(load_instrument, tmp_path / "latin.toml")
+
+
+# --- the slopes, the loop, and frames
+
+
+def test_the_rtcs_own_slopes_are_described_as_they_are(write):
+    slopes = (
+        '[slopes]\norder = "interleaved"\nnormalisation = "local"\n'
+        "orientation = { swap_xy = true, flip_y = true, sign = -1 }\n"
+    )
+    recipe = load_instrument(write(ABOUT + WFS + MIRROR + MODES + slopes)).slopes
+    assert recipe.order is SlopeOrder.INTERLEAVED
+    assert recipe.normalisation is Normalisation.LOCAL
+    assert recipe.orientation == Orientation(swap_xy=True, flip_y=True, sign_x=-1, sign_y=-1)
+
+
+def test_the_signs_of_the_two_components_may_differ(write):
+    slopes = "[slopes]\norientation = { sign = [1, -1] }\n"
+    recipe = load_instrument(write(ABOUT + WFS + MIRROR + MODES + slopes)).slopes
+    assert recipe.orientation == Orientation(sign_x=1, sign_y=-1)
+
+
+def test_an_orientation_that_is_not_given_is_not_known(write):
+    assert load_instrument(write(ABOUT + WFS + MIRROR + MODES)).slopes.orientation is None
+
+
+def test_what_is_known_of_the_loop_is_carried(write):
+    loop = "[loop]\nframe_rate_hz = 500\ndelay_frames = 1.5\nn_controlled = 40\n"
+    bench = load_instrument(write(ABOUT + WFS + MIRROR + MODES + loop))
+    assert bench.loop == LoopFacts(frame_rate_hz=500.0, delay_frames=1.5, n_controlled=40)
+    assert load_instrument(write(ABOUT + WFS + MIRROR + MODES)).loop is None
+
+
+def test_full_frames_have_windows(write):
+    wfs = (
+        WFS + 'input = "frames"\npixels_per_subaperture = 2\n'
+        "pupil_centres_px = [[20, 21.5], [20.5, 93], [92, 21], [93, 92]]\n"
+    )
+    frames = load_instrument(write(ABOUT + wfs + MIRROR + MODES)).frames
+    assert frames.pixels_per_subaperture == 2
+    np.testing.assert_array_equal(frames.centres_px[1], [20.5, 93.0])
+    auto = WFS + 'input = "frames"\npupil_centres_px = "auto"\n'
+    assert load_instrument(write(ABOUT + auto + MIRROR + MODES)).frames.centres_px is None
+    assert load_instrument(write(ABOUT + WFS + MIRROR + MODES)).frames is None
+
+
+# --- the mount, and modes of the user's own
+
+
+def save(path, **datasets):
+    with h5py.File(path, "w") as file:
+        for name, values in datasets.items():
+            file[name] = values
+
+
+def test_how_a_mirror_is_mounted_is_told_or_not_known(write):
+    mount = 'nominal_rotation_deg = -130.0\nparity = -1\nstroke = "unknown"\n'
+    mirror = load_instrument(write(ABOUT + WFS + MIRROR + mount + MODES)).mirror
+    assert mirror.nominal_rotation_rad == pytest.approx(np.deg2rad(-130))
+    assert (mirror.parity, mirror.y_sign, mirror.stroke_known) == (-1, -1.0, False)
+    bench = load_instrument(write(ABOUT + WFS + MIRROR + MODES))
+    assert (bench.mirror.nominal_rotation_rad, bench.mirror.parity) == (None, None)
+    assert bench.mirror.stroke_known
+    assert bench.start == Misregistration()
+
+
+def test_a_mirror_seen_from_behind_shows_its_modes_with_y_reversed(write):
+    seen, behind = (
+        modal_basis(load_instrument(write(ABOUT + WFS + MIRROR + more + MODES)))
+        for more in ("", "parity = -1\n")
+    )
+    points = np.random.default_rng(1).uniform(-9, 9, (30, 2))
+    direction = points[::-1]
+    flip = np.array([1.0, -1.0])
+    np.testing.assert_array_equal(behind.render(points), seen.render(points * flip))
+    np.testing.assert_array_equal(
+        behind.render_slope(points, direction), seen.render_slope(points * flip, direction * flip)
+    )
+    np.testing.assert_array_equal(behind.mirrored().render(points), seen.render(points))
+
+
+ALPAO = '[mirror]\nlayout = "grid"\nn_across = 11\npitch_m = 0.75\ndiameter_m = 8.25\n'
+
+
+def test_a_mode_to_actuator_matrix_makes_the_users_modes_of_an_alpao(write, tmp_path):
+    strokes = np.random.default_rng(2).normal(size=(97, 7))
+    save(tmp_path / "m2c.h5", m2c=strokes.astype(">f4"))
+    bench = load_instrument(
+        write(ABOUT + WFS + ALPAO + 'mode_to_actuator = "m2c.h5:/m2c"\nmodes_kind = "surface"\n')
+    )
+    assert bench.modes.n_modes == 7
+    basis = modal_basis(bench)
+    assert basis.n_modes == 7
+    at_actuators = basis.render(bench.mirror.positions_m / bench.subaperture_m)
+    np.testing.assert_allclose(at_actuators, 2 * strokes, rtol=1e-4, atol=1e-6)
+    assert basis.known(np.array([[0.0, 30.0]])).all()
+    some = basis.subset([4, 1])
+    points = np.array([[0.3, 0.7], [2.0, -4.0]])
+    np.testing.assert_allclose(some.render(points), basis.render(points)[:, [4, 1]])
+    np.testing.assert_array_equal(some.variance_m2, basis.variance_m2[[4, 1]])
+
+
+def test_a_zonal_basis_is_the_actuators_themselves(write):
+    bench = load_instrument(write(ABOUT + WFS + ALPAO + 'basis = "zonal"\n'))
+    assert bench.modes.n_modes == 97
+    at_actuators = modal_basis(bench).render(bench.mirror.positions_m / bench.subaperture_m)
+    np.testing.assert_allclose(at_actuators, np.eye(97), atol=1e-9)
+
+
+def measured_modes(n=90, pitch=0.1):
+    """Tip, tilt and defocus on a grid, metres."""
+    line = (np.arange(n) - (n - 1) / 2) * pitch
+    x, y = np.meshgrid(line, line)
+    return np.array([x, y, x**2 + y**2]), np.hypot(x, y)
+
+
+CUBE = '[mirror]\nmodes = "cube.h5:/modes"\nmodes_pitch_m = 0.1\n'
+
+
+def test_a_cube_of_measured_modes_is_what_it_says_whatever_its_byte_order(write, tmp_path):
+    cube, _ = measured_modes()
+    save(tmp_path / "cube.h5", modes=cube.astype(">f8"))
+    for kind, factor in (("opd", 1.0), ("surface", 2.0)):
+        bench = load_instrument(write(ABOUT + WFS + CUBE + f'modes_kind = "{kind}"\n'))
+        assert bench.remarks == ()
+        assert bench.modes.n_modes == 3
+        points = np.array([[1.0, -2.0], [0.0, 0.0], [7.5, 3.0]])
+        x, y = (points * bench.subaperture_m).T
+        np.testing.assert_allclose(
+            modal_basis(bench).render(points),
+            factor * np.column_stack([x, y, x**2 + y**2]),
+            atol=1e-6,
+        )
+
+
+def test_a_cube_that_is_zero_outside_the_pupil_is_told_of_and_continued(write, tmp_path):
+    cube, radius = measured_modes()
+    save(tmp_path / "cube.h5", modes=np.where(radius < 3.8, cube, 0.0))
+    bench = load_instrument(write(ABOUT + WFS + CUBE))
+    assert "44% of the table is zero in every mode" in bench.remarks[0]
+    basis = modal_basis(bench)
+    points = np.array([[9.8, 0.0], [9.0, 0.0]])
+    np.testing.assert_array_equal(basis.known(points), [False, True])
+    np.testing.assert_allclose(basis.render(points)[:, 0], points[:, 0] * 0.4, rtol=1e-3)
+
+
+def test_influence_functions_and_a_matrix_make_modes(write, tmp_path):
+    rng = np.random.default_rng(3)
+    functions, strokes = rng.normal(size=(5, 90, 90)), rng.normal(size=(5, 2))
+    save(tmp_path / "ifs.h5", cube=functions, m2c=strokes)
+    mirror = '[mirror]\ninfluence_functions = "ifs.h5:/cube"\nmodes_pitch_m = 0.1\n'
+    bench = load_instrument(write(ABOUT + WFS + mirror + 'mode_to_actuator = "ifs.h5:/m2c"\n'))
+    np.testing.assert_allclose(
+        bench.mirror.cube, np.einsum("am,ayx->myx", strokes, functions), rtol=1e-12
+    )
+    zonal = load_instrument(write(ABOUT + WFS + mirror + 'basis = "zonal"\n'))
+    np.testing.assert_array_equal(zonal.mirror.cube, functions)
+
+
+def test_arrays_come_from_fits_files_too(write, tmp_path):
+    fits = pytest.importorskip("astropy.io.fits")
+    cube, _ = measured_modes()
+    images = [
+        fits.PrimaryHDU(),
+        fits.ImageHDU(cube.astype(np.float32), name="MODES"),
+        fits.ImageHDU(np.ones((20, 20), np.uint8)),
+    ]
+    fits.HDUList(images).writeto(tmp_path / "bench.fits")
+    mask = 'valid_subapertures = "bench.fits:2"\n'
+    for reference in ("bench.fits", "bench.fits:modes", "bench.fits:1"):
+        text = CUBE.replace("cube.h5:/modes", reference)
+        bench = load_instrument(write(ABOUT + WFS + mask + text))
+        np.testing.assert_array_equal(bench.mirror.cube, cube.astype(np.float32))
+        assert bench.mirror.cube.dtype.isnative
+        assert bench.wfs.valid_subapertures.all()
+    missing = CUBE.replace("cube.h5:/modes", "bench.fits:nothing")
+    message = refusal(load_instrument, write(ABOUT + WFS + missing))
+    assert "no dataset /nothing in" in message
+    assert "it holds MODES (3, 90, 90)" in message
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (WFS + CUBE + "[modes]\nn_modes = 3\n", "modes.n_modes: found it beside a basis"),
+        (WFS + CUBE + 'layout = "rings"\n', "found layout and modes, expected one of"),
+        (WFS + CUBE + "pitch_m = 0.3\n", "mirror.pitch_m: has no meaning beside mirror.modes"),
+        (WFS + CUBE + 'basis = "zonal"\n', "mirror.basis: has no meaning beside mirror.modes"),
+        (
+            WFS + CUBE.replace("modes_pitch_m = 0.1\n", ""),
+            "mirror.modes_pitch_m: missing, mirror.modes needs the step of its grid",
+        ),
+        (
+            WFS + CUBE.replace("0.1", "0.25"),
+            "found 0.25 m, 1.6 table points per subaperture, expected at least 2",
+        ),
+        (WFS + CUBE.replace("= 0.1", "= 100.0"), "table points per subaperture, expected"),
+        (WFS + CUBE.replace("= 0.1", "= 0.0001"), "a surface known over 0% of the pupil's area"),
+        (WFS + CUBE.replace("/modes", "/flat"), "found shape (90, 90), expected (n, ny, nx)"),
+        (WFS + CUBE.replace("/modes", "/nothing"), "mirror.modes: found no dataset /nothing in"),
+        (WFS + CUBE.replace("/modes", "/wide"), "a table of 25 pupil diameters, expected at most"),
+        (WFS + CUBE.replace("/modes", "/dark"), "a surface known over 0% of the pupil's area"),
+        (
+            WFS + '[mirror]\ninfluence_functions = "cube.h5:/modes"\nmodes_pitch_m = 0.1\n',
+            "mirror.mode_to_actuator: missing, mirror.influence_functions needs it",
+        ),
+        (
+            WFS + ALPAO + 'mode_to_actuator = "cube.h5:/turned"\n',
+            "shape (7, 97) (it looks transposed), expected (97 actuators, n_modes)",
+        ),
+        (WFS + ALPAO + 'mode_to_actuator = "cube.h5:/nan"\n', "strokes that are not finite"),
+        (
+            WFS + ALPAO + 'mode_to_actuator = "cube.h5:/m2c"\nbasis = "KL"\n',
+            "mirror.basis: found it beside mirror.mode_to_actuator, expected only one of the two",
+        ),
+        (WFS + ALPAO + 'modes_kind = "surface"\n', "mirror.modes_kind: found it, expected it besi"),
+        (WFS + ALPAO + "modes_pitch_m = 0.1\n", "mirror.modes_pitch_m: has no meaning beside"),
+        (
+            WFS + ALPAO + 'mode_to_actuator = "cube.h5:/m2c"\n[loop]\nn_controlled = 8\n',
+            "loop.n_controlled: found 8, expected at most the 7 modes of the basis",
+        ),
+        (
+            WFS + "pixels_per_subaperture = 2\n" + MIRROR + MODES,
+            'wfs.pixels_per_subaperture: belongs to input = "frames", found input = "slopes"',
+        ),
+        (
+            WFS + "pupil_centres_px = [[1, 2], [1, 9], [9, 2], [9, 9]]\n" + MIRROR + MODES,
+            'wfs.pupil_centres_px: belongs to input = "frames"',
+        ),
+        (
+            WFS
+            + 'input = "frames"\npupil_centres_px = [[1, 2], [1, 3], [9, 2], [9, 1]]\n'
+            + MIRROR
+            + MODES,
+            "wfs.pupil_centres_px: found pupil images at",
+        ),
+        (
+            WFS + 'input = "frames"\npupil_centres_px = [1, 2, 3, 4]\n' + MIRROR + MODES,
+            'expected "auto" or four pairs [row, column]',
+        ),
+        (
+            WFS + 'input = "frames"\n' + MIRROR + MODES + '[slopes]\norder = "xy"\n',
+            "slopes.order: has no meaning beside wfs.input",
+        ),
+        (
+            WFS + MIRROR + MODES + "[slopes]\norientation = { sign = 0 }\n",
+            "slopes.orientation.sign: found 0, expected 1, -1 or two of them",
+        ),
+        (WFS + MIRROR + "parity = 2\n" + MODES, "mirror.parity: found 2, expected -1 or 1"),
+    ],
+)
+def test_what_contradicts_itself_or_its_arrays_is_refused_in_one_line(
+    write, tmp_path, text, expected
+):
+    cube, _ = measured_modes()
+    save(
+        tmp_path / "cube.h5",
+        modes=cube,
+        flat=cube[0],
+        wide=np.ones((1, 2000, 2000), np.float32),
+        dark=np.zeros((2, 90, 90)),
+        m2c=np.ones((97, 7)),
+        turned=np.ones((7, 97)),
+        nan=np.full((97, 7), np.nan),
+    )
+    path = write(ABOUT + text)
+    message = refusal(load_instrument, path)
+    assert message.startswith(f"{path}: ")
+    assert expected in message
+
+
+def test_a_coarse_table_is_told_of(write, tmp_path):
+    cube, _ = measured_modes(45, 0.2)
+    save(tmp_path / "cube.h5", modes=cube)
+    bench = load_instrument(write(ABOUT + WFS + CUBE.replace("0.1", "0.18")))
+    assert "2.2 table points per subaperture; below 4 the high modes" in bench.remarks[0]
+
+
+def test_the_mask_is_in_the_rtcs_axes_and_the_model_turns_it(write, tmp_path):
+    mask = np.zeros((20, 20), np.uint8)
+    mask[3, 7] = mask[3, 8] = mask[4, 7] = 1
+    save(tmp_path / "mask.h5", valid=mask)
+    wfs = WFS + 'valid_subapertures = "mask.h5:/valid"\n'
+    slopes = "[slopes]\norientation = { flip_x = true, swap_xy = true }\n"
+    bench = load_instrument(write(ABOUT + wfs + MIRROR + MODES + slopes))
+    np.testing.assert_array_equal(rtc_valid_subapertures(bench), mask.astype(bool))
+    np.testing.assert_array_equal(valid_subapertures(bench), mask[:, ::-1].T.astype(bool))
 
 
 # --- settings

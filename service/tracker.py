@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from service import events as ev
 from service.events import Command, Event
+from service.reactions.dither import on_dither, on_silence
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.loop import close_again, on_loop
 from service.reactions.matrices import (
@@ -21,7 +22,6 @@ from service.reactions.measurements import MEASURING, meanwhile, on_measurement
 from service.reactions.operator import on_command
 from service.reactions.policy import Policy, decide
 from service.reactions.rtc import (
-    on_dither,
     on_failure,
     on_new_session,
     on_status,
@@ -101,6 +101,8 @@ def _react_to_matrices(state: TrackerState, event: Event, policy: Policy, now_ns
             return on_acknowledgement(state, event, now_ns), ()
         case ev.DitherAnswered():
             return on_dither(state, event, now_ns), ()
+        case ev.DitherSilent():
+            return on_silence(state, event, now_ns), ()
         case ev.JobFailed(effect=effect, text=text):
             return on_failure(state, effect, text, now_ns), ()
         case _:

@@ -32,6 +32,7 @@ from service.events.effects import (
 from service.events.heard import (
     Acknowledged,
     DitherAnswered,
+    DitherSilent,
     Event,
     JobFailed,
     LoopAnswered,
@@ -61,6 +62,7 @@ __all__ = [
     "Command",
     "CopyMatrix",
     "DitherAnswered",
+    "DitherSilent",
     "Effect",
     "Event",
     "FetchMatrix",

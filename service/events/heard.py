@@ -126,6 +126,15 @@ class DitherAnswered:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DitherSilent:
+    """A dither should be on the mirror, and the frames hold none of it."""
+
+    id: str
+    silent_s: float
+    """By the frames' own time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LoopAnswered:
     """The RTC accepted or refused a change of its loop, or a gain ramp."""
 
@@ -165,6 +174,7 @@ Event = (
     | MarginJudged
     | Acknowledged
     | DitherAnswered
+    | DitherSilent
     | LoopAnswered
     | MatrixMeasured
     | JobFailed

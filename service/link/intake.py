@@ -26,6 +26,7 @@ from service.link.events import (
     SecondRtc,
     SessionChanged,
     StatusReceived,
+    WrongShape,
 )
 from service.link.ring import FrameCounts, FrameRing
 from service.link.sessions import SessionWatch
@@ -71,6 +72,7 @@ class Intake:
         self._patience_s = endpoint.reorder_s
         self._basis_id: str | None = None
         self._config_id: str | None = None
+        self._shape: tuple[int, int] | None = None
         self._counts = FrameCounts()
         self._tally: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
@@ -138,6 +140,7 @@ class Intake:
             self._tally["statuses"] += 1
             if self._admit(status.session, now_s):
                 self._expected(status.basis_id, status.config_id, now_s)
+                self._shape = (status.n_slopes, status.n_modes)
                 self._queue.put(StatusReceived(status=status))
         self._wakeup.ring()
 
@@ -216,14 +219,24 @@ class Intake:
             )
 
     def _belongs(self, header: FrameHeader, now_s: float) -> bool:
-        """Return whether frames are of the session, basis and configuration that count."""
+        """Return whether frames are of the session, basis, configuration and shape that count."""
         if not self._admit(header.session, now_s):
             self._refused["session"] += header.n
             return False
         wrong = self._expected(header.basis_id, header.config_id, now_s)
+        wrong = wrong or self._misshapen(header, now_s)
         if wrong:
             self._refused[wrong] += header.n
         return not wrong
+
+    def _misshapen(self, header: FrameHeader, now_s: float) -> str:
+        """Return "shape" for frames of other sizes than the status says, else an empty string."""
+        found = (header.n_slopes, header.n_modes)
+        if self._shape is None or found == self._shape:
+            return ""
+        if self._bursts.opens("shape", now_s):
+            self._queue.put(WrongShape(expected=self._shape, found=found))
+        return "shape"
 
     def _store(self, batch: FrameBatch, now_s: float) -> None:
         header = batch.header
@@ -244,6 +257,7 @@ class Intake:
         current = self._sessions.current
         admission = self._sessions.admit(session, now_s)
         if admission.changed:
+            self._shape = None
             self._queue.put(SessionChanged(old=admission.previous, new=session))
         if admission.second and current and self._bursts.opens("second", now_s):
             self._queue.put(SecondRtc(current=current, other=session))

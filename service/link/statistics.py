@@ -45,7 +45,7 @@ class LinkStatistics:
     """Frames nobody drained in time, or that a new session made void."""
 
     frames_refused: Mapping[str, int]
-    """Frames of batches not used, by reason: session, basis, config."""
+    """Frames of batches not used, by reason: session, basis, config, shape."""
 
     messages_malformed: Mapping[str, int]
     """Messages that broke the contract, by kind: frames, status, ack, im, reply."""

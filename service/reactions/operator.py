@@ -7,6 +7,7 @@ from dataclasses import replace
 from service import events as ev
 from service.errors import CommandError
 from service.events import Event
+from service.reactions.dither import found_again
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send
 from service.reactions.policy import Policy, moved, plan_dither, why_unusable
@@ -28,7 +29,7 @@ def on_command(  # noqa: C901 - one line for each command
         case ev.SetMode(mode=mode):
             return logged(replace(state, mode=mode), "mode", f"mode is {mode}", now_ns), ()
         case ev.StopDither():
-            state = replace(state, dither=None, dither_stopped=True)
+            state = found_again(replace(state, dither=None, dither_stopped=True), now_ns)
             return logged(state, "dither.stopped", "by the operator", now_ns), (ev.AskNoDither(),)
         case ev.StartDither():
             return _start_dither(state, event, policy, now_ns)

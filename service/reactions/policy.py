@@ -112,7 +112,8 @@ def _dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> _
     wanted = policy.dither_enabled and not state.dither_stopped and state.dither is None
     if rtc.loop != "closed" or not wanted:
         return state, ()
-    if rtc.dither is not None and why_unusable(rtc.dither, rtc, policy) is None:
+    usable = rtc.dither is not None and rtc.dither.id != state.dither_lost
+    if usable and rtc.dither is not None and why_unusable(rtc.dither, rtc, policy) is None:
         state = replace(state, dither=replace(rtc.dither, asked_ns_utc=now_ns))
         text = f"{rtc.dither.id} runs since frame {rtc.dither.start_seq}"
         state = without_alarm(state, "dither", now_ns)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from service import events as ev
 from service.events import Effect
+from service.reactions.dither import follow_status, found_again
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS
 from service.reactions.shelf import with_in_use, with_state
@@ -20,7 +21,7 @@ STALE_AFTER_S = 60.0
 FORGOTTEN_AFTER_S = 15.0
 """An alarm the link repeats while it lasts is over after this much silence."""
 
-_RENEWED = ("second-rtc", "basis-mismatch")
+_RENEWED = ("second-rtc", "basis-mismatch", "frames-shape")
 
 COMPUTE_WITHIN_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
@@ -82,14 +83,7 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
         state = with_alarm(state, "loop-open", "the loop is open: close it to calibrate", now_ns)
     else:
         state = without_alarm(state, "loop-open", now_ns)
-    dither = state.dither
-    if dither is None or dither.start_seq is None or rtc.dither_id == dither.id:
-        return state
-    # a status on its way when the dither was accepted does not know it yet
-    if now_ns - dither.asked_ns_utc > 2 * SECOND_NS:
-        state = replace(state, dither=None)
-        state = logged(state, "dither.ended", f"{dither.id} has ended", now_ns)
-    return state
+    return follow_status(state, rtc, now_ns)
 
 
 def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerState:
@@ -108,21 +102,8 @@ def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerSta
         retry_ns_utc=0,
         registration=registration and replace(registration, n_windows=0),
     )
+    state = found_again(state, now_ns)
     return logged(state, "rtc.session", f"the RTC started session {session}", now_ns)
-
-
-def on_dither(state: TrackerState, event: ev.DitherAnswered, now_ns: int) -> TrackerState:
-    """Note when the dither starts, or why it does not."""
-    if state.dither is None or state.dither.id != event.id:
-        return state
-    if event.accepted:
-        state = replace(
-            state, dither=replace(state.dither, start_seq=event.start_seq, asked_ns_utc=now_ns)
-        )
-        text = f"{event.id} starts at frame {event.start_seq}"
-        return logged(without_alarm(state, "dither", now_ns), "dither.started", text, now_ns)
-    state = replace(state, dither=None, retry_ns_utc=now_ns + 10 * SECOND_NS)
-    return with_alarm(state, "dither", f"the RTC refused the dither: {event.reason}", now_ns)
 
 
 def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> TrackerState:
@@ -142,6 +123,6 @@ def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> T
 
 def on_vanished(state: TrackerState, now_ns: int) -> TrackerState:
     """Forget what belonged to the RTC, and nothing else."""
-    state = replace(state, rtc=None, dither=None)
+    state = found_again(replace(state, rtc=None, dither=None), now_ns)
     text = "the RTC vanished; α and every reconstructor are kept: restart the RTC"
     return with_alarm(state, "rtc-vanished", text, now_ns)

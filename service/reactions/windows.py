@@ -10,6 +10,7 @@ from service import events as ev
 from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
 from service.estimation.kalman import begin, update
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.reactions.dither import found_again
 from service.reactions.journal import OFF_LOOP, logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import HistoryEntry, Level, Registration, TrackerState, Watchdog
@@ -37,6 +38,7 @@ def on_window(
     reason = _why_useless(state, estimate)
     if reason is not None:
         return refuse_window(state, reason, now_ns)
+    state = found_again(state, now_ns)
     for alarm in ("columns-misaligned", "estimate-stale"):
         state = without_alarm(state, alarm, now_ns)
     measured, noise = estimate.alpha.vector, estimate.covariance

@@ -39,7 +39,15 @@ class Streams:
     lock_in: LockIn | None = None
     """None while no dither runs."""
 
-    dither_id: str | None = None
+    dither: DitherView | None = None
+    """The one whose windows are under way, or cannot be."""
+
+    dither_seen_seq: int = 0
+    """Up to here the frames held it, or it need not have been there."""
+
+    dither_silent_s: float = 0.0
+    """For how long the last frames should have held it and did not."""
+
     passive: Passive | None = None
     health: LoopHealth = field(default_factory=LoopHealth)
     matrices: tuple[tuple[str, NDArray[np.float32]], ...] = ()
@@ -59,7 +67,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     streams = replace(streams, rtc=rtc)
     if rtc is None:
         return replace(
-            streams, passive=None, lock_in=None, dither_id=None, check=LoopCheck(), off=None
+            streams, passive=None, lock_in=None, dither=None, check=LoopCheck(), off=None
         )
     if before is not None and _same_loop(before, rtc):
         return streams if before.seq == rtc.seq else _confirmed(streams, rtc)
@@ -67,7 +75,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None)
     memory = Passive(n_modes=rtc.n_controlled, memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz)
     if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
-        return replace(streams, passive=memory, lock_in=None, dither_id=None)
+        return replace(streams, passive=memory, lock_in=None, dither=None)
     return replace(streams, passive=memory, lock_in=_cut(streams.lock_in, rtc))
 
 
@@ -139,11 +147,16 @@ def with_dither(streams: Streams, dither: DitherView | None, window_s: float) ->
     """
     rtc = streams.rtc
     if dither is None or dither.start_seq is None or rtc is None:
-        return replace(streams, lock_in=None, dither_id=None)
-    if dither.id == streams.dither_id:
+        return replace(streams, lock_in=None, dither=None, dither_silent_s=0.0)
+    dither = replace(dither, asked_ns_utc=0)
+    if dither == streams.dither:
         return streams
-    plan = lock_in_plan(dither, rtc, window_s)
-    return replace(streams, lock_in=LockIn(plan=plan), dither_id=dither.id)
+    # a status may announce a dither that began long ago
+    seen_seq = max(dither.start_seq or 0, rtc.seq)
+    streams = replace(
+        streams, lock_in=None, dither=dither, dither_seen_seq=seen_seq, dither_silent_s=0.0
+    )
+    return replace(streams, lock_in=LockIn(plan=lock_in_plan(dither, rtc, window_s)))
 
 
 def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
@@ -154,6 +167,7 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     terms = _terms(streams, block.cm_id)
     if terms is not None:
         streams = replace(streams, check=loopcheck.observe(streams.check, block, terms))
+    streams = _listening(streams, rtc, block)
     windows: list[Window] = []
     if streams.lock_in is not None:
         lock_in, ended = lockin.accumulate(streams.lock_in, block)
@@ -164,6 +178,18 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     variance = streams.description.mode_variance_m2
     health = observe(streams.health, block, variance, rtc.n_controlled)
     return replace(streams, health=health), windows
+
+
+def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:
+    """Note whether a block holds the dither that should be there."""
+    dither, next_seq = streams.dither, block.first_seq + block.n_frames
+    if block.dither_m is not None:
+        return replace(streams, dither_seen_seq=next_seq, dither_silent_s=0.0)
+    if dither is None:
+        return streams
+    stop_seq = (dither.start_seq or 0) + round(dither.duration_s * rtc.frame_rate_hz)
+    silent = max(min(next_seq, stop_seq) - streams.dither_seen_seq, 0)
+    return replace(streams, dither_silent_s=silent / rtc.frame_rate_hz)
 
 
 def _obeying(streams: Streams, window: Window) -> Window:

@@ -21,6 +21,7 @@ from service.estimation.lockin import Spectra, WindowRefused
 from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
 from service.model.misregistration import Misregistration
+from service.reactions.dither import SILENT_S
 from service.reactions.journal import OFF_LOOP, WRONG_RTC
 from service.reactions.policy import Policy
 from service.routes.service import Snapshot
@@ -167,10 +168,15 @@ class Supervisor:
         if self._streams is None:
             return
         was_diverging = self._streams.health.diverging
+        was_silent_s = self._streams.dither_silent_s
         for block in self._bridge.drain():
             self._streams, windows = fed(self._streams, block)
             for window in windows:
                 self._take(window)
+        silent_s, dither = self._streams.dither_silent_s, self._streams.dither
+        due = silent_s >= SILENT_S and int(2 * silent_s) > int(2 * was_silent_s)
+        if dither is not None and due:
+            self._post(ev.DitherSilent(id=dither.id, silent_s=silent_s))
         health = self._streams.health
         if health.diverging != was_diverging:
             text = (
@@ -301,8 +307,8 @@ class Supervisor:
         try:
             self._streams = with_dither(self._streams, dither, self._policy.window_s)
         except ModelError as error:
-            unusable = None if dither is None else dither.id
-            self._streams = replace(self._streams, lock_in=None, dither_id=unusable)
+            unusable = None if dither is None else replace(dither, asked_ns_utc=0)
+            self._streams = replace(self._streams, lock_in=None, dither=unusable)
             self._note("dither.unusable", str(error), Level.WARNING)
 
     async def _do(self, effect: Effect, state: TrackerState) -> None:

@@ -67,6 +67,12 @@ class TrackerState:
     dither_stopped: bool = False
     """An operator stopped it: the service does not start another by itself."""
 
+    dither_lost: str | None = None
+    """The last dither that did not reach the mirror: not adopted though a status shows it."""
+
+    dither_losses: int = 0
+    """Dithers lost since the last window was accepted."""
+
     loop_command: LoopCommand | None = None
     """The last change of the loop that was asked of the RTC; None: none was."""
 

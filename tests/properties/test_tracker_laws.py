@@ -136,6 +136,11 @@ heard = st.one_of(
         reason=st.just("r"),
         frame_seq=st.none() | st.integers(0, 10**6),
     ),
+    st.builds(
+        ev.DitherSilent,
+        id=st.sampled_from(["dither-1", "other"]),
+        silent_s=st.sampled_from([1.0, 2.0, 100.0]),
+    ),
     st.builds(lambda name: ev.MatrixFetched(record=foreign(name)), ids),
     st.builds(
         lambda name, state, reason: ev.MatrixMeasured(

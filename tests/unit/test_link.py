@@ -5,12 +5,29 @@ import pytest
 
 from service.errors import UnknownIdError, WireError
 from service.link.endpoint import Endpoint
-from service.link.events import EventQueue, MalformedMessage, RtcAppeared, SecondRtc, SessionChanged
+from service.link.events import (
+    EventQueue,
+    MalformedMessage,
+    RtcAppeared,
+    SecondRtc,
+    SessionChanged,
+    WrongShape,
+)
 from service.link.intake import Intake
 from service.link.measured import MeasuredIntake
 from service.link.outbox import OFFERS, Offer, Outbox
 from service.link.sessions import SessionWatch
-from service.wire import FrameHeader, Keys, Manifest, encode_frames, encode_manifest, layout_of
+from service.wire import (
+    FrameHeader,
+    Keys,
+    Loop,
+    Manifest,
+    Status,
+    encode_frames,
+    encode_manifest,
+    encode_status,
+    layout_of,
+)
 
 
 class Clock:
@@ -114,6 +131,63 @@ def test_frames_of_another_size_start_over_in_the_same_session(intake):
     send(intake, 10, n_modes=4)
     (block,) = intake.drain()
     assert block.commands_m.shape == (10, 4)
+
+
+def say(intake, **changes):
+    """The RTC's status: 3 slopes, 2 modes unless told otherwise."""
+    values = {
+        "session": "s1",
+        "seq": 0,
+        "t_ns": 10**18,
+        "loop": Loop.CLOSED,
+        "frame_rate_hz": 1000.0,
+        "delay_frames": 2.0,
+        "gains": (0.4, 0.4),
+        "leak": 1.0,
+        "n_slopes": 3,
+        "n_modes": 2,
+        "n_controlled": 2,
+        "cm_id": None,
+        "basis_id": "b",
+        "config_id": "c",
+        "dither": None,
+        "max_dither_m": 1e-8,
+        "max_dither_modes": 2,
+        "magnitude": None,
+        "flux": None,
+    }
+    intake.status(encode_status(Status(**(values | changes))))
+
+
+def test_frames_of_another_shape_than_the_status_says_cost_themselves_only(intake):
+    say(intake)
+    send(intake, 0)
+    send(intake, 10, n_slopes=2)
+    send(intake, 20)
+    send(intake, 30, n_slopes=2)
+    assert [e for e in intake.events() if isinstance(e, WrongShape)] == [
+        WrongShape(expected=(3, 2), found=(2, 2))
+    ]
+    assert intake.statistics().frames_refused == {"shape": 20}
+    assert intake.statistics().frames_overwritten == 0
+    assert spans(intake.drain()) == [("s1", 0, 10)]
+
+
+def test_a_status_of_another_shape_brings_frames_of_that_shape(intake):
+    say(intake)
+    send(intake, 0)
+    say(intake, n_slopes=4)
+    send(intake, 10, n_slopes=4)
+    assert spans(intake.drain()) == [("s1", 10, 10)]
+    say(intake, session="s2", n_slopes=4)
+    send(intake, 0, session="s2", n_slopes=4)
+    assert intake.statistics().frames_refused == {}
+
+
+def test_a_new_session_need_not_have_the_shape_of_the_one_before(intake):
+    say(intake)
+    send(intake, 0, session="s2", n_slopes=4)
+    assert intake.statistics().frames_refused == {}
 
 
 def test_frames_behind_a_hole_are_held_back_until_patience_ends(intake, clock):

@@ -1,7 +1,5 @@
 """Whole stories: what the service does, event after event, as a pure function of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -26,7 +24,8 @@ def apply_what_is_sent(story, effects, n_modes):
     (sent,) = of_kind(effects, ev.SendMatrix)
     story.acknowledge(sent.id, MatrixState.STAGED)
     story.acknowledge(sent.id)
-    story.tell(ev.StatusSeen(rtc=replace(rtc(n_modes), cm_id=sent.id)))
+    playing = story.state.dither and story.state.dither.id
+    story.tell(ev.StatusSeen(rtc=rtc(n_modes, cm_id=sent.id, dither_id=playing)))
 
 
 def test_the_main_job_in_auto():

@@ -5,7 +5,7 @@ import pytest
 
 from service import events as ev
 from service.state import Level, MatrixState, Mode
-from tests.unit.reactions.situations import Story, estimate, of_kind, rtc
+from tests.unit.reactions.situations import POLICY, Story, estimate, of_kind, rtc
 
 
 @pytest.fixture
@@ -194,8 +194,9 @@ class TestDither:
         first = story.state.dither.id
         story.tell(ev.StatusSeen(rtc=rtc(dither_id=first)), after_s=5)
         assert story.state.dither.id == first
-        story.tell(ev.StatusSeen(rtc=rtc()), after_s=1)
+        story.tell(ev.StatusSeen(rtc=rtc()), after_s=POLICY.dither_duration_s - 5)
         assert "dither.ended" in story.logged
+        assert not story.alarms
         assert story.state.dither.id != first
 
     def test_a_status_older_than_the_dither_does_not_end_it(self, story):

@@ -256,3 +256,42 @@ class TestCommandsOffTheLoop:
         for name in ("a", "b", "c", "b"):
             streams = with_matrix(streams, name, self.R)
         assert [name for name, _ in streams.matrices] == ["c", "b"]
+
+
+class TestADitherThatIsNotThere:
+    def test_frames_without_it_are_counted_from_where_it_should_have_begun(self, streams):
+        streams = with_dither(streams, replace(DITHER, start_seq=250), WINDOW_S)
+        streams, _ = play(streams, 0, 10, dither=False)
+        assert streams.dither_silent_s == pytest.approx(0.75)
+
+    def test_one_that_comes_late_is_no_longer_missed(self, streams):
+        streams, _ = play(streams, 0, 8, dither=False)
+        assert streams.dither_silent_s == pytest.approx(0.8)
+        streams, _ = play(streams, 800, 1)
+        assert streams.dither_silent_s == 0.0
+        _, windows = play(streams, 900, 6)
+        assert [type(w) for w in windows] == [Spectra]
+        assert windows[0].first_seq == 800
+
+    def test_nobody_misses_it_after_its_time(self, streams):
+        short = replace(DITHER, duration_s=0.3)
+        streams, _ = play(with_dither(streams, short, WINDOW_S), 0, 20, dither=False)
+        assert streams.dither_silent_s == pytest.approx(0.3)
+
+    def test_one_of_another_frequency_than_told_gives_no_window(self, streams):
+        other = replace(DITHER, frequency_hz=(300.0,))
+        _, windows = play(with_dither(streams, other, WINDOW_S), 0, 9)
+        assert isinstance(windows[0], WindowRefused)
+        assert "mode 6 carries 0.00 nm of dither at 300.0 Hz" in windows[0].reason
+
+    def test_a_correction_of_its_first_frame_moves_the_windows(self, streams):
+        streams = with_dither(streams, replace(DITHER, start_seq=400), WINDOW_S)
+        _, windows = play(streams, 0, 14)
+        assert [w.first_seq for w in windows] == [700]
+
+    def test_the_columns_have_the_last_word_on_the_amplitude(self, streams):
+        half = replace(DITHER, amplitude_m=(9e-9,))
+        _, windows = play(with_dither(streams, half, WINDOW_S), 0, 9)
+        (window,) = windows
+        found = np.abs(window.dither[0, 6]) / (0.25 * window.plan.n_frames) / np.sqrt(2)
+        assert found == pytest.approx(5e-9, rel=0.01)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from service.estimation.frames import FrameBlock
 from service.model.interaction import Linearisation
@@ -91,6 +92,16 @@ def accumulate(state: Passive, block: FrameBlock) -> Passive:
 
 def interaction_matrix(state: Passive) -> Array | None:
     """Return the noisy interaction matrix ``(n_slopes, n_modes)``, or None when too young."""
+    found = _noisy_matrix(state)
+    return None if found is None else found[0]
+
+
+def _noisy_matrix(state: Passive) -> tuple[Array, Array] | None:
+    """Return the noisy matrix and the relative noise variance ``(n_modes,)`` of its columns.
+
+    The residual slopes are as noisy for every column, so a column's noise is what the inverse of
+    the command covariance makes of it: the diagonal of that inverse.
+    """
     if state.command_power is None or state.cross is None:
         return None
     if state.n_effective < MIN_FRAMES_PER_MODE * state.n_modes:
@@ -98,7 +109,10 @@ def interaction_matrix(state: Passive) -> Array | None:
     power = _invertible_power(state.command_power)
     if power is None:
         return None
-    return np.asarray(np.linalg.solve(power, state.cross.T.astype(np.float64)).T)
+    lower, _ = factor = cho_factor(power, lower=True)
+    half = solve_triangular(lower, np.eye(len(power)), lower=True)
+    matrix = cho_solve(factor, state.cross.T.astype(np.float64)).T
+    return np.asarray(matrix), np.einsum("km,km->m", half, half)
 
 
 def _invertible_power(command_power: Array) -> Array | None:
@@ -120,10 +134,11 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     Variable projection (Kaufman 1975): ``g_j = D_j.Y_j / D_j.D_j``,
     ``J_jk = g_j (I - P_j) dD_j/dα_k``, each mode weighted by its noise.
     """
-    measured = interaction_matrix(state)
-    if measured is None:
+    found = _noisy_matrix(state)
+    if found is None:
         return None
-    weight = _column_weights(state, measured)
+    measured, noise = found
+    weight = 1.0 / (np.mean(np.einsum("sm,sm->m", measured, measured)) * noise)
     modes = slice(0, state.n_modes)
     matrix = linearisation.matrix[:, modes].astype(np.float64)
     norm = np.einsum("sm,sm->m", matrix, matrix)
@@ -145,15 +160,3 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
         gains=gains,
         step=step,
     )
-
-
-def _column_weights(state: Passive, measured: Array) -> Array:
-    """Return ``(n_modes,)`` inverse noise variance of each column of the noisy matrix, scaled.
-
-    The residual slopes are as noisy for every column, so a column's noise is what the inverse of
-    the command covariance makes of it.
-    """
-    power = _invertible_power(np.asarray(state.command_power))
-    noise = np.ones(state.n_modes) if power is None else np.diag(np.linalg.inv(power))
-    scale = np.mean(np.einsum("sm,sm->m", measured, measured)) * noise
-    return np.asarray(1.0 / scale)

@@ -53,13 +53,13 @@ class CalibrationGains:
         ModelError
             If modes and gains do not match, a gain is not positive, or ``passes`` is not 1 or 2.
         """
-        order = np.argsort(modes, kind="stable")
-        known, given = np.asarray(modes)[order], np.asarray(gains, dtype=np.float64)[order]
-        if len(given) == 0 or len(known) != len(given) or len(set(known.tolist())) != len(known):
+        if len(gains) == 0 or len(modes) != len(gains) or len(np.unique(modes)) != len(modes):
             raise ModelError(
-                f"calibration gains: found {len(given)} gains for {len(known)} modes; "
+                f"calibration gains: found {len(gains)} gains for {len(modes)} modes; "
                 "expected one for each, every mode once"
             )
+        order = np.argsort(modes)
+        known, given = np.asarray(modes)[order], np.asarray(gains, dtype=np.float64)[order]
         if known[0] < 0 or known[-1] >= n_basis:
             raise ModelError(
                 f"calibration gains: found modes {known[0]} to {known[-1]}; expected modes of "

@@ -1,0 +1,71 @@
+"""Recipe and provenance."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from service.control.modal_gains import CalibrationGains
+from service.control.recipe import Method, Provenance, Recipe, Source, reconstruct
+from service.control.reconstructor import invert
+from service.control.regularised import Prior, invert_with_prior
+from service.errors import ModelError
+from tests.numerics import N_CONTROLLED, N_MODES, SOMEWHERE, small_basis, small_linearisation
+
+MATRIX = small_linearisation().matrix
+PRIOR = Prior(variance_m2=small_basis().variance_m2, slope_noise=np.full(len(MATRIX), 0.05))
+BY_MAP = Recipe(n_modes=N_CONTROLLED, method=Method.MAP, prior=PRIOR)
+
+
+def test_a_recipe_is_carried_out_by_its_method():
+    by_svd = reconstruct(MATRIX, Recipe(n_modes=N_CONTROLLED))
+    np.testing.assert_array_equal(by_svd.matrix, invert(MATRIX, N_CONTROLLED).matrix)
+    expected = invert_with_prior(MATRIX, N_CONTROLLED, PRIOR).matrix
+    np.testing.assert_array_equal(reconstruct(MATRIX, BY_MAP).matrix, expected)
+
+
+def test_the_limit_of_the_condition_is_obeyed():
+    truncated = reconstruct(MATRIX, Recipe(n_modes=N_MODES, max_condition=1.5))
+    assert truncated.n_truncated > 0
+
+
+def test_a_map_recipe_needs_a_prior():
+    with pytest.raises(ModelError, match="method map without a prior"):
+        Recipe(n_modes=3, method=Method.MAP)
+
+
+def test_the_provenance_of_a_tuned_synthetic_matrix_says_what_it_was_made_of():
+    gains = CalibrationGains.of_modes(np.ones(20), np.arange(20), N_MODES, passes=2)
+    found = Provenance(
+        source=Source.SYNTHETIC,
+        recipe=BY_MAP,
+        inversion=reconstruct(gains.tuned(MATRIX), BY_MAP),
+        alpha=SOMEWHERE,
+        covariance=np.diag([0.01, 0.02, np.deg2rad(0.1), 0.001]) ** 2,
+        gains=gains,
+        reference_sha256="ab12",
+        reference_passes=2,
+        measured_illumination=True,
+    ).attributes()
+    assert found["method"] == "map"
+    assert found["n_gains_measured"] == 20
+    assert found["n_gains_extended"] == N_CONTROLLED - 20
+    assert found["rotation_deg"] == pytest.approx(0.4)
+    assert found["sigma_rotation_deg"] == pytest.approx(0.1)
+    assert found["prior_slope_noise"] == pytest.approx(0.05)
+    assert found["reference_passes"] == 2
+    assert found["single_pass"] is True
+    assert found["measured_illumination"] is True
+    assert json.loads(json.dumps(found)) == found
+
+
+def test_the_provenance_of_a_measured_matrix_claims_no_registration():
+    recipe = Recipe(n_modes=10)
+    found = Provenance(
+        source=Source.MEASURED, recipe=recipe, inversion=reconstruct(MATRIX, recipe)
+    ).attributes()
+    assert found["source"] == "measured"
+    assert found["max_condition"] == 100.0
+    assert not {"rotation_deg", "prior_n_modes", "n_gains_measured"} & set(found)

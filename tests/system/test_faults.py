@@ -61,13 +61,28 @@ def test_damaged_telemetry_costs_windows_and_nothing_else(night):
     assert "link.callback_failed" not in service.log
     for named in ("frames missing", "message.malformed", "the RTC's clock stepped or it paused"):
         assert named in service.log, named
-    # frozen slopes show no dither
-    assert "optical gains of" in service.log
+    # frozen slopes ask for no commands
+    assert "off the loop equation" in service.log or "optical gains of" in service.log
     state = night.state
     assert state["in_use"] == in_use
     assert {r["id"] for r in kept} <= {r["id"] for r in night.shelf}
     check_registration(state["registration"])
-    assert set(night.alarms) <= {"watchdog"}
+    assert set(night.alarms) <= {"watchdog", "frames-shape"}
+    assert "frames-shape" in service.log
+    assert link["frames_refused"] == {"shape": 300}
+    assert "Traceback" not in service.log
+
+
+def test_a_dither_that_never_reaches_the_mirror_is_named_and_asked_for_again(night):
+    service = night.service("hold")
+    night.rtc(*faults("dither-lost@0:9"))
+    wait_for(lambda: night.state["dither"], 30.0, "a dither is asked for")
+    first = night.state["dither"]["id"]
+    wait_for(lambda: "dither-lost" in night.alarms, 6.0, "the alarm of a lost dither")
+    wait_for(lambda: (night.state["dither"] or {"id": first})["id"] != first, 8.0, "another")
+    wait_for(lambda: night.state["windows_accepted"] >= 1, 30.0, "a window")
+    assert "dither-lost" not in night.alarms
+    assert "estimate-stale" not in service.log
     assert "Traceback" not in service.log
 
 
@@ -134,4 +149,36 @@ def test_an_open_loop_little_stroke_and_a_stall_pass(night):
     accepts_windows_again(night)
     check_registration(night.state["registration"])
     assert night.state["link"]["frames_lost"] == 0
+    assert "Traceback" not in service.log
+
+
+def test_a_deaf_rtc_is_an_alarm_and_hears_again(night):
+    service = night.service("auto")
+    night.rtc(*faults("deaf@0:9"))
+    wait_for(lambda: "no-acknowledgement" in night.alarms, 40.0, "the alarm")
+    (unheard,) = night.ids("failed")
+    state = night.state
+    assert state["in_use"] == state["rtc"]["cm_id"]
+    assert night.n_modes_in_use() == 0, "the first matrix, the RTC's own, is kept"
+    frames = night.state["link"]["frames_received"]
+    wait_for(lambda: night.state["link"]["frames_received"] > max(frames, 9000), 30.0, "it hears")
+    night.post("/v1/refit", {"n_modes": N_START})
+    wait_for(lambda: night.n_modes_in_use() > 0, 20.0, "the next reconstructor")
+    assert night.ids("failed") == [unheard]
+    assert "Traceback" not in service.log
+
+
+def test_a_mute_rtc_is_believed_by_its_status_and_another_basis_is_an_alarm(night):
+    service = night.service("auto")
+    rtc = night.rtc(*faults("mute@0:1000", "basis@10:0.5"))
+    night.wait_for_modes(N_TARGET)
+    assert "reconstructor.applied" in rtc.log
+    assert "no-acknowledgement" not in service.log
+    assert night.state["rtc"]["cm_id"] == night.state["in_use"]
+    alpha = night.state["registration"]["alpha"]
+    wait_for(lambda: "basis-mismatch" in night.alarms, 30.0, "the alarm of another basis")
+    assert "expected kl-90-" in night.alarms["basis-mismatch"]
+    assert night.state["registration"]["alpha"] == pytest.approx(alpha, abs=0.02)
+    check_registration(night.state["registration"])
+    assert night.n_modes_in_use() == N_TARGET
     assert "Traceback" not in service.log

@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import sys
 import time
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO
@@ -68,16 +68,22 @@ class Progress:
         self.stream.flush()
 
 
-def carry_out(tasks: tuple[Task, ...], store: Store, *, n_workers: int) -> float:
-    """Do what is not in the store yet, dependencies first; return the seconds it took."""
+def carry_out(
+    tasks: tuple[Task, ...], store: Store, *, n_workers: int, executor: Executor | None = None
+) -> float:
+    """Do what is not in the store yet, dependencies first; return the seconds it took.
+
+    Without an executor it makes one of ``n_workers`` processes; at its end it is shut down.
+    """
     waiting = [task for task in in_order(tasks) if not store.has(task)]
     if not waiting:
         return 0.0
     started = time.monotonic()
     progress = Progress(total_s=sum(task.cost_s for task in waiting), n_steps=len(waiting))
-    executor = ProcessPoolExecutor(
-        n_workers, multiprocessing.get_context("spawn"), initializer=_settle_in
-    )
+    if executor is None:
+        executor = ProcessPoolExecutor(
+            n_workers, multiprocessing.get_context("spawn"), initializer=_settle_in
+        )
     running: dict[Future[None], Task] = {}
     try:
         while waiting or running:

@@ -46,6 +46,13 @@ class Section:
     """HTML."""
 
 
+def canvas(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure; matplotlib is needed from here on and not before."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
 def page(title: str, opening: str, sections: Sequence[Section]) -> str:
     """Return the whole file; ``opening`` is HTML before the first heading."""
     links = "".join(f'<a href="#{s.anchor}">{html.escape(s.title)}</a>' for s in sections)

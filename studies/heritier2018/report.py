@@ -10,7 +10,7 @@ import numpy as np
 import service
 from service.model.misregistration import PARAMETERS
 from service.registration.options import Method
-from studies.heritier2018 import closed, influence, matrices, page, paper, scans
+from studies.heritier2018 import closed, curves, influence, matrices, page, paper, scans
 from studies.heritier2018.calibration import Measurement
 from studies.heritier2018.loops import LoopRun
 from studies.heritier2018.plan import (
@@ -92,7 +92,7 @@ def _registration_rows(budget: Budget, store: Store) -> list[list[str]]:
 
 
 def _influence_rows(budget: Budget, store: Store) -> list[list[str]]:
-    found = influence.curves(budget, store)
+    found = curves.curves(budget, store)
     rule = 100.0 * SWEEPS[0].border_subap(1.0)
     rows = [
         [
@@ -102,11 +102,11 @@ def _influence_rows(budget: Budget, store: Store) -> list[list[str]]:
         ]
     ]
     for n_modes in INFLUENCE_MODES:
-        tolerances = influence.border_tolerances(found, n_modes)
+        tolerances = curves.border_tolerances(found, n_modes)
         listed = ", ".join(f"{100 * v:.0f} % ({symbol})" for symbol, v in tolerances.items())
         rows.append(
             [
-                f"movement of the border that costs {influence.COSTLY_NM:g} nm, {n_modes} modes",
+                f"movement of the border that costs {curves.COSTLY_NM:g} nm, {n_modes} modes",
                 listed or "not reached",
                 "figure only",
             ]

@@ -94,12 +94,10 @@ def _steps_table(scans: Record) -> str:
 
 
 def _parabolas_figure(scans: Record) -> Figure:
-    from matplotlib.figure import Figure
-
     n_steps = len(scans["steps"])
     columns = 4
     n_rows = int(np.ceil(n_steps / columns))
-    figure = Figure(figsize=(10.5, 2.3 * n_rows), layout="constrained")
+    figure = page.canvas(10.5, 2.3 * n_rows)
     panels = figure.subplots(n_rows, columns, squeeze=False).reshape(-1)
     for k, axes in enumerate(panels):
         if k < n_steps:
@@ -165,8 +163,6 @@ def _found_remark(budget: Budget, store: Store) -> str:
 
 
 def _registration_figure(joint: Record) -> Figure:
-    from matplotlib.figure import Figure
-
     alpha = fitted_alpha(joint)
     points = telescope.actuators_subap()
     angle = alpha.rotation_rad
@@ -175,9 +171,9 @@ def _registration_figure(joint: Record) -> Figure:
     valid = joint["valid"]
     row, column = np.nonzero(valid)
     centre = (len(valid) - 1) / 2
-    figure = Figure(figsize=(7.0, 7.0), layout="constrained")
+    figure = page.canvas(5.6, 5.6)
     axes = figure.subplots()
-    axes.plot(column - centre, row - centre, "s", markersize=9, color="#d7e3f4")
+    axes.plot(column - centre, row - centre, "s", markersize=7, color="#d7e3f4")
     axes.plot(*placed.T, ".", markersize=4, color="#b3261e")
     x_axis = alpha.magnification * turn @ np.array([15.0, 0.0])
     axes.annotate(
@@ -240,9 +236,7 @@ def _starts_remark(budget: Budget, store: Store) -> str:
 
 
 def _starts_figure(budget: Budget, store: Store) -> Figure:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.5, 3.8), layout="constrained")
+    figure = page.canvas(7.5, 3.8)
     axes = figure.subplots()
     for method, mark in ((Method.JOINT, "o"), (Method.PAPER, "x")):
         runs = fits_from_random_starts(budget, method)

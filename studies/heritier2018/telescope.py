@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +16,8 @@ from service.config import load_instrument
 from service.model.instrument import Instrument, Mirror
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from sim_rtc.assembly import build_plant, build_sky
 from sim_rtc.detector import Detector
+from sim_rtc.devices import build_plant, build_sky
 from sim_rtc.diffractive_plant import DiffractiveOptics, DiffractivePlant
 from sim_rtc.options import Options, parse_options
 from sim_rtc.pixels import PixelDetector
@@ -51,7 +50,7 @@ class Occasion:
     """Of the star or the fibre, in R."""
 
     seeing_arcsec: float = 1.0
-    """By day: of the turbulence played on the mirror."""
+    """By day: of the turbulence played on the mirror, as the sensor sees it."""
 
     @property
     def passes(self) -> int:
@@ -175,10 +174,7 @@ def measuring(occasion: Occasion, part: int) -> np.random.Generator:
     return occasion.rng(_MEASURING).spawn(part + 1)[part]
 
 
-def on_grid(telescope: DiffractivePlant, values: NDArray[Any]) -> Array:
-    """Return a map ``[y, x]`` of values ``(n_points,)`` in the pupil, NaN outside."""
-    place = np.round((telescope.points_m - telescope.points_m.min(axis=0)) / telescope.pitch_m)
-    column, row = place.astype(np.intp).T
-    grid = np.full((row.max() + 1, column.max() + 1), np.nan)
-    grid[row, column] = values
-    return grid
+def forget() -> None:
+    """Let go of everything that was kept: another instrument follows."""
+    for kept in (_plant, _optics, incoming):
+        kept.cache_clear()

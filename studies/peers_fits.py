@@ -1,0 +1,154 @@
+"""What ``pyrcal fit`` makes of the peers' matrices, and how far that is from the truth."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.instrument import Stop
+from service.model.misregistration import PARAMETERS
+from studies.peers_cases import Case, in_degrees
+from studies.peers_files import (
+    LISTINGS,
+    Listing,
+    turned,
+    write_instrument,
+    write_reference,
+)
+from studies.peers_pushpull import Measured
+
+Array = NDArray[Any]
+
+LIMITS = np.array([0.002, 0.002, 0.005, 0.0003])
+"""Largest error with all modes: subapertures, degrees, ratio."""
+
+LIMITS_FEW = np.array([0.005, 0.005, np.inf, np.inf])
+"""Largest error with the 20 lowest modes: only of the shifts is anything asked."""
+
+RESIDUAL_LIMIT = 0.02
+
+FEW = "0:20"
+_TIMEOUT_S = 600.0
+_ACCEPTED_OR_REFUSED = (0, 1)
+
+
+class Question(StrEnum):
+    """What is asked of a matrix."""
+
+    ALL = "all modes"
+    FEW = "20 lowest"
+    TURNED = "other axes"
+    WRONG_STOP = "wrong stop"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Answer:
+    """One fit against the truth."""
+
+    case: Case
+    """What was measured."""
+
+    question: Question
+    """What was asked."""
+
+    error: Array
+    """``(4,)`` found less true: subapertures, degrees, ratio; in the axes that were found."""
+
+    sigma: Array
+    """``(4,)`` 1 σ that the fit claims."""
+
+    residual: float
+    """Fraction of the signal left over."""
+
+    accepted: bool
+    """The verdict."""
+
+    verdict: str
+    """In words."""
+
+    orientation: dict[str, Any]
+    """As found."""
+
+    seconds: float
+    """That the fit took."""
+
+    @property
+    def as_asked(self) -> bool:
+        """Whether the issue's numbers are reached; of a wrong stop, that it is refused."""
+        if self.question is Question.WRONG_STOP:
+            return not self.accepted
+        limits = LIMITS_FEW if self.question is Question.FEW else LIMITS
+        near = bool(np.all(np.abs(self.error) <= limits))
+        return near and self.accepted and self.residual <= RESIDUAL_LIMIT
+
+
+def ask(case: Case, measured: Measured, cube: Array | None, folder: Path) -> list[Answer]:
+    """Return the answers to all that is asked of one matrix."""
+    reference = folder / "reference.h5"
+    write_reference(reference, measured, cube)
+    listing = LISTINGS[case.peer]
+    right = folder / "instrument.toml"
+    write_instrument(right, reference, case, measured, listing, case.stop)
+    answers = [
+        _answer(case, Question.ALL, right, reference),
+        _answer(case, Question.FEW, right, reference, "--modes", FEW),
+    ]
+    if case.own_mirror or case.as_shipped:
+        return answers
+    other = Stop.MIRROR if case.stop is Stop.TELESCOPE else Stop.TELESCOPE
+    wrong = folder / "wrong-stop.toml"
+    write_instrument(wrong, reference, case, measured, listing, other)
+    answers.append(_answer(case, Question.WRONG_STOP, wrong, reference))
+    if case.stop is Stop.MIRROR:
+        answers.append(_ask_turned(case, measured, folder))
+    return answers
+
+
+def _ask_turned(case: Case, measured: Measured, folder: Path) -> Answer:
+    reference, toml = folder / "other-axes.h5", folder / "other-axes.toml"
+    seen = turned(measured)
+    write_reference(reference, seen, None)
+    listing = Listing(order="interleaved", normalisation=LISTINGS[case.peer].normalisation)
+    write_instrument(toml, reference, case, seen, listing, case.stop)
+    return _answer(case, Question.TURNED, toml, reference)
+
+
+def _answer(case: Case, question: Question, toml: Path, reference: Path, *more: str) -> Answer:
+    command = [sys.executable, "-m", "service", "fit", str(toml), str(reference), "--json", *more]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+    if done.returncode not in _ACCEPTED_OR_REFUSED:
+        raise RuntimeError(f"{case.name}, {question}: pyrcal fit: {done.stderr.strip()}")
+    found = json.loads(done.stdout)
+    return Answer(
+        case=case,
+        question=question,
+        error=error(found, in_degrees(case.alpha)),
+        sigma=np.array([found["sigma"][name] for name in PARAMETERS], dtype=float),
+        residual=float(found["residual_fraction"]),
+        accepted=done.returncode == 0,
+        verdict=found["verdict"],
+        orientation=found["orientation"],
+        seconds=float(found["seconds"]),
+    )
+
+
+def error(found: dict[str, Any], truth: tuple[float, float, float, float]) -> Array:
+    """Return found less true ``(4,)``: subapertures, degrees, ratio.
+
+    Quarter turns of the sensor's axes are no error: the same sensor seen with its axes a quarter
+    turn on has the mirror, and the shift with it, a quarter turn further.
+    """
+    alpha = np.array([found[name] for name in PARAMETERS], dtype=float)
+    quarters = round((alpha[2] - truth[2]) / 90.0)
+    x, y = truth[:2]
+    for _ in range(quarters % 4):
+        x, y = -y, x
+    return alpha - np.array([x, y, truth[2] + 90.0 * quarters, truth[3]])

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_rtc.vibration import DAYTIME_LINES
 from studies.heritier2018 import page, paper
 from studies.heritier2018.influence import record_of_registered
 from studies.heritier2018.loops import SETTLING_FRAMES, wavefront_error_nm
@@ -49,8 +50,8 @@ def section(budget: Budget, store: Store) -> page.Section:
         "By day: a turbulence of 1 arcsec is played on the mirror, which also corrects it, the "
         f"light meets it twice, gain {CLOSED_GAIN:g} of every mode, fibre of magnitude 7. Errors "
         f"are at the sensor, after both passes. {n_frames} frames a loop after {SETTLING_FRAMES} "
-        f"of settling, {n_seeds} telescope(s), each with imperfections, measured matrix, fit and "
-        "turbulence of its own; ± is their scatter."
+        f"of settling, {n_seeds} telescope{'s' * (n_seeds > 1)}, each with imperfections, measured "
+        "matrix, fit and turbulence of its own; ± is their scatter."
     )
     body += _errors_table(budget, store)
     body += _paper_remarks(budget, store)
@@ -157,12 +158,18 @@ def shaken_remark(still: Array, shaken: Array) -> str:
     low = min(quoted.values)
     needed = float(np.sqrt(max(low**2 - float(np.mean(still**2)), 0.0)))
     text += (
-        f"The simulated dome (tip 60 nm at 13 Hz, tilt 40 nm at 22 Hz, focus 15 nm at 47 Hz) adds "
-        f"{added:.0f} nm to the residual; {needed:.0f} nm would be needed for the paper's lowest "
-        f"value. How strongly the telescope shook that day is not in the paper's tables, so the "
+        f"The simulated dome ({_shaking()}) adds {added:.0f} nm to the residual; {needed:.0f} nm "
+        "would be needed for the paper's lowest value. How strongly the telescope shook that day is not in the paper's tables, so the "
         "comparison between reconstructors below is what can be checked, not this level."
     )
     return page.remark(text, agrees=False)
+
+
+def _shaking() -> str:
+    return ", ".join(
+        f"{line.shape} {line.rms_m * 1e9:.0f} nm at {line.frequency_hz:g} Hz"
+        for line in DAYTIME_LINES
+    )
 
 
 def _pairs_remark(budget: Budget, store: Store) -> str:

@@ -29,7 +29,7 @@ LEAK = 0.999
 STROKE_M = 10e-6
 """Largest command of a mode: a loop that diverges stays finite."""
 
-_OVERHEAD_S = 6.0
+_OVERHEAD_S = 2.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

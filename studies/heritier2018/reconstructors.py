@@ -8,17 +8,18 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.modal_gains import CalibrationGains
 from service.control.reconstructor import Inversion, invert
 from service.control.regularised import Prior, invert_with_prior
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from studies.heritier2018 import telescope
 from studies.heritier2018.calibration import Measurement
-from studies.heritier2018.registration import FitRun, fitted_alpha, fitted_gains
+from studies.heritier2018.registration import FitRun, fitted_alpha
 from studies.heritier2018.store import Record, Store, Task
 from studies.heritier2018.telescope import Occasion
 
-INVERSION_COST_S = 6.0
+INVERSION_COST_S = 3.0
 
 
 class Kind(StrEnum):
@@ -105,7 +106,7 @@ class FittedReconstructor:
     fit: FitRun
     n_modes: int
     tuned: bool
-    """Whether columns have the gains of the measurement; modes beyond it the mean of its last."""
+    """Whether the columns have the gains of the measurement."""
 
     @property
     def label(self) -> str:
@@ -125,22 +126,20 @@ class FittedReconstructor:
 
     def compute(self, store: Store) -> Record:
         """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
-        matrix = synthetic_matrix(fitted_alpha(store.read(self.fit)))
-        matrix = matrix * self.fit.measurement.occasion.passes
+        fit, passes = store.read(self.fit), self.fit.measurement.occasion.passes
+        matrix = synthetic_matrix(fitted_alpha(fit))
         if self.tuned:
-            gains = fitted_gains(store.read(self.fit))
-            matrix = matrix * extended(gains, matrix.shape[1])
-        return _record(invert(matrix, self.n_modes))
+            matrix = calibration_gains(fit, matrix.shape[1], passes).tuned(matrix)
+        return _record(invert(passes * matrix, self.n_modes))
 
 
 AnyReconstructor = ModelReconstructor | MeasuredReconstructor | FittedReconstructor
 
-_LAST = 20
 
-
-def extended(gains: NDArray[np.float64], n_modes: int) -> NDArray[np.float64]:
-    """Return the gains of ``n_modes`` modes: beyond those measured the mean of the last ones."""
-    return np.append(gains, np.full(n_modes - len(gains), gains[-_LAST:].mean()))
+def calibration_gains(fit: Record, n_basis: int, passes: int) -> CalibrationGains:
+    """Return the gains that a fit found, for every mode of the basis."""
+    modes = np.arange(len(fit["gains"]))
+    return CalibrationGains.of_modes(fit["gains"], modes, n_basis, passes=passes)
 
 
 def synthetic_matrix(alpha: Misregistration) -> NDArray[np.float64]:

@@ -104,11 +104,6 @@ def fitted_alpha(record: Mapping[str, NDArray[Any]]) -> Misregistration:
     return Misregistration.from_vector(record["alpha"] / BOUNDARY_SCALE)
 
 
-def fitted_gains(record: Mapping[str, NDArray[Any]]) -> Array:
-    """Return the gain of each measured mode, ``(n_modes,)``."""
-    return np.asarray(record["gains"])
-
-
 def errors(record: Mapping[str, NDArray[Any]], truth: Misregistration) -> Array:
     """Return ``(4,)`` found less true: % of a subaperture (two), degrees, % of magnification."""
     off = record["alpha"] - truth.vector * BOUNDARY_SCALE

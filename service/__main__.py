@@ -248,6 +248,9 @@ def _compute(settings: Settings) -> Compute:
         pupil_sampling=table.pupil_sampling,
         detector_nodes=table.detector_nodes,
         working_point_modes=table.working_point_modes,
+        method=settings.control.method,
+        max_condition=settings.control.max_condition,
+        slope_noise=settings.control.slope_noise,
     )
 
 

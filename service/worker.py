@@ -22,14 +22,19 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.control.gate import GateVerdict, LoopSettings, judge
-from service.control.reconstructor import invert
+from service.control.recipe import Method, Recipe, reconstruct
+from service.control.reconstructor import MAX_CONDITION
+from service.control.regularised import Prior
 from service.estimation import passive
 from service.estimation.instrumental import Loop, WindowEstimate, fit_window
 from service.estimation.lockin import Spectra, WindowRefused
+from service.estimation.noisymatrix import RandomEstimate, fit_random
+from service.estimation.randomdither import Correlated
 from service.model.instrument import Instrument
-from service.model.interaction import InteractionModel, Linearisation
+from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from service.model.modes import karhunen_loeve_basis
+from service.model.modes import modal_basis
+from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo, working_point
 
 SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
@@ -49,7 +54,7 @@ COARSE_SAMPLING = 2
 four times as fast."""
 
 FIT_RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
-"""An estimate further out than this has diverged (numeric units)."""
+"""An estimate further than this from the nominal rotation has diverged (numeric units)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,6 +70,15 @@ class Compute:
     working_point_modes: int | None = None
     """Telemetry is compared with the response of a loop that controls this many modes at the
     instrument's r0; None: with that of a flat wavefront."""
+
+    method: Method = Method.SVD
+    """How interaction matrices are inverted."""
+
+    max_condition: float = MAX_CONDITION
+    """Of a truncated SVD."""
+
+    slope_noise: float = 0.05
+    """Of a MAP inversion: 1 σ of one slope in one frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,11 +110,12 @@ class Workbench:
     """
 
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
-        basis = karhunen_loeve_basis(instrument)
+        _check(instrument)
+        basis = modal_basis(instrument)
         self._threads = ThreadPoolExecutor(compute.threads)
 
-        def model(sampling: int, nodes: int, halo: Halo | None) -> InteractionModel:
-            return InteractionModel(
+        def model(sampling: int, nodes: int, halo: Halo | None) -> RtcInteractionModel:
+            return RtcInteractionModel(
                 instrument,
                 basis,
                 pupil_sampling=sampling,
@@ -117,27 +132,29 @@ class Workbench:
                 instrument, n_controlled=compute.working_point_modes, sampling=sampling
             )
             self._sensor = model(sampling, nodes, halo)
+        self._start = instrument.start
         self._linearisation: Linearisation | None = None
+        self._compute = compute
 
     def describe(self) -> Description:
         """Return what telemetry must look like, and prepare for the first fit."""
-        self._near(Misregistration())
+        self._near(self._start)
         return Description(
             n_slopes=self._model.n_slopes,
-            n_modes=self._model.basis.mode_to_actuator.shape[1],
+            n_modes=self._model.basis.n_modes,
             mode_variance_m2=self._model.basis.variance_m2,
         )
 
     def fit(
-        self, spectra: Spectra, loop: Loop, start: Misregistration
+        self, spectra: Spectra, loop: Loop, start: Misregistration | None
     ) -> WindowEstimate | WindowRefused:
-        """Estimate α from one window.
+        """Estimate α from one window, from ``start`` or, without one, from the nominal rotation.
 
         Where the linearisation at hand is too far away, the coarse model leads to within reach of
         one new, fine linearisation.
         """
         try:
-            estimate = fit_window(spectra, self._near(start), loop)
+            estimate = fit_window(spectra, self._near(start or self._start), loop)
             if not _settled(estimate):
                 near = self._approach(spectra, loop, estimate)
                 if near is None:
@@ -150,12 +167,25 @@ class Workbench:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
         return estimate if _settled(estimate) else _unsettled(spectra)
 
+    def fit_random(
+        self, window: Correlated, start: Misregistration
+    ) -> RandomEstimate | WindowRefused:
+        """Estimate α from one window of random dither, about the linearisation near ``start``."""
+        estimate = fit_random(window, self._near(start))
+        for _ in range(MAX_APPROACHES):
+            if isinstance(estimate, WindowRefused) or _settled(estimate):
+                return estimate
+            if np.any(np.abs(estimate.alpha.vector - self._start.vector) > FIT_RANGE):
+                break
+            estimate = fit_random(window, self._linearise(estimate.alpha))
+        return _unsettled(window)
+
     def _approach(
         self, spectra: Spectra, loop: Loop, estimate: WindowEstimate
     ) -> Misregistration | None:
         """Return where the coarse model's steps lead; None when they do not shrink."""
         for _ in range(MAX_APPROACHES):
-            if np.any(np.abs(estimate.alpha.vector - [0.0, 0.0, 0.0, 1.0]) > FIT_RANGE):
+            if np.any(np.abs(estimate.alpha.vector - self._start.vector) > FIT_RANGE):
                 return None
             before = _length(estimate)
             estimate = fit_window(spectra, self._coarse.linearise(estimate.alpha), loop)
@@ -174,10 +204,24 @@ class Workbench:
     ) -> Made:
         """Compute the reconstructor for α, as many modes as the loop has gains, and judge it."""
         matrix = self._model.interaction_matrix(alpha)
-        inversion = invert(matrix, len(loop.gains))
+        inversion = reconstruct(matrix, self._recipe(len(loop.gains)))
         verdict = self.judge(inversion.matrix, alpha, covariance, loop, bound)
         return Made(
             matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
+        )
+
+    def _recipe(self, n_modes: int) -> Recipe:
+        prior = None
+        if self._compute.method is Method.MAP:
+            prior = Prior(
+                variance_m2=self._model.basis.variance_m2,
+                slope_noise=np.full(self._model.n_slopes, self._compute.slope_noise),
+            )
+        return Recipe(
+            n_modes=n_modes,
+            method=self._compute.method,
+            max_condition=self._compute.max_condition,
+            prior=prior,
         )
 
     def judge(
@@ -209,16 +253,16 @@ class Workbench:
         return self._linearisation
 
 
-def _length(estimate: WindowEstimate) -> float:
+def _length(estimate: WindowEstimate | RandomEstimate) -> float:
     """Return the length of a step, in units of what counts as settled."""
     return float(np.abs(estimate.step / SETTLED).max())
 
 
-def _settled(estimate: WindowEstimate) -> bool:
+def _settled(estimate: WindowEstimate | RandomEstimate) -> bool:
     return _length(estimate) <= 1.0
 
 
-def _unsettled(spectra: Spectra) -> WindowRefused:
+def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:
     return WindowRefused(
         reason="the fit did not settle: the mirror moved inside the window, the registration is "
         "outside the capture range, or the instrument file is another's",
@@ -251,14 +295,19 @@ def run_job(job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs
 
 
 def _enter(instrument: Instrument, compute: Compute) -> None:
-    """Prepare the worker process: polite, one BLAS thread, gone when the service is gone."""
+    """Prepare the worker process."""
     global _open_workbench
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(compute.nice)
-    threading.Thread(target=_follow_parent, daemon=True).start()
-    threadpool_limits(1)
+    be_polite(compute.nice)
     # made by the first job, so that an impossible instrument fails that job and says why
     _open_workbench = functools.cache(lambda: Workbench(instrument, compute))
+
+
+def be_polite(nice: int) -> None:
+    """Make this process nice, one BLAS thread wide, and gone when its parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(nice)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    threadpool_limits(1)
 
 
 def _follow_parent() -> None:

@@ -11,6 +11,8 @@ from typing import Annotated, get_args, get_origin
 from pydantic import Field, model_validator
 
 from service.config.strict import Id, Table, Tuple, in_file, nearest, read_toml, validated
+from service.control.recipe import Method
+from service.control.reconstructor import MAX_CONDITION
 from service.errors import ConfigurationError
 from service.state import Mode
 from service.wire import CHUNK_LIMIT
@@ -120,6 +122,15 @@ class ControlTable(Table):
     pole_radius_bound: float = Field(default=0.95, gt=0.0, lt=1.0)
     """Largest closed-loop pole radius, anywhere in α ± 3σ, of a matrix that may be published."""
 
+    method: Method = Field(default=Method.SVD, strict=False)
+    """How the interaction matrix is inverted: "svd", or "map", which knows noise and turbulence."""
+
+    max_condition: float = Field(default=MAX_CONDITION, gt=1.0)
+    """svd: singular values below the largest over this are left out."""
+
+    slope_noise: Positive = 0.05
+    """map: 1 sigma of one slope in one frame; the turbulence is the instrument's ``[modes]``."""
+
     update_shift_subap: Positive = 0.01
     """Change of a shift that makes a new reconstructor worthwhile, subapertures."""
 
@@ -153,6 +164,19 @@ class ComputeTable(Table):
     instrument's r0, less biased on sky and slower; None: with that of a flat wavefront."""
 
 
+class FitsTable(Table):
+    """``[fits]``: fits of uploaded matrices (``POST /v1/fits``)."""
+
+    upload_limit_mb: int = Field(default=512, ge=1, le=100_000)
+    """Largest upload, megabytes; a zip archive must stay below it unpacked, too."""
+
+    waiting: int = Field(default=4, ge=1, le=100)
+    """Fits that may be unfinished at once: as many uploads may lie on the disk."""
+
+    time_limit_s: Positive = 600.0
+    """A fit that takes longer is stopped."""
+
+
 class Settings(Table):
     """Everything the user may decide about the service."""
 
@@ -163,6 +187,7 @@ class Settings(Table):
     tracking: TrackingTable = TrackingTable()
     control: ControlTable = ControlTable()
     compute: ComputeTable = ComputeTable()
+    fits: FitsTable = FitsTable()
 
 
 _Key = tuple[str, ...]

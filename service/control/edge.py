@@ -3,7 +3,7 @@
 Poles say whether a loop is stable; they do not see that the outermost actuators, half in the dark,
 are driven by noise. Where an excursion reaches a quarter of the wavelength the pyramid may lose
 the edge to the next fringe, and a loop without leak never brings it back. On the diffractive
-telescope every loop slipped above 200 nm per unit of slope noise and none below 190 nm
+telescope every such loop slipped above 200 nm per unit of slope noise and none below 190 nm
 (docs/results/edge_slip.md), while pole radii said nothing.
 """
 

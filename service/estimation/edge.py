@@ -2,8 +2,9 @@
 
 A segment at the edge of the pupil can slip by wavelengths and stay there: the sensor sees little
 light across it, its slopes look healthy, and only the command shows the step. On the diffractive
-telescope the slowly averaged position of the outermost actuators stays below 1.5 times what
-turbulence asks of them in every healthy loop tried, and a slip takes it to 3 to 8.
+telescope the slowly averaged position of the outermost actuators stays below 2.2 times what
+turbulence asks of them in every loop that held, and a slip takes it to 7 to 18
+(docs/results/edge_slip.md).
 """
 
 from __future__ import annotations

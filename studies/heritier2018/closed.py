@@ -159,8 +159,9 @@ def shaken_remark(still: Array, shaken: Array) -> str:
     needed = float(np.sqrt(max(low**2 - float(np.mean(still**2)), 0.0)))
     text += (
         f"The simulated dome ({_shaking()}) adds {added:.0f} nm to the residual; {needed:.0f} nm "
-        "would be needed for the paper's lowest value. How strongly the telescope shook that day is not in the paper's tables, so the "
-        "comparison between reconstructors below is what can be checked, not this level."
+        "would be needed for the paper's lowest value. How strongly the telescope shook that day "
+        "is not in the paper's tables, so the comparison between reconstructors below is what can "
+        "be checked, not this level."
     )
     return page.remark(text, agrees=False)
 

@@ -288,10 +288,11 @@ class RealTimeComputer:
             return accepted(request.id, self._seq)
 
     def _start_measurement(self, request: MeasureRequest) -> Reply:
-        reason = self._bench.refusal(request)
+        in_use = self._active.matrix
+        reason = self._bench.refusal(request, len(in_use))
         if reason:
             return refused(request.id, reason)
-        measurement = self._bench.measurement(request)
+        measurement = self._bench.measurement(request, in_use)
         with self._lock:
             exercises, was_closed = self._exercises, self._settings.closed
             reason = exercises.on_the_mirror() or exercises.in_the_loops_way()

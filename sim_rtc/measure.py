@@ -25,6 +25,7 @@ from sim_rtc.strokes import (
     hadamard_shapes,
     modal,
     pokes,
+    system_shapes,
 )
 
 Array = NDArray[np.float64]
@@ -115,8 +116,11 @@ class Bench:
 
     limits: MeasureLimits = MeasureLimits()
 
-    def refusal(self, request: MeasureRequest) -> str:
-        """Return why a matrix cannot be measured so, in the wire's words; empty: it can."""
+    def refusal(self, request: MeasureRequest, n_controlled: int | None = None) -> str:
+        """Return why a matrix cannot be measured so, in the wire's words; empty: it can.
+
+        ``n_controlled`` modes have a row in the matrix in use; None: all have.
+        """
         if max(request.modes) >= self.n_modes:
             return f"range: mode {max(request.modes)}, expected 0 to {self.n_modes - 1}"
         largest_m = max(request.amplitude_m)
@@ -128,13 +132,20 @@ class Bench:
             reason = self._zonal_refusal(request)
         elif request.pattern is Pattern.SINE:
             reason = self._sine_refusal(request)
+        elif request.pattern is Pattern.SYSTEM_MODES:
+            reason = self._system_refusal(request, n_controlled or self.n_modes)
         else:
             reason = ""
         return reason or self._length_refusal(request)
 
-    def measurement(self, request: MeasureRequest) -> Measurement:
-        """Return the measurement of a request that :meth:`refusal` has nothing against."""
-        strokes = self._strokes(request)
+    def measurement(
+        self, request: MeasureRequest, reconstructor: Array32 | None = None
+    ) -> Measurement:
+        """Return the measurement of a request that :meth:`refusal` has nothing against.
+
+        Only system modes need the ``reconstructor`` in use, ``(n_controlled, n_slopes)``.
+        """
+        strokes = self._strokes(request, reconstructor)
         solver: Solver
         if isinstance(strokes, Tones):
             solver = Demodulation(strokes, n_slopes=self.n_slopes)
@@ -142,7 +153,7 @@ class Bench:
             solver = Regression(request.modes, n_modes=self.n_modes, n_slopes=self.n_slopes)
         return Measurement(request, strokes, solver)
 
-    def _strokes(self, request: MeasureRequest) -> PushPull | Tones:
+    def _strokes(self, request: MeasureRequest, reconstructor: Array32 | None) -> PushPull | Tones:
         modes, amplitude_m = request.modes, request.amplitude_m
         if request.pattern is Pattern.SINE:
             return Tones(
@@ -156,6 +167,8 @@ class Bench:
             shapes = hadamard_shapes(modes, amplitude_m, self.n_modes)
         elif request.pattern is Pattern.PUSH_PULL_ZONAL and self.mode_to_actuator is not None:
             shapes = pokes(self.mode_to_actuator, amplitude_m[0])
+        elif request.pattern is Pattern.SYSTEM_MODES and reconstructor is not None:
+            shapes = system_shapes(reconstructor, modes, amplitude_m[0], self.n_modes)
         else:
             shapes = modal(modes, amplitude_m, self.n_modes)
         return PushPull(shapes_m=shapes, n_average=request.n_average or 1)
@@ -163,8 +176,19 @@ class Bench:
     def _zonal_refusal(self, request: MeasureRequest) -> str:
         if self.mode_to_actuator is None:
             return "unsupported: the actuators of this mirror are not known, ask for modal"
+        return self._uneven_refusal(request, "actuator")
+
+    def _system_refusal(self, request: MeasureRequest, n_controlled: int) -> str:
+        if max(request.modes) >= n_controlled:
+            return (
+                f"range: mode {max(request.modes)} has no row in the reconstructor in use, "
+                f"expected 0 to {n_controlled - 1}"
+            )
+        return self._uneven_refusal(request, "system mode")
+
+    def _uneven_refusal(self, request: MeasureRequest, shape: str) -> str:
         if len(set(request.amplitude_m)) > 1:
-            return "range: several values in amplitude_m, expected the same for every actuator"
+            return f"range: several values in amplitude_m, expected the same for every {shape}"
         return ""
 
     def _sine_refusal(self, request: MeasureRequest) -> str:

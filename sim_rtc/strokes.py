@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, hadamard
+from scipy.linalg import cho_factor, cho_solve, eigh, hadamard
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -94,6 +94,21 @@ def hadamard_shapes(
     """
     signs = hadamard(hadamard_order(len(modes)))[:, : len(modes)]
     return np.asarray(signs @ modal(modes, amplitude_m, n_modes), dtype=np.float32)
+
+
+def system_shapes(
+    reconstructor: Array32, modes: tuple[int, ...], amplitude_m: float, n_modes: int
+) -> Array32:
+    """Return the eigenmodes of what the loop corrects with, each of this RMS OPD.
+
+    ``reconstructor`` is ``(n_controlled, n_slopes)``. Its left singular vectors make slopes that
+    are orthogonal to one another, so none is mistaken for a mixture of the others.
+    """
+    rows = reconstructor[list(modes)].astype(np.float64)
+    _, vectors = eigh(rows @ rows.T)
+    shapes = np.zeros((len(modes), n_modes), dtype=np.float32)
+    shapes[:, list(modes)] = amplitude_m * vectors.T
+    return shapes
 
 
 def pokes(mode_to_actuator: Array, amplitude_m: float) -> Array32:

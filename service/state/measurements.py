@@ -18,6 +18,9 @@ class MeasurePattern(StrEnum):
     HADAMARD = "hadamard"
     """All modes at once with the signs of a Hadamard matrix, loop open."""
 
+    SYSTEM_MODES = "system-modes"
+    """One eigenmode of the reconstructor in use after the other, loop open."""
+
     SINE = "sine"
     """All modes at once, each at its own frequency, loop closed."""
 

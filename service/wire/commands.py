@@ -60,6 +60,9 @@ class Pattern(StrEnum):
     PUSH_PULL_MODAL = "push-pull-modal"
     PUSH_PULL_ZONAL = "push-pull-zonal"
     HADAMARD = "hadamard"
+    SYSTEM_MODES = "system-modes"
+    """Push-pull of the modes that the loop's own reconstructor tells apart best (optional)."""
+
     SINE = "sine"
 
 

@@ -1,5 +1,6 @@
 """Measuring on a plant of a few modes, through the whole computer, against the plant's own D."""
 
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -27,7 +28,7 @@ from sim_rtc.measure import Bench, Circumstances, MeasureLimits, product
 from sim_rtc.options import parse_options
 from sim_rtc.plant import Optics
 from sim_rtc.reconstructors import Reconstructor
-from sim_rtc.strokes import PushPull, frames_per_shape, hadamard_shapes, pokes
+from sim_rtc.strokes import PushPull, frames_per_shape, hadamard_shapes, pokes, system_shapes
 from sim_rtc.telemetry import Identity, LoopSettings
 
 N_MODES, N_SLOPES, N_ACTUATORS = 6, 16, 9
@@ -382,6 +383,41 @@ def test_hadamard_shapes_move_every_mode_by_its_own_amplitude():
     assert not shapes[:, [1, 3, 4]].any()
     gram = shapes.T.astype(float) @ shapes
     np.testing.assert_allclose(gram - np.diag(np.diag(gram)), 0.0, atol=1e-20)
+
+
+def test_system_modes_are_apart_in_slopes_and_in_modes():
+    inverse = np.linalg.pinv(RESPONSE[:, :CONTROLLED]).astype(np.float32)
+    shapes = system_shapes(inverse, tuple(range(CONTROLLED)), 2e-8, N_MODES).astype(float)
+    np.testing.assert_allclose(np.linalg.norm(shapes, axis=1), 2e-8, rtol=1e-6)
+    assert not shapes[:, CONTROLLED:].any()
+    for seen in (shapes, shapes @ RESPONSE.T):
+        gram = seen @ seen.T
+        assert np.abs(gram - np.diag(np.diag(gram))).max() < 1e-5 * np.abs(gram).max()
+
+
+def test_system_modes_measure_the_columns_that_were_asked_for():
+    request = push_pull(pattern=Pattern.SYSTEM_MODES, modes=(3, 0, 2))
+    manifest, matrix, batches = measured(computer_on(sky(noise=0.002)), request)
+    assert manifest.pattern is Pattern.SYSTEM_MODES
+    np.testing.assert_allclose(matrix, RESPONSE[:, [3, 0, 2]], atol=0.05 * np.abs(RESPONSE).max())
+    exact = measured(computer_on(sky()), request)[1]
+    np.testing.assert_allclose(exact, RESPONSE[:, [3, 0, 2]], rtol=1e-4)
+    played = np.concatenate([b.commands_m for b in batches])
+    assert not played[:, [1, 4, 5]].any()
+
+
+@pytest.mark.parametrize(
+    ("modes", "amplitude_m", "reason"),
+    [
+        ((0, CONTROLLED), (2e-8,) * 2, "range: mode 5 has no row in the reconstructor in use"),
+        ((0, 1), (2e-8, 1e-8), "range: several values in amplitude_m, expected the same for every"),
+    ],
+)
+def test_system_modes_that_cannot_be_are_refused(modes, amplitude_m, reason):
+    request = replace(push_pull(pattern=Pattern.SYSTEM_MODES, modes=modes), amplitude_m=amplitude_m)
+    reply = computer_on(sky()).execute(request)
+    assert not reply.accepted
+    assert reply.reason.startswith(reason)
 
 
 def test_pokes_are_the_nearest_the_modes_can_come_to_single_actuators():

@@ -25,6 +25,7 @@ from service.control.gate import GateVerdict, LoopSettings, judge
 from service.control.recipe import Method, Recipe, reconstruct
 from service.control.reconstructor import MAX_CONDITION
 from service.control.regularised import Prior
+from service.errors import ModelError
 from service.estimation import passive
 from service.estimation.instrumental import Loop, WindowEstimate, fit_window
 from service.estimation.lockin import Spectra, WindowRefused
@@ -268,6 +269,26 @@ def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:
         "outside the capture range, or the instrument file is another's",
         t_ns_utc=spectra.t_end_ns_utc,
     )
+
+
+def _check(instrument: Instrument) -> None:
+    """Refuse what can be fitted offline, but not controlled with.
+
+    Raises
+    ------
+    ModelError
+        If the stroke is unknown, or the RTC delivers frames.
+    """
+    if not instrument.mirror.stroke_known:
+        raise ModelError(
+            f"{instrument.name}: found mirror.stroke = unknown; expected a known one: a "
+            "reconstructor gives metres (pyrcal fit needs none)"
+        )
+    if instrument.frames is not None:
+        raise ModelError(
+            f"{instrument.name}: found wfs.input = frames; expected slopes, which is what an RTC "
+            "sends (pyrcal fit takes frames)"
+        )
 
 
 _open_workbench: Callable[[], Workbench] | None = None

@@ -20,7 +20,6 @@ from service.estimation.instrumental import Loop
 from service.estimation.lockin import Spectra, WindowRefused
 from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
-from service.model.misregistration import Misregistration
 from service.reactions.dither import SILENT_S
 from service.reactions.journal import OFF_LOOP, WRONG_RTC
 from service.reactions.policy import Policy
@@ -232,7 +231,7 @@ class Supervisor:
             return _lost(spectra, "the RTC or its reconstructor is not known")
         try:
             matrix = await asyncio.to_thread(self._deeds.matrix, spectra.cm_id)
-            start = Misregistration() if known is None else known.alpha
+            start = None if known is None else known.alpha
             outcome = await self._crew.call(Workbench.fit, spectra, _loop(rtc, matrix), start)
         except PyrcalError as error:
             return _lost(spectra, str(error))

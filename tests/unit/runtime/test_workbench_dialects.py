@@ -46,9 +46,7 @@ def bench(instrument):
 @pytest.fixture(scope="module")
 def seen(instrument):
     """The true matrix as such an RTC sees it, from the model in the conventions' axes."""
-    model = InteractionModel(
-        instrument, modal_basis(instrument), pupil_sampling=2, detector_nodes=2
-    )
+    model = InteractionModel(instrument, modal_basis(instrument))
     matrix = model.interaction_matrix(ALPHA)
     mask = rtc_valid_subapertures(instrument)
     return to_rtc(matrix, RECIPE.order, RECIPE.orientation, mask)

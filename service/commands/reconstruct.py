@@ -1,0 +1,227 @@
+"""``pyrcal reconstruct``: from a registration to a reconstructor that says what it is made of."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from service.archive.product import write_whole
+from service.commands.terminal import check_folder, say
+from service.config import load_instrument
+from service.control.modal_gains import CalibrationGains
+from service.control.recipe import Method, Provenance, Recipe, Source, reconstruct
+from service.control.reconstructor import MAX_CONDITION
+from service.control.regularised import Prior
+from service.errors import ConfigurationError, MatrixError
+from service.fits.fingerprint import instrument_sha256
+from service.fits.product import KnownFit, read_fit
+from service.fits.reconstructor import Reconstructor, fill_reconstructor
+from service.fits.recorded import file_sha256
+from service.fits.report import orientation_words
+from service.fits.request import parse_alpha
+from service.model.instrument import Instrument
+from service.model.modes import modal_basis
+from service.model.rtc import RtcInteractionModel
+
+SAMPLING = 4
+"""Pupil points per subaperture, and detector nodes: the finest of the design's table that takes
+seconds; D is then good to 0.5 %."""
+
+_DESCRIPTION = """
+Compute the noise-free interaction matrix for a registration, invert it, and write both with
+everything they were made of. As many modes as the basis has may be controlled, however few were
+measured.
+"""
+
+
+def add_reconstruct_arguments(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+) -> None:
+    """Declare ``pyrcal reconstruct``; ``commands`` is argparse's collection of sub-commands."""
+    make = commands.add_parser(
+        "reconstruct",
+        help="a reconstructor for a known registration",
+        description=_DESCRIPTION,
+        epilog="Exit status: 0 written, 2 input that cannot be used.",
+    )
+    make.add_argument("instrument", metavar="INSTRUMENT", help="TOML file, or a packaged name")
+    make.add_argument(
+        "alpha",
+        metavar="ALPHA",
+        help="X,Y,ROT,MAG (subapertures, degrees, ratio), or a file that pyrcal fit wrote with "
+        "--json or --output",
+    )
+    make.add_argument("--modes", type=int, required=True, metavar="N", help="the first N modes")
+    make.add_argument("--output", type=Path, required=True, metavar="FILE.h5")
+    make.add_argument(
+        "--method",
+        type=Method,
+        choices=list(Method),
+        default=Method.SVD,
+        help="svd: least squares, weak singular values left out (default); map: with noise and "
+        "turbulence as priors",
+    )
+    make.add_argument(
+        "--max-condition", type=float, default=MAX_CONDITION, help="of svd, default %(default)g"
+    )
+    make.add_argument(
+        "--slope-noise",
+        type=float,
+        default=0.05,
+        metavar="RMS",
+        help="of map: 1 sigma of one slope in one frame, default %(default)g",
+    )
+    make.add_argument(
+        "--no-gains",
+        action="store_true",
+        help="leave the columns as the model has them; by default they take the gains of the fit",
+    )
+    make.add_argument(
+        "--reference", type=Path, metavar="FILE", help="the measured matrix, for its checksum"
+    )
+
+
+def run_reconstruct(options: argparse.Namespace) -> int:
+    """Compute, write, and return the exit status.
+
+    Raises
+    ------
+    PyrcalError
+        If something that was given cannot be used.
+    """
+    check_folder(options.output)
+    if options.max_condition < 1.0:
+        raise ConfigurationError(
+            f"--max-condition: found {options.max_condition:g}, expected at least 1"
+        )
+    known = _known(options)
+    described = load_instrument(options.instrument)
+    found = instrument_sha256(described)
+    if known.instrument_sha256 not in {None, found}:
+        say(f"note: {options.instrument} has changed since {known.origin} was fitted with it")
+    known = replace(known, instrument_sha256=found)
+    instrument = _oriented(described, known)
+    with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        model = RtcInteractionModel(
+            instrument,
+            modal_basis(instrument),
+            pupil_sampling=SAMPLING,
+            detector_nodes=SAMPLING,
+            mapper=pool.map,
+        )
+        say(f"model: {model.n_slopes} slopes, {model.basis.n_modes} modes")
+        matrix = model.interaction_matrix(known.alpha)
+    made = _made(options, known, instrument, model, matrix)
+    write_whole(options.output, lambda file: fill_reconstructor(file, made))
+    inversion = made.provenance.inversion
+    print(
+        f"{options.output}: {options.modes} modes, {model.n_slopes} slopes, {options.method}, "
+        f"condition number {inversion.condition_number:.2f}, {inversion.n_truncated} singular "
+        "values left out"
+    )
+    return 0
+
+
+def _known(options: argparse.Namespace) -> KnownFit:
+    """Return the registration, from the words or from the file.
+
+    Raises
+    ------
+    MatrixError
+        If the file is of a refused fit.
+    ConfigurationError
+        If the words are neither a registration nor a file.
+    """
+    path = Path(options.alpha)
+    if path.is_file():
+        known = read_fit(path)
+        if not known.accepted:
+            raise MatrixError(
+                f"{path}: found a fit that was refused, expected an accepted one; whoever knows "
+                "better gives the registration itself: X,Y,ROT,MAG"
+            )
+    else:
+        try:
+            known = KnownFit(alpha=parse_alpha(options.alpha))
+        except ValueError as error:
+            raise ConfigurationError(f"ALPHA: no such file, and {error}") from error
+    if options.reference is not None:
+        found = file_sha256(options.reference)
+        if known.reference_sha256 not in {None, found}:
+            raise MatrixError(
+                f"{options.reference}: found checksum {found}, expected {known.reference_sha256} "
+                f"of the reference that {path} was fitted to"
+            )
+        known = replace(known, reference_sha256=found)
+    return known
+
+
+def _oriented(instrument: Instrument, known: KnownFit) -> Instrument:
+    """Return the instrument with the slopes as the fit found them."""
+    recipe = instrument.slopes
+    if known.orientation is not None and known.order is not None:
+        recipe = replace(recipe, orientation=known.orientation, order=known.order)
+    elif recipe.orientation is None:
+        say(
+            'note: slopes.orientation is "auto" and no fit has found it: the reconstructor is for '
+            "slopes in the axes of docs/fitting.md"
+        )
+    return replace(instrument, slopes=recipe)
+
+
+def _made(
+    options: argparse.Namespace,
+    known: KnownFit,
+    instrument: Instrument,
+    model: RtcInteractionModel,
+    matrix: NDArray[Any],
+) -> Reconstructor:
+    gains = None
+    if known.gains is not None and known.modes is not None and not options.no_gains:
+        gains = CalibrationGains.of_modes(
+            known.gains, known.modes, model.basis.n_modes, passes=2 if known.double_pass else 1
+        )
+        matrix = gains.tuned(matrix)
+    prior = Prior(
+        variance_m2=model.basis.variance_m2,
+        slope_noise=np.full(model.n_slopes, options.slope_noise),
+    )
+    recipe = Recipe(
+        n_modes=options.modes,
+        method=options.method,
+        max_condition=options.max_condition,
+        prior=prior if options.method is Method.MAP else None,
+    )
+    inversion = reconstruct(matrix, recipe)
+    slopes = instrument.slopes
+    return Reconstructor(
+        matrix=inversion.matrix,
+        interaction_matrix=matrix[:, : options.modes],
+        provenance=Provenance(
+            source=Source.SYNTHETIC,
+            recipe=recipe,
+            inversion=inversion,
+            alpha=known.alpha,
+            covariance=known.covariance,
+            gains=gains,
+            reference_sha256=known.reference_sha256,
+            reference_passes=None if known.double_pass is None else 1 + known.double_pass,
+        ),
+        circumstances={
+            "instrument": instrument.name,
+            "instrument_sha256": known.instrument_sha256 or instrument_sha256(instrument),
+            "alpha_from": known.origin,
+            "model_pupil_sampling": SAMPLING,
+            "model_detector_nodes": SAMPLING,
+            "slopes": json.dumps(orientation_words(slopes.assumed_orientation, slopes.order)),
+        },
+    )

@@ -1,0 +1,54 @@
+"""What commands share about words, files and the terminal."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from service.errors import ConfigurationError
+
+Value = TypeVar("Value")
+
+
+_NEGATIVE = re.compile(r"-[\d.][-+\d.eE]*,.*")
+
+
+def with_negative_numbers(given: Sequence[str]) -> list[str]:
+    """Return command-line words such that argparse takes ``-0.3,0.1,65,1`` for a value.
+
+    It takes it for an option; a word with a blank in it, never.
+    """
+    return [f" {word}" if _NEGATIVE.fullmatch(word) else word for word in given]
+
+
+def say(line: str) -> None:
+    """Tell the user how far it is, without touching the answer."""
+    sys.stderr.write(f"{line}\n")
+
+
+def parsed_by(parse: Callable[[str], Value]) -> Callable[[str], Value]:
+    """Return a parser whose refusal argparse prints as it is."""
+
+    def parsed(text: str) -> Value:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return parsed
+
+
+def check_folder(path: Path | None) -> None:
+    """Refuse a file whose folder does not exist, before the work and not after it.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such folder.
+    """
+    if path is not None and not path.absolute().parent.is_dir():
+        raise ConfigurationError(f"{path}: found no folder {path.parent}, expected it to exist")

@@ -169,7 +169,14 @@ def test_gains_other_than_the_status_says_are_named_with_their_modes():
     assert np.flatnonzero(found.disobeys).tolist() == [3, 4, 5, 9]
     np.testing.assert_allclose(found.share[[3, 4, 5]], 0.25, atol=1e-3)
     assert "4 of 16 modes (3-5, 9)" in found.text
-    assert "mode 9 0.00" in found.text
+    assert "least mode 9: 0.00" in found.text
+
+
+def test_an_eighth_of_gain_missing_everywhere_is_seen():
+    found = verdict(closed_loop(gains=0.875 * GAINS))
+    assert found.disobeys.all()
+    np.testing.assert_allclose(found.share, 0.875, atol=1e-3)
+    assert verdict(closed_loop(gains=0.95 * GAINS)).holds
 
 
 def test_another_reconstructor_than_the_one_named_is_seen():

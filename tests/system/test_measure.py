@@ -92,6 +92,11 @@ def test_a_matrix_is_measured_kept_and_handed_out(night):
     wait_for(lambda: night.state["rtc"]["loop"] == "closed", what="the loop closed again")
     assert night.alarms.keys() <= {"loop-open"}
 
+    # one shape after the other: ten times the pushes, for turbulence in the open loop
+    other = measured(night, {"pattern": "system-modes", "n_average": 60})
+    assert other["state"] == "stored", other
+    check_against_model(numbers_of(night, other), other["modes"])
+
 
 def test_a_matrix_is_measured_by_sines_with_the_loop_closed(night):
     quiet_night(night)

@@ -76,10 +76,10 @@ def write_snapshot(telescope: Telescope, path: Path) -> None:
     slope = 3.0 * float(np.nanstd(rows[0].slopes))
     for moment, (images, along_x, along_y, left) in zip(rows, axes, strict=True):
         images.set_ylabel(f"frame {moment.frame}")
-        _show(images, moment.images, "light on the detector", (0.0, None), "inferno")
+        _show(images, moment.images, "four pupil images, mean 1", (0.0, None), "inferno")
         for axis, values, name in zip((along_x, along_y), moment.slopes, "xy", strict=True):
             _show(axis, values, f"slopes along {name}", (-slope, slope), "RdBu_r")
-        title = f"residual wavefront, {moment.error_nm:.0f} nm RMS"
+        title = f"residual wavefront in nm, {moment.error_nm:.0f} RMS"
         largest = 3.0 * moment.error_nm
         _show(left, moment.residual_nm, title, (-largest, largest), "RdBu_r")
     try:

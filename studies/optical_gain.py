@@ -48,6 +48,10 @@ class Run:
     residual_m: Array32
     """``(n_frames, n_points)``, piston-free."""
 
+    def error_m(self, weights: NDArray[np.float64]) -> float:
+        """Return the RMS of the residual over pupil and time."""
+        return float(np.sqrt(np.mean(self.residual_m.astype(np.float64) ** 2 @ weights)))
+
 
 def closed_loop(telescope: Telescope, gains: Array32, n_frames: int) -> Run:
     """Run the loop with these gains ``(n_controlled,)``, from the first frame of its feed on."""
@@ -126,7 +130,7 @@ def budget_nm(
         "temporal": modal_residual(content.T, gain, noise=False),
         "noise": modal_residual(noise, gain, noise=True),
     }
-    total = float(np.sqrt(np.mean(run.residual_m.astype(np.float64) ** 2 @ weights)))
+    total = run.error_m(weights)
     rest = total**2 - sum(part**2 for part in parts.values())
     parts["aliasing, non-linearity, other"] = float(np.sqrt(max(rest, 0.0)))
     return {name: value * 1e9 for name, value in ({"wavefront error": total} | parts).items()}
@@ -162,27 +166,32 @@ def main() -> None:
         second = closed_loop(
             telescope_of(options), (given.gain / everywhere).astype(np.float32), n_frames
         )
+        left_nm = 1e9 * first.error_m(telescope.weights)
         budget = budget_nm(second, telescope, given.gain, everywhere)
     for mode, gain in zip(modes, gains, strict=True):
         sys.stdout.write(f"mode {mode:4d}  optical gain {gain:.3f}\n")
+    sys.stdout.write(f"measured while the loop left {left_nm:.1f} nm; with compensated gains:\n")
     for name, value in budget.items():
         sys.stdout.write(f"{name:32s} {value:7.1f} nm\n")
     if given.plot is not None:
-        title = (
-            f'seeing {given.seeing}", magnitude {given.mag}: '
-            f"{budget['wavefront error']:.0f} nm left with compensated gains"
-        )
-        plot(given.plot, modes, gains, title)
+        title = f'optical gain at {given.seeing}" seeing, magnitude {given.mag}'
+        plot(given.plot, modes, gains, title, left_nm)
 
 
-def plot(path: Path, modes: NDArray[np.intp], gains: NDArray[np.float64], title: str) -> None:
+def plot(
+    path: Path,
+    modes: NDArray[np.intp],
+    gains: NDArray[np.float64],
+    title: str,
+    left_nm: float,
+) -> None:
     """Draw the optical gain against the mode, the prototype's figures beside it."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.subplots()
     # tip is mode 0, which a logarithm does not show
-    axes.semilogx(modes + 1, gains, ".-", label="measured here, loop closed")
+    axes.semilogx(modes + 1, gains, ".-", label=f"measured, loop closed at {left_nm:.0f} nm")
     axes.semilogx(
         np.array(list(PROTOTYPE)) + 1,
         list(PROTOTYPE.values()),

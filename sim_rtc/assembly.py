@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
-from service.model.modes import karhunen_loeve_basis
+from service.model.modes import analytic_basis
 from sim_rtc.beforehand import identity_of, initial_reconstructor
 from sim_rtc.computer import RealTimeComputer
 from sim_rtc.detector import Detector
@@ -31,6 +31,7 @@ from sim_rtc.motion import MovingOptics, background_executor
 from sim_rtc.options import Options
 from sim_rtc.pixels import binned
 from sim_rtc.plant import Plant
+from sim_rtc.playable import check_playable
 from sim_rtc.reconstructors import Reconstructor
 from sim_rtc.telemetry import Identity, LoopSettings
 
@@ -81,8 +82,9 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
     Raises
     ------
     ConfigurationError
-        If more modes are to be controlled than the instrument has.
+        If the instrument is not simulated, or more modes are to be controlled than it has.
     """
+    check_playable(instrument)
     n_modes = instrument.modes.n_modes
     if options.n_controlled > n_modes:
         raise ConfigurationError(
@@ -90,10 +92,12 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
         )
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
     binning = options.devices.binning
-    basis = binned_basis(instrument, karhunen_loeve_basis(instrument), binning)
+    basis = binned_basis(instrument, analytic_basis(instrument), binning)
     instrument = binned(instrument, binning)
     plant = build_plant(options, instrument, basis, plant_rng)
-    optics = MovingOptics(plant, build_schedule(options, alpha_rng), background_executor())
+    optics = MovingOptics(
+        plant, build_schedule(options, instrument, alpha_rng), background_executor()
+    )
     detector = build_detector(options, instrument, plant, optics.start())
     sky = build_sky(options, instrument, basis, plant, sky_rng)
     double_pass = options.sky.scene.passes == 2

@@ -127,10 +127,10 @@ def binned_basis(instrument: Instrument, basis: ModalBasis, binning: int) -> Mod
     return replace(basis, surface=surface, coefficients=coefficients)
 
 
-def build_schedule(options: Options, rng: np.random.Generator) -> Schedule:
-    """Return how the registration moves; one that was not given begins at random."""
+def build_schedule(options: Options, instrument: Instrument, rng: np.random.Generator) -> Schedule:
+    """Return how the registration moves; one that was not given begins near the nominal one."""
     return Schedule(
-        start=options.alpha or random_registration(rng),
+        start=options.alpha or random_registration(rng, instrument.start.rotation_rad),
         drift=options.drift,
         flexure=options.sky.flexure,
         walk=replace(options.sky.walk, seed=int(rng.integers(2**63))),

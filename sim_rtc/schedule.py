@@ -146,8 +146,11 @@ class Schedule:
         return min((j.time_s for j in self.jumps if j.time_s > time_s), default=float("inf"))
 
 
-def random_registration(rng: np.random.Generator) -> Misregistration:
-    """Draw a registration a 400-mode loop can hold: |shift| <= 0.2 subap, 0.3 deg, 0.5 %."""
+def random_registration(rng: np.random.Generator, nominal_rad: float = 0.0) -> Misregistration:
+    """Draw a registration a 400-mode loop can hold: |shift| <= 0.2 subap, 0.3 deg, 0.5 %.
+
+    The rotation is that far from the nominal one.
+    """
     radius = _LARGEST_SHIFT_SUBAP * np.sqrt(rng.uniform())
     angle = rng.uniform(0.0, 2 * np.pi)
     return Misregistration.from_vector(
@@ -155,7 +158,8 @@ def random_registration(rng: np.random.Generator) -> Misregistration:
             [
                 radius * np.cos(angle),
                 radius * np.sin(angle),
-                np.deg2rad(rng.uniform(-_LARGEST_ROTATION_DEG, _LARGEST_ROTATION_DEG)),
+                nominal_rad
+                + np.deg2rad(rng.uniform(-_LARGEST_ROTATION_DEG, _LARGEST_ROTATION_DEG)),
                 1.0 + rng.uniform(-_LARGEST_MAGNIFICATION, _LARGEST_MAGNIFICATION),
             ]
         )

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config.datasets import read_dataset
-from service.config.instrument_schema import InstrumentFile, LoopTable, ModesTable, WfsTable
+from service.config.instrument_schema import (
+    Centres,
+    InstrumentFile,
+    LoopTable,
+    ModesTable,
+    WfsTable,
+)
 from service.config.mirrors import MirrorFile, own_modes, read_mirror
 from service.config.strict import Place, in_file, read_toml, refuse, validated
 from service.errors import ConfigurationError, ModelError
@@ -27,6 +33,8 @@ from service.model.instrument import (
 )
 from service.model.slopes import Normalisation, Orientation, SlopeOrder, SlopeRecipe
 from service.model.windows import by_quadrant
+
+_SEPARATION_TOLERANCE = 0.1
 
 _FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
 
@@ -146,14 +154,15 @@ def _frames(table: WfsTable, source: _Source) -> FrameWindows | None:
         return None
     centres = None
     if table.pupil_centres_px is not None:
-        centres = np.array(table.pupil_centres_px)
-        try:
-            by_quadrant(centres)
-        except ModelError as error:
-            raise ConfigurationError(
-                f"{source.place(('wfs', 'pupil_centres_px'))}: {error}"
-            ) from error
+        centres = _by_quadrant(table.pupil_centres_px, source).reshape(4, 2)
     return FrameWindows(centres_px=centres, pixels_per_subaperture=table.pixels_per_subaperture)
+
+
+def _by_quadrant(centres_px: Centres, source: _Source) -> NDArray[np.float64]:
+    try:
+        return by_quadrant(np.array(centres_px))
+    except ModelError as error:
+        raise ConfigurationError(f"{source.place(('wfs', 'pupil_centres_px'))}: {error}") from error
 
 
 def _loop(table: LoopTable, n_modes: int, source: _Source) -> LoopFacts | None:
@@ -170,10 +179,11 @@ def _loop(table: LoopTable, n_modes: int, source: _Source) -> LoopFacts | None:
 
 def _pyramid(table: WfsTable, source: _Source) -> Pyramid:
     diameter = table.pupil_diameter_subap or float(table.n_subapertures)
-    if table.pupil_separation_subap < diameter:
+    separation = _separation(table, source)
+    if separation < diameter:
         refuse(
             source.place(("wfs", "pupil_separation_subap")),
-            f"{table.pupil_separation_subap:g}",
+            f"{separation:g}",
             f"at least the pupil's diameter, {diameter:g} subapertures: the images would overlap",
         )
     mask = None
@@ -188,11 +198,30 @@ def _pyramid(table: WfsTable, source: _Source) -> Pyramid:
         n_subapertures=table.n_subapertures,
         wavelength_m=table.wavelength_m,
         modulation_lambda_over_d=table.modulation_lambda_over_d,
-        pupil_separation_subap=table.pupil_separation_subap,
+        pupil_separation_subap=separation,
         pupil_diameter_subap=table.pupil_diameter_subap,
         flux_threshold=table.flux_threshold,
         valid_subapertures=mask,
     )
+
+
+def _separation(table: WfsTable, source: _Source) -> float:
+    """Return the images' distance: as given, or as the images on the frames lie."""
+    stated = table.pupil_separation_subap
+    if table.pupil_centres_px is None or table.input == "slopes":
+        return stated
+    centres = _by_quadrant(table.pupil_centres_px, source)
+    sides = (centres[1, :, 0] - centres[0, :, 0], centres[:, 1, 1] - centres[:, 0, 1])
+    measured = float(np.mean(sides)) / table.pixels_per_subaperture
+    if "pupil_separation_subap" not in table.model_fields_set:
+        return measured
+    if abs(measured / stated - 1.0) > _SEPARATION_TOLERANCE:
+        refuse(
+            source.place(("wfs", "pupil_separation_subap")),
+            f"{stated:g}",
+            f"about {measured:.1f}, the distance of wfs.pupil_centres_px",
+        )
+    return stated
 
 
 def _mask(table: WfsTable, source: _Source) -> NDArray[np.bool_]:

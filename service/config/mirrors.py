@@ -64,10 +64,10 @@ class MirrorFile:
         return self.place(("mirror", key))
 
     def read(self, key: str) -> NDArray[np.floating]:
-        """Return the array this key refers to: floating point, of at least single precision."""
+        """Return the array this key refers to, as float32 where it is no finer, else float64."""
         values = read_dataset(getattr(self.table, key), self.folder, self.where(key))
-        kind = np.result_type(values.dtype, np.float32) if values.dtype.kind == "f" else np.float64
-        return values.astype(kind, copy=False)
+        single = values.dtype.kind == "f" and values.dtype.itemsize <= 4
+        return values.astype(np.float32 if single else np.float64, copy=False)
 
 
 def read_mirror(file: MirrorFile) -> tuple[Mirror | TabulatedModes, tuple[str, ...]]:

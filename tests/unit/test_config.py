@@ -1,5 +1,6 @@
 """Instrument files and settings: what is read, and the one line that says what is wrong."""
 
+import sys
 from pathlib import Path
 
 import h5py
@@ -70,6 +71,10 @@ def test_an_11_by_11_grid_in_a_circle_has_the_97_actuators_of_an_alpao_dm97():
     assert positions.shape == (97, 2)
     np.testing.assert_allclose(positions.mean(axis=0), 0, atol=1e-12)
     assert typical_pitch(positions) == pytest.approx(0.5)
+
+
+def test_a_17_by_17_grid_in_a_circle_has_the_241_actuators_of_an_alpao_dm241():
+    assert len(grid(17, 1.5e-3, 17.5 * 1.5e-3)) == 241
 
 
 def test_a_grid_keeps_the_points_that_lie_on_its_circle():
@@ -324,9 +329,11 @@ def test_what_is_known_of_the_loop_is_carried(write):
 def test_full_frames_have_windows(write):
     wfs = (
         WFS + 'input = "frames"\npixels_per_subaperture = 2\n'
-        "pupil_centres_px = [[20, 21.5], [20.5, 93], [92, 21], [93, 92]]\n"
+        "pupil_centres_px = [[93, 92], [20.5, 93], [92, 21], [20, 21.5]]\n"
     )
-    frames = load_instrument(write(ABOUT + wfs + MIRROR + MODES)).frames
+    bench = load_instrument(write(ABOUT + wfs + MIRROR + MODES))
+    frames = bench.frames
+    assert bench.wfs.pupil_separation_subap == pytest.approx((72 + 72.5 + 71.5 + 71) / 8)
     assert frames.pixels_per_subaperture == 2
     np.testing.assert_array_equal(frames.centres_px[1], [20.5, 93.0])
     auto = WFS + 'input = "frames"\npupil_centres_px = "auto"\n'
@@ -469,6 +476,16 @@ def test_arrays_come_from_fits_files_too(write, tmp_path):
     assert "it holds MODES (3, 90, 90)" in message
 
 
+def test_without_astropy_a_fits_file_is_refused_with_what_to_install(write, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "astropy.io", None)
+    (tmp_path / "cube.fits").write_bytes(b"SIMPLE  =                    T")
+    message = refusal(
+        load_instrument, write(ABOUT + WFS + CUBE.replace("cube.h5:/modes", "cube.fits"))
+    )
+    assert "mirror.modes: " in message
+    assert "needs astropy; expected pyrcal installed with its extra 'fits'" in message
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -523,6 +540,14 @@ def test_arrays_come_from_fits_files_too(write, tmp_path):
             + MIRROR
             + MODES,
             "wfs.pupil_centres_px: found pupil images at",
+        ),
+        (
+            WFS
+            + 'input = "frames"\npupil_separation_subap = 36\n'
+            + "pupil_centres_px = [[20, 20], [20, 50], [50, 20], [50, 50]]\n"
+            + MIRROR
+            + MODES,
+            "pupil_separation_subap: found 36, expected about 30.0, the distance of",
         ),
         (
             WFS + 'input = "frames"\npupil_centres_px = [1, 2, 3, 4]\n' + MIRROR + MODES,

@@ -5,10 +5,19 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from service.model.instrument import Stop
 from service.model.interaction import rotation
 from service.model.misregistration import Misregistration
+from service.model.slopes import (
+    Orientation,
+    SlopeOrder,
+    rtc_mask,
+    to_conventions,
+    to_rtc,
+    turned_mask,
+)
 from tests.numerics import small_linearisation, small_model
 
 registrations = st.builds(
@@ -59,3 +68,27 @@ def test_a_linearisation_moves_linearly(alpha):
     expected = (start.matrix_at(alpha) + start.matrix) / 2
     scale = np.abs(expected).max()
     np.testing.assert_allclose(start.matrix_at(middle), expected, atol=1e-5 * scale)
+
+
+signs = st.sampled_from((1, -1))
+orientations = st.builds(
+    Orientation,
+    swap_xy=st.booleans(),
+    flip_x=st.booleans(),
+    flip_y=st.booleans(),
+    sign_x=signs,
+    sign_y=signs,
+)
+masks = arrays.arrays(bool, st.tuples(st.integers(1, 6), st.integers(1, 6)))
+
+
+@given(masks, orientations, st.sampled_from(SlopeOrder))
+def test_an_rtcs_list_of_slopes_is_a_permutation_with_signs(mask, orientation, order):
+    """Every slope is there once, its sign is 1 or -1, and the way back undoes the way there."""
+    listed = np.arange(1.0, 2 * mask.sum() + 1)
+    there = to_conventions(listed, order, orientation, mask)
+    np.testing.assert_array_equal(np.sort(np.abs(there)), listed)
+    np.testing.assert_array_equal(to_rtc(there, order, orientation, mask), listed)
+    turned = turned_mask(mask, orientation)
+    assert turned.sum() == mask.sum()
+    np.testing.assert_array_equal(rtc_mask(turned, orientation), mask)

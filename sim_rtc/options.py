@@ -279,7 +279,8 @@ def _add_loop(group: argparse._ArgumentGroup) -> None:
         const=1.0,
         metavar="S",
         help="at the start raise the gain of tip and tilt, of the modes to 100, and of the rest in "
-        "turn, S seconds a step (default: 1), and keep those of least residual slopes",
+        "turn, S seconds a step (default: 1), and keep those of least residual slopes; later the "
+        "service may ask for another",
     )
     group.add_argument(
         "--leak",

@@ -16,7 +16,7 @@ from service.fits.jobs import FitAsked, FitJob, FitState
 from service.fits.request import parse_alpha, parse_modes
 from service.registration.options import FitOptions, Method
 from service.routes.problems import INVALID, UNKNOWN, problem_response
-from service.routes.schemas import Number, View
+from service.routes.views import Number, View
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
 

@@ -11,8 +11,8 @@ from prometheus_client.exposition import choose_encoder
 from service import __version__
 from service.routes.metrics import SnapshotCollector
 from service.routes.problems import problem, problem_response
-from service.routes.schemas import View
 from service.routes.service import ServiceDep
+from service.routes.views import View
 
 router = APIRouter(tags=["how it is doing"])
 

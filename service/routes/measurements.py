@@ -17,8 +17,8 @@ from service.errors import UnknownIdError
 from service.events import GiveUp, Measure
 from service.routes.operating import AcceptedView, Positive, Request, accepted
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
-from service.routes.schemas import View
 from service.routes.service import ServiceDep
+from service.routes.views import View
 from service.state import MeasurePattern, MeasureState
 
 router = APIRouter(

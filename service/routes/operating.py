@@ -23,8 +23,8 @@ from service.events import (
     StopDither,
 )
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
-from service.routes.schemas import View
 from service.routes.service import Service, ServiceDep
+from service.routes.views import View
 from service.state import Mode
 
 router = APIRouter(

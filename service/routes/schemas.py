@@ -2,61 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from typing import Annotated
-
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import Field
 
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.routes.rtc_views import DitherView, LoopCommandView, MeasuringView, RtcView
 from service.routes.service import Snapshot
-from service.state import (
-    CommandState,
-    Level,
-    MatrixState,
-    MeasurePattern,
-    MeasureState,
-    Mode,
-    Registration,
-)
-
-
-def _finite_or_none(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
-Number = Annotated[float | None, BeforeValidator(_finite_or_none)]
-"""A number, or null where there is none or it is not finite."""
-
-
-class View(BaseModel):
-    """A read-only picture of one of the service's records, made from its attributes."""
-
-    model_config = ConfigDict(frozen=True, from_attributes=True, use_attribute_docstrings=True)
-
-
-class FourView(View):
-    """The four parameters of a registration, or their 1 σ."""
-
-    shift_x_subap: Number
-    """Along sensor +x, subapertures."""
-
-    shift_y_subap: Number
-    """Along sensor +y, subapertures."""
-
-    rotation_deg: Number
-    """From sensor +x towards +y, degrees."""
-
-    magnification: Number
-    """Ratio; 1 is nominal."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _in_boundary_units(cls, value: Misregistration | NDArray[np.float64]) -> dict[str, float]:
-        if isinstance(value, Misregistration):
-            return value.to_boundary()
-        return dict(zip(PARAMETERS, (value * BOUNDARY_SCALE).tolist(), strict=True))
+from service.routes.views import FourView, Number, View
+from service.state import Level, MatrixState, Mode, Registration
 
 
 class AlphaView(View):
@@ -216,116 +169,6 @@ class ReconstructorsView(View):
 
     reconstructors: tuple[ReconstructorView, ...]
     """Oldest first."""
-
-
-class GainGroupView(View):
-    """Neighbouring modes with the same loop gain."""
-
-    first: int
-    """0-based basis index of the first mode."""
-
-    last: int
-    """Of the last one; it belongs to the group."""
-
-    gain: Number
-
-
-def _by_group(gains: tuple[float, ...]) -> list[dict[str, float]]:
-    groups: list[dict[str, float]] = []
-    for mode, gain in enumerate(gains):
-        if groups and groups[-1]["gain"] == gain:
-            groups[-1]["last"] = mode
-        else:
-            groups.append({"first": mode, "last": mode, "gain": gain})
-    return groups
-
-
-class RtcView(View):
-    """The RTC as its last status message shows it."""
-
-    session: str
-    loop: str
-    """"open", "closed" or "partial"."""
-
-    frame_rate_hz: Number
-    delay_frames: Number
-    leak: Number
-    """Per frame."""
-
-    gains: Annotated[tuple[GainGroupView, ...], BeforeValidator(_by_group)]
-    """Of all modes of the basis, 0 where uncontrolled."""
-
-    n_controlled: int
-    n_modes: int
-    n_slopes: int
-    cm_id: str | None
-    """The reconstructor it says it uses."""
-
-    basis_id: str
-    config_id: str
-    magnitude: Number
-    """Of the star; null: not known."""
-
-    max_dither_m: Number
-    """Largest dither it accepts, metres OPD RMS."""
-
-    max_dither_modes: int
-    t_ns_utc: int
-    """The RTC's own timestamp."""
-
-
-class DitherView(View):
-    """The dither now requested of the RTC."""
-
-    id: str
-    modes: tuple[int, ...]
-    """0-based basis indices."""
-
-    amplitude_m: tuple[Number, ...]
-    """RMS of each mode, metres OPD."""
-
-    frequency_hz: tuple[Number, ...]
-    duration_s: Number
-    start_seq: int | None
-    """First frame that contains it; null until the RTC has accepted."""
-
-
-class MeasuringView(View):
-    """The interaction matrix being measured."""
-
-    id: str
-    """Of the matrix to come: ``/v1/measurements/{id}`` says more."""
-
-    state: MeasureState
-    """"asked" or "running"."""
-
-    pattern: MeasurePattern
-    modes: tuple[int, ...]
-    """0-based basis indices."""
-
-    asked_ns_utc: int | None
-    """Since when."""
-
-    opens_loop: bool
-    """Whether the loop is open meanwhile."""
-
-
-class LoopCommandView(View):
-    """The last change of the loop, or gain ramp, asked of the RTC."""
-
-    id: str
-    text: str
-    """What was asked for."""
-
-    state: CommandState
-    """"asked", "accepted", "refused" or "failed"."""
-
-    reason: str
-    """Why it was refused, or has failed."""
-
-    asked_ns_utc: int
-    lasts_s: float
-    """How long the RTC is busy with it, at its nominal rate; 0: it changes at once."""
 
 
 class WatchdogView(View):

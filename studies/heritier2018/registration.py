@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from service.registration.fit import fit_matrix
 
 from service.errors import PyrcalError
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.slopes import Orientation
+from service.registration.fit import fit_matrix
 from service.registration.options import Fit, FitOptions, Method
 from studies.heritier2018 import telescope
 from studies.heritier2018.calibration import Measurement
@@ -21,7 +21,7 @@ from studies.heritier2018.store import Record, Store, Task
 
 Array = NDArray[np.float64]
 
-_COST_S = {Method.JOINT: 8.0, Method.PAPER: 45.0, Method.SENSITIVITY: 8.0}
+_COST_S = {Method.JOINT: 3.0, Method.PAPER: 10.0, Method.SENSITIVITY: 5.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,10 +52,10 @@ class FitRun:
         """Return what the fit found, flattened; a fit that gives up is a record of its reason."""
         options = FitOptions(method=self.method, start=self.start, orientation=Orientation())
         reference = self.measurement.reference(store)
-        telescope.basis()
+        instrument, basis = telescope.instrument(), telescope.basis()
         started = time.process_time()
         try:
-            fit = fit_matrix(telescope.instrument(), reference, options)
+            fit = fit_matrix(instrument, reference, options, basis=basis)
         except PyrcalError as error:
             return _gave_up(str(error), time.process_time() - started)
         return flattened(fit, time.process_time() - started)

@@ -1,0 +1,254 @@
+"""Where the pupil images lie on the sensor, from nothing but their mean light.
+
+With the mirror as stop the outline and the obscuration move with the shift, so their edges are a
+start for a fit, before any matrix is looked at. The light inside the outline may be uneven: it is
+modelled as a smooth surface times what an even beam would show, diffraction included, and only the
+edges tell the position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.model.instrument import Instrument
+from service.model.interaction import instrument_pupil
+from service.model.pyramid import PyramidOptics, enough_modulation_points
+
+Array = NDArray[np.float64]
+
+_SAMPLING = 2
+_ORDER = 3
+"""Of the polynomial that stands for uneven light."""
+
+_FIRST_STEPS = np.arange(-3.0, 3.1, 1.0)
+"""Positions tried first on either axis, subapertures."""
+
+_PROBE_SUBAP = 0.05
+_SETTLED_SUBAP = 1e-3
+_MOST_STEPS = 20
+_LARGEST_STEP_SUBAP = 0.7
+_HUBER = 2.0
+"""Residuals beyond so many robust σ count less."""
+
+_BAD_SIGMA = 6.0
+_BAD_SHARE = 0.25
+"""A pixel is bad when it departs from its three companions by so many robust σ and, besides, by
+this share of their light: static aberrations make good ones differ by some per cent."""
+
+_LARGEST_RESIDUAL = 0.25
+"""RMS residual over mean light from which the map is no image of this pupil."""
+
+_LARGEST_SIGMA_SUBAP = 1.0
+
+_FLOOR_SUBAP = 0.02
+"""1 σ of what smooth light of any shape moves an edge."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PupilPosition:
+    """Where the pupil images lie, all four alike."""
+
+    x_subap: float
+    """Of their centre, from the centre of the sensor's grid along +x."""
+
+    y_subap: float
+    """The same along +y."""
+
+    sigma_x_subap: float
+    """1 σ of x: noise, and what the four images disagree by."""
+
+    sigma_y_subap: float
+    """1 σ of y."""
+
+    residual: float
+    """RMS of what the pupil and smooth light leave unexplained, over the mean light."""
+
+    n_bad_pixels: int
+    """Pixels that disagree with the same place of the other images; left out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CannotTell:
+    """The map does not say; a value, because it may well happen."""
+
+    reason: str
+    """What was found, and what would help."""
+
+
+def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | CannotTell:
+    """Return the position of the pupil images in the mean counts ``(4, n, n)``.
+
+    The axes are those of conventions.md, the images in row-major order of their place on the
+    detector.
+
+    Raises
+    ------
+    ModelError
+        If the counts are not four images of the instrument's size.
+    """
+    images, bad = mended(counts, instrument)
+    light = float(images.mean())
+    if not light > 0.0:
+        return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
+    images = images / light
+    optics = even_optics(instrument)
+    try:
+        start = _first_guess(images, even_optics(instrument, 1))
+        position, steps, formal, residual = _settled(images, optics, start)
+    except np.linalg.LinAlgError:
+        return CannotTell(reason="the light has no edge the position could be read from")
+    if residual > _LARGEST_RESIDUAL:
+        return CannotTell(
+            reason=f"the light is not that of the instrument's pupil: {residual:.0%} of it remain "
+            f"unexplained, expected at most {_LARGEST_RESIDUAL:.0%}; check the mask, the pupil "
+            "diameter and the obscuration"
+        )
+    scatter = steps.std(axis=0, ddof=1) / np.sqrt(len(steps))
+    sigma = np.sqrt(scatter**2 + (formal**2).mean(axis=0) / len(steps) + _FLOOR_SUBAP**2)
+    if not np.all(sigma < _LARGEST_SIGMA_SUBAP):
+        return CannotTell(
+            reason=f"the four images disagree by {scatter.max() * 2:.1f} subapertures; "
+            "check that each is cut out of the frame at its own place"
+        )
+    return PupilPosition(
+        x_subap=float(position[0]),
+        y_subap=float(position[1]),
+        sigma_x_subap=float(sigma[0]),
+        sigma_y_subap=float(sigma[1]),
+        residual=residual,
+        n_bad_pixels=int(bad.sum()),
+    )
+
+
+def even_optics(instrument: Instrument, sampling: int = _SAMPLING) -> PyramidOptics:
+    """Return the sensor with an evenly lit pupil, as finely as light needs it."""
+    return PyramidOptics(
+        wfs=instrument.wfs,
+        pupil=instrument_pupil(instrument, sampling),
+        n_nodes=sampling,
+        n_modulation=enough_modulation_points(instrument.wfs),
+    )
+
+
+def even_images(optics: PyramidOptics, shift: tuple[float, float]) -> Array:
+    """Return what an even beam shows ``(4, n, n)``, in the order of the counts."""
+    n = optics.wfs.n_subapertures
+    return optics.images(shift).transpose(0, 2, 1, 3).reshape(4, n, n)
+
+
+def mended(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the counts ``(4, n, n)`` with bad pixels replaced, and which were bad.
+
+    A pixel is bad when it is no number or far from the median of the same place in all images,
+    each scaled to the same light: four images of one pupil see the same unevenness.
+
+    Raises
+    ------
+    ModelError
+        If the counts are not four images of the instrument's size.
+    """
+    n = instrument.wfs.n_subapertures
+    if counts.shape != (4, n, n):
+        raise ModelError(f"flux map: found counts {counts.shape}; expected {(4, n, n)}")
+    images = np.where(np.isfinite(counts), counts, np.nan).astype(np.float64)
+    if np.isnan(images).all():
+        return np.zeros_like(images), np.ones(images.shape, dtype=np.bool_)
+    level = np.nanmean(np.clip(images, 0.0, np.nanpercentile(images, 95.0)), axis=(1, 2))
+    level = np.where(level > 0.0, level, 1.0)
+    scaled = images / level[:, None, None]
+    middle = np.nanmedian(scaled, axis=0)
+    difference = scaled - middle
+    spread = 1.4826 * np.nanmedian(np.abs(difference))
+    bad = ~(np.abs(difference) <= _BAD_SIGMA * spread + _BAD_SHARE * np.abs(middle))
+    return np.where(bad, np.nan_to_num(middle) * level[:, None, None], images), bad
+
+
+def _settled(
+    images: Array, optics: PyramidOptics, position: Array
+) -> tuple[Array, Array, Array, float]:
+    """Return position, the four images' own departures and their formal σ, and the residual."""
+    for _ in range(_MOST_STEPS):
+        steps, formal, residual = _departures(images, optics, position)
+        step = np.clip(steps.mean(axis=0), -_LARGEST_STEP_SUBAP, _LARGEST_STEP_SUBAP)
+        position = position + step
+        if np.abs(step).max() < _SETTLED_SUBAP:
+            break
+    return position, steps, formal, residual
+
+
+def _first_guess(images: Array, optics: PyramidOptics) -> Array:
+    """Return the best of a coarse grid of positions."""
+    total = images.sum(axis=0).ravel()
+    surface = _polynomials(images.shape[1], 1)
+
+    def left(x: float, y: float) -> float:
+        even = even_images(optics, (x, y)).sum(axis=0).reshape(-1, 1)
+        columns = np.hstack([surface * even, np.ones_like(even)])
+        return float(np.linalg.norm(total - columns @ np.linalg.lstsq(columns, total)[0]))
+
+    tried = [(left(x, y), x, y) for x in _FIRST_STEPS for y in _FIRST_STEPS]
+    return np.array(min(tried)[1:])
+
+
+def _departures(
+    images: Array, optics: PyramidOptics, position: Array
+) -> tuple[Array, Array, float]:
+    """Return how far each image lies from ``position`` and its σ, ``(4, 2)`` each, and the rest."""
+    even = even_images(optics, _pair(position))
+    rates = [
+        (
+            even_images(optics, _pair(position + probe))
+            - even_images(optics, _pair(position - probe))
+        )
+        / (2 * _PROBE_SUBAP)
+        for probe in _PROBE_SUBAP * np.eye(2)
+    ]
+    surface = _polynomials(images.shape[1], _ORDER)
+    found = [
+        _departure(image.ravel(), shown.ravel(), [rate[k].ravel() for rate in rates], surface)
+        for k, (image, shown) in enumerate(zip(images, even, strict=True))
+    ]
+    steps, formal, residuals = (np.array(part) for part in zip(*found, strict=True))
+    return steps, formal, float(np.sqrt(np.mean(residuals**2)))
+
+
+def _departure(
+    image: Array, even: Array, rates: list[Array], surface: Array
+) -> tuple[Array, Array, float]:
+    """Fit smooth light, a background and a small movement to one image, robustly.
+
+    The movement's columns need the light itself: it is fitted first without them.
+    """
+    lit = np.column_stack([surface * even[:, None], np.ones_like(even)])
+    weights = np.ones_like(image)
+    light = surface @ _weighted(lit, image, weights)[0][:-1]
+    for _ in range(5):
+        columns = np.column_stack([lit, rates[0] * light, rates[1] * light])
+        solution, covariance = _weighted(columns, image, weights)
+        left = image - columns @ solution
+        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
+        weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(left), 1e-12))
+        light = surface @ solution[: surface.shape[1]]
+    return solution[-2:], scale * np.sqrt(np.diag(covariance)[-2:]), float(left.std())
+
+
+def _weighted(columns: Array, values: Array, weights: Array) -> tuple[Array, Array]:
+    normal = columns.T @ (columns * weights[:, None])
+    covariance = np.asarray(np.linalg.inv(normal))
+    return covariance @ (columns.T @ (weights * values)), covariance
+
+
+def _polynomials(n: int, order: int) -> Array:
+    """Return monomials up to ``order`` over the grid, ``(n², n_terms)``."""
+    u = np.linspace(-1.0, 1.0, n)
+    x, y = np.tile(u, n), np.repeat(u, n)
+    return np.column_stack([x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)])
+
+
+def _pair(position: Array) -> tuple[float, float]:
+    return float(position[0]), float(position[1])

@@ -1,0 +1,108 @@
+"""A telescope measured by day, and the model put in its place: what studies of matrices begin with.
+
+The matrix is measured with noise, push and pull, mode by mode, on the diffractive telescope with
+its light through the mirror twice; the registration is what a small joint fit of all its modes
+says, with a free gain for each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config import load_instrument
+from service.model.interaction import InteractionModel
+from service.model.misregistration import Misregistration
+from service.wire import MeasureRequest, Pattern
+from sim_rtc.assembly import Telescope, build_telescope
+from sim_rtc.measure import Circumstances, product
+from sim_rtc.options import parse_options
+
+Array = NDArray[Any]
+
+N_MEASURED = 400
+PASSES = 2
+STROKE_M = 20e-9
+_N_STEPS = 4
+_CALM = "--seeing 0.05 --vibration none"
+"""Nothing is played on the mirror while its matrix is measured; 0.05 is the least seeing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Registered:
+    """The model where the measured matrix puts it."""
+
+    alpha: Misregistration
+    gains: NDArray[np.float64]
+    """``(n_measured,)`` measured over model, both of one pass."""
+
+    residual: float
+    """RMS of measured less fitted model over the RMS of the measured."""
+
+
+def telescope_of(words: str) -> Telescope:
+    """Return a fresh telescope of these options of ``pyrcal sim``: the same sky every time."""
+    options = parse_options(words.split())
+    return build_telescope(options, load_instrument(options.instrument))
+
+
+def measured_by_day(words: str, n_average: int) -> tuple[Array, Telescope]:
+    """Return a noisy matrix of one pass ``(n_slopes, 400)`` and the telescope it is of.
+
+    Raises
+    ------
+    ValueError
+        If the telescope refuses the measurement.
+    """
+    telescope = telescope_of(f"{words} {_CALM}")
+    computer = telescope.computer(iter(telescope.feed.blocks()))
+    computer.prepare()
+    reply = computer.execute(
+        MeasureRequest(
+            id="study",
+            pattern=Pattern.PUSH_PULL_MODAL,
+            modes=tuple(range(N_MEASURED)),
+            amplitude_m=(STROKE_M,) * N_MEASURED,
+            n_average=n_average,
+        )
+    )
+    if not reply.accepted:
+        raise ValueError(f"measurement: refused: {reply.reason}")
+    while not (ended := computer.take_measured()):
+        computer.next_batch()
+    where = Circumstances(
+        system="study", basis_id="basis", config_id="sensor", double_pass=True, created_ns=0
+    )
+    manifest, matrix = product(ended[0], where)
+    if matrix is None:
+        raise ValueError(f"measurement: {manifest.reason}")
+    return matrix.astype(np.float64) / PASSES, telescope
+
+
+def registered(
+    model: InteractionModel, measured: Array, start: Misregistration | None = None
+) -> Registered:
+    """Return the joint fit of α and a gain per mode, each mode weighted by its size."""
+    vector = (start or Misregistration()).vector
+    n_modes = measured.shape[1]
+    weight = 1.0 / np.einsum("ij,ij->j", measured, measured)
+    for _ in range(_N_STEPS):
+        linear = model.linearise(Misregistration.from_vector(vector))
+        columns = linear.matrix[:, :n_modes].astype(np.float64)
+        power = np.einsum("ij,ij->j", columns, columns)
+        gains = np.einsum("ij,ij->j", columns, measured) / power
+        left = measured - gains * columns
+        jacobian = gains * linear.derivatives[:, :, :n_modes]
+        jacobian -= columns * (np.einsum("kij,ij->kj", jacobian, columns) / power)[:, None]
+        normal = np.einsum("kij,lij,j->kl", jacobian, jacobian, weight, optimize=True)
+        vector = vector + np.linalg.solve(
+            normal, np.einsum("kij,ij,j->k", jacobian, left, weight, optimize=True)
+        )
+    return Registered(
+        alpha=Misregistration.from_vector(vector),
+        gains=gains,
+        residual=float(np.linalg.norm(left) / np.linalg.norm(measured)),
+    )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.instrument import Instrument, Pyramid, Stop
+from service.model.instrument import Instrument, Mirror, Pyramid, Stop
 from service.model.interaction import reference_slopes, rotation, valid_subapertures
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
@@ -217,18 +217,12 @@ class DiffractivePlant:
         )
         drawn = instrument.analytic_mirror
         mirror = misplaced(drawn, imperfections.position_error, position_rng)
-        strokes = basis.mode_to_actuator
+        width_m, strokes = instrument.subaperture_m, basis.mode_to_actuator
         if influence is None:
-            self._surface: PlantSurface = TensionedPlate(
-                mirror.positions_m / instrument.subaperture_m,
-                tension=instrument.subaperture_m / (_TENSION_PITCHES * mirror.pitch_m),
-                softness=_SOFTNESS,
-            )
+            self._surface: PlantSurface = _plate(mirror, width_m)
             strokes = heights(drawn, strokes)
         else:
-            self._surface = influence.surface(
-                drawn.positions_m, mirror.positions_m, instrument.subaperture_m
-            )
+            self._surface = influence.surface(drawn.positions_m, mirror.positions_m, width_m)
         self._weights = disobedient(self._surface, strokes, faults or MirrorFaults())
         self._points = distorted(pupil.points, pupil.weights, imperfections)
         self.points_m: Array = self._points * instrument.subaperture_m
@@ -274,6 +268,15 @@ class DiffractivePlant:
         ]
         shapes = np.concatenate([block.astype(np.float32) for block in blocks])
         return np.asfortranarray(shapes[:, :-1]), np.ascontiguousarray(shapes[:, -1])
+
+
+def _plate(mirror: Mirror, subaperture_m: float) -> TensionedPlate:
+    """Return the plate through these actuators, in coordinates of subapertures."""
+    return TensionedPlate(
+        mirror.positions_m / subaperture_m,
+        tension=subaperture_m / (_TENSION_PITCHES * mirror.pitch_m),
+        softness=_SOFTNESS,
+    )
 
 
 def _quadrature(wfs: Pyramid, binning: int) -> Quadrature:

@@ -111,6 +111,18 @@ class InteractionModel:
         """Return dD/dα ``(4, n_slopes, n_modes)``: per subaperture, radian, magnification."""
         return np.stack([*self._shift_derivatives(alpha), *self._shape_derivatives(alpha)])
 
+    def stretch_derivatives(self, alpha: Misregistration) -> Array:
+        """Return how D changes with an anamorphosis of the mirror's image, ``(2, ...)``.
+
+        Per unit of stretch along x, and as much shrinking along y; the second along 45 deg and
+        135 deg. The size stays, so that neither is a magnification.
+        """
+        jacobian, points = self.sensor_jacobian(alpha), self._mirror_points(alpha)
+        turn = rotation(alpha.rotation_rad)
+        on_sensor = points @ turn.T
+        directions = (on_sensor * [-1.0, 1.0] @ turn, -on_sensor[:, ::-1] @ turn)
+        return np.stack([self._product(jacobian, self._moved(points, way)) for way in directions])
+
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return D(α) and its derivatives together."""
         return Linearisation(

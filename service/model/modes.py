@@ -58,6 +58,9 @@ class Basis(Protocol):
     def subset(self, indices: Indices) -> Self:
         """Return a basis of these modes only, in this order."""
 
+    def combined(self, weights: Array) -> Self:
+        """Return a basis of combinations of the modes, ``weights`` ``(n_modes, n_combined)``."""
+
     def mirrored(self) -> Self:
         """Return the same modes of the mirror seen from its other side: y runs backwards."""
 
@@ -110,6 +113,18 @@ class ModalBasis:
             mode_to_actuator=np.ascontiguousarray(self.mode_to_actuator[:, indices]),
             coefficients=np.ascontiguousarray(self.coefficients[:, indices]),
             variance_m2=self.variance_m2[indices],
+        )
+
+    def combined(self, weights: Array) -> ModalBasis:
+        """Return a basis of combinations of the modes, ``weights`` ``(n_modes, n_combined)``.
+
+        Modes are taken to vary apart from one another.
+        """
+        return replace(
+            self,
+            mode_to_actuator=self.mode_to_actuator @ weights,
+            coefficients=self.coefficients @ weights,
+            variance_m2=self.variance_m2 @ weights**2,
         )
 
     def mirrored(self) -> ModalBasis:

@@ -88,6 +88,10 @@ class TabulatedBasis:
         """Return a basis of these modes only."""
         return replace(self, coefficients=np.ascontiguousarray(self.coefficients[:, indices]))
 
+    def combined(self, weights: Array) -> TabulatedBasis:
+        """Return a basis of combinations of the modes, ``weights`` ``(n_modes, n_combined)``."""
+        return replace(self, coefficients=self.coefficients @ weights)
+
     def mirrored(self) -> TabulatedBasis:
         """Return the same modes of the mirror seen from its other side."""
         return replace(self, y_sign=-self.y_sign)

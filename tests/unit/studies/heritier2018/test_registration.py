@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.registration.options import Method
+from studies.heritier2018.plan import FULL, TRUTH, fits_from_random_starts, joint_fit
+from studies.heritier2018.registration import errors, fitted_alpha, is_right, random_starts
+
+
+def found(alpha: Misregistration) -> dict[str, np.ndarray]:
+    return {"alpha": alpha.vector * BOUNDARY_SCALE}
+
+
+def test_errors_are_in_per_cent_degrees_and_per_cent() -> None:
+    step = np.array([0.01, -0.02, np.deg2rad(0.1), 0.001])
+    off = errors(found(Misregistration.from_vector(TRUTH.vector + step)), TRUTH)
+    assert off == pytest.approx([1.0, -2.0, 0.1, 0.1])
+
+
+def test_a_fit_is_right_only_when_every_parameter_is() -> None:
+    assert is_right(found(TRUTH), TRUTH)
+    for axis, step in enumerate((0.06, -0.06, np.deg2rad(0.4), 0.006)):
+        moved = TRUTH.vector
+        moved[axis] += step
+        assert not is_right(found(Misregistration.from_vector(moved)), TRUTH)
+    assert not is_right({"alpha": np.full(4, np.nan)}, TRUTH)
+
+
+def test_a_kept_fit_gives_back_its_registration() -> None:
+    assert fitted_alpha(found(TRUTH)).vector == pytest.approx(TRUTH.vector)
+
+
+def test_random_starts_fill_the_capture_range_and_no_more() -> None:
+    starts = random_starts(TRUTH, 500, np.random.default_rng(1))
+    off = np.array([start.vector - TRUTH.vector for start in starts])
+    reach = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
+    assert np.all(np.abs(off) <= reach)
+    assert np.all(np.abs(off).max(axis=0) > 0.95 * reach)
+
+
+def test_both_methods_begin_at_the_same_starts_and_with_the_same_matrix() -> None:
+    joint, scans = (fits_from_random_starts(FULL, m) for m in (Method.JOINT, Method.PAPER))
+    assert len(joint) == 20
+    assert [run.start for run in joint] == [run.start for run in scans]
+    assert {run.measurement for run in (*joint, *scans)} == {joint_fit(FULL, 1).measurement}

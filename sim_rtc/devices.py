@@ -16,7 +16,6 @@ from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.drive import MirrorDrive
 from sim_rtc.feed import Feed, OpenLoopFeed
 from sim_rtc.influence import read_influence
-from sim_rtc.mirror import MirrorFaults
 from sim_rtc.motion import MovingOptics
 from sim_rtc.options import Options
 from sim_rtc.phases import PhaseFeed
@@ -36,8 +35,8 @@ def build_plant(
     Raises
     ------
     ConfigurationError
-        If actuators are to fail, or pixels to be binned, on a plant that cannot show it, or the
-        influence functions are not of this mirror.
+        If pixels are to be binned on a plant that cannot, or actuators to fail that the mirror does
+        not have, or the influence functions are not of this mirror.
     """
     faults, binning = options.devices.faults, options.devices.binning
     influence = None
@@ -54,10 +53,9 @@ def build_plant(
             influence=influence,
             binning=binning,
         )
-    if faults != MirrorFaults() or binning > 1:
+    if binning > 1:
         raise ConfigurationError(
-            "--dead-actuators, --stuck-actuators and a binned sensor (--preset) need "
-            "--plant diffractive; found --plant linear"
+            "--preset: a binned sensor needs --plant diffractive; found --plant linear"
         )
     return LinearPlant(
         instrument,
@@ -65,6 +63,7 @@ def build_plant(
         rng=rng,
         imperfections=options.sky.imperfections,
         scene=options.sky.scene,
+        faults=faults,
         influence=influence,
     )
 

@@ -45,7 +45,8 @@ class OpenLoopBlock:
     """``(n_frames, n_slopes)`` what comes in, and noise; n_frames is a multiple of the batch."""
 
     phases_m: Array32
-    """``(n_batches, n_points)`` OPD that comes in at the first frame of each batch."""
+    """``(n_batches, n_points)`` OPD that comes in at the first frame of each batch, what is stuck
+    on the mirror included."""
 
     played_m: Array32 | None = None
     """``(n_frames, n_modes)`` turbulence played on the mirror; None: none is."""
@@ -136,6 +137,8 @@ class OpenLoopFeed:
             now = _linear(self._optics.at(float(time_s[0])))
             if now is not optics:
                 optics, source_slopes = now, self._sources.T @ now.slopes_per_phase.T
+                if now.stuck_opd_m is not None:
+                    source_slopes[-1] += now.slopes_per_phase @ now.stuck_opd_m
             yield self._block(frame, time_s, optics, source_slopes)
             frame += n_frames
 
@@ -156,6 +159,8 @@ class OpenLoopFeed:
         if played is None:
             slopes += turbulence.through(optics.slopes_per_phase)
             phases += turbulence.phases_m(BATCH_FRAMES)
+        if optics.stuck_opd_m is not None:
+            phases += optics.stuck_opd_m
         return OpenLoopBlock(
             first_frame=first_frame,
             optics=optics,

@@ -119,6 +119,32 @@ class TensionedPlate:
         return _tension_kernel(scaled)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnSurface:
+    """The drawing's own influence functions, on actuators that may be switched off.
+
+    A thin plate without one of them bends as the others tell it; a Gaussian is then just missing.
+    """
+
+    mirror: Mirror
+    subaperture_m: float
+
+    def coefficients(self, strokes: Array, free: tuple[int, ...] = ()) -> Array:
+        """Return ``(n_basis, n_shapes)`` weights of the shapes with these strokes."""
+        n = len(self.mirror.positions_m)
+        held = np.setdiff1d(np.arange(n), free)
+        supports = replace(self.mirror, positions_m=self.mirror.positions_m[held])
+        found = mirror_surface(supports, self.subaperture_m).coefficients(strokes[held])
+        n_others = len(found) - len(held)
+        weights = np.zeros((n + n_others, strokes.shape[1]))
+        weights[np.append(held, n + np.arange(n_others))] = found
+        return weights
+
+    def basis(self, points: Array) -> Array:
+        """Return ``(n_points, n_basis)`` of all actuators, those that are off included."""
+        return mirror_surface(self.mirror, self.subaperture_m).basis(points)
+
+
 def _tension_kernel(scaled: Array) -> Array:
     """Return ``-(K0(x) + log x + γ - log 2)``, by its series where the terms would cancel."""
     x = np.maximum(scaled, 1e-12)

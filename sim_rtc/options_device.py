@@ -134,14 +134,14 @@ def _add_mirror(group: argparse._ArgumentGroup) -> None:
         type=arguments.indices,
         default=(),
         metavar="N,N...",
-        help="actuators that are switched off and follow their neighbours (diffractive plant)",
+        help="actuators that are switched off and follow their neighbours",
     )
     group.add_argument(
         "--stuck-actuators",
         type=arguments.stuck_actuator,
         action="append",
         metavar="N:METRES",
-        help="an actuator that stays at this OPD; may be repeated (diffractive plant)",
+        help="an actuator that stays at this OPD; may be repeated",
     )
 
 

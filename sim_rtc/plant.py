@@ -21,7 +21,6 @@ from service.model.interaction import (
     rotation,
     valid_subapertures,
 )
-from service.model.mirror import Surface, mirror_surface
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
@@ -33,9 +32,9 @@ from sim_rtc.imperfections import (
     non_common_path,
     true_sensor,
 )
-from sim_rtc.influence import InfluenceCube, TabulatedSurface
+from sim_rtc.influence import InfluenceCube
 from sim_rtc.loop import ControlTerms, LoopTerms
-from sim_rtc.mirror import misplaced
+from sim_rtc.mirror import DrawnSurface, MirrorFaults, PlantSurface, disobedient, misplaced
 from sim_rtc.scene import Scene
 
 Array = NDArray[np.float64]
@@ -95,6 +94,9 @@ class Optics:
     images: Array
     """``(2, n, 2, n)`` share of the light that every pixel detects, 0 where it is dead."""
 
+    stuck_opd_m: Array32 | None = None
+    """``(n_points,)`` what stuck actuators add; None: none is stuck."""
+
     @property
     def n_slopes(self) -> int:
         """Slopes of a frame."""
@@ -127,6 +129,9 @@ class Optics:
             slopes_per_command=blend(self.slopes_per_command, other.slopes_per_command),
             opd_per_command=blend(self.opd_per_command, other.opd_per_command),
             images=(1.0 - share) * self.images + share * other.images,
+            stuck_opd_m=None
+            if self.stuck_opd_m is None or other.stuck_opd_m is None
+            else blend(self.stuck_opd_m, other.stuck_opd_m),
         )
 
 
@@ -172,6 +177,7 @@ class LinearPlant:
         rng: np.random.Generator,
         imperfections: Imperfections | None = None,
         scene: Scene | None = None,
+        faults: MirrorFaults | None = None,
         influence: InfluenceCube | None = None,
     ) -> None:
         """Take influence functions to use instead of the drawing's."""
@@ -190,12 +196,13 @@ class LinearPlant:
         )
         drawn, width_m = instrument.analytic_mirror, instrument.subaperture_m
         mirror = misplaced(drawn, imperfections.position_error, position_rng)
-        self._surface: Surface | TabulatedSurface = (
-            mirror_surface(mirror, width_m)
+        self._surface: PlantSurface = (
+            DrawnSurface(mirror=mirror, subaperture_m=width_m)
             if influence is None
             else influence.surface(drawn.positions_m, mirror.positions_m, width_m)
         )
-        self._coefficients = self._surface.coefficients(basis.mode_to_actuator)
+        weights = disobedient(self._surface, basis.mode_to_actuator, faults or MirrorFaults())
+        self._weights = np.column_stack(weights)
         self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)
         self._points = distorted(pupil.points, pupil.weights, imperfections)
         self.points_m: Array = self._points * instrument.subaperture_m
@@ -224,7 +231,7 @@ class LinearPlant:
         jacobian = normalised_jacobian(response, self.valid)
         jacobian *= np.float32(2 * np.pi / self._instrument.wfs.wavelength_m)
         jacobian = self.slope_errors.applied(jacobian)
-        modes = self._render(alpha)
+        modes, stuck_opd_m = self._render(alpha)
         matrix = jacobian @ modes
         jacobian += (matrix * (self._gain - 1.0)) @ self._projection(modes)
         return Optics(
@@ -233,6 +240,7 @@ class LinearPlant:
             slopes_per_command=matrix * (self._gain * self._passes),
             opd_per_command=modes * self._passes,
             images=response.images / light,
+            stuck_opd_m=stuck_opd_m * self._passes if stuck_opd_m.any() else None,
         )
 
     def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
@@ -240,16 +248,18 @@ class LinearPlant:
             return (0.0, 0.0)
         return (alpha.shift_x_subap, alpha.shift_y_subap)
 
-    def _render(self, alpha: Misregistration) -> Array32:
+    def _render(self, alpha: Misregistration) -> tuple[Array32, Array32]:
+        """Return the modes ``(n_points, n_modes)`` and what is stuck ``(n_points,)``, seen once."""
         points = self._points
         if self._instrument.stop is Stop.TELESCOPE:
             points = points - alpha.vector[:2]
         on_mirror = points @ rotation(alpha.rotation_rad) / alpha.magnification
         blocks = [
-            self._surface.basis(on_mirror[start : start + _RENDER_ROWS]) @ self._coefficients
+            self._surface.basis(on_mirror[start : start + _RENDER_ROWS]) @ self._weights
             for start in range(0, len(on_mirror), _RENDER_ROWS)
         ]
-        return np.concatenate([block.astype(np.float32) for block in blocks])
+        shapes = np.concatenate([block.astype(np.float32) for block in blocks])
+        return np.ascontiguousarray(shapes[:, :-1]), shapes[:, -1]
 
     def _projection(self, modes: Array32) -> Array32:
         """Return ``(n_modes, n_points)``: least-squares modal content of a phase, by area."""

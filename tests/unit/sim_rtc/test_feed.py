@@ -9,7 +9,8 @@ from service.model.misregistration import Misregistration
 from sim_rtc.atmosphere import Layer, frozen_layers
 from sim_rtc.detector import Detector
 from sim_rtc.feed import Ahead, OpenLoopFeed
-from sim_rtc.imperfections import Imperfections
+from sim_rtc.imperfections import SETS, Imperfections
+from sim_rtc.mirror import MirrorFaults
 from sim_rtc.motion import MovingOptics
 from sim_rtc.plant import LinearPlant
 from sim_rtc.scene import PlayedTurbulence
@@ -222,3 +223,23 @@ def test_a_flexure_is_followed_through_exact_optics(plant):
     truth = np.array([optics.at(t).alpha.shift_x_subap for t in times])
     # Twelve straight pieces (3.4 %) of ten steps, half a step of 3 degrees (2.6 %) either way.
     assert np.abs(truth - 0.1 * np.sin(2 * np.pi * times / 60.0)).max() < 0.1 * (0.034 + 0.027)
+
+
+def test_a_stuck_actuator_is_in_slopes_and_phases(small_instrument, small_basis):
+    def block(faults):
+        plant = LinearPlant(
+            small_instrument,
+            small_basis,
+            rng=np.random.default_rng(1),
+            imperfections=SETS["ideal"],
+            faults=faults,
+        )
+        return next(make_feed(plant, small_instrument, STILL).blocks())
+
+    stuck, free = block(MirrorFaults(stuck=((30, 1e-7),))), block(None)
+    added = stuck.optics.stuck_opd_m
+    np.testing.assert_allclose(stuck.phases_m - free.phases_m, np.tile(added, (50, 1)), atol=1e-11)
+    expected = stuck.optics.slopes_per_phase @ added
+    assert np.abs(expected).max() > 0.01
+    # the same sky and noise, and no optical gain that goes by the modes
+    np.testing.assert_allclose(stuck.slopes - free.slopes, np.tile(expected, (500, 1)), atol=1e-5)

@@ -78,10 +78,16 @@ def test_the_plant_is_the_one_asked_for(small_instrument, small_basis):
     assert isinstance(plant, DiffractivePlant)
 
 
-@pytest.mark.parametrize("given", [["--dead-actuators", "3"], ["--preset", "flao", "--mag", "12"]])
-def test_a_linear_plant_refuses_what_it_cannot_show(small_instrument, small_basis, given):
-    options = parse_options(given)
-    with pytest.raises(ConfigurationError, match="need --plant diffractive; found --plant linear"):
+def test_a_linear_plant_refuses_pixels_it_cannot_bin(small_instrument, small_basis):
+    options = parse_options(["--preset", "flao", "--mag", "12"])
+    with pytest.raises(ConfigurationError, match="needs --plant diffractive; found --plant linear"):
+        build_plant(options, small_instrument, small_basis, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("plant", ["linear", "diffractive"])
+def test_actuators_the_mirror_does_not_have_are_refused(small_instrument, small_basis, plant):
+    options = parse_options(["--plant", plant, "--dead-actuators", "3,500"])
+    with pytest.raises(ConfigurationError, match="found actuator 500"):
         build_plant(options, small_instrument, small_basis, np.random.default_rng(1))
 
 

@@ -5,8 +5,9 @@ import pytest
 
 from service.model.instrument import Stop
 from service.model.interaction import InteractionModel, instrument_pupil
+from service.model.mirror import ThinPlate
 from service.model.misregistration import Misregistration
-from sim_rtc.mirror import misplaced
+from sim_rtc.mirror import MirrorFaults, misplaced
 from sim_rtc.plant import Imperfections, LinearPlant, optical_gain, uneven
 
 ALIGNED = Misregistration()
@@ -101,6 +102,48 @@ def test_the_illumination_is_uneven_by_ten_per_cent(small_instrument):
     assert np.abs(flux - 1).max() == pytest.approx(0.10)
     assert flux @ pupil.weights == pytest.approx(1.0)
     np.testing.assert_array_equal(lit.lit, pupil.lit)
+
+
+def test_a_dead_actuator_is_where_the_others_bend_the_plate(small_instrument, small_basis):
+    """A thin plate without one of its supports: what the service's drawing makes of the others."""
+    held = np.arange(len(small_instrument.mirror.positions_m)) != 30
+    mirror = small_instrument.mirror
+    positions = mirror.positions_m / small_instrument.subaperture_m
+    plate = ThinPlate(positions[held])
+    faulty = LinearPlant(
+        small_instrument,
+        small_basis,
+        rng=np.random.default_rng(1),
+        imperfections=PERFECT,
+        faults=MirrorFaults(dead=(30,)),
+    )
+    points = faulty.points_m / small_instrument.subaperture_m
+    weights = plate.coefficients(small_basis.mode_to_actuator[held])
+    expected = plate.basis(points) @ weights
+    found = faulty.optics(ALIGNED).opd_per_command
+    assert distance(found, expected) < 1e-5
+    assert distance(found, small_basis.render(points)) > 0.01
+
+
+def test_a_stuck_actuator_is_in_the_wavefront_and_follows_no_mode(small_instrument, small_basis):
+    faulty = LinearPlant(
+        small_instrument,
+        small_basis,
+        rng=np.random.default_rng(1),
+        imperfections=PERFECT,
+        faults=MirrorFaults(stuck=((30, 1e-7),)),
+    )
+    optics = faulty.optics(ALIGNED)
+    at = np.argmin(np.hypot(*(faulty.points_m - small_instrument.mirror.positions_m[30]).T))
+    assert optics.stuck_opd_m[at] == pytest.approx(1e-7, rel=0.05)
+    assert np.argmax(optics.stuck_opd_m) in np.flatnonzero(
+        np.hypot(*(faulty.points_m - faulty.points_m[at]).T) < 0.2
+    )
+    healthy = small_basis.render(faulty.points_m / small_instrument.subaperture_m)
+    assert np.abs(optics.opd_per_command[at]).max() < 0.1 * np.abs(healthy[at]).max()
+    near = Misregistration(shift_x_subap=0.02)
+    halfway = optics.towards(faulty.optics(near), 0.5)
+    assert halfway.stuck_opd_m.max() == pytest.approx(1e-7, rel=0.05)
 
 
 def test_a_small_drift_is_linear_between_exact_optics(plant):

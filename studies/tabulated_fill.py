@@ -2,7 +2,8 @@
 
 ``python -m studies.tabulated_fill`` samples the modes of the full telescope on a grid, cuts the
 table at the pupil or at its box, fills what is missing in several ways, and fits the exact matrix
-with it: once with all slopes, once without those within one subaperture of unknown surface.
+with it: once with all slopes, once without those within one subaperture of unknown surface. At the
+end the service's own fit does the same, orientation and all, with the fill it has.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
 from service.model.pyramid import Mapper
+from service.registration.fit import fit_matrix
+from service.registration.options import Fit
+from service.registration.reference import Reference
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -127,6 +131,19 @@ def cases(
             yield end, fill, model(complete(table.cube, known), np.ones_like(known)), knowing
 
 
+def by_the_service(
+    instrument: Instrument, table: Table, pitch_m: float, measured: Array, mapper: Mapper
+) -> Iterator[tuple[str, Fit]]:
+    """Yield end of the table and what ``pyrcal fit`` makes of the matrix with it."""
+    radius = instrument.wfs.pupil_diameter / 2
+    ends = {"at the pupil": table.radius <= radius, "at its box": table.offset <= radius}
+    for end, known in ends.items():
+        cube = np.where(known, table.cube, 0.0)
+        modes = TabulatedModes(cube=cube, pitch_m=pitch_m, known=known)
+        tabulated = replace(instrument, mirror=modes)
+        yield end, fit_matrix(tabulated, Reference(matrix=measured), mapper=mapper)
+
+
 def main() -> None:
     """Print the error of α for every end, fill and truth, with and without the rule."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -155,6 +172,17 @@ def main() -> None:
                 print(
                     f"table ends {end:13s} filled with {fill:19s} {name:24s} all:{texts[0]}   "
                     f"rule:{texts[1]}   ({left} of {model.n_slopes} left out)",
+                    flush=True,
+                )
+        for name, truth in TRUTHS.items():
+            for end, fit in by_the_service(
+                instrument, table, pitch_m, measured[name].astype(np.float64), threads.map
+            ):
+                error = (fit.alpha.vector - truth.vector) * BOUNDARY_SCALE
+                print(
+                    f"table ends {end:13s} the service's fit {name:24s} "
+                    f"{100 * np.hypot(*error[:2]):7.3f} {error[2]:8.4f} {100 * error[3]:8.4f}   "
+                    f"{fit.verdict}",
                     flush=True,
                 )
 

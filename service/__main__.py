@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +22,13 @@ from typing_extensions import override
 from service import __version__
 from service.api import create_app
 from service.archive import Archive
+from service.commands.fit import add_fit_arguments, run_fit
+from service.commands.reconstruct import add_reconstruct_arguments, run_reconstruct
+from service.commands.terminal import with_negative_numbers
 from service.config import Settings, load_instrument, load_settings
 from service.demo import add_demo_arguments, run_demo
 from service.errors import ConfigurationError, PyrcalError
+from service.fits.upload import UploadFitter
 from service.model.instrument import Instrument
 from service.reactions.measurements import MEASUREMENTS_KEPT
 from service.reactions.policy import Policy
@@ -32,6 +36,7 @@ from service.reactions.shelf import restored
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds, Publishing
+from service.runtime.fitting import FitDesk, FitLimits
 from service.runtime.supervisor import Supervisor
 from service.state import TrackerState
 from service.worker import Compute, start_worker
@@ -48,16 +53,19 @@ _OPTIONS = {
 """Command-line options that stand for a settings key."""
 
 
+STOP_WITHIN_S = 3
+"""Requests under way when the service is asked to stop may take this long: an upload would take
+longer."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 refused at the start."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words[:1] == ["sim"]:
         os.execv(sys.executable, [sys.executable, "-m", "sim_rtc", *words[1:]])
-    options = _parser().parse_args(words)
+    options = _parser().parse_args(with_negative_numbers(words))
     try:
-        if options.command == "demo":
-            return run_demo(options)
-        return _run(options)
+        return _COMMANDS[options.command](options)
     except PyrcalError as error:
         sys.stderr.write(f"pyrcal: {error}\n")
         return 2
@@ -85,6 +93,8 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--connect", metavar="ENDPOINT", help="an observatory's own zenoh router")
     run.add_argument("--host", help="of the REST API, default 127.0.0.1")
     run.add_argument("--port", type=int, help="of the REST API, default 8080")
+    add_fit_arguments(commands)
+    add_reconstruct_arguments(commands)
     add_demo_arguments(commands)
     commands.add_parser("sim", help="the simulated RTC: pyrcal sim --help", add_help=False)
     return parser
@@ -114,6 +124,14 @@ def _run(options: argparse.Namespace) -> int:
     return asyncio.run(_serve(settings, instrument))
 
 
+_COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "run": _run,
+    "fit": run_fit,
+    "reconstruct": run_reconstruct,
+    "demo": run_demo,
+}
+
+
 async def _serve(settings: Settings, instrument: Instrument) -> int:
     """Open everything, run until asked to stop or the service fails, close everything."""
     listener = _listener(settings.api.host, settings.api.port)
@@ -128,13 +146,20 @@ async def _serve(settings: Settings, instrument: Instrument) -> int:
         with archive, Bridge(_endpoint(settings, system)) as bridge:
             bridge.expect(instrument.basis_id, instrument.config_id)
             supervisor = _supervisor(settings, instrument, system, bridge, crew, archive)
-            return await _until_stopped(supervisor, listener)
+            desk = _desk(settings, instrument)
+            return await _until_stopped(supervisor, desk, listener)
     finally:
         crew.dismiss()
 
 
-async def _until_stopped(supervisor: Supervisor, listener: socket.socket) -> int:
-    config = uvicorn.Config(create_app(supervisor), log_config=None, access_log=False)
+async def _until_stopped(supervisor: Supervisor, desk: FitDesk, listener: socket.socket) -> int:
+    desk.open()
+    config = uvicorn.Config(
+        create_app(supervisor, desk),
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=STOP_WITHIN_S,
+    )
     server = _Server(config)
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, server.stop)
@@ -147,6 +172,7 @@ async def _until_stopped(supervisor: Supervisor, listener: socket.socket) -> int
     server.should_exit = True
     work.cancel()
     outcomes = await asyncio.gather(work, web, return_exceptions=True)
+    await desk.close()
     for outcome in outcomes:
         _explain(outcome)
     return 1 if failed else 0
@@ -228,6 +254,27 @@ def _supervisor(
         crew=crew,
         archive=archive,
         deeds=deeds,
+    )
+
+
+def _desk(settings: Settings, instrument: Instrument) -> FitDesk:
+    """Return the desk for fits of uploads; an uploaded instrument is read like any other."""
+    most_bytes = settings.fits.upload_limit_mb * 1_000_000
+    return FitDesk(
+        folder=settings.service.data_dir / "uploads",
+        fit=UploadFitter(
+            own=instrument,
+            load_instrument=load_instrument,
+            most_bytes=most_bytes,
+            threads=settings.compute.threads,
+        ),
+        limits=FitLimits(
+            most_bytes=most_bytes,
+            waiting=settings.fits.waiting,
+            seconds=settings.fits.time_limit_s,
+            nice=settings.compute.nice,
+        ),
+        clock_ns=time.time_ns,
     )
 
 

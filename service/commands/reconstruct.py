@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.archive.product import write_whole
-from service.commands.terminal import check_folder, say
+from service.commands.terminal import check_folder, say, show_progress
 from service.config import load_instrument
 from service.control.modal_gains import CalibrationGains
 from service.control.recipe import Method, Provenance, Recipe, Source, reconstruct
@@ -118,7 +118,7 @@ def run_reconstruct(options: argparse.Namespace) -> int:
             detector_nodes=SAMPLING,
             mapper=pool.map,
         )
-        say(f"model: {model.n_slopes} slopes, {model.basis.n_modes} modes")
+        show_progress(f"{model.n_slopes} slopes, {model.basis.n_modes} modes")
         matrix = model.interaction_matrix(known.alpha)
     made = _made(options, known, instrument, model, matrix)
     write_whole(options.output, lambda file: fill_reconstructor(file, made))

@@ -26,8 +26,14 @@ def with_negative_numbers(given: Sequence[str]) -> list[str]:
 
 
 def say(line: str) -> None:
-    """Tell the user how far it is, without touching the answer."""
+    """Tell the user something beside the answer."""
     sys.stderr.write(f"{line}\n")
+
+
+def show_progress(step: str) -> None:
+    """Tell somebody who watches how far it is; a log needs no such lines."""
+    if sys.stderr.isatty():
+        say(f"... {step}")
 
 
 def parsed_by(parse: Callable[[str], Value]) -> Callable[[str], Value]:

@@ -127,7 +127,7 @@ def _kind(begins: bytes) -> str:
         return "a NumPy file"
     if begins.startswith(b"MATLAB 5"):
         return "a MATLAB file older than 7.3"
-    return "neither kind"
+    return "something else"
 
 
 @contextmanager

@@ -82,7 +82,7 @@ def test_a_missing_file_is_said(tmp_path):
         (b"", "an empty file"),
         (b"\x93NUMPY\x01\x00v", "a NumPy file"),
         (b"MATLAB 5.0 MAT-file", "a MATLAB file"),
-        (b"shift,rotation\n", "neither"),
+        (b"shift,rotation\n", "something else"),
     ],
 )
 def test_another_kind_of_file_is_named(tmp_path, content, kind):

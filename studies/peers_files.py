@@ -19,19 +19,22 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listing:
-    """What the instrument file says of the peer's slopes."""
+    """How the peer lists its slopes, and what its user would say of that."""
 
     order: str
-    """``xy`` or ``interleaved``."""
+    """``xy`` or ``interleaved``, as its user would say."""
 
     normalisation: str
     """``global`` or ``local``."""
+
+    rows_first: bool = False
+    """Whether what the peer lists first, and calls x, is the slope along the rows of its mask."""
 
 
 LISTINGS = {
     "oopao": Listing(order="xy", normalisation="global"),
     "hcipy": Listing(order="xy", normalisation="local"),
-    "specula": Listing(order="xy", normalisation="global"),
+    "specula": Listing(order="xy", normalisation="global", rows_first=True),
 }
 
 
@@ -72,8 +75,8 @@ def write_instrument(
     )
 
 
-def turned(measured: Measured) -> Measured:
-    """Return the same matrix as a bench with other habits lists it: interleaved.
+def turned(measured: Measured, listing: Listing) -> Measured:
+    """Return the same matrix as a bench with other habits lists it: interleaved, x first.
 
     The detector is mirrored on its diagonal, its rows are counted from the other end while Sy
     keeps its sign, and every slope has the other sign.
@@ -81,7 +84,9 @@ def turned(measured: Measured) -> Measured:
     n_modes = measured.matrix.shape[1]
     maps = np.zeros((2, *measured.valid.shape, n_modes))
     maps[:, measured.valid] = measured.matrix.reshape(2, -1, n_modes)
-    maps = -maps[::-1].transpose(0, 2, 1, 3)[:, ::-1]
+    # The slope along the rows runs along the columns once the detector is mirrored.
+    by_columns = maps if listing.rows_first else maps[::-1]
+    maps = -by_columns.transpose(0, 2, 1, 3)[:, ::-1]
     valid = np.ascontiguousarray(measured.valid.T[::-1])
     interleaved = maps[:, valid].transpose(1, 0, 2).reshape(-1, n_modes)
     return replace(measured, matrix=interleaved, valid=valid)

@@ -114,7 +114,7 @@ def ask(case: Case, measured: Measured, cube: Array | None, folder: Path) -> lis
 
 def _ask_turned(case: Case, measured: Measured, folder: Path) -> Answer:
     reference, toml = folder / "other-axes.h5", folder / "other-axes.toml"
-    seen = turned(measured)
+    seen = turned(measured, LISTINGS[case.peer])
     write_reference(reference, seen, None)
     listing = Listing(order="interleaved", normalisation=LISTINGS[case.peer].normalisation)
     write_instrument(toml, reference, case, seen, listing, case.stop)

@@ -146,7 +146,7 @@ def test_the_instrument_file_of_every_peer_is_one_that_pyrcal_reads(tmp_path):
 
 
 def test_another_listing_holds_the_same_slopes_of_the_same_subapertures(tmp_path):
-    seen = turned(_measured())
+    seen = turned(_measured(), LISTINGS["oopao"])
     # Subaperture (row 3, column 5): the diagonal makes it (5, 3), rows from the end (24, 3).
     here = np.flatnonzero(np.flatnonzero(_mask()) == 3 * 30 + 5)[0]
     there = np.flatnonzero(np.flatnonzero(seen.valid) == 24 * 30 + 3)[0]
@@ -156,6 +156,17 @@ def test_another_listing_holds_the_same_slopes_of_the_same_subapertures(tmp_path
     write_reference(tmp_path / "r.h5", seen, None)
     with h5py.File(tmp_path / "r.h5") as file:
         assert file["interaction_matrix"].shape == (2 * n, 2)
+
+
+def test_a_peer_that_lists_the_slope_along_the_rows_first_comes_out_x_first_all_the_same():
+    rows_first = replace(LISTINGS["specula"], order="xy")
+    n = int(_mask().sum())
+    exchanged = replace(
+        _measured(), matrix=np.vstack([_measured().matrix[n:], _measured().matrix[:n]])
+    )
+    np.testing.assert_array_equal(
+        turned(exchanged, rows_first).matrix, turned(_measured(), LISTINGS["oopao"]).matrix
+    )
 
 
 def test_quarter_turns_of_the_sensors_axes_are_no_error():

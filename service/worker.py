@@ -27,14 +27,15 @@ from service.control.reconstructor import MAX_CONDITION
 from service.control.regularised import Prior
 from service.errors import ModelError
 from service.estimation import passive
+from service.estimation.edge import Actuators
 from service.estimation.instrumental import Loop, WindowEstimate, fit_window
 from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.noisymatrix import RandomEstimate, fit_random
 from service.estimation.randomdither import Correlated
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, Mirror
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from service.model.modes import modal_basis
+from service.model.modes import ModalBasis, modal_basis
 from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo, working_point
 
@@ -91,6 +92,9 @@ class Description:
     mode_variance_m2: NDArray[np.float64]
     """``(n_modes,)`` expected variance of each mode under the instrument's turbulence."""
 
+    actuators: Actuators | None = None
+    """None: the modes are measured surfaces, and nobody knows the actuators behind them."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Made:
@@ -144,6 +148,7 @@ class Workbench:
             n_slopes=self._model.n_slopes,
             n_modes=self._model.basis.n_modes,
             mode_variance_m2=self._model.basis.variance_m2,
+            actuators=_actuators(self._model),
         )
 
     def fit(
@@ -252,6 +257,13 @@ class Workbench:
     def _linearise(self, alpha: Misregistration) -> Linearisation:
         self._linearisation = self._sensor.linearise(alpha)
         return self._linearisation
+
+
+def _actuators(model: RtcInteractionModel) -> Actuators | None:
+    basis, mirror = model.basis, model.instrument.mirror
+    if not isinstance(basis, ModalBasis) or not isinstance(mirror, Mirror):
+        return None
+    return Actuators(positions=mirror.positions_m, strokes=basis.mode_to_actuator)
 
 
 def _length(estimate: WindowEstimate | RandomEstimate) -> float:

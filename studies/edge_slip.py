@@ -21,7 +21,7 @@ from service.config import load_instrument
 from service.control.edge import Outer, edge_motion_m
 from service.control.reconstructor import invert
 from service.control.stability import pole_radius
-from service.estimation.edge import EdgeHealth, edge_watch, observe_edge
+from service.estimation.edge import Actuators, EdgeHealth, edge_watch, observe_edge
 from service.estimation.frames import FrameBlock
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -90,9 +90,10 @@ def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, f
     coupling = matrix @ model.interaction_matrix(alpha)[:, :n]
     gains = np.full(n, gain * OPTICAL_GAIN)
     eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
-    positions = model.instrument.mirror.positions_m
-    radius = np.hypot(*positions.T)
-    outer = Outer(actuators=model.basis.mode_to_actuator[radius > 0.96 * radius.max()])
+    actuators = Actuators(
+        positions=model.instrument.mirror.positions_m, strokes=model.basis.mode_to_actuator
+    )
+    outer = Outer(actuators=actuators.strokes[actuators.outer])
     motion = edge_motion_m(matrix, coupling, gains, outer, leak=case.leak, delay_frames=2.0)
     return float(pole_radius(eigenvalues, leak=case.leak).max()), motion
 
@@ -105,12 +106,8 @@ def run(case: Case, given: argparse.Namespace) -> Outcome:
         f"--n-controlled {case.n_controlled} --wind {given.wind},40".split()
     )
     basis = karhunen_loeve_basis(instrument)
-    watch = edge_watch(
-        instrument.mirror.positions_m,
-        basis.mode_to_actuator,
-        basis.variance_m2,
-        case.n_controlled,
-    )
+    actuators = Actuators(positions=instrument.mirror.positions_m, strokes=basis.mode_to_actuator)
+    watch = edge_watch(actuators, basis.variance_m2, case.n_controlled)
     if watch is None:
         raise SystemExit(f"{case.n_controlled} modes are too few to watch")
     telescope = build_telescope(options, instrument)

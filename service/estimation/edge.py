@@ -33,6 +33,23 @@ _MEMORY_S = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Actuators:
+    """Where the actuators are, and how far each mode moves them."""
+
+    positions: NDArray[np.float64]
+    """``(n_actuators, 2)`` in any unit."""
+
+    strokes: NDArray[np.float64]
+    """``(n_actuators, n_modes)`` position for a unit command of each mode."""
+
+    @property
+    def outer(self) -> NDArray[np.bool_]:
+        """``(n_actuators,)`` within 4 % of the largest radius: one ring of FLAO's fourteen."""
+        radius = np.hypot(*self.positions.T)
+        return np.asarray(radius > 0.96 * radius.max())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EdgeWatch:
     """Where the actuators of one mirror stand for a modal command, in σ of turbulence."""
 
@@ -60,24 +77,19 @@ class EdgeHealth:
 
 
 def edge_watch(
-    positions: NDArray[np.float64],
-    mode_to_actuator: NDArray[np.float64],
-    mode_variance_m2: NDArray[np.float64],
-    n_controlled: int,
+    actuators: Actuators, mode_variance_m2: NDArray[np.float64], n_controlled: int
 ) -> EdgeWatch | None:
     """Return what to watch; None when the loop controls too few modes to say.
 
-    ``positions`` is ``(n_actuators, 2)`` in any unit; the outermost ring is whatever lies within
-    4 % of the largest radius, one ring of FLAO's fourteen.
+    The same when nothing is known of the turbulence in the modes.
     """
-    if n_controlled <= 2 * LOW_MODES:
-        return None
     used = np.zeros(len(mode_variance_m2))
     used[LOW_MODES:n_controlled] = 1.0
-    expected = np.sqrt(mode_to_actuator**2 @ (used * mode_variance_m2))
-    shapes = (mode_to_actuator * used / expected[:, None]).astype(np.float32)
-    radius = np.hypot(*positions.T)
-    outer = radius > 0.96 * radius.max()
+    expected = np.sqrt(actuators.strokes**2 @ (used * mode_variance_m2))
+    if n_controlled <= 2 * LOW_MODES or expected.min() <= 0.0:
+        return None
+    shapes = (actuators.strokes * used / expected[:, None]).astype(np.float32)
+    outer = actuators.outer
     return EdgeWatch(outer=shapes[outer], inner=shapes[~outer])
 
 

@@ -90,7 +90,7 @@ def decide(
     return state, tuple(effects)
 
 
-_PARALYSING = (*WRONG_RTC, "loop-diverging")
+_PARALYSING = (*WRONG_RTC, "loop-diverging", "edge-slip")
 _Choice = tuple[TrackerState, tuple[Effect, ...]]
 
 

@@ -31,6 +31,14 @@ GAIN_RANGE = (0.1, 3.0)
 mirror is seen twice."""
 
 
+_OUT_OF_HAND = {
+    "loop-diverging": "the loop was diverging",
+    "edge-slip": "the edge had slipped",
+    OFF_LOOP: "the loop was not obeyed, see the alarm commands-off-loop",
+}
+"""Alarms under which no window is believed."""
+
+
 def on_window(
     state: TrackerState, estimate: WindowEstimate, policy: Policy, now_ns: int
 ) -> TrackerState:
@@ -91,10 +99,9 @@ def _why_useless(state: TrackerState, estimate: WindowEstimate) -> str | None:
     """Return why a window's estimate must not be used, or None."""
     if state.rtc is None or estimate.session != state.rtc.session:
         return "the RTC has restarted since"
-    if any(alarm.name == "loop-diverging" for alarm in state.alarms):
-        return "the loop was diverging: its telemetry is no measurement"
-    if any(alarm.name == OFF_LOOP for alarm in state.alarms):
-        return "the commands were off the loop equation: see the alarm"
+    out_of_hand = next((_OUT_OF_HAND[a.name] for a in state.alarms if a.name in _OUT_OF_HAND), None)
+    if out_of_hand is not None:
+        return f"{out_of_hand}: its telemetry is no measurement"
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
         return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"

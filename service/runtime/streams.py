@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation import lockin, loopcheck, passive
+from service.estimation.edge import EdgeHealth, EdgeWatch, edge_watch, observe_edge
 from service.estimation.frames import FrameBlock
 from service.estimation.health import LoopHealth, observe
 from service.estimation.lockin import LockIn, Spectra, WindowRefused
 from service.estimation.loopcheck import LoopCheck, LoopTerms, Obedience
 from service.estimation.passive import Passive
+from service.reactions.journal import OFF_LOOP
 from service.reactions.policy import SETTLING_S, lock_in_plan
 from service.state import DitherView, RtcView
 from service.worker import Description
@@ -50,6 +52,10 @@ class Streams:
 
     passive: Passive | None = None
     health: LoopHealth = field(default_factory=LoopHealth)
+    edge_watch: EdgeWatch | None = None
+    """How the outer ring is watched; None: too few modes are controlled."""
+
+    edge: EdgeHealth = field(default_factory=EdgeHealth)
     matrices: tuple[tuple[str, NDArray[np.float32]], ...] = ()
     """Reconstructors by id, oldest first, bounded."""
 
@@ -67,16 +73,32 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     streams = replace(streams, rtc=rtc)
     if rtc is None:
         return replace(
-            streams, passive=None, lock_in=None, dither=None, check=LoopCheck(), off=None
+            streams,
+            passive=None,
+            lock_in=None,
+            dither=None,
+            check=LoopCheck(),
+            off=None,
+            edge_watch=None,
         )
     if before is not None and _same_loop(before, rtc):
         return streams if before.seq == rtc.seq else _confirmed(streams, rtc)
+    streams = _watching_the_edge(streams, rtc)
     # frames that are on their way may have been made by the loop as it was
     streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None)
     memory = Passive(n_modes=rtc.n_controlled, memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz)
     if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
         return replace(streams, passive=memory, lock_in=None, dither=None)
     return replace(streams, passive=memory, lock_in=_cut(streams.lock_in, rtc))
+
+
+def _watching_the_edge(streams: Streams, rtc: RtcView) -> Streams:
+    """Watch the ring that this loop drives; a loop closed anew begins with a clean slate."""
+    known = streams.description
+    if rtc.loop != "closed" or known.actuators is None:
+        return replace(streams, edge_watch=None, edge=EdgeHealth())
+    watch = edge_watch(known.actuators, known.mode_variance_m2, rtc.n_controlled)
+    return replace(streams, edge_watch=watch)
 
 
 def _cut(lock_in: LockIn | None, rtc: RtcView) -> LockIn | None:
@@ -177,7 +199,11 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
         streams = replace(streams, passive=passive.accumulate(streams.passive, block))
     variance = streams.description.mode_variance_m2
     health = observe(streams.health, block, variance, rtc.n_controlled)
-    return replace(streams, health=health), windows
+    streams = replace(streams, health=health)
+    if streams.edge_watch is not None:
+        edge = observe_edge(streams.edge, block, streams.edge_watch)
+        streams = replace(streams, edge=edge)
+    return streams, windows
 
 
 def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:
@@ -202,6 +228,25 @@ def _obeying(streams: Streams, window: Window) -> Window:
     if found is None or found.holds:
         return window
     return WindowRefused(reason=found.text, t_ns_utc=window.t_end_ns_utc)
+
+
+def troubles(streams: Streams) -> list[tuple[str, str | None, str]]:
+    """Return name, text (None: all is well) and what is said when it is over, of each alarm."""
+    health, edge, off = streams.health, streams.edge, streams.off
+    diverging = (
+        f"the loop is diverging: its high modes carry {health.ratio:.0f} times what turbulence "
+        "asks of them; open the loop, lower the gain or control fewer modes"
+    )
+    slipped = (
+        f"an outer actuator stands {edge.ratio:.0f} sigma from where turbulence would have it: "
+        "the edge has slipped, whatever the slopes say; open the loop and close it again with "
+        "fewer modes or a leak of 0.99"
+    )
+    return [
+        ("loop-diverging", diverging if health.diverging else None, "the high modes are calm"),
+        ("edge-slip", slipped if edge.slipped else None, "the outer ring is back"),
+        (OFF_LOOP, None if off is None else off.text, "commands obey the loop equation again"),
+    ]
 
 
 def _fits(rtc: RtcView, block: FrameBlock) -> bool:

@@ -21,7 +21,7 @@ from service.estimation.lockin import Spectra, WindowRefused
 from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
 from service.reactions.dither import SILENT_S
-from service.reactions.journal import OFF_LOOP, WRONG_RTC
+from service.reactions.journal import WRONG_RTC
 from service.reactions.policy import Policy
 from service.routes.service import Snapshot
 from service.rtc_bridge import Bridge
@@ -33,6 +33,7 @@ from service.runtime.streams import (
     Streams,
     fed,
     shape_mismatch,
+    troubles,
     with_dither,
     with_matrix,
     with_rtc,
@@ -166,7 +167,6 @@ class Supervisor:
     def _feed(self) -> None:
         if self._streams is None:
             return
-        was_diverging = self._streams.health.diverging
         was_silent_s = self._streams.dither_silent_s
         for block in self._bridge.drain():
             self._streams, windows = fed(self._streams, block)
@@ -176,18 +176,10 @@ class Supervisor:
         due = silent_s >= SILENT_S and int(2 * silent_s) > int(2 * was_silent_s)
         if dither is not None and due:
             self._post(ev.DitherSilent(id=dither.id, silent_s=silent_s))
-        health = self._streams.health
-        if health.diverging != was_diverging:
-            text = (
-                f"the loop is diverging: its high modes carry {health.ratio:.0f} times what "
-                "turbulence asks of them; open the loop, lower the gain or control fewer modes"
-            )
-            self._post(ev.Trouble(name="loop-diverging", text=text, over=was_diverging))
-        off = self._streams.off
-        known = any(alarm.name == OFF_LOOP for alarm in self._state.alarms)
-        if (off is not None) is not known:
-            text = "commands obey the loop equation again" if off is None else off.text
-            self._post(ev.Trouble(name=OFF_LOOP, text=text, over=known))
+        for name, trouble, over in troubles(self._streams):
+            known = any(alarm.name == name for alarm in self._state.alarms)
+            if (trouble is not None) is not known:
+                self._post(ev.Trouble(name=name, text=trouble or over, over=known))
 
     def _take(self, window: Spectra | WindowRefused) -> None:
         if isinstance(window, WindowRefused):

@@ -42,6 +42,7 @@ TROUBLES = [
     "basis-mismatch",
     "instrument-mismatch",
     "loop-diverging",
+    "edge-slip",
     "commands-off-loop",
     "other",
 ]

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from service.config.layouts import rings
-from service.estimation.edge import EdgeHealth, EdgeWatch, edge_watch, observe_edge
+from service.estimation.edge import Actuators, EdgeHealth, EdgeWatch, edge_watch, observe_edge
 from service.model.instrument import KarhunenLoeve
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from tests.numerics import block_of, small_instrument
@@ -24,9 +24,13 @@ def basis() -> ModalBasis:
     return karhunen_loeve_basis(small_instrument(n_modes=N_MODES, turbulence=KarhunenLoeve()))
 
 
+def actuators() -> Actuators:
+    return Actuators(positions=rings(1, 5, 0.8), strokes=basis().mode_to_actuator)
+
+
 @cache
 def watch() -> EdgeWatch:
-    found = edge_watch(rings(1, 5, 0.8), basis().mode_to_actuator, basis().variance_m2, N_MODES)
+    found = edge_watch(actuators(), basis().variance_m2, N_MODES)
     assert found is not None
     return found
 
@@ -81,5 +85,8 @@ def test_tip_and_tilt_however_large_are_no_slip():
 
 
 def test_a_loop_of_few_modes_is_not_watched():
-    few = edge_watch(rings(1, 5, 0.8), basis().mode_to_actuator, basis().variance_m2, 60)
-    assert few is None
+    assert edge_watch(actuators(), basis().variance_m2, 60) is None
+
+
+def test_modes_of_which_no_turbulence_is_known_are_not_watched():
+    assert edge_watch(actuators(), np.zeros(N_MODES), N_MODES) is None

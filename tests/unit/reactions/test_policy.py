@@ -8,7 +8,7 @@ from service.reactions.policy import lock_in_plan, plan_dither
 from service.state import MatrixState, Mode
 from tests.unit.reactions.situations import N_MODES, POLICY, START_NS, Story, moved, of_kind, rtc
 
-PARALYSING = ["second-rtc", "basis-mismatch", "instrument-mismatch", "loop-diverging"]
+PARALYSING = ["second-rtc", "basis-mismatch", "instrument-mismatch", "loop-diverging", "edge-slip"]
 
 
 @pytest.fixture

@@ -103,11 +103,14 @@ def test_misaligned_columns_are_an_alarm_until_a_window_is_good_again(story):
     assert "columns-misaligned" not in story.alarms
 
 
-def test_telemetry_of_a_diverging_loop_is_no_measurement(story):
-    story.tell(ev.Trouble(name="loop-diverging", text="it is"))
+@pytest.mark.parametrize(
+    ("alarm", "word"), [("loop-diverging", "diverging"), ("edge-slip", "slipped")]
+)
+def test_telemetry_of_a_loop_out_of_hand_is_no_measurement(story, alarm, word):
+    story.tell(ev.Trouble(name=alarm, text="it is"))
     story.see()
     assert story.state.registration is None
-    assert "diverging" in story.state.log[-1].text
+    assert word in story.state.log[-1].text
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
+from service.estimation.edge import Actuators
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra, WindowRefused
 from service.runtime.streams import (
     Streams,
     fed,
     shape_mismatch,
+    troubles,
     with_dither,
     with_matrix,
     with_rtc,
@@ -295,3 +297,47 @@ class TestADitherThatIsNotThere:
         (window,) = windows
         found = np.abs(window.dither[0, 6]) / (0.25 * window.plan.n_frames) / np.sqrt(2)
         assert found == pytest.approx(5e-9, rel=0.01)
+
+
+N_MANY = 80
+STROKES = np.random.default_rng(4).normal(size=(20, N_MANY))
+RING = Actuators(
+    positions=np.array(
+        [[r * np.cos(t), r * np.sin(t)] for r in (1.0, 2.0) for t in np.arange(10) * 0.628]
+    ),
+    strokes=STROKES,
+)
+MANY = rtc(N_MANY, n_modes=N_MANY, n_slopes=N_SLOPES, gains=(0.4,) * N_MANY)
+
+
+def driven(first_seq, outermost_m):
+    """Frames of turbulence of 10 nm per mode, and the last actuator pushed away."""
+    rng = np.random.default_rng(first_seq)
+    push = np.linalg.lstsq(STROKES[:, 30:], np.eye(20)[19] * outermost_m, rcond=None)[0]
+    commands = 1e-8 * rng.standard_normal((10, N_MANY))
+    commands[:, 30:] += push
+    return replace(
+        block(first_seq, 10, dither=False),
+        commands_m=commands.astype(np.float32),
+        dither_m=None,
+    )
+
+
+def test_an_edge_that_has_slipped_is_named_until_the_loop_is_closed_anew():
+    description = replace(
+        DESCRIPTION, n_modes=N_MANY, mode_variance_m2=np.full(N_MANY, 1e-16), actuators=RING
+    )
+    streams = with_rtc(Streams(description=description), MANY)
+    for first_seq in range(0, 1000, 10):
+        streams, _ = fed(streams, driven(first_seq, 0.0))
+    assert streams.edge_watch is not None
+    assert dict(told(streams))["edge-slip"] is None
+    for first_seq in range(1000, 2000, 10):
+        streams, _ = fed(streams, driven(first_seq, 2e-6))
+    assert "the edge has slipped" in dict(told(streams))["edge-slip"]
+    opened = with_rtc(streams, replace(MANY, loop="open", seq=2000))
+    assert dict(told(opened))["edge-slip"] is None
+
+
+def told(streams):
+    return [(name, text) for name, text, _ in troubles(streams)]

@@ -83,19 +83,27 @@ def measured_by_day(words: str, n_average: int) -> tuple[Array, Telescope]:
 
 
 def registered(
-    model: InteractionModel, measured: Array, start: Misregistration | None = None
+    model: InteractionModel,
+    measured: Array,
+    start: Misregistration | None = None,
+    read: NDArray[np.bool_] | None = None,
 ) -> Registered:
-    """Return the joint fit of α and a gain per mode, each mode weighted by its size."""
+    """Return the joint fit of α and a gain per mode, each mode weighted by its size.
+
+    ``read`` ``(n_slopes,)`` are the slopes that count; None: all.
+    """
     vector = (start or Misregistration()).vector
+    used = slice(None) if read is None else np.flatnonzero(read)
+    measured = measured[used]
     n_modes = measured.shape[1]
     weight = 1.0 / np.einsum("ij,ij->j", measured, measured)
     for _ in range(_N_STEPS):
         linear = model.linearise(Misregistration.from_vector(vector))
-        columns = linear.matrix[:, :n_modes].astype(np.float64)
+        columns = linear.matrix[used, :n_modes].astype(np.float64)
         power = np.einsum("ij,ij->j", columns, columns)
         gains = np.einsum("ij,ij->j", columns, measured) / power
         left = measured - gains * columns
-        jacobian = gains * linear.derivatives[:, :, :n_modes]
+        jacobian = gains * linear.derivatives[:, used, :n_modes]
         jacobian -= columns * (np.einsum("kij,ij->kj", jacobian, columns) / power)[:, None]
         normal = np.einsum("kij,lij,j->kl", jacobian, jacobian, weight, optimize=True)
         vector = vector + np.linalg.solve(

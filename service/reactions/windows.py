@@ -34,7 +34,7 @@ mirror is seen twice."""
 _OUT_OF_HAND = {
     "loop-diverging": "the loop was diverging",
     "edge-slip": "the edge had slipped",
-    OFF_LOOP: "the loop was not obeyed, see the alarm commands-off-loop",
+    OFF_LOOP: "the commands were off the loop equation",
 }
 """Alarms under which no window is believed."""
 

@@ -80,7 +80,7 @@ def bench(diameter_px: float) -> Instrument:
 def centres_px(separation_px: int) -> Array:
     """Return where the images lie, ``(4, 2)`` row and column."""
     side = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
-    return separation_px * (side + 0.5) + OFFSETS_PX - 0.5
+    return np.asarray(separation_px * (side + 0.5) + OFFSETS_PX - 0.5)
 
 
 def exposed(instrument: Instrument, n: int, offsets_px: Array, modes: NDArray[np.intp]) -> Light:

@@ -14,13 +14,14 @@ import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from service.control.edge import Outer
 from service.control.gate import GateVerdict, LoopSettings, judge
 from service.control.recipe import Method, Recipe, reconstruct
 from service.control.reconstructor import MAX_CONDITION
@@ -32,7 +33,7 @@ from service.estimation.instrumental import Loop, WindowEstimate, fit_window
 from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.noisymatrix import RandomEstimate, fit_random
 from service.estimation.randomdither import Correlated
-from service.model.instrument import Instrument, Mirror
+from service.model.instrument import Influence, Instrument, Mirror
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, modal_basis
@@ -239,6 +240,7 @@ class Workbench:
         bound: float,
     ) -> GateVerdict:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
+        loop = replace(loop, outer=_outer(self._model))
         return judge(reconstructor, self._near(alpha), alpha, covariance, loop, bound=bound)
 
     def watch(
@@ -264,6 +266,16 @@ def _actuators(model: RtcInteractionModel) -> Actuators | None:
     if not isinstance(basis, ModalBasis) or not isinstance(mirror, Mirror):
         return None
     return Actuators(positions=mirror.positions_m, strokes=basis.mode_to_actuator)
+
+
+def _outer(model: RtcInteractionModel) -> Outer | None:
+    """Return the outermost ring where a stroke is the height of the surface in metres."""
+    actuators, mirror = _actuators(model), model.instrument.mirror
+    if actuators is None or not isinstance(mirror, Mirror):
+        return None
+    if mirror.influence is not Influence.THIN_PLATE or not mirror.stroke_known:
+        return None
+    return Outer(actuators=actuators.strokes[actuators.outer])
 
 
 def _length(estimate: WindowEstimate | RandomEstimate) -> float:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.edge import Outer, edge_motion_m, why_slippery
 from service.control.stability import pole_radius
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
@@ -34,6 +35,9 @@ class GateVerdict:
     reason: str
     """What the operator should know, and do when it was refused."""
 
+    edge_motion_m: float | None = None
+    """Largest RMS motion of an outer actuator for slope noise of 1, metres; None: not known."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopSettings:
@@ -46,6 +50,9 @@ class LoopSettings:
     delay_frames: float
     optical_gain: float = 1.0
     """How much of the model's response the sensor shows: below 1 on sky, up to 2 in double pass."""
+
+    outer: Outer | None = None
+    """The mirror's outermost ring; None: the modes are measured, it is not known."""
 
 
 def judge(
@@ -61,19 +68,45 @@ def judge(
 
     Tries the estimate and the eight ends of the axes of its 3σ ellipsoid; ``covariance``
     ``(4, 4)`` includes the model-error floor. The bound is never tighter than half-way between
-    the aligned loop and the edge of stability, or a slow loop could never be served at all.
+    the aligned loop and the edge of stability, or a slow loop could never be served at all. A
+    loop that is stable must not let its outer ring slip either: ``service.control.edge``.
     """
     n = len(reconstructor)
     centre = reconstructor @ linearisation.matrix_at(registration)[:, :n]
     slopes = [reconstructor @ derivative[:, :n] for derivative in linearisation.derivatives]
     gains = (loop.gains * loop.optical_gain).astype(np.float32)
-    radii = []
-    for step in _ellipsoid_ends(covariance):
-        moved = centre + np.tensordot(step.astype(np.float32), np.array(slopes), axes=1)
-        eigenvalues = np.linalg.eigvals(gains[:, None] * moved)
-        radii.append(pole_radius(eigenvalues, leak=loop.leak, delay_frames=loop.delay_frames).max())
+    couplings = (
+        centre + np.tensordot(step.astype(np.float32), np.array(slopes), axes=1)
+        for step in _ellipsoid_ends(covariance)
+    )
+    radii = [_worst_pole(coupling, gains, loop) for coupling in couplings]
     aligned = float(pole_radius(gains, leak=loop.leak, delay_frames=loop.delay_frames).max())
-    return _verdict(float(max(radii)), aligned, max(bound, (1.0 + aligned) / 2), len(radii))
+    stable = _verdict(max(radii), aligned, max(bound, (1.0 + aligned) / 2), len(radii))
+    if loop.outer is None or not stable.accepted:
+        return stable
+    motion_m = edge_motion_m(
+        reconstructor,
+        centre,
+        gains.astype(float),
+        loop.outer,
+        leak=loop.leak,
+        delay_frames=loop.delay_frames,
+    )
+    slippery = why_slippery(motion_m, loop.leak)
+    return replace(
+        stable,
+        accepted=slippery is None,
+        reason=slippery or stable.reason,
+        edge_motion_m=motion_m,
+    )
+
+
+def _worst_pole(
+    coupling: NDArray[np.float32], gains: NDArray[np.float32], loop: LoopSettings
+) -> float:
+    eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
+    radii = pole_radius(eigenvalues, leak=loop.leak, delay_frames=loop.delay_frames)
+    return float(radii.max())
 
 
 def _ellipsoid_ends(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -117,6 +117,9 @@ class VerdictView(View):
     reason: str
     """What to know, and to do when it was refused."""
 
+    edge_motion_m: float | None = None
+    """RMS motion of the outermost actuators for slope noise of 1, metres; null: not known."""
+
 
 class ReconstructorView(View):
     """One reconstructor."""

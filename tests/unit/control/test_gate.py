@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from service.control.edge import FORGIVING_LEAK, LIMIT_M, Outer
 from service.control.gate import LoopSettings, judge
 from service.control.reconstructor import invert
 from service.control.stability import pole_radius
@@ -172,3 +175,19 @@ def test_a_reconstructor_of_fewer_modes_is_judged_on_its_own_modes():
     loop = LoopSettings(gains=np.full(10, 0.5), leak=1.0, delay_frames=2.0)
     found = judge(few, small_linearisation(), turned(8.0), np.diag(SIGMA**2), loop, bound=BOUND)
     assert found.worst_pole_radius < verdict(truth=turned(8.0)).worst_pole_radius
+
+
+def with_ring(scale: float, leak: float = 1.0) -> LoopSettings:
+    """The aligned loop with an outer ring that a mode moves by this many metres per metre."""
+    ring = Outer(actuators=scale * np.random.default_rng(1).normal(size=(9, N_CONTROLLED)))
+    return replace(settings(outer=ring), leak=leak)
+
+
+def test_a_stable_loop_whose_edge_would_slip_is_refused_and_a_leak_forgives_it():
+    quiet, loud = verdict(loop=with_ring(0.1)), verdict(loop=with_ring(10.0))
+    assert quiet.accepted
+    assert loud.edge_motion_m == pytest.approx(100.0 * quiet.edge_motion_m)
+    assert loud.edge_motion_m > LIMIT_M > quiet.edge_motion_m
+    assert not loud.accepted
+    assert loud.reason.startswith("its outer ring would slip")
+    assert verdict(loop=with_ring(10.0, FORGIVING_LEAK)).accepted

@@ -80,6 +80,7 @@ def fit_matrix(
     )
     used = basis.subset(usable.reference.columns)
     tell("orientation")
+    instrument = _masked(instrument)
     axes = _axes(instrument, usable, used, options, mapper)
     instrument = oriented(instrument, axes.order, axes.orientation)
     target = target_of(usable.reference, instrument)
@@ -99,6 +100,12 @@ def fit_matrix(
 
 def _silent(_: str) -> None:
     return None
+
+
+def _masked(instrument: Instrument) -> Instrument:
+    """Return the instrument with its mask worked out: every model of the fit asks for it."""
+    mask = rtc_valid_subapertures(instrument)
+    return replace(instrument, wfs=replace(instrument.wfs, valid_subapertures=mask))
 
 
 def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference:

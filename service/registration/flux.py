@@ -30,7 +30,7 @@ _FIRST_STEPS = np.arange(-3.0, 3.1, 1.0)
 
 _PROBE_SUBAP = 0.05
 _SETTLED_SUBAP = 1e-3
-_MOST_STEPS = 20
+_MOST_STEPS = 10
 _LARGEST_STEP_SUBAP = 0.7
 _HUBER = 2.0
 """Residuals beyond so many robust σ count less."""
@@ -38,7 +38,10 @@ _HUBER = 2.0
 _BAD_SIGMA = 6.0
 _BAD_SHARE = 0.25
 """A pixel is bad when it departs from its three companions by so many robust σ and, besides, by
-this share of their light: static aberrations make good ones differ by some per cent."""
+this share of a lit pixel: diffraction and static aberrations make good ones differ."""
+
+_MOST_BAD = 0.03
+"""Share of an image's pixels: beyond it they are not bad, the image is another one."""
 
 _LARGEST_RESIDUAL = 0.25
 """RMS residual over mean light from which the map is no image of this pupil."""
@@ -164,7 +167,9 @@ def mended(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArray
     middle = np.nanmedian(scaled, axis=0)
     difference = scaled - middle
     spread = 1.4826 * np.nanmedian(np.abs(difference))
-    bad = ~(np.abs(difference) <= _BAD_SIGMA * spread + _BAD_SHARE * np.abs(middle))
+    lit = np.nanpercentile(middle, 75.0)
+    bad = ~(np.abs(difference) <= _BAD_SIGMA * spread + _BAD_SHARE * np.maximum(middle, lit))
+    bad &= np.isnan(images) | (bad.mean(axis=(1, 2), keepdims=True) <= _MOST_BAD)
     return np.where(bad, np.nan_to_num(middle) * level[:, None, None], images), bad
 
 

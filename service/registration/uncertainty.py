@@ -16,12 +16,18 @@ from service.registration.projection import Projection
 
 Array = NDArray[np.float64]
 
-MODEL_FLOOR = np.array([1e-4, 1e-4, np.deg2rad(8e-4), 1.7e-4])
+MODEL_FLOOR = np.array([8e-5, 8e-5, np.deg2rad(6e-4), 1.3e-4])
 """1 σ that no matrix is free of: what a mirror of another kind does to a noise-free one."""
 
-REGIONAL_SHARE = np.array([0.45, 0.45, 0.14, 1.15])
+REGIONAL_SHARE = np.array([0.42, 0.42, 0.14, 1.25])
 """Error of the registration over the scatter of the regions of the pupil, by parameter: what pulls
 one region one way pulls another the other way."""
+
+FEW_MODES = 45.0
+"""Number of modes over which errors of the model cease to average out."""
+
+FEW_MODES_EXCESS = 5.0
+"""How much larger their share is with hardly any modes, less 1."""
 
 N_SECTORS, N_RINGS = 12, 3
 MOST_SETS = 8
@@ -90,7 +96,8 @@ def uncertainty(
     from_modes = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
     from_modes = _at_least(from_modes, (spread * noise)[:4, :4])
     regional = _sandwich(spread, _regional_scores(projection, regions))
-    share = REGIONAL_SHARE * np.sqrt(np.diag(regional))
+    few = 1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)
+    share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
     from_model = np.diag(share**2 + MODEL_FLOOR**2)
     steps, covariances = _subsets(normals, held, scores, prior * noise * values, noise)
     scatter = np.zeros((4, 4))

@@ -34,7 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=1)
-    parser.add_argument("--averages", type=int, default=4, help="push-pulls per mode")
+    parser.add_argument("--averages", type=int, default=4, help="push-pulls per mode; 0: no noise")
     parser.add_argument("--truth", default="realistic", help="imperfections of the telescope")
     parser.add_argument("--extra", default="", help="further options of the simulator, in quotes")
     given = parser.parse_args()
@@ -75,6 +75,8 @@ def main() -> None:
 
 def noise_share(measured: Array, counts: Array, valid: NDArray[np.bool_], averages: int) -> float:
     """Return the RMS noise of the matrix over its RMS, from the light alone."""
+    if averages == 0:
+        return 0.0
     slope = np.sqrt(np.mean(noise_of_counts(counts, valid) ** 2))
     element = slope / (STROKE_M * PASSES * np.sqrt(2 * averages))
     return float(element / np.sqrt(np.mean(measured**2)))

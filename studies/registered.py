@@ -18,6 +18,7 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.wire import MeasureRequest, Pattern
 from sim_rtc.assembly import Telescope, build_telescope
+from sim_rtc.diffractive_plant import DiffractiveOptics
 from sim_rtc.measure import Circumstances, product
 from sim_rtc.options import parse_options
 
@@ -50,7 +51,9 @@ def telescope_of(words: str) -> Telescope:
 
 
 def measured_by_day(words: str, n_average: int) -> tuple[Array, Telescope]:
-    """Return a noisy matrix of one pass ``(n_slopes, 400)`` and the telescope it is of.
+    """Return a matrix of one pass ``(n_slopes, 400)`` and the telescope it is of.
+
+    ``n_average`` is the number of pushes and pulls of each mode; 0: as if there were no noise.
 
     Raises
     ------
@@ -58,6 +61,8 @@ def measured_by_day(words: str, n_average: int) -> tuple[Array, Telescope]:
         If the telescope refuses the measurement.
     """
     telescope = telescope_of(f"{words} {_CALM}")
+    if n_average == 0:
+        return noise_free(telescope), telescope
     computer = telescope.computer(iter(telescope.feed.blocks()))
     computer.prepare()
     reply = computer.execute(
@@ -80,6 +85,20 @@ def measured_by_day(words: str, n_average: int) -> tuple[Array, Telescope]:
     if matrix is None:
         raise ValueError(f"measurement: {manifest.reason}")
     return matrix.astype(np.float64) / PASSES, telescope
+
+
+def noise_free(telescope: Telescope) -> Array:
+    """Return the matrix that endless averaging would measure, of one pass."""
+    optics = telescope.optics.at(0.0)
+    if not isinstance(optics, DiffractiveOptics):
+        raise TypeError(f"study: found {type(optics).__name__}; expected --plant diffractive")
+    rng = np.random.default_rng(0)
+    columns = []
+    for mode in range(N_MEASURED):
+        stroke = STROKE_M * optics.opd_per_command[:, mode]
+        push, pull = (optics.slopes(sign * stroke, None, rng) for sign in (1.0, -1.0))
+        columns.append((push - pull).astype(np.float64) / (2 * STROKE_M * PASSES))
+    return np.column_stack(columns)
 
 
 def registered(

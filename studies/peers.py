@@ -17,7 +17,7 @@ import venv
 from pathlib import Path
 
 from studies.peers_cases import Case, bench, cases, digest, job_arrays
-from studies.peers_fits import Answer, ask
+from studies.peers_fits import Answer, ask, kept_answers
 from studies.peers_page import page
 from studies.peers_pushpull import Measured, read_product, write_job
 
@@ -68,6 +68,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--peers", nargs="+", choices=list(REQUIREMENTS), default=None)
     parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument(
+        "--page-only", action="store_true", help="fit nothing: the page of the last run's answers"
+    )
     given = parser.parse_args()
     matrices: list[tuple[Case, Measured]] = []
     answers: list[Answer] = []
@@ -75,8 +78,12 @@ def main() -> int:
         print(f"{case.name}: measuring", file=sys.stderr, flush=True)
         matrix, beside = read_product(measured(case))
         matrices.append((case, matrix))
+        folder = KEPT / "files" / case.name
+        if given.page_only:
+            answers += kept_answers(case, folder)
+            continue
         print(f"{case.name}: fitting", file=sys.stderr, flush=True)
-        answers += ask(case, matrix, beside.get("influence_functions"), KEPT / "files" / case.name)
+        answers += ask(case, matrix, beside.get("influence_functions"), folder)
     given.page.parent.mkdir(parents=True, exist_ok=True)
     given.page.write_text(page(matrices, answers))
     print(given.page)

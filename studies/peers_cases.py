@@ -45,6 +45,9 @@ OTHER_SAMPLES = replace(OTHER, shift_x_subap=-0.75)
 SMALL_SAMPLES = replace(SMALL, shift_x_subap=0.25, shift_y_subap=-0.25)
 """Whole samples, for a peer that cannot move its images by less."""
 
+SMALLEST = (SMALL, SMALL_SAMPLES)
+"""The registrations nearest to perfect."""
+
 _SIZES = {SMALL: "small", LARGE: "large", OTHER: "other"}
 _SIZES |= {SMALL_SAMPLES: "small", OTHER_SAMPLES: "other"}
 

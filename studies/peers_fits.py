@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.model.instrument import Stop
 from service.model.misregistration import PARAMETERS
-from studies.peers_cases import Case, in_degrees
+from studies.peers_cases import SMALLEST, Case, in_degrees
 from studies.peers_files import (
     LISTINGS,
     Listing,
@@ -36,6 +36,10 @@ LIMITS_FEW = np.array([0.005, 0.005, np.inf, np.inf])
 RESIDUAL_LIMIT = 0.02
 
 FEW = "0:20"
+
+KEPT_ANSWERS = "answers.jsonl"
+"""Beside the files that were fitted: what ``pyrcal fit`` said, one line each."""
+
 _TIMEOUT_S = 600.0
 _ACCEPTED_OR_REFUSED = (0, 1)
 
@@ -94,6 +98,7 @@ def ask(case: Case, measured: Measured, cube: Array | None, folder: Path) -> lis
     """Return the answers to all that is asked of one matrix."""
     reference = folder / "reference.h5"
     write_reference(reference, measured, cube)
+    (folder / KEPT_ANSWERS).unlink(missing_ok=True)
     listing = LISTINGS[case.peer]
     right = folder / "instrument.toml"
     write_instrument(right, reference, case, measured, listing, case.stop)
@@ -107,7 +112,7 @@ def ask(case: Case, measured: Measured, cube: Array | None, folder: Path) -> lis
     wrong = folder / "wrong-stop.toml"
     write_instrument(wrong, reference, case, measured, listing, other)
     answers.append(_answer(case, Question.WRONG_STOP, wrong, reference))
-    if case.stop is Stop.MIRROR:
+    if case.stop is Stop.MIRROR and case.alpha not in SMALLEST:
         answers.append(_ask_turned(case, measured, folder))
     return answers
 
@@ -126,14 +131,27 @@ def _answer(case: Case, question: Question, toml: Path, reference: Path, *more: 
     done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
     if done.returncode not in _ACCEPTED_OR_REFUSED:
         raise RuntimeError(f"{case.name}, {question}: pyrcal fit: {done.stderr.strip()}")
-    found = json.loads(done.stdout)
+    found = {"question": question, "accepted": done.returncode == 0, **json.loads(done.stdout)}
+    with (toml.parent / KEPT_ANSWERS).open("a") as kept:
+        print(json.dumps(found), file=kept)
+    return _judged(case, found)
+
+
+def kept_answers(case: Case, folder: Path) -> list[Answer]:
+    """Return the answers of the last run; none where there are none."""
+    kept = folder / KEPT_ANSWERS
+    lines = kept.read_text().splitlines() if kept.exists() else []
+    return [_judged(case, json.loads(line)) for line in lines]
+
+
+def _judged(case: Case, found: dict[str, Any]) -> Answer:
     return Answer(
         case=case,
-        question=question,
+        question=Question(found["question"]),
         error=error(found, in_degrees(case.alpha)),
         sigma=np.array([found["sigma"][name] for name in PARAMETERS], dtype=float),
         residual=float(found["residual_fraction"]),
-        accepted=done.returncode == 0,
+        accepted=bool(found["accepted"]),
         verdict=found["verdict"],
         orientation=found["orientation"],
         seconds=float(found["seconds"]),

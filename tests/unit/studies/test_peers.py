@@ -1,5 +1,6 @@
 """The peers' study: what it tells a peer, and how it judges a fit."""
 
+import json
 from dataclasses import replace
 
 import h5py
@@ -10,7 +11,8 @@ from service.config import load_instrument
 from service.model.instrument import Stop
 from studies.peers_cases import LARGE, Case, bench, cases, digest, mirror_points
 from studies.peers_files import LISTINGS, turned, write_instrument, write_reference
-from studies.peers_fits import Answer, Question, error
+from studies.peers_fits import KEPT_ANSWERS, Answer, Question, error, kept_answers
+from studies.peers_page import page
 from studies.peers_pushpull import (
     Bench,
     Measured,
@@ -209,6 +211,50 @@ def test_an_answer_is_as_asked_when_near_accepted_and_small_in_residual(
         seconds=1.0,
     )
     assert answer.as_asked is as_asked
+
+
+def test_the_answers_of_the_last_run_are_judged_again_from_what_was_said(tmp_path):
+    case = cases("hcipy")[0]
+    assert kept_answers(case, tmp_path) == []
+    four = dict.fromkeys(("shift_x_subap", "shift_y_subap", "rotation_deg", "magnification"), 0.1)
+    said = {
+        "question": "20 lowest",
+        "accepted": True,
+        "shift_x_subap": 0.901,
+        "shift_y_subap": -0.7,
+        "rotation_deg": 2.0,
+        "magnification": 1.02,
+        "sigma": four,
+        "residual_fraction": 0.01,
+        "verdict": "accepted",
+        "orientation": {},
+        "seconds": 3.0,
+    }
+    (tmp_path / KEPT_ANSWERS).write_text(json.dumps(said) + "\n")
+    (answer,) = kept_answers(case, tmp_path)
+    np.testing.assert_allclose(answer.error, [0.001, 0.0, 0.0, 0.0], atol=1e-12)
+    assert answer.question is Question.FEW
+    assert answer.as_asked
+
+
+def test_the_page_tells_the_refusal_of_a_wrong_stop_and_what_was_missed():
+    case = cases("hcipy")[0]
+    right = Answer(
+        case=case,
+        question=Question.ALL,
+        error=np.array([0.0021, 0.0, 0.0, 0.0]),
+        sigma=np.full(4, 1e-3),
+        residual=0.0123,
+        accepted=True,
+        verdict="accepted",
+        orientation={},
+        seconds=1.0,
+    )
+    wrong = replace(right, question=Question.WRONG_STOP, accepted=False, verdict="refused: stop")
+    text = page([(case, _measured())], [right, wrong])
+    assert "| +0.210, +0.000 | +0.0000 | +0.0000 | 0.100 | 1.23% | accepted | **no** |" in text
+    assert "| refused: stop |" in text
+    assert "As asked: 1 of 2." in text
 
 
 def _mask():

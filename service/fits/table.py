@@ -48,8 +48,12 @@ def _registration(fit: Fit) -> Iterator[str]:
     for (name, unit, decimals), value, one, spread in zip(
         _ROWS, values, sigma, scatter, strict=True
     ):
-        numbers = "".join(f"{number:11.{decimals}f}" for number in (value, one, spread))
+        numbers = "".join(_number(number, decimals) for number in (value, one, spread))
         yield f"{name:15s}{numbers}  {unit}"
+
+
+def _number(value: float, decimals: int) -> str:
+    return f"{value:11.{decimals}f}" if np.isfinite(value) else f"{'-':>11s}"
 
 
 def _basis(report: FitReport) -> Iterator[str]:

@@ -229,7 +229,7 @@ async def fit(
 ) -> FitAcceptedView:
     """Fit the registration to the measured interaction matrix that is the body of this request.
 
-    `curl --data-binary @im.h5 ...`. The answer comes as soon as the file is here; the fit runs in
+    `curl -X POST -T im.h5 ...`. The answer comes as soon as the file is here; the fit runs in
     a process of its own, one after the other.
     """
     job = await fits.take(parameters.asked(), _body(request), content_length)

@@ -126,6 +126,8 @@ def _line(error: Mapping[str, Any]) -> str:
     if isinstance(error["input"], bytes):
         return f"{where}: expected JSON with Content-Type: application/json"
     expected = error["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    if expected.startswith("found "):
+        return f"{where}: {expected}"
     return f"{where}: found {error['input']!r:.80}, expected {expected}"
 
 

@@ -144,7 +144,7 @@ class FitDesk:
     def _check_room(self, n_bytes: int | None) -> None:
         most = self._limits.most_bytes
         if n_bytes is not None and n_bytes > most:
-            raise _too_large(n_bytes, most)
+            raise _too_large(f"{n_bytes / 1e6:.0f} MB", most)
         unfinished = sum(job.state in UNFINISHED for job in self._jobs.values())
         if unfinished >= self._limits.waiting:
             raise BusyError(f"found {unfinished} fits unfinished, the most there may be: try later")
@@ -178,7 +178,7 @@ class FitDesk:
                 _check_kind(chunk)
             n_bytes += len(chunk)
             if n_bytes > self._limits.most_bytes:
-                raise _too_large(n_bytes, self._limits.most_bytes)
+                raise _too_large("more", self._limits.most_bytes)
             block += chunk
             if len(block) >= _BLOCK:
                 await flush()
@@ -232,12 +232,11 @@ def _check_kind(first: bytes) -> None:
     if not first.startswith(_BEGINS):
         raise MatrixError(
             f"upload: found a body that begins with {first[:8]!r}, expected an HDF5, FITS or zip "
-            "file (curl --data-binary @FILE)"
+            "file (curl -X POST -T FILE)"
         )
 
 
-def _too_large(found: int, most: int) -> TooLargeError:
+def _too_large(found: str, most: int) -> TooLargeError:
     return TooLargeError(
-        f"upload: found {found / 1e6:.0f} MB or more, expected at most {most / 1e6:.0f} MB "
-        "(fits.upload_limit_mb)"
+        f"upload: found {found}, expected at most {most / 1e6:.0f} MB (fits.upload_limit_mb)"
     )

@@ -15,7 +15,7 @@ from service.fits.figures.sheet import check_plots, write_sheet
 from service.fits.product import fill_fit
 from service.fits.recorded import DATASET
 from service.fits.report import document
-from service.fits.request import parse_alpha, parse_modes
+from service.fits.request import parse_alpha, parse_count, parse_modes
 from service.fits.run import fit_file
 from service.fits.table import table
 from service.registration.options import FitOptions, Method
@@ -72,7 +72,11 @@ def add_fit_arguments(commands: argparse._SubParsersAction[argparse.ArgumentPars
     fit.add_argument("--plot", type=Path, metavar="FILE.png", help="write the paper's figures")
     fit.add_argument("--output", type=Path, metavar="FILE.h5", help="write all that was found")
     fit.add_argument(
-        "--threads", type=int, default=os.cpu_count() or 1, help="default: one for every core"
+        "--threads",
+        type=parsed_by(parse_count),
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="default: one for every core",
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.archive.product import write_whole
-from service.commands.terminal import check_folder, say, show_progress
+from service.commands.terminal import check_folder, parsed_by, say, show_progress
 from service.config import load_instrument
 from service.control.modal_gains import CalibrationGains
 from service.control.recipe import Method, Provenance, Recipe, Source, reconstruct
@@ -27,7 +27,7 @@ from service.fits.product import KnownFit, read_fit
 from service.fits.reconstructor import Reconstructor, fill_reconstructor
 from service.fits.recorded import file_sha256
 from service.fits.report import orientation_words
-from service.fits.request import parse_alpha
+from service.fits.request import parse_alpha, parse_count
 from service.model.instrument import Instrument
 from service.model.modes import modal_basis
 from service.model.rtc import RtcInteractionModel
@@ -60,7 +60,13 @@ def add_reconstruct_arguments(
         help="X,Y,ROT,MAG (subapertures, degrees, ratio), or a file that pyrcal fit wrote with "
         "--json or --output",
     )
-    make.add_argument("--modes", type=int, required=True, metavar="N", help="the first N modes")
+    make.add_argument(
+        "--modes",
+        type=parsed_by(parse_count),
+        required=True,
+        metavar="N",
+        help="the first N modes",
+    )
     make.add_argument("--output", type=Path, required=True, metavar="FILE.h5")
     make.add_argument(
         "--method",

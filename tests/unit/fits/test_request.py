@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from service.fits.request import parse_alpha, parse_modes
+from service.fits.request import parse_alpha, parse_count, parse_modes
 
 
 @pytest.mark.parametrize(
@@ -35,3 +35,10 @@ def test_a_start_is_in_subapertures_degrees_and_ratio():
 def test_another_start_is_refused(text):
     with pytest.raises(ValueError, match="expected X,Y,ROT,MAG"):
         parse_alpha(text)
+
+
+def test_a_count_is_above_zero():
+    assert parse_count("3") == 3
+    for text in ("0", "-1", "1.5", "x", ""):
+        with pytest.raises(ValueError, match="above 0"):
+            parse_count(text)

@@ -7,6 +7,7 @@ from http import HTTPStatus
 from typing import Annotated, Any, Protocol
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from starlette.requests import ClientDisconnect
@@ -16,6 +17,7 @@ from service.fits.jobs import FitAsked, FitJob, FitState
 from service.fits.request import parse_alpha, parse_modes
 from service.registration.options import FitOptions, Method
 from service.routes.problems import INVALID, UNKNOWN, problem_response
+from service.routes.service import ServiceDep
 from service.routes.views import Number, View
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
@@ -93,6 +95,9 @@ class FitParameters(BaseModel):
 
     reference: str | None = Field(default=None, min_length=1, max_length=_TEXT)
     """Name of the measured file in an uploaded zip."""
+
+    measurement: str | None = Field(default=None, min_length=1, max_length=_TEXT)
+    """Id of a matrix the RTC has measured for this service; there is no body then."""
 
     @field_validator("modes")
     @classmethod
@@ -217,12 +222,14 @@ _UPLOAD: dict[str, Any] = {
     status_code=202,
     openapi_extra=_UPLOAD,
     responses={
+        **UNKNOWN,
         413: problem_response("The upload is larger than this service takes"),
         503: problem_response("Too many fits wait already"),
     },
 )
 async def fit(
     request: Request,
+    service: ServiceDep,
     fits: FitsDep,
     parameters: Annotated[FitParameters, Query()],
     content_length: Annotated[int | None, Header(ge=0)] = None,
@@ -230,9 +237,16 @@ async def fit(
     """Fit the registration to the measured interaction matrix that is the body of this request.
 
     `curl -X POST -T im.h5 ...`. The answer comes as soon as the file is here; the fit runs in
-    a process of its own, one after the other.
+    a process of its own, one after the other. `?measurement=ID` fits a matrix the RTC has measured
+    for this service, without a body.
     """
-    job = await fits.take(parameters.asked(), _body(request), content_length)
+    body = _body(request)
+    if parameters.measurement is not None:
+        if content_length:
+            raise MatrixError("found a body beside ?measurement=, expected one of the two")
+        content = await run_in_threadpool(service.measured_file, parameters.measurement)
+        body, content_length = _kept(content), len(content)
+    job = await fits.take(parameters.asked(), body, content_length)
     return FitAcceptedView(id=job.id, links={"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"})
 
 
@@ -256,6 +270,10 @@ async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
         raise MatrixError(job.reason)
     view = FitJobView.model_validate(job)
     return JSONResponse(view.model_dump(mode="json"), status_code=HTTPStatus.ACCEPTED)
+
+
+async def _kept(content: bytes) -> AsyncIterator[bytes]:
+    yield content
 
 
 async def _body(request: Request) -> AsyncIterator[bytes]:

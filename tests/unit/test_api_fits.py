@@ -47,9 +47,18 @@ def desk():
     return FakeDesk()
 
 
+class FakeService:
+    """Has measured one matrix."""
+
+    def measured_file(self, measurement_id):
+        if measurement_id != "im-1":
+            raise UnknownIdError(f"measurement {measurement_id}: no such matrix in the archive")
+        return b"measured"
+
+
 @pytest.fixture
 async def client(desk):
-    transport = httpx.ASGITransport(create_app(object(), desk), raise_app_exceptions=False)
+    transport = httpx.ASGITransport(create_app(FakeService(), desk), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
         yield client
 
@@ -125,6 +134,22 @@ async def test_a_parameter_that_means_nothing_is_named(client, desk, parameters)
 async def test_an_upload_that_is_not_taken_says_why(client, desk, refusal, status, kind):
     desk.refusal = refusal
     assert_problem(await client.post("/v1/fits", content=b"x"), status, kind, str(refusal))
+
+
+async def test_a_matrix_the_rtc_has_measured_needs_no_upload(client, desk):
+    response = await client.post("/v1/fits", params={"measurement": "im-1", "modes": "0:4"})
+    assert response.status_code == 202, response.text
+    assert (desk.body, desk.length) == (b"measured", 8)
+
+
+async def test_a_measurement_nobody_made_is_404(client):
+    response = await client.post("/v1/fits", params={"measurement": "im-2"})
+    assert_problem(response, 404, "unknown-id", "im-2")
+
+
+async def test_a_measurement_and_a_body_are_one_too_many(client):
+    response = await client.post("/v1/fits", params={"measurement": "im-1"}, content=b"file")
+    assert_problem(response, 422, "unusable-matrix", "expected one of the two")
 
 
 async def test_fits_are_listed_with_their_state(client):

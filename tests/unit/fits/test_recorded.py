@@ -4,8 +4,11 @@ import h5py
 import numpy as np
 import pytest
 
+from service.archive import Archive
 from service.errors import MatrixError
 from service.fits.recorded import read_recorded
+from service.state import MeasurementRecord, MeasurePattern, MeasureState
+from service.wire import checksum
 
 MATRIX = np.random.default_rng(1).normal(size=(8, 3))
 
@@ -44,9 +47,25 @@ def test_a_plain_matrix_says_nothing_else(path):
     assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_what_our_archive_writes_is_understood(path):
-    attributes = {"modes": np.array([4, 2, 9]), "double_pass": np.bool_(True)}
-    found = read_recorded(written(path, matrix=MATRIX.astype("<f4"), attributes=attributes))
+def test_what_our_archive_writes_is_understood(tmp_path):
+    matrix = MATRIX.astype(np.float32)
+    record = MeasurementRecord(
+        id="im-1",
+        state=MeasureState.STORED,
+        pattern=MeasurePattern.HADAMARD,
+        modes=(4, 2, 9),
+        amplitude_m=(1e-8,) * 3,
+        n_average=5,
+        n_slopes=8,
+        double_pass=True,
+        sha256=checksum(matrix),
+    )
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        archive.measured.store(record, matrix, "bench")
+    found = read_recorded(tmp_path / "interaction_matrices" / "im-1.h5")
+    assert np.array_equal(found.values, matrix)
     assert found.modes.tolist() == [4, 2, 9]
     assert found.double_pass is True
 

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_rtc.vibration import DAYTIME_LINES
 from studies.heritier2018 import page, paper
+from studies.heritier2018.closed_remarks import noise_remark, shaken_remark, still_remark
 from studies.heritier2018.influence import record_of_registered
 from studies.heritier2018.loops import SETTLING_FRAMES, wavefront_error_nm
-from studies.heritier2018.plan import CLOSED_GAIN, N_MEASURED, Budget, Variant, closed_run
+from studies.heritier2018.plan import (
+    CLOSED_GAIN,
+    N_MEASURED,
+    Budget,
+    Variant,
+    closed_run,
+    hasty,
+)
 from studies.heritier2018.psf import FIELD, OVERSAMPLING, marechal, strehl
 from studies.heritier2018.spectra import smoothed
 from studies.heritier2018.store import Record, Store
@@ -56,6 +64,12 @@ def section(budget: Budget, store: Store) -> page.Section:
     body += _errors_table(budget, store)
     body += _paper_remarks(budget, store)
     body += _pairs_remark(budget, store)
+    body += _noise_table(budget, store)
+    well, in_haste = (
+        np.array([gained_nm(b, store, vibrations=v)[0] for v in (False, True)])
+        for b in (budget, hasty(budget))
+    )
+    body += noise_remark(well, in_haste)
     body += page.picture(
         _spectra_figure(budget, store),
         f"Residual by mode, telescope {budget.seeds[0]}, without and with vibrations. "
@@ -94,11 +108,6 @@ def _with_scatter(values: Array) -> str:
     return f"{values.mean():.1f} ± {values.std(ddof=1):.1f}"
 
 
-def spread_nm(values: Array) -> float:
-    """Return the scatter over telescopes; of a single one, 5 % of its value."""
-    return float(values.std(ddof=1)) if len(values) > 1 else 0.05 * float(values[0])
-
-
 def _paper_remarks(budget: Budget, store: Store) -> str:
     still = errors_nm(budget, store, Variant.TUNED, vibrations=False)
     shaken = errors_nm(budget, store, Variant.TUNED, vibrations=True)
@@ -112,93 +121,54 @@ def beyond_mirror_nm(night: Record) -> float:
     return float(np.sqrt(night["total_nm2"] - night["modal_nm2"].sum()))
 
 
-def still_remark(still: Array, by_night_nm: float, beyond_nm: float) -> str:
-    """Return how the error without vibrations compares with the paper's simulation.
-
-    ``by_night_nm`` is the same loop with all of the turbulence, ``beyond_nm`` the part of that
-    which no mode of the mirror can make.
-    """
-    ours, spread = float(still.mean()), spread_nm(still)
-    quoted = paper.STILL_ERROR
-    away = quoted.distance(ours)
-    text = f"Without vibrations: {ours:.0f} ± {spread:.0f} nm here, {quoted.text} in the paper. "
-    if away <= spread:
-        return page.remark(text + "Within our own spread.", agrees=True)
-    left = quoted.distance(by_night_nm)
-    text += (
-        f"Ours differs by {away:.0f} nm. Played on the mirror, a turbulence holds only what the "
-        f"mirror can make; by night, with the {beyond_nm:.0f} nm that it cannot make, the "
-        f"registered loop with as many modes leaves {by_night_nm:.0f} nm"
-    )
-    if left <= spread:
-        text += ", as in the paper: that is the difference."
-    elif left < 0.5 * away:
-        text += (
-            f", {left:.0f} nm from the paper's: that is most of the difference. The rest is in "
-            "what the paper does not give us: wind, outer scale, frame rate and gains."
-        )
-    else:
-        text += (
-            f", {left:.0f} nm from the paper's: that is not the reason. What the paper does not "
-            "give us differs: wind, outer scale, frame rate and gains."
-        )
-    return page.remark(text, agrees=False)
-
-
-def shaken_remark(still: Array, shaken: Array) -> str:
-    """Return how the error with vibrations compares with the paper's Table 2."""
-    ours, spread = float(shaken.mean()), spread_nm(shaken)
-    quoted = paper.SHAKEN_ERROR
-    away = quoted.distance(ours)
-    more_nm2 = float(np.mean(shaken**2 - still**2))
-    added = float(np.sqrt(max(more_nm2, 0.0)))
-    text = f"With vibrations: {ours:.0f} ± {spread:.0f} nm here, {quoted.text} in the paper. "
-    if away <= spread:
-        return page.remark(text + "Within our own spread.", agrees=True)
-    low = min(quoted.values)
-    needed = float(np.sqrt(max(low**2 - float(np.mean(still**2)), 0.0)))
-    text += (
-        f"The simulated dome ({_shaking()}) adds {added:.0f} nm to the residual; {needed:.0f} nm "
-        "would be needed for the paper's lowest value. How strongly the telescope shook that day "
-        "is not in the paper's tables, so the comparison between reconstructors below is what can "
-        "be checked, not this level."
-    )
-    return page.remark(text, agrees=False)
-
-
-def _shaking() -> str:
-    return ", ".join(
-        f"{line.shape} {line.rms_m * 1e9:.0f} nm at {line.frequency_hz:g} Hz"
-        for line in DAYTIME_LINES
-    )
-
-
 def _pairs_remark(budget: Budget, store: Store) -> str:
-    """Return measured against synthetic, telescope by telescope."""
+    """Return measured against synthetic, telescope by telescope, and 500 modes."""
     text, good = "", True
     for vibrations in (False, True):
-        measured = errors_nm(budget, store, Variant.MEASURED, vibrations=vibrations)
-        synthetic = errors_nm(budget, store, Variant.TUNED, vibrations=vibrations)
-        gained = measured - synthetic
+        gained = gained_nm(budget, store, vibrations=vibrations)
         good &= bool(np.all(gained >= 0.0))
-        listed = ", ".join(f"{value:+.1f}" for value in gained)
+        listed = ", ".join(f"{value:+.2f}" for value in gained)
         word = "with" if vibrations else "without"
-        text += f"Measured less synthetic {word} vibrations, by telescope: {listed} nm. "
+        text += f"Measured less synthetic (gains tuned) {word} vibrations: {listed} nm. "
     text += (
-        "The synthetic matrix is not worse on any of them; it carries no measurement noise."
+        "The synthetic matrix is not worse on any telescope. "
         if good
         else "The synthetic matrix is worse on some: there the model's error costs more than the "
-        "noise of the measurement does."
+        "noise of the measurement does. "
     )
     more = errors_nm(budget, store, Variant.MORE, vibrations=True)
     tuned = errors_nm(budget, store, Variant.TUNED, vibrations=True)
     better = float(np.mean(tuned - more))
     stable = bool(np.all(more < 2.0 * tuned))
     text += (
-        f" 500 modes with the synthetic matrix, 100 beyond any that was measured, "
+        f"500 modes with the synthetic matrix, 100 beyond any that was measured, "
         f"{'hold' if stable else 'do not hold'}: {better:+.1f} nm better on average."
     )
     return page.remark(text, agrees=good and stable)
+
+
+def gained_nm(budget: Budget, store: Store, *, vibrations: bool) -> Array:
+    """Return what the synthetic matrix, gains tuned, gains on the measured one, nm."""
+    measured = errors_nm(budget, store, Variant.MEASURED, vibrations=vibrations)
+    return measured - errors_nm(budget, store, Variant.TUNED, vibrations=vibrations)
+
+
+def _noise_table(budget: Budget, store: Store) -> str:
+    """Return the same with a matrix measured well and measured in haste, first telescope."""
+    head = ["pushes and pulls of a mode", "vibrations", "measured [nm]", "synthetic [nm]", "gained"]
+    first = replace(budget, seeds=budget.seeds[:1])
+    rows = []
+    for measured in dict.fromkeys((first, hasty(budget))):
+        for vibrations in (False, True):
+            pair = [
+                float(errors_nm(measured, store, variant, vibrations=vibrations)[0])
+                for variant in (Variant.MEASURED, Variant.TUNED)
+            ]
+            cells = [*(f"{value:.1f}" for value in pair), f"{pair[0] - pair[1]:+.1f}"]
+            rows.append([str(measured.n_average), "on" if vibrations else "off", *cells])
+    return page.heading("What the noise of the measured matrix costs") + page.table(
+        head, rows, words=(1,)
+    )
 
 
 def _spectra_figure(budget: Budget, store: Store) -> Figure:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -80,6 +80,11 @@ QUICK = Budget(
     n_starts=2,
     every=4,
 )
+
+
+def hasty(budget: Budget) -> Budget:
+    """Return the same with every mode pushed and pulled only once, on the first telescope."""
+    return replace(budget, n_average=1, seeds=budget.seeds[:1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,6 +236,10 @@ def every_task(budget: Budget) -> tuple[Task, ...]:
     for seed in budget.seeds:
         for vibrations in (False, True):
             tasks += [closed_run(budget, seed, v, vibrations=vibrations) for v in Variant]
+    for vibrations in (False, True):
+        for variant in (Variant.MEASURED, Variant.TUNED):
+            brief = hasty(budget)
+            tasks.append(closed_run(brief, brief.seeds[0], variant, vibrations=vibrations))
     tasks += influence_runs(budget)
     for method in (Method.JOINT, Method.PAPER):
         tasks += fits_from_random_starts(budget, method)

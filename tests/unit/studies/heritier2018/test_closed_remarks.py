@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from studies.heritier2018 import paper
-from studies.heritier2018.closed import shaken_remark, spread_nm, still_remark
+from studies.heritier2018.closed_remarks import noise_remark, shaken_remark, spread_nm, still_remark
 
 
 def test_a_value_between_two_of_the_papers_is_no_distance_away() -> None:
@@ -32,3 +32,9 @@ def test_a_dome_that_shakes_less_says_how_much_more_the_paper_needs() -> None:
     text = shaken_remark(still, shaken)
     assert "adds 75 nm" in text
     assert f"{np.sqrt(195**2 - 100**2):.0f} nm would be needed" in text
+
+
+def test_noise_is_named_as_the_reason_only_where_more_of_it_gains_more() -> None:
+    well = np.array([0.2, 0.5])
+    assert "grows with it" in noise_remark(well, np.array([4.0, 9.0]))
+    assert "not what separates" in noise_remark(well, np.array([0.3, 0.6]))

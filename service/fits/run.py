@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,8 +15,8 @@ from service.errors import MatrixError
 from service.fits.fingerprint import instrument_sha256
 from service.fits.recorded import FLUX_FRAME, Recorded, read_recorded
 from service.fits.report import FitReport
-from service.model.instrument import Instrument
-from service.model.windows import slopes_from_frames
+from service.model.instrument import FrameWindows, Instrument
+from service.model.windows import frame_windows, slopes_from_frames
 from service.registration.fit import fit_matrix
 from service.registration.options import FitOptions
 from service.registration.reference import Reference
@@ -86,13 +86,26 @@ def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference,
     frames = recorded.values.ndim == 3
     if frames and recorded.noise is not None:
         notes.append("the noise in the measured file is of frames, not of slopes: not used")
+    matrix = _slopes(recorded, instrument)
+    if instrument.frames is not None and recorded.flux_frame is not None:
+        notes.extend(_windows_note(instrument, instrument.frames, recorded.flux_frame))
     reference = Reference(
-        matrix=_slopes(recorded, instrument),
+        matrix=matrix,
         modes=recorded.modes,
         noise=None if frames else recorded.noise,
         double_pass=double_pass,
     )
     return reference, tuple(notes)
+
+
+def _windows_note(
+    instrument: Instrument, frames: FrameWindows, flux_frame: NDArray[np.float64]
+) -> Iterator[str]:
+    """Yield where the pupil images were found, where the instrument does not tell."""
+    if frames.centres_px is None:
+        centres = frame_windows(instrument, flux_frame).centres_px.reshape(4, 2)
+        words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in centres)
+        yield f"shifts count from the pupil images as found: pupil_centres_px = [{words}]"
 
 
 def _slopes(recorded: Recorded, instrument: Instrument) -> NDArray[np.float64]:

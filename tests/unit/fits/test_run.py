@@ -161,3 +161,11 @@ def test_an_instrument_that_delivers_frames_needs_them(camera):
 def test_frames_need_the_mean_frame(camera, cube):
     with pytest.raises(MatrixError, match="found no flux_frame"):
         reference_of(replace(read_recorded(cube), flux_frame=None), camera)
+
+
+def test_where_pupil_images_were_found_is_told(camera, cube):
+    auto = replace(camera, frames=FrameWindows())
+    reference, notes = reference_of(read_recorded(cube), auto)
+    assert reference.matrix.shape == (224, N_MODES)
+    assert "pupil_centres_px = [[8." in notes[0]
+    assert not reference_of(read_recorded(cube), camera)[1]

@@ -48,6 +48,7 @@ def measured(case: Case) -> Path:
     folder = KEPT / case.peer
     kept = folder / f"{case.name}-{digest(case, REQUIREMENTS[case.peer])}.npz"
     if not kept.exists():
+        print(f"{case.name}: measuring", file=sys.stderr, flush=True)
         interpreter = environment(case.peer)
         job = folder / f"{case.name}-job.npz"
         write_job(job, bench(case), **job_arrays(case))
@@ -75,7 +76,6 @@ def main() -> int:
     matrices: list[tuple[Case, Measured]] = []
     answers: list[Answer] = []
     for case in (case for peer in given.peers or REQUIREMENTS for case in cases(peer)):
-        print(f"{case.name}: measuring", file=sys.stderr, flush=True)
         matrix, beside = read_product(measured(case))
         matrices.append((case, matrix))
         folder = KEPT / "files" / case.name

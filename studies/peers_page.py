@@ -26,7 +26,7 @@ shift as well: OOPAO by tilting the pyramid's faces, HCIPy by moving the detecto
 the pupil by whole samples. "own mirror" is OOPAO's own: Gaussian influence functions moved by its
 `MisRegistration`; pyrcal has them only as a cube at perfect registration, which ends with the
 pupil's square. "as shipped": OOPAO's binary pupil, and 3 λ/D by its own count (3.025 λ/D);
-elsewhere every peer has the same grey pupil.
+elsewhere every peer has the same grey pupil. Seconds are wall time on a machine that was busy.
 """
 
 _READING = """
@@ -45,6 +45,22 @@ _TURNED = """
 
 The same matrices as a bench with other habits would list them: detector mirrored on its diagonal,
 rows counted from the other end while Sy keeps its sign, all signs turned, slopes interleaved.
+"""
+
+
+_HABITS = """
+## What the peers do differently
+
+- OOPAO 1.0.0: slopes of the other sign than ours; pupil binary; its modulation tilts rise by λ from
+  the first sample to the last, so that 3 λ/D are 3 n / (n - 1). The binary pupil, not the pyramid,
+  makes most of the residual as shipped.
+- HCIPy 0.7.1: images turned by half a turn, slopes normalised in each subaperture; the subsampling
+  of its detector is never applied at read-out, the study sums the pixels itself.
+- SPECULA 1.1.0: what it calls x runs along the rows of its mask. The instrument file says what its
+  user would say, order "xy"; the fit finds and reports "yx". Its `pup_shifts` add an eighth of a
+  subaperture and stretch the images by 0.3 %, the faces of its `pyr_tlt_coeff` no longer meet: the
+  study moves the pupil instead. At its own thresholds its pupil finder takes diffracted light for
+  pupil: the study raises them.
 """
 
 
@@ -69,6 +85,8 @@ def page(matrices: Sequence[tuple[Case, Measured]], answers: Sequence[Answer]) -
         "\n",
         _wrong_table(wrong),
         f"\nAs asked: {reached} of {len(answers)}.\n",
+        _worst(straight + turned),
+        _HABITS,
         _refusals(straight + turned),
     ]
     return "".join(parts)
@@ -147,6 +165,20 @@ def _wrong_table(answers: Sequence[Answer]) -> str:
             for answer in answers
         ),
     )
+
+
+def _worst(answers: Sequence[Answer]) -> str:
+    """Return by how many σ the fits are off: whether σ covers what codes differ by."""
+    if not answers:
+        return ""
+    ratios = np.array([np.abs(answer.error) / answer.sigma for answer in answers])
+    rms = np.sqrt(np.mean(ratios**2, axis=0))
+    worst = ratios.max(axis=0)
+    told = ", ".join(
+        f"{name} {a:.1f} ({b:.1f})"
+        for name, a, b in zip(("x", "y", "rotation", "magnification"), rms, worst, strict=True)
+    )
+    return f"\nErrors over the σ that the fits claim, RMS (largest): {told}.\n"
 
 
 def _refusals(answers: Sequence[Answer]) -> str:

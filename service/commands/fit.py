@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from service.archive.product import write_whole
 from service.commands.terminal import check_folder, parsed_by, say, show_progress
 from service.config import load_instrument
 from service.fits.figures.sheet import check_plots, write_sheet
+from service.fits.light import read_light
 from service.fits.product import fill_fit
 from service.fits.recorded import DATASET
 from service.fits.report import document
@@ -66,6 +68,13 @@ def add_fit_arguments(commands: argparse._SubParsersAction[argparse.ArgumentPars
         metavar="X,Y,ROT,MAG",
         help="where to begin: subapertures, degrees, ratio",
     )
+    fit.add_argument(
+        "--flux-map",
+        type=Path,
+        metavar="FILE",
+        help="mean counts of the four pupil images, array flux (4, n, n): the model is lit as it "
+        "says",
+    )
     fit.add_argument("--gain-map", action="store_true", help="fit a gain over the pupil, too")
     fit.add_argument("--anamorphosis", action="store_true", help="fit a stretched image, too")
     fit.add_argument("--json", action="store_true", help="print one JSON object, not a table")
@@ -93,12 +102,14 @@ def run_fit(options: argparse.Namespace) -> int:
     for path in (options.plot, options.output):
         check_folder(path)
     instrument = load_instrument(options.instrument)
+    light = None if options.flux_map is None else read_light(options.flux_map, instrument)
     asked = FitOptions(
         method=options.method,
         modes=options.modes,
         start=options.start,
         gain_map=options.gain_map,
         anamorphosis=options.anamorphosis,
+        illumination=None if light is None else light.illumination,
     )
     report = fit_file(
         instrument,
@@ -108,6 +119,8 @@ def run_fit(options: argparse.Namespace) -> int:
         threads=options.threads,
         progress=show_progress,
     )
+    if light is not None:
+        report = replace(report, notes=(*report.notes, light.note))
     if options.json:
         print(json.dumps(document(report), allow_nan=False))
         for note in report.notes:

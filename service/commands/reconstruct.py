@@ -23,6 +23,7 @@ from service.control.reconstructor import MAX_CONDITION
 from service.control.regularised import Prior
 from service.errors import ConfigurationError, MatrixError
 from service.fits.fingerprint import instrument_sha256
+from service.fits.light import read_light
 from service.fits.product import KnownFit, read_fit
 from service.fits.reconstructor import Reconstructor, fill_reconstructor
 from service.fits.recorded import file_sha256
@@ -92,6 +93,9 @@ def add_reconstruct_arguments(
         help="leave the columns as the model has them; by default they take the gains of the fit",
     )
     make.add_argument(
+        "--flux-map", type=Path, metavar="FILE", help="as of pyrcal fit: the model is lit like it"
+    )
+    make.add_argument(
         "--reference", type=Path, metavar="FILE", help="the measured matrix, for its checksum"
     )
 
@@ -116,12 +120,14 @@ def run_reconstruct(options: argparse.Namespace) -> int:
         say(f"note: {options.instrument} has changed since {known.origin} was fitted with it")
     known = replace(known, instrument_sha256=found)
     instrument = _oriented(described, known)
+    light = None if options.flux_map is None else read_light(options.flux_map, instrument)
     with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         model = RtcInteractionModel(
             instrument,
             modal_basis(instrument),
             pupil_sampling=SAMPLING,
             detector_nodes=SAMPLING,
+            illumination=None if light is None else light.illumination,
             mapper=pool.map,
         )
         show_progress(f"{model.n_slopes} slopes, {model.basis.n_modes} modes")
@@ -220,6 +226,7 @@ def _made(
             covariance=known.covariance,
             gains=gains,
             reference_sha256=known.reference_sha256,
+            measured_illumination=options.flux_map is not None,
             reference_passes=None if known.double_pass is None else 1 + known.double_pass,
         ),
         circumstances={

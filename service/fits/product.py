@@ -67,6 +67,7 @@ def provenance(report: FitReport) -> dict[str, Any]:
         "method": str(report.method),
         "verdict": report.fit.verdict,
         "accepted": report.fit.accepted,
+        "notes": "\n".join(report.notes),
         "software": f"pyrcal {__version__}",
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
     }

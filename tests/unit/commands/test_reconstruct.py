@@ -133,6 +133,22 @@ def test_the_json_of_a_fit_will_do():
         assert "calibration_gains" not in file, "JSON does not say which modes the gains belong to"
 
 
+def test_a_model_lit_as_a_flux_map_says_says_so():
+    counts = np.zeros((4, 12, 12))
+    y, x = np.mgrid[:12, :12] - 5.5
+    counts[:] = 1000.0 * (np.hypot(x, y) < 6.0) * (1.0 + 0.02 * x)
+    with h5py.File("flux.h5", "w") as file:
+        file["flux"] = counts
+    with made(kept(a_tiny_report())) as file:
+        even = file["interaction_matrix"][()]
+        assert not file.attrs["measured_illumination"]
+    Path("cm.h5").unlink()
+    with made("fit.h5", "--flux-map", "flux.h5") as file:
+        lit = file["interaction_matrix"][()]
+        assert file.attrs["measured_illumination"]
+    assert 0.005 < np.linalg.norm(lit - even) / np.linalg.norm(even) < 0.2
+
+
 def test_an_instrument_that_has_changed_since_is_said(capsys):
     report = a_report(a_tiny_report().fit, instrument_sha256="0" * 64)
     made(kept(report)).close()

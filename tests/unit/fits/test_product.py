@@ -33,12 +33,13 @@ def test_the_file_holds_what_json_cannot(path):
 
 
 def test_the_file_says_where_it_comes_from_and_holds_the_document(path):
-    report = a_report()
+    report = a_report(notes=("the model is lit as the flux map says",))
     with h5py.File(written(path, report), "r") as file:
         assert json.loads(file.attrs["document"]) == document(report)
         assert file.attrs["reference_sha256"] == "2" * 64
         assert file.attrs["instrument_sha256"] == "1" * 64
         assert file.attrs["double_pass"]
+        assert "flux map" in file.attrs["notes"]
         assert file.attrs["rotation_deg"] == pytest.approx(65.08)
 
 

@@ -1,4 +1,4 @@
-"""From how far away does a fit find the registration, and does it ever believe a false one?
+"""How far away a fit finds the registration from, and whether it ever believes a false one.
 
 Random starts about the truth of a few measured matrices of the diffractive telescope by day, each
 through the whole search of the joint fit. What a start leads to is fitted on the fine grid and

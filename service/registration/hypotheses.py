@@ -35,7 +35,7 @@ def rivals(bench: Bench, target: Target, solution: Solution) -> dict[str, float]
 
     def left(matrix: NDArray[Any]) -> float:
         seen = project(matrix, derivatives, few)
-        step = np.linalg.solve(seen.normal(slice(None)), seen.scores.sum(axis=1))
+        step = np.linalg.solve(seen.normal, seen.scores.sum(axis=1))
         return seen.chi - float(step @ seen.scores.sum(axis=1))
 
     bench.counter.n += 1

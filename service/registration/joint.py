@@ -88,7 +88,7 @@ def approach(model: InteractionModel, target: Target, start: Array, counter: Cou
         here = Misregistration.from_vector(vector)
         counter.n += 4
         seen = project(model.interaction_matrix(here), model.derivatives(here), target)
-        normal = seen.normal(slice(None))
+        normal = seen.normal
         scale = np.sqrt(np.diag(normal))
         damped = normal + np.diag(1e-6 * scale**2)
         step = np.linalg.solve(damped, seen.scores.sum(axis=1))
@@ -187,7 +187,7 @@ def _bounded_step(seen: Projection, values: Array, sigma: Array) -> tuple[Array,
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
     prior = prior_of(sigma) * noise
     pull = prior * np.concatenate([np.zeros(4), values])
-    normal = seen.normal(slice(None)) + np.diag(prior)
+    normal = seen.normal + np.diag(prior)
     step = np.linalg.solve(normal, seen.scores.sum(axis=1) - pull)
     step /= max(1.0, float(np.max(np.abs(step[:4]) / LONGEST_STEP)))
     return step[:4], step[4:]

@@ -49,15 +49,18 @@ class Projection:
         along = np.einsum("ksm,sm->km", self.jacobian, self.residual)
         return np.asarray(along * self.weights)
 
-    def normal(self, modes: slice | NDArray[np.intp]) -> Array:
-        """Return the normal matrix ``(n_unknowns, n_unknowns)`` of some of the modes."""
-        picked = self.jacobian[:, :, modes] * np.sqrt(self.weights[modes])
+    @property
+    def normal(self) -> Array:
+        """Normal matrix of all modes together, ``(n_unknowns, n_unknowns)``."""
+        picked = self.jacobian * np.sqrt(self.weights)
         flat = picked.reshape(len(picked), -1)
         return np.asarray(flat @ flat.T)
 
-    def normals(self, n_sets: int) -> Array:
-        """Return the normal matrices ``(n_sets, n_unknowns, n_unknowns)`` of interleaved sets."""
-        return np.array([self.normal(slice(k, None, n_sets)) for k in range(n_sets)])
+    @property
+    def normals(self) -> Array:
+        """Normal matrix of every mode, ``(n_modes, n_unknowns, n_unknowns)``."""
+        by_mode = self.jacobian.transpose(2, 0, 1)
+        return np.asarray(by_mode @ by_mode.transpose(0, 2, 1) * self.weights[:, None, None])
 
 
 def project(model: NDArray[Any], derivatives: NDArray[Any], target: Target) -> Projection:

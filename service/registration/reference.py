@@ -20,6 +20,10 @@ PLAUSIBLE = 1e-4
 reciprocal the unit is another one: nanometres and micrometres are 1e-9 and 1e-6."""
 
 
+_UNIT_DECADES = 1.5
+"""Powers of ten around a unit that are still recognised as it."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reference:
     """A measured interaction matrix in the RTC's own order, axes and signs."""
@@ -162,8 +166,10 @@ def _check_unit(matrix: Array, wavelength_m: float) -> None:
     typical = float(np.median(np.sqrt(np.mean(matrix**2, axis=0)))) * wavelength_m
     if PLAUSIBLE < typical < 1.0 / PLAUSIBLE:
         return
-    power = -9 if abs(np.log10(typical) + 9) < 3 else -6 if abs(np.log10(typical) + 6) < 1.5 else 0
-    unit = {-9: "nanometre", -6: "micrometre"}.get(power, "")
+    distance = {"nanometre": np.log10(typical) + 9, "micrometre": np.log10(typical) + 6}
+    unit = min(distance, key=lambda name: abs(distance[name]))
+    if abs(distance[unit]) > _UNIT_DECADES:
+        unit = ""
     hint = f": it looks like slope per {unit}" if unit else ""
     raise MatrixError(
         f"reference: found {typical / wavelength_m:.3g} as the typical slope per metre{hint}; "

@@ -29,6 +29,9 @@ FEW_MODES = 45.0
 FEW_MODES_EXCESS = 5.0
 """How much larger their share is with hardly any modes, less 1."""
 
+FEW_MODES_POWER = np.array([1.0, 1.0, 1.0, 0.5])
+"""By parameter: the magnification feels it less."""
+
 N_SECTORS, N_RINGS = 12, 3
 MOST_SETS = 8
 LEAST_PER_SET = 3
@@ -88,7 +91,7 @@ def uncertainty(
     """
     n_modes = len(projection.gains)
     n_sets = min(MOST_SETS, n_modes // LEAST_PER_SET)
-    normals = projection.normals(max(n_sets, 1))
+    normals = projection.normals
     noise = projection.chi / max(projection.residual.size - len(prior) - n_modes, 1)
     held = np.diag(prior * noise)
     spread = np.linalg.inv(normals.sum(axis=0) + held)
@@ -96,10 +99,11 @@ def uncertainty(
     from_modes = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
     from_modes = _at_least(from_modes, (spread * noise)[:4, :4])
     regional = _sandwich(spread, _regional_scores(projection, regions))
-    few = 1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)
+    few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
     share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
     from_model = np.diag(share**2 + MODEL_FLOOR**2)
-    steps, covariances = _subsets(normals, held, scores, prior * noise * values, noise)
+    pull = prior * noise * values
+    steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
     scatter = np.zeros((4, 4))
     if n_sets > 1:
         scatter = np.diag(steps.var(axis=0, ddof=1) / n_sets)
@@ -145,14 +149,21 @@ def _regional_scores(projection: Projection, regions: NDArray[np.intp]) -> Array
 
 
 def _subsets(
-    normals: Array, held: Array, scores: Array, pull: Array, noise: float
+    n_sets: int, normals: Array, held: Array, scores: Array, pull: Array, noise: float
 ) -> tuple[Array, Array]:
-    """Return the step of every set of modes ``(n_sets, 4)`` and its covariance."""
-    n_sets = len(normals)
+    """Return the step of every set of modes ``(n_sets, 4)`` and its covariance.
+
+    The covariance of a set is from how its modes scatter about the set's own solution: about the
+    common one, sets that agree within themselves and not with each other would hide it.
+    """
     steps, covariances = [], []
-    for k, normal in enumerate(normals):
-        spread = np.linalg.inv(normal + held)
-        own = scores[:, k::n_sets]
-        steps.append((spread @ (own.sum(axis=1) - pull))[:4])
-        covariances.append(_at_least(_sandwich(spread, own), (spread * noise)[:4, :4]))
+    for k in range(n_sets):
+        own, scored = normals[k::n_sets], scores[:, k::n_sets]
+        spread = np.linalg.inv(own.sum(axis=0) + held)
+        step = spread @ (scored.sum(axis=1) - pull)
+        about = scored - (own @ step).T
+        n_modes = len(own)
+        covariance = _sandwich(spread, about) * n_modes / max(n_modes - 1, 1)
+        steps.append(step[:4])
+        covariances.append(_at_least(covariance, (spread * noise)[:4, :4]))
     return np.array(steps), np.array(covariances)

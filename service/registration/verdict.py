@@ -22,13 +22,13 @@ Array = NDArray[np.float64]
 MOST_RESIDUAL = 0.55
 """RMS share of the signal left over, by which even strongly uneven light is exceeded."""
 
-MOST_TENSION = 4.0
+MOST_TENSION = 5.0
 """Distance of a set of modes from the others, in its own σ."""
 
 MOST_SCATTER = 0.35
 """Robust relative scatter of the gains; modes of another basis scatter by more than this."""
 
-LARGEST_SIGMA = np.array([0.3, 0.3, np.deg2rad(3.0), 0.03])
+LARGEST_SIGMA = np.array([0.3, 0.3, np.deg2rad(3.0), 0.06])
 """Less certain than this is not determined (numeric units)."""
 
 BETTER = 0.7

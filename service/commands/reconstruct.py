@@ -203,16 +203,7 @@ def _made(
             known.gains, known.modes, model.basis.n_modes, passes=2 if known.double_pass else 1
         )
         matrix = gains.tuned(matrix)
-    prior = Prior(
-        variance_m2=model.basis.variance_m2,
-        slope_noise=np.full(model.n_slopes, options.slope_noise),
-    )
-    recipe = Recipe(
-        n_modes=options.modes,
-        method=options.method,
-        max_condition=options.max_condition,
-        prior=prior if options.method is Method.MAP else None,
-    )
+    recipe = _recipe(options, model)
     inversion = reconstruct(matrix, recipe)
     slopes = instrument.slopes
     return Reconstructor(
@@ -237,4 +228,19 @@ def _made(
             "model_detector_nodes": SAMPLING,
             "slopes": json.dumps(orientation_words(slopes.assumed_orientation, slopes.order)),
         },
+    )
+
+
+def _recipe(options: argparse.Namespace, model: RtcInteractionModel) -> Recipe:
+    prior = None
+    if options.method is Method.MAP:
+        prior = Prior(
+            variance_m2=model.basis.variance_m2,
+            slope_noise=np.full(model.n_slopes, options.slope_noise),
+        )
+    return Recipe(
+        n_modes=options.modes,
+        method=options.method,
+        max_condition=options.max_condition,
+        prior=prior,
     )

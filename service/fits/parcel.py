@@ -60,10 +60,7 @@ def opened_parcel(upload: Path, folder: Path, reference: str | None, most_bytes:
             names = _unpack(archive, folder, most_bytes)
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
         raise MatrixError(f"upload: damaged zip archive: {error}") from error
-    tomls = [name for name in names if name.endswith(".toml")]
-    if len(tomls) != 1:
-        raise MatrixError(f"upload: found {len(tomls)} .toml files in the archive, expected one")
-    instrument = folder / tomls[0]
+    instrument = folder / _only_toml(names)
     referred = set(_referred(instrument))
     for name in sorted(referred - set(names)):
         raise ConfigurationError(
@@ -71,13 +68,25 @@ def opened_parcel(upload: Path, folder: Path, reference: str | None, most_bytes:
             f"{', '.join(names)}"
         )
     left = [name for name in names if name not in referred and name != instrument.name]
+    return Parcel(reference=folder / _measured(left, names, reference), instrument=instrument)
+
+
+def _only_toml(names: list[str]) -> str:
+    tomls = [name for name in names if name.endswith(".toml")]
+    if len(tomls) != 1:
+        raise MatrixError(f"upload: found {len(tomls)} .toml files in the archive, expected one")
+    return tomls[0]
+
+
+def _measured(left: list[str], names: list[str], reference: str | None) -> str:
+    """Return the name of the measured file: the one asked for, or the only one ``left``."""
     chosen = reference if reference is not None else left[0] if len(left) == 1 else None
-    if chosen not in names:
+    if chosen is None or chosen not in names:
         raise MatrixError(
             f"upload: found {reference or 'several files or none'} as the measured one, expected "
-            f"?reference= and one of {', '.join(n for n in names if n != instrument.name)}"
+            f"?reference= and one of {', '.join(n for n in names if not n.endswith('.toml'))}"
         )
-    return Parcel(reference=folder / str(chosen), instrument=instrument)
+    return chosen
 
 
 def _unpack(archive: zipfile.ZipFile, folder: Path, most_bytes: int) -> list[str]:

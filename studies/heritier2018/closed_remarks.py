@@ -30,7 +30,7 @@ def still_remark(still: Array, by_night_nm: float, beyond_nm: float) -> str:
         f"registered loop with as many modes leaves {by_night_nm:.0f} nm"
     )
     if left <= spread:
-        text += ", as in the paper: that is the difference."
+        text += ", as in the paper: that accounts for the difference."
     elif left < 0.5 * away:
         text += (
             f", {left:.0f} nm from the paper's: that is most of the difference. The rest is in "

@@ -34,6 +34,9 @@ N_MEASURED = 400
 N_MORE = 500
 N_BASIS = 594
 
+USUAL, IDEAL, REALISTIC = "usual", "ideal", "realistic"
+"""How far a telescope is from the drawing, by the simulator's names."""
+
 INFLUENCE_GAIN = 0.6
 CLOSED_GAIN = 0.6
 
@@ -156,7 +159,7 @@ INFLUENCE_MODES = (N_MEASURED, N_BASIS)
 
 def influence_run(budget: Budget, alpha: Misregistration, n_modes: int, kind: Kind) -> LoopRun:
     """Return the loop, by night, of a telescope at ``alpha`` whose model says 0."""
-    night = Occasion(daytime=False, seed=1, imperfections="ideal")
+    night = Occasion(daytime=False, seed=1, imperfections=IDEAL)
     return LoopRun(
         occasion=night,
         alpha=alpha,
@@ -168,19 +171,20 @@ def influence_run(budget: Budget, alpha: Misregistration, n_modes: int, kind: Ki
     )
 
 
-def measurement(budget: Budget, seed: int) -> Measurement:
+def measurement(budget: Budget, seed: int, imperfections: str = USUAL) -> Measurement:
     """Return the measured matrix of a telescope, by day and in a shaking dome."""
     return Measurement(
-        occasion=Occasion(daytime=True, seed=seed, vibrations=True),
+        occasion=Occasion(daytime=True, seed=seed, imperfections=imperfections, vibrations=True),
         alpha=TRUTH,
         n_modes=N_MEASURED,
         n_average=budget.n_average,
     )
 
 
-def joint_fit(budget: Budget, seed: int) -> FitRun:
+def joint_fit(budget: Budget, seed: int, imperfections: str = USUAL) -> FitRun:
     """Return the joint fit to it, begun where the paper began."""
-    return FitRun(measurement=measurement(budget, seed), method=Method.JOINT, start=ROUGH)
+    measured = measurement(budget, seed, imperfections)
+    return FitRun(measurement=measured, method=Method.JOINT, start=ROUGH)
 
 
 def paper_fit(budget: Budget, seed: int) -> FitRun:
@@ -236,6 +240,7 @@ def every_task(budget: Budget) -> tuple[Task, ...]:
     for seed in budget.seeds:
         for vibrations in (False, True):
             tasks += [closed_run(budget, seed, v, vibrations=vibrations) for v in Variant]
+    tasks += [joint_fit(budget, budget.seeds[0], other) for other in (IDEAL, REALISTIC)]
     for vibrations in (False, True):
         for variant in (Variant.MEASURED, Variant.TUNED):
             brief = hasty(budget)

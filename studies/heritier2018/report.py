@@ -11,7 +11,7 @@ import service
 from service.model.misregistration import PARAMETERS
 from service.registration.options import Method
 from studies.heritier2018 import closed, curves, influence, matrices, page, paper, scans
-from studies.heritier2018.calibration import Measurement
+from studies.heritier2018.calibration import MeasuredPart
 from studies.heritier2018.loops import LoopRun
 from studies.heritier2018.plan import (
     INFLUENCE_MODES,
@@ -22,7 +22,6 @@ from studies.heritier2018.plan import (
     every_task,
     fits_from_random_starts,
     joint_fit,
-    measurement,
 )
 from studies.heritier2018.psf import strehl
 from studies.heritier2018.registration import errors, is_right
@@ -128,7 +127,7 @@ def _loop_rows(budget: Budget, store: Store) -> list[list[str]]:
     rows = []
     for vibrations, quoted in ((False, paper.STILL_ERROR), (True, paper.SHAKEN_ERROR)):
         values = [
-            f"{closed.errors_nm(budget, store, variant, vibrations=vibrations).mean():.0f}"
+            f"{closed.errors_nm(budget, store, variant, vibrations=vibrations).mean():.1f}"
             for variant in (Variant.MEASURED, Variant.TUNED, Variant.MORE)
         ]
         word = "with" if vibrations else "without"
@@ -152,11 +151,12 @@ def _conditions(budget: Budget, seconds: float) -> page.Section:
     loops = [task for task in tasks if isinstance(task, LoopRun)]
     night = [task for task in loops if not task.occasion.daytime]
     day = [task for task in loops if task.occasion.daytime]
-    measured: list[Measurement] = [measurement(budget, seed) for seed in budget.seeds]
+    parts = [task for task in tasks if isinstance(task, MeasuredPart)]
+    measured = {(part.occasion, part.n_average) for part in parts}
     rows = [
         ["influence of misregistrations", str(len(night)), f"{_frames(night):,}"],
         ["closed loops by day", str(len(day)), f"{_frames(day):,}"],
-        ["measured matrices", str(len(measured)), f"{sum(m.n_frames for m in measured):,}"],
+        ["measured matrices", str(len(measured)), f"{sum(part.n_frames for part in parts):,}"],
     ]
     body = page.table(["diffractive frames", "runs", "frames"], rows)
     cost = sum(task.cost_s for task in tasks)

@@ -21,7 +21,7 @@ def test_within_our_own_spread_nothing_needs_a_reason() -> None:
 
 def test_the_missing_turbulence_is_the_reason_only_as_far_as_it_closes_the_gap() -> None:
     ours = np.array([99.0, 100.0, 101.0])
-    assert "that is the difference" in still_remark(ours, by_night_nm=130.0, beyond_nm=85.0)
+    assert "accounts for the difference" in still_remark(ours, by_night_nm=130.0, beyond_nm=85.0)
     assert "most of the difference" in still_remark(ours, by_night_nm=120.0, beyond_nm=60.0)
     assert "not the reason" in still_remark(ours, by_night_nm=105.0, beyond_nm=30.0)
     assert "not the reason" in still_remark(ours, by_night_nm=300.0, beyond_nm=280.0)

@@ -5,6 +5,7 @@ WORKDIR /opt/pyrcal
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY service service
 COPY sim_rtc sim_rtc
+COPY studies studies
 RUN pip install --no-cache-dir -c constraints.txt . \
     && useradd --system --create-home --home-dir /var/lib/pyrcal pyrcal
 

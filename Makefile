@@ -33,9 +33,6 @@ check: $(STAMP) ## lint, formatting, types and import contracts
 	@.venv/bin/lint-imports --no-logo
 
 paper: $(STAMP) ## the seed paper, figure by figure, as one HTML report; ARGS=--quick rehearses
-	@$(PY) -c 'import matplotlib' 2>/dev/null || { \
-	    echo "paper: installing the extra 'plots'"; \
-	    $(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[plots]'; }
 	@$(PY) -m studies.heritier2018 $(ARGS)
 
 clean: ## remove what make made; never var/, which holds calibration products
@@ -60,5 +57,5 @@ $(STAMP): pyproject.toml constraints.txt
 	    "$$python" -m venv --clear .venv || exit 1; \
 	fi
 	@echo "setup: installing pyrcal and its tools (the first time takes a minute or two)"
-	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,test]'
+	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,test,fits,plots]'
 	@printf '%s\n' '$(CURDIR)' > $@

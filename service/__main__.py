@@ -52,6 +52,8 @@ _OPTIONS = {
 }
 """Command-line options that stand for a settings key."""
 
+_OTHER_PROGRAMS = {"sim": "sim_rtc", "campaign": "studies.campaign"}
+"""Run in this one's place: the service does not know the simulator."""
 
 STOP_WITHIN_S = 3
 """Requests under way when the service is asked to stop may take this long: an upload would take
@@ -61,8 +63,9 @@ longer."""
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 refused at the start."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words[:1] == ["sim"]:
-        os.execv(sys.executable, [sys.executable, "-m", "sim_rtc", *words[1:]])
+    if words and words[0] in _OTHER_PROGRAMS:
+        program = _OTHER_PROGRAMS[words[0]]
+        os.execv(sys.executable, [sys.executable, "-m", program, *words[1:]])
     options = _parser().parse_args(with_negative_numbers(words))
     try:
         return _COMMANDS[options.command](options)
@@ -97,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
     add_reconstruct_arguments(commands)
     add_demo_arguments(commands)
     commands.add_parser("sim", help="the simulated RTC: pyrcal sim --help", add_help=False)
+    commands.add_parser(
+        "campaign", help="many simulated nights: pyrcal campaign --help", add_help=False
+    )
     return parser
 
 

@@ -101,9 +101,16 @@ def test_the_demo_refuses_a_busy_port_instead_of_watching_another_service(capsys
     assert "service" in capsys.readouterr().err
 
 
-def test_the_simulator_is_reached_through_the_same_program():
+@pytest.mark.parametrize(
+    ("words", "begins"),
+    [
+        (["sim", "--alpha", "nonsense"], "sim_rtc: "),
+        (["campaign", "--plant", "nonsense"], "usage: pyrcal campaign"),
+    ],
+)
+def test_simulator_and_campaigns_are_reached_through_the_same_program(words, begins):
     found = subprocess.run(
-        [sys.executable, "-m", "service", "sim", "--alpha", "nonsense"],
+        [sys.executable, "-m", "service", *words],
         capture_output=True,
         text=True,
         timeout=60,
@@ -111,4 +118,4 @@ def test_the_simulator_is_reached_through_the_same_program():
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert found.returncode == 2
-    assert found.stderr.startswith("sim_rtc: ")
+    assert found.stderr.startswith(begins)

@@ -1,0 +1,1 @@
+"""What was measured on the simulated telescope; each study is a script with a command line."""

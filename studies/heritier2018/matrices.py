@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
-from studies.heritier2018 import page, paper
+from studies.heritier2018 import page, paper, telescope
 from studies.heritier2018.matrix_figures import (
     gains_figure,
     maps_figure,
     spectra_figure,
     variance_figure,
 )
-from studies.heritier2018.plan import ROUGH, Budget, Variant, closed_run, joint_fit
+from studies.heritier2018.plan import ROUGH, TRUTH, Budget, Variant, closed_run, joint_fit
 from studies.heritier2018.reconstructors import synthetic_matrix
 from studies.heritier2018.registration import FitRun, fitted_alpha
 from studies.heritier2018.store import Record, Store, Task
@@ -23,16 +23,6 @@ from studies.heritier2018.store import Record, Store, Task
 Array = NDArray[np.float64]
 
 _NOISY_DRAWS = 3
-
-_EFFECT = {
-    "shift": "The mask of valid subapertures is that of the unshifted pupil here, so part of the "
-    "border is dark; at the telescope it is drawn where the light is.",
-    "rotation": "The mirror's rings then lie otherwise on the square subapertures.",
-    "magnification": "The outline keeps its size while the mirror's image shrinks, so the modes of "
-    "the edge lie otherwise in the pupil; how the paper's model ends its mirror there we do not "
-    "know.",
-}
-"""What each part of a registration does to the modes that are seen worst."""
 
 _AS_IN_THE_PAPER = 0.05
 """Relative difference of condition numbers that needs no reason: peers differ by 2 %."""
@@ -209,11 +199,32 @@ def _why_another_condition(record: Record) -> str:
     name = min(without, key=lambda part: without[part])
     quoted = paper.CONDITION_SYNTHETIC.values[0]
     if abs(without[name] - quoted) < 0.5 * abs(synthetic - quoted):
-        return text + f"So it is the {name} that makes it larger than the paper's. {_EFFECT[name]}"
+        return text + f"So it is the {name} that makes it larger than the paper's. {_effect(name)}"
     return text + (
         "No single part of the registration makes it; the model's KL modes are those of a "
         "thin-plate mirror with unit RMS, not those of the real shell."
     )
+
+
+def _effect(name: str) -> str:
+    """Return what this part of a registration does to the modes that are seen worst."""
+    match name:
+        case "shift":
+            return (
+                "The mask of valid subapertures is that of the unshifted pupil here, so part of "
+                "the border is dark; at the telescope it is drawn where the light is."
+            )
+        case "rotation":
+            return "The mirror's rings then lie otherwise on the square subapertures."
+        case _:
+            found, nominal = (
+                telescope.beyond_actuators_subap(m) for m in (TRUTH.magnification, 1.0)
+            )
+            return (
+                "The outline keeps its size while the mirror's image shrinks: the pupil reaches "
+                f"{found:.2f} subaperture beyond the outermost actuators ({nominal:.2f} nominally),"
+                " and the surface there is an extrapolation, in the paper's model another one."
+            )
 
 
 def _quoted_excess() -> float:

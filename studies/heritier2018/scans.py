@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.registration.options import Method
 from service.registration.paper import N_LEFT_OUT
-from studies.heritier2018 import page, paper
+from studies.heritier2018 import page, paper, telescope
 from studies.heritier2018.plan import (
     IDEAL,
     N_MEASURED,
@@ -181,8 +181,10 @@ def pull_reason(ideal: float) -> str:
             "actuators of the others, which shift every set of modes alike, that σ does not know. "
         )
     return (
-        f"On the ideal telescope it is {ideal:.1f} too: what σ does not know is in the model "
-        "(its influence functions, its sampling), not in the telescope's imperfections. "
+        f"On the ideal telescope it is {ideal:.1f}: what σ does not know is in the model rather "
+        "than in the telescope's imperfections. At this magnification the pupil reaches "
+        f"{telescope.beyond_actuators_subap(TRUTH.magnification):.2f} subaperture beyond the "
+        "outermost actuators, where simulator and model extrapolate the mirror differently. "
     )
 
 

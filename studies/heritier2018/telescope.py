@@ -102,6 +102,12 @@ def actuators_subap() -> Array:
     return np.asarray(mirror.positions_m / instrument().subaperture_m)
 
 
+def beyond_actuators_subap(magnification: float) -> float:
+    """Return how far the pupil reaches beyond the outermost actuators, in subapertures."""
+    outermost = float(np.hypot(*actuators_subap().T).max())
+    return instrument().wfs.pupil_diameter / 2 - magnification * outermost
+
+
 def plant(occasion: Occasion) -> DiffractivePlant:
     """Return the telescope of an occasion."""
     return _plant(occasion.still)

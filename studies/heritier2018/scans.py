@@ -67,7 +67,7 @@ def section(budget: Budget, store: Store) -> page.Section:
     body += page.picture(
         registration_figure(joint),
         "Registration found by the joint fit: actuators of the mirror (dots) over the valid "
-        "subapertures of the sensor (squares).",
+        "subapertures of the sensor (squares); the arrow is the mirror's x axis.",
     )
     body += page.heading(f"From {budget.n_starts} random starts")
     body += page.paragraph(

@@ -37,7 +37,7 @@ def main() -> int:
     try:
         seconds = carry_out(tasks, store, n_workers=given.workers)
     except KeyboardInterrupt:
-        sys.stderr.write("\npaper: interrupted; the same command goes on from here\n")
+        sys.stderr.write("paper: the same command goes on from here\n")
         return 130
     path = given.output / f"heritier2018{'-quick' if given.quick else ''}.html"
     report.write(budget, store, path, seconds=seconds)

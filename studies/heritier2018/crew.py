@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 import time
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
@@ -95,6 +96,9 @@ def carry_out(
                 task = running.pop(future)
                 future.result()
                 progress.step(task)
+    except KeyboardInterrupt:
+        progress.stream.write("\npaper: interrupted; the steps under way are finished first\n")
+        raise
     finally:
         executor.shutdown(cancel_futures=True)
     return time.monotonic() - started
@@ -106,6 +110,8 @@ def _ready(waiting: list[Task], store: Store) -> list[Task]:
 
 def _settle_in() -> None:
     os.nice(_NICENESS)
+    # Ctrl-C reaches every process of the terminal: what is nearly done shall be kept.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _work(task: Task, folder: Path) -> None:

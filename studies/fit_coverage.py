@@ -43,7 +43,7 @@ STROKE_M = 10e-9
 N_AVERAGE = 20
 MAGNITUDE = 7.0
 FRAME_RATE_HZ = 1000.0
-FIRST_SEED = 1000
+FIRST_SEED = 2000
 """Seeds below this were used to choose the constants of the uncertainty."""
 
 SHOWN = BOUNDARY_SCALE * [100.0, 100.0, 1.0, 100.0]

@@ -16,10 +16,10 @@ from service.registration.projection import Projection
 
 Array = NDArray[np.float64]
 
-MODEL_FLOOR = np.array([8e-5, 8e-5, np.deg2rad(6e-4), 1.3e-4])
+MODEL_FLOOR = np.array([8e-5, 8e-5, np.deg2rad(6e-4), 1.5e-4])
 """1 σ that no matrix is free of: what a mirror of another kind does to a noise-free one."""
 
-REGIONAL_SHARE = np.array([0.42, 0.42, 0.14, 1.25])
+REGIONAL_SHARE = np.array([0.53, 0.53, 0.165, 1.43])
 """Error of the registration over the scatter of the regions of the pupil, by parameter: what pulls
 one region one way pulls another the other way."""
 

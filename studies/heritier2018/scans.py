@@ -156,12 +156,12 @@ def _found_remark(budget: Budget, store: Store) -> str:
         f"Joint fit: within {max(worst[:2]):.2f} % of a subaperture, {worst[2]:.4f} deg and "
         f"{worst[3]:.3f} % of magnification. "
     )
-    largest = max(_largest_pull(record) for record in records)
-    text += f"The largest error is {largest:.1f} of its own σ"
+    ideal, realistic = (store.read(joint_fit(budget, budget.seeds[0], o)) for o in _OTHERS)
+    largest = max(_largest_pull(record) for record in (*records, ideal, realistic))
+    text += f"The largest error of all these telescopes is {largest:.1f} of its own σ"
     if largest < _MOST_SIGMAS:
         text += ", as it should be of so few. "
     else:
-        ideal = store.read(joint_fit(budget, budget.seeds[0], IDEAL))
         text += ": more than it says of itself. " + pull_reason(_largest_pull(ideal))
     for seed, record in zip(budget.seeds, records, strict=True):
         text += f"Telescope {seed}: {record['verdict']}. "

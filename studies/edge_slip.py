@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -23,9 +24,10 @@ from service.control.reconstructor import invert
 from service.control.stability import pole_radius
 from service.estimation.edge import Actuators, EdgeHealth, edge_watch, observe_edge
 from service.estimation.frames import FrameBlock
+from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.modes import karhunen_loeve_basis
+from service.model.modes import ModalBasis, karhunen_loeve_basis
 from sim_rtc.assembly import build_telescope
 from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.loop import ModalLoop
@@ -76,6 +78,20 @@ def parse_case(text: str) -> Case:
     return Case(int(n_controlled), alpha, float(leak))
 
 
+@cache
+def modes_of(instrument: Instrument) -> ModalBasis:
+    """Return the modes, which take seconds to make."""
+    return karhunen_loeve_basis(instrument)
+
+
+def actuators_of(instrument: Instrument) -> Actuators:
+    """Return where the actuators are, and how far each mode moves them."""
+    return Actuators(
+        positions=instrument.analytic_mirror.positions_m,
+        strokes=modes_of(instrument).mode_to_actuator,
+    )
+
+
 def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, float]:
     """Return the worst pole radius and the motion of the outer ring, metres per unit of slope."""
     x, y, rotation_deg, magnification = (float(word) for word in case.alpha.split(","))
@@ -90,31 +106,30 @@ def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, f
     coupling = matrix @ model.interaction_matrix(alpha)[:, :n]
     gains = np.full(n, gain * OPTICAL_GAIN)
     eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
-    actuators = Actuators(
-        positions=model.instrument.mirror.positions_m, strokes=model.basis.mode_to_actuator
-    )
+    actuators = actuators_of(model.instrument)
     outer = Outer(actuators=actuators.strokes[actuators.outer])
     motion = edge_motion_m(matrix, coupling, gains, outer, leak=case.leak, delay_frames=2.0)
     return float(pole_radius(eigenvalues, leak=case.leak).max()), motion
 
 
-def run(case: Case, given: argparse.Namespace) -> Outcome:
+def run(case: Case, given: argparse.Namespace, instrument: Instrument) -> Outcome:
     """Run one loop and its watch."""
-    instrument = load_instrument("flao-lbt")
     options = parse_options(
         f"--plant diffractive --alpha {case.alpha} --seed {given.seed} --mag {given.mag} "
         f"--n-controlled {case.n_controlled} --wind {given.wind},40".split()
     )
-    basis = karhunen_loeve_basis(instrument)
-    actuators = Actuators(positions=instrument.mirror.positions_m, strokes=basis.mode_to_actuator)
-    watch = edge_watch(actuators, basis.variance_m2, case.n_controlled)
+    actuators, variance_m2 = actuators_of(instrument), modes_of(instrument).variance_m2
+    watch = edge_watch(actuators, variance_m2, case.n_controlled)
     if watch is None:
         raise SystemExit(f"{case.n_controlled} modes are too few to watch")
     telescope = build_telescope(options, instrument)
     weights = telescope.weights.astype(np.float32)
     loop = ModalLoop(n_modes=len(telescope.settings.gains), delay_frames=2, stroke_m=STROKE_M)
     gains = np.full(case.n_controlled, given.gain, np.float32)
-    health, errors, ratios, slips = EdgeHealth(), [], [], []
+    health = EdgeHealth()
+    errors: list[float] = []
+    ratios: list[float] = []
+    slips: list[bool] = []
     for block in telescope.feed.blocks():
         terms = block.optics.terms(telescope.reconstructor.matrix, gains, case.leak)
         for row in range(0, block.n_frames, BATCH_FRAMES):
@@ -166,10 +181,10 @@ def main() -> None:
     )
     with threadpool_limits(1):
         instrument = load_instrument("flao-lbt")
-        model = InteractionModel(instrument, karhunen_loeve_basis(instrument))
+        model = InteractionModel(instrument, modes_of(instrument))
         for case in given.case or [parse_case(text) for text in CASES]:
             radius, motion = foreseen(case, given.gain, model)
-            found = run(case, given)
+            found = run(case, given, instrument)
             when = "no slip" if found.first_slip_s is None else f"{found.first_slip_s:.2f} s"
             errors = " ".join(f"{error:.0f}" for error in found.wavefront_nm)
             sys.stdout.write(

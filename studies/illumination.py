@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.control.noise import noise_of_counts
-from service.model.interaction import InteractionModel
+from service.model.interaction import InteractionModel, valid_subapertures
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import Illumination
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--extra", default="", help="further options of the simulator, in quotes")
     given = parser.parse_args()
     instrument = load_instrument("flao-lbt")
-    basis = karhunen_loeve_basis(instrument)
+    basis, valid = karhunen_loeve_basis(instrument), valid_subapertures(instrument)
     sys.stdout.write(
         "| seed | light | residual | without noise | x, y / % of a subaperture | rotation / deg | "
         "magnification / % |\n| --- | --- | --- | --- | --- | --- | --- |\n"
@@ -62,7 +62,7 @@ def main() -> None:
             start = Misregistration(shift_x_subap=position.x_subap, shift_y_subap=position.y_subap)
             _tell(f"{seed} | images alone", None, 0.0, start, optics.alpha)
             read = np.abs(measured).sum(axis=1) > 0.0
-            noise = noise_share(measured, counts, optics.valid, given.averages)
+            noise = noise_share(measured, counts, valid, given.averages)
             lights: dict[str, Illumination | None] = {
                 "even": None,
                 "measured": measured_illumination(counts, instrument, position),

@@ -107,9 +107,10 @@ def instrument() -> Instrument:
 def basis(influence: Influence) -> ModalBasis:
     """Return its modes, with the influence functions given."""
     shared = instrument()
+    drawn = shared.analytic_mirror
     mirror = Mirror(
-        positions_m=shared.mirror.positions_m,
-        pitch_m=shared.mirror.pitch_m,
+        positions_m=drawn.positions_m,
+        pitch_m=drawn.pitch_m,
         influence=influence,
     )
     return karhunen_loeve_basis(
@@ -140,8 +141,8 @@ def job_arrays(case: Case) -> dict[str, Array]:
     """Return the shapes the peer shall push: modes where the mirror lies, or the mirror itself."""
     if case.own_mirror:
         return {
-            "positions_m": instrument().mirror.positions_m,
-            "pitch_m": np.array(instrument().mirror.pitch_m),
+            "positions_m": instrument().analytic_mirror.positions_m,
+            "pitch_m": np.array(instrument().analytic_mirror.pitch_m),
             "mode_to_actuator": basis(Influence.GAUSSIAN).mode_to_actuator,
         }
     points = mirror_points(case)

@@ -169,4 +169,4 @@ def error(found: dict[str, Any], truth: tuple[float, float, float, float]) -> Ar
     x, y = truth[:2]
     for _ in range(quarters % 4):
         x, y = -y, x
-    return alpha - np.array([x, y, truth[2] + 90.0 * quarters, truth[3]])
+    return np.asarray(alpha - np.array([x, y, truth[2] + 90.0 * quarters, truth[3]]))

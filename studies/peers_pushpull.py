@@ -79,7 +79,7 @@ class Bench:
         along = (np.arange(fine) - (fine - 1) / 2) / (fine / 2)
         radius = np.hypot(along, along[:, None])
         lit = (radius <= 1.0) & (radius >= self.obscuration_ratio)
-        return lit.reshape(self.n_pupil, _FINE, self.n_pupil, _FINE).mean(axis=(1, 3))
+        return np.asarray(lit.reshape(self.n_pupil, _FINE, self.n_pupil, _FINE).mean(axis=(1, 3)))
 
     @property
     def n_detector(self) -> int:
@@ -183,7 +183,8 @@ def fold(frame: Array, *, absolute: bool = False) -> Array:
 def _centroid(image: Array) -> Array:
     """Return the centroid (columns, rows) of an image from its middle, pixels."""
     along = np.arange(len(image)) - (len(image) - 1) / 2
-    return np.array([image.sum(axis=0) @ along, image.sum(axis=1) @ along]) / image.sum()
+    centre = np.array([image.sum(axis=0) @ along, image.sum(axis=1) @ along])
+    return np.asarray(centre / image.sum())
 
 
 def _poke(towards: tuple[float, float], bench: Bench) -> Array:
@@ -229,7 +230,8 @@ def job_and_product() -> tuple[Path, Path]:
 def write_product(path: Path, measured: Measured, **arrays: Array) -> None:
     """Write what a peer measured, whole or not at all."""
     part = path.with_suffix(".part.npz")
-    np.savez(part, **asdict(measured), **arrays)
+    product: dict[str, Any] = asdict(measured) | arrays
+    np.savez(part, **product)
     part.rename(path)
 
 

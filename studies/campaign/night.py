@@ -25,9 +25,10 @@ from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, Workbench
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.computer import Batch, RealTimeComputer
+from sim_rtc.computer import RealTimeComputer
 from sim_rtc.feed import Ahead
 from sim_rtc.options import parse_options
+from sim_rtc.telemetry import Batch
 from sim_rtc.truth import WavefrontError
 from studies.campaign.trouble import Trouble, options_for, troubled
 
@@ -267,15 +268,17 @@ def _row(outcome: Outcome, true: Misregistration, errors_nm: list[float]) -> dic
     if isinstance(outcome, WindowRefused):
         return row | {"refused": outcome.reason}
     difference = outcome.alpha.vector - true.vector
+    misfit: float | None = None
     if isinstance(outcome, PassiveEstimate):
-        covariance, gains, misfit = np.diag(outcome.sigma**2), outcome.gains, None
+        covariance, gains = np.diag(outcome.sigma**2), outcome.gains
     else:
-        covariance, gains, misfit = outcome.covariance, outcome.optical_gain, outcome.misfit
+        covariance, gains = outcome.covariance, np.abs(outcome.optical_gain)
+        misfit = outcome.misfit
     return row | {
         "refused": None,
         "error": (difference * BOUNDARY_SCALE).tolist(),
         "covariance": (covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)).tolist(),
-        "optical_gain": float(np.abs(gains).mean()),
+        "optical_gain": float(gains.mean()),
         "misfit": misfit,
     }
 

@@ -127,6 +127,8 @@ def _run(options: argparse.Namespace) -> int:
         ],
         logger_factory=structlog.PrintLoggerFactory(sys.stderr),
     )
+    for remark in instrument.remarks:
+        structlog.get_logger().warning("instrument.remark", text=remark)
     return asyncio.run(_serve(settings, instrument))
 
 

@@ -122,8 +122,8 @@ def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference
     missing = [int(mode) for mode in modes if int(mode) not in place]
     if missing:
         raise ModelError(
-            f"modes: found {missing[0]} asked for; expected some of the {len(place)} measured "
-            f"({min(place)} to {max(place)})"
+            f"modes: {missing[0]} is asked for and was not measured; expected some of the "
+            f"{len(place)} that were ({min(place)} to {max(place)})"
         )
     columns = np.array([place[int(mode)] for mode in modes], dtype=np.intp)
     return replace(

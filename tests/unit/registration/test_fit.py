@@ -69,7 +69,7 @@ def test_modes_may_be_any_of_those_measured():
 
 
 def test_a_mode_that_was_not_measured_cannot_be_used():
-    with pytest.raises(ModelError, match="found 35 asked for"):
+    with pytest.raises(ModelError, match="35 is asked for and was not measured"):
         fit(matrix()[:, :30], options=FitOptions(modes=np.array([1, 35])))
 
 

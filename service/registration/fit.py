@@ -204,7 +204,13 @@ def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, options: 
     seen = solution.projection
     values = np.concatenate([np.zeros(4), solution.nuisances])
     regions = pupil_regions(target.valid)[target.rows]
-    sure = uncertainty(seen, values, prior_of(found.nuisances.sigma), regions)
+    sure = uncertainty(
+        seen,
+        values,
+        prior_of(found.nuisances.sigma),
+        regions,
+        shift_subap=float(np.hypot(*solution.vector[:2])),
+    )
     by_mode = np.sqrt(
         np.sum(seen.residual**2, axis=0) / np.sum(target.matrix[target.rows] ** 2, axis=0)
     )

@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 MODEL_FLOOR = np.array([8e-5, 8e-5, np.deg2rad(6e-4), 1.5e-4])
 """1 σ that no matrix is free of: what a mirror of another kind does to a noise-free one."""
 
+SHIFT_SHARE = 0.002
+"""1 σ of the shifts over the shift itself: far off, a mirror of another kind parts from the model
+at the border. Telescopes at 0.92 subapertures were read off by 0.08 to 0.30 % of one."""
+
 REGIONAL_SHARE = np.array([0.53, 0.53, 0.165, 1.43])
 """Error of the registration over the scatter of the regions of the pupil, by parameter: what pulls
 one region one way pulls another the other way."""
@@ -73,7 +77,12 @@ class Uncertainty:
 
 
 def uncertainty(
-    projection: Projection, values: Array, prior: Array, regions: NDArray[np.intp]
+    projection: Projection,
+    values: Array,
+    prior: Array,
+    regions: NDArray[np.intp],
+    *,
+    shift_subap: float,
 ) -> Uncertainty:
     """Return how sure the first four unknowns of a projection at its solution are.
 
@@ -88,6 +97,8 @@ def uncertainty(
         ``(n_unknowns,)`` reciprocal variance of each unknown.
     regions
         ``(n_rows,)`` region of the pupil of each slope.
+    shift_subap
+        Length of the shift at the solution: part of the model's error grows with it.
     """
     n_modes = len(projection.gains)
     n_sets = min(MOST_SETS, n_modes // LEAST_PER_SET)
@@ -101,7 +112,8 @@ def uncertainty(
     regional = _sandwich(spread, _regional_scores(projection, regions))
     few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
     share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
-    from_model = np.diag(share**2 + MODEL_FLOOR**2)
+    far = SHIFT_SHARE * shift_subap * np.array([1.0, 1.0, 0.0, 0.0])
+    from_model = np.diag(share**2 + MODEL_FLOOR**2 + far**2)
     pull = prior * noise * values
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
     scatter = np.zeros((4, 4))

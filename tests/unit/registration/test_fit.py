@@ -9,6 +9,7 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
 from service.registration.options import FitOptions, Method
+from service.registration.uncertainty import SHIFT_SHARE
 from tests.numerics import small_basis
 from tests.unit.registration.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, matrix
 
@@ -37,6 +38,15 @@ def test_errors_of_noisy_matrices_are_those_that_sigma_says():
         chi.append(error(found) @ np.linalg.solve(found.covariance, error(found)))
     # 6 draws of a chi-squared of 4 degrees: mean 4 +- 1.2; the floor makes it smaller
     assert 0.8 < np.mean(chi) < 7.6
+
+
+def test_far_shifts_are_said_to_be_less_sure_by_a_share_of_themselves():
+    """The errors of a model whose mirror is of another kind grow with the shift."""
+    far = replace(ELSEWHERE, shift_x_subap=0.9, shift_y_subap=0.3)
+    near = replace(ELSEWHERE, shift_x_subap=0.0, shift_y_subap=0.0)
+    sigma = [np.sqrt(fit(matrix(alpha)).covariance[0, 0]) for alpha in (near, far)]
+    assert sigma[1] > SHIFT_SHARE * np.hypot(0.9, 0.3)
+    assert sigma[0] < sigma[1]
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1, 1), (1, -1, -1, 1), (-1, 1, 1, -1), (-1, -1, -1, -1)])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from service import events as ev
 from service.events import Command, Event
+from service.reactions.decision import decide
 from service.reactions.dither import on_dither, on_silence
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.loop import close_again, on_loop
@@ -20,7 +21,7 @@ from service.reactions.matrices import (
 )
 from service.reactions.measurements import MEASURING, meanwhile, on_measurement
 from service.reactions.operator import on_command
-from service.reactions.policy import Policy, decide
+from service.reactions.policy import Policy
 from service.reactions.rtc import (
     on_failure,
     on_new_session,

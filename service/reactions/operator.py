@@ -8,10 +8,12 @@ from service import events as ev
 from service.errors import CommandError
 from service.events import Event
 from service.reactions.dither import found_again
+from service.reactions.dither_choice import plan_dither, why_unusable
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send
-from service.reactions.policy import Policy, moved, plan_dither, why_unusable
+from service.reactions.policy import Policy
 from service.reactions.shelf import known_record, with_state
+from service.reactions.update_choice import moved
 from service.state import MatrixState, Mode, TrackerState
 
 

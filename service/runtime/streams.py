@@ -14,8 +14,8 @@ from service.estimation.health import LoopHealth, observe
 from service.estimation.lockin import LockIn, Spectra, WindowRefused
 from service.estimation.loopcheck import LoopCheck, LoopTerms, Obedience
 from service.estimation.passive import Passive
+from service.reactions.dither_choice import SETTLING_S, lock_in_plan
 from service.reactions.journal import OFF_LOOP
-from service.reactions.policy import SETTLING_S, lock_in_plan
 from service.state import DitherView, RtcView
 from service.worker import Description
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service import events as ev
-from service.reactions.policy import plan_dither
+from service.reactions.dither_choice import plan_dither
 from service.runtime.translate import rtc_view
 from service.wire import (
     DitherAction,

@@ -4,7 +4,7 @@ import pytest
 
 from service import events as ev
 from service.errors import ModelError
-from service.reactions.policy import lock_in_plan, plan_dither
+from service.reactions.dither_choice import lock_in_plan, plan_dither
 from service.state import MatrixState, Mode
 from tests.unit.reactions.situations import N_MODES, POLICY, START_NS, Story, moved, of_kind, rtc
 

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Coroutine
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,10 @@ from numpy.typing import NDArray
 
 from service import events as ev
 from service.archive import Archive
-from service.errors import ModelError, PyrcalError, WorkerError
-from service.estimation.instrumental import Loop
+from service.errors import PyrcalError, WorkerError
 from service.estimation.lockin import Spectra, WindowRefused
 from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
-from service.reactions.dither import SILENT_S
-from service.reactions.journal import WRONG_RTC
 from service.reactions.policy import Policy
 from service.routes.service import Snapshot
 from service.rtc_bridge import Bridge
@@ -29,16 +25,10 @@ from service.runtime import translate
 from service.runtime.asking import why_not
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
-from service.runtime.streams import (
-    Streams,
-    fed,
-    shape_mismatch,
-    troubles,
-    with_dither,
-    with_matrix,
-    with_rtc,
-)
-from service.state import Level, LogEntry, MeasureState, RtcView, TrackerState
+from service.runtime.following import followed, news, shape_news
+from service.runtime.streams import Streams, fed, with_matrix
+from service.runtime.windows import fitted, watched
+from service.state import Level, LogEntry, MeasureState, TrackerState
 from service.tracker import step
 from service.wire import AlarmMessage
 from service.worker import Description, Workbench
@@ -172,14 +162,8 @@ class Supervisor:
             self._streams, windows = fed(self._streams, block)
             for window in windows:
                 self._take(window)
-        silent_s, dither = self._streams.dither_silent_s, self._streams.dither
-        due = silent_s >= SILENT_S and int(2 * silent_s) > int(2 * was_silent_s)
-        if dither is not None and due:
-            self._post(ev.DitherSilent(id=dither.id, silent_s=silent_s))
-        for name, trouble, over in troubles(self._streams):
-            known = any(alarm.name == name for alarm in self._state.alarms)
-            if (trouble is not None) is not known:
-                self._post(ev.Trouble(name=name, text=trouble or over, over=known))
+        for event in news(was_silent_s, self._streams, self._state):
+            self._post(event)
 
     def _take(self, window: Spectra | WindowRefused) -> None:
         if isinstance(window, WindowRefused):
@@ -215,46 +199,23 @@ class Supervisor:
     async def _fit(self) -> None:
         while True:
             spectra = await self._windows.get()
-            self._post(await self._fitted(spectra))
-
-    async def _fitted(self, spectra: Spectra) -> Event:
-        rtc, known = self._state.rtc, self._state.registration
-        if rtc is None or spectra.cm_id is None:
-            return _lost(spectra, "the RTC or its reconstructor is not known")
-        try:
-            matrix = await asyncio.to_thread(self._deeds.matrix, spectra.cm_id)
-            start = None if known is None else known.alpha
-            outcome = await self._crew.call(Workbench.fit, spectra, _loop(rtc, matrix), start)
-        except PyrcalError as error:
-            return _lost(spectra, str(error))
-        if isinstance(outcome, WindowRefused):
-            return ev.WindowLost(refused=outcome)
-        return ev.WindowFitted(estimate=outcome)
+            self._post(await fitted(spectra, self._state, self._crew, self._deeds))
 
     async def _watch(self) -> None:
         while True:
             await asyncio.sleep(WATCH_INTERVAL_S)
-            known = self._state.registration
-            sums = self._streams.passive if self._streams is not None else None
-            if known is None or sums is None:
+            if self._streams is None:
                 continue
-            try:
-                estimate = await self._crew.call(Workbench.watch, sums, known.alpha)
-            except PyrcalError as error:
-                self._note("watchdog.failed", str(error), Level.WARNING)
-                continue
-            if estimate is not None:
-                self._post(ev.Watched(estimate=estimate, t_ns_utc=time.time_ns()))
+            event = await watched(self._streams, self._state, self._crew, time.time_ns())
+            if event is not None:
+                self._post(event)
 
     def _check_shape(self) -> None:
-        rtc = self._state.rtc
-        if rtc is None or self._streams is None:
+        if self._streams is None:
             return
-        reason = shape_mismatch(self._streams.description, rtc)
-        known = any(alarm.name == "instrument-mismatch" for alarm in self._state.alarms)
-        if (reason is not None) is not known:
-            text = reason or "the RTC's telemetry fits the instrument file again"
-            self._post(ev.Trouble(name="instrument-mismatch", text=text, over=known))
+        event = shape_news(self._streams, self._state)
+        if event is not None:
+            self._post(event)
 
     def _post(self, event: Event) -> tuple[Effect, ...]:
         """Let the tracker decide, replace the state, and set what it wants in motion."""
@@ -290,17 +251,9 @@ class Supervisor:
         """Keep the streaming estimators in step with the RTC and the dither."""
         if self._streams is None:
             return
-        if any(alarm.name in WRONG_RTC for alarm in self._state.alarms):
-            self._streams = with_rtc(self._streams, None)
-            return
-        self._streams = with_rtc(self._streams, self._state.rtc)
-        dither = self._state.dither
-        try:
-            self._streams = with_dither(self._streams, dither, self._policy.window_s)
-        except ModelError as error:
-            unusable = None if dither is None else replace(dither, asked_ns_utc=0)
-            self._streams = replace(self._streams, lock_in=None, dither=unusable)
-            self._note("dither.unusable", str(error), Level.WARNING)
+        self._streams, note = followed(self._streams, self._state, self._policy)
+        if note is not None:
+            self._post(note)
 
     async def _do(self, effect: Effect, state: TrackerState) -> None:
         try:
@@ -357,18 +310,3 @@ def _write(archive: Archive, before: TrackerState, after: TrackerState) -> None:
             archive.update(record)
     for entry in _new_entries(before, after):
         archive.audit(entry.t_ns_utc, "service", entry.name, entry.text)
-
-
-def _lost(spectra: Spectra, reason: str) -> Event:
-    refused = WindowRefused(reason=reason, t_ns_utc=spectra.t_end_ns_utc)
-    return ev.WindowLost(refused=refused)
-
-
-def _loop(rtc: RtcView, matrix: NDArray[np.float32]) -> Loop:
-    return Loop(
-        reconstructor=matrix,
-        gains=np.array(rtc.gains),
-        leak=rtc.leak,
-        delay_frames=rtc.delay_frames,
-        frame_rate_hz=rtc.frame_rate_hz,
-    )

@@ -1,0 +1,60 @@
+"""Having the worker look at telemetry: a window to be fitted, the watchdog's sums."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+
+from service import events as ev
+from service.errors import PyrcalError
+from service.estimation.instrumental import Loop
+from service.estimation.lockin import Spectra, WindowRefused
+from service.events import Event
+from service.runtime.crew import Crew
+from service.runtime.deeds import Deeds
+from service.runtime.streams import Streams
+from service.state import Level, TrackerState
+from service.worker import Workbench
+
+
+async def fitted(spectra: Spectra, state: TrackerState, crew: Crew, deeds: Deeds) -> Event:
+    """Return what becomes of one window: an estimate, or why there is none."""
+    rtc, known = state.rtc, state.registration
+    if rtc is None or spectra.cm_id is None:
+        return lost(spectra, "the RTC or its reconstructor is not known")
+    try:
+        matrix = await asyncio.to_thread(deeds.matrix, spectra.cm_id)
+        loop = Loop(
+            reconstructor=matrix,
+            gains=np.array(rtc.gains),
+            leak=rtc.leak,
+            delay_frames=rtc.delay_frames,
+            frame_rate_hz=rtc.frame_rate_hz,
+        )
+        start = None if known is None else known.alpha
+        outcome = await crew.call(Workbench.fit, spectra, loop, start)
+    except PyrcalError as error:
+        return lost(spectra, str(error))
+    if isinstance(outcome, WindowRefused):
+        return ev.WindowLost(refused=outcome)
+    return ev.WindowFitted(estimate=outcome)
+
+
+async def watched(
+    streams: Streams, state: TrackerState, crew: Crew, now_ns: int
+) -> ev.Watched | ev.Noted | None:
+    """Return what the watchdog makes of ordinary telemetry; None: there is too little of it."""
+    if state.registration is None or streams.passive is None:
+        return None
+    try:
+        estimate = await crew.call(Workbench.watch, streams.passive, state.registration.alpha)
+    except PyrcalError as error:
+        return ev.Noted(name="watchdog.failed", text=str(error), level=Level.WARNING)
+    return None if estimate is None else ev.Watched(estimate=estimate, t_ns_utc=now_ns)
+
+
+def lost(spectra: Spectra, reason: str) -> Event:
+    """Return what becomes of a window that cannot be fitted."""
+    refused = WindowRefused(reason=reason, t_ns_utc=spectra.t_end_ns_utc)
+    return ev.WindowLost(refused=refused)

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 import structlog
 import uvicorn
 from threadpoolctl import threadpool_limits
@@ -26,12 +25,12 @@ from service.commands.fit import add_fit_arguments, run_fit
 from service.commands.reconstruct import add_reconstruct_arguments, run_reconstruct
 from service.commands.terminal import with_negative_numbers
 from service.config import Settings, load_instrument, load_settings
+from service.config.policy import policy_of
 from service.demo import add_demo_arguments, run_demo
 from service.errors import ConfigurationError, PyrcalError
 from service.fits.upload import UploadFitter
 from service.model.instrument import Instrument
 from service.reactions.measurements import MEASUREMENTS_KEPT
-from service.reactions.policy import Policy
 from service.reactions.shelf import restored
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.crew import Crew
@@ -257,7 +256,7 @@ def _supervisor(
     )
     return Supervisor(
         state=state,
-        policy=_policy(settings),
+        policy=policy_of(settings),
         bridge=bridge,
         crew=crew,
         archive=archive,
@@ -306,44 +305,6 @@ def _compute(settings: Settings) -> Compute:
         method=settings.control.method,
         max_condition=settings.control.max_condition,
         slope_noise=settings.control.slope_noise,
-    )
-
-
-def _policy(settings: Settings) -> Policy:
-    dither, tracking, control = settings.dither, settings.tracking, settings.control
-    per_minute = np.array(
-        [
-            tracking.drift_subap_per_minute,
-            tracking.drift_subap_per_minute,
-            np.deg2rad(tracking.drift_deg_per_minute),
-            tracking.drift_magnification_per_minute,
-        ]
-    )
-    return Policy(
-        dither_enabled=dither.enabled,
-        dither_amplitude_m=dither.amplitude_m,
-        dither_modes=dither.modes,
-        dither_frequencies_hz=dither.frequencies_hz,
-        window_s=dither.window_s,
-        drift_rate=per_minute / np.sqrt(60.0),
-        floor=np.array(
-            [
-                tracking.floor_shift_subap,
-                tracking.floor_shift_subap,
-                np.deg2rad(tracking.floor_rotation_deg),
-                tracking.floor_magnification,
-            ]
-        ),
-        n_modes_target=control.n_modes_target,
-        update_threshold=np.array(
-            [
-                control.update_shift_subap,
-                control.update_shift_subap,
-                np.deg2rad(control.update_rotation_deg),
-                control.update_magnification,
-            ]
-        ),
-        minimum_interval_s=control.minimum_interval_s,
     )
 
 

@@ -1,0 +1,47 @@
+"""The tracker's policy, from the user's settings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.config.settings import Settings
+from service.reactions.policy import Policy
+
+
+def policy_of(settings: Settings) -> Policy:
+    """Return the policy in numeric units: radians, rates per square root of a second."""
+    dither, tracking, control = settings.dither, settings.tracking, settings.control
+    per_minute = np.array(
+        [
+            tracking.drift_subap_per_minute,
+            tracking.drift_subap_per_minute,
+            np.deg2rad(tracking.drift_deg_per_minute),
+            tracking.drift_magnification_per_minute,
+        ]
+    )
+    return Policy(
+        dither_enabled=dither.enabled,
+        dither_amplitude_m=dither.amplitude_m,
+        dither_modes=dither.modes,
+        dither_frequencies_hz=dither.frequencies_hz,
+        window_s=dither.window_s,
+        drift_rate=per_minute / np.sqrt(60.0),
+        floor=np.array(
+            [
+                tracking.floor_shift_subap,
+                tracking.floor_shift_subap,
+                np.deg2rad(tracking.floor_rotation_deg),
+                tracking.floor_magnification,
+            ]
+        ),
+        n_modes_target=control.n_modes_target,
+        update_threshold=np.array(
+            [
+                control.update_shift_subap,
+                control.update_shift_subap,
+                np.deg2rad(control.update_rotation_deg),
+                control.update_magnification,
+            ]
+        ),
+        minimum_interval_s=control.minimum_interval_s,
+    )

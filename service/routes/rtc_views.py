@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import BeforeValidator
 
 from service.routes.views import Number, View
-from service.state import CommandState, MeasurePattern, MeasureState
+from service.state import CommandState, DitherKind, MeasurePattern, MeasureState
 
 
 class GainGroupView(View):
@@ -76,7 +76,15 @@ class DitherView(View):
     amplitude_m: tuple[Number, ...]
     """RMS of each mode, metres OPD."""
 
+    kind: DitherKind
+    """"sine" or "binary"."""
+
     frequency_hz: tuple[Number, ...]
+    """One for each mode of a sine; empty: a binary dither has none."""
+
+    seed: int | None
+    """Of a binary dither's signs."""
+
     duration_s: Number
     start_seq: int | None
     """First frame that contains it; null until the RTC has accepted."""

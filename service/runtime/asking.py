@@ -86,11 +86,12 @@ async def _dither(bridge: Bridge, question: ev.AskDither) -> Event:
         DitherRequest(
             id=dither.id,
             action=DitherAction.START,
-            kind=DitherKind.SINE,
+            kind=DitherKind(dither.kind.value),
             modes=dither.modes,
             amplitude_m=dither.amplitude_m,
-            frequency_hz=dither.frequency_hz,
+            frequency_hz=dither.frequency_hz or None,
             duration_s=dither.duration_s,
+            seed=dither.seed,
         )
     )
     return ev.DitherAnswered(

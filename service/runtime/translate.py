@@ -6,6 +6,7 @@ from service import events as ev
 from service.link import events as heard
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.state import (
+    DitherKind,
     DitherView,
     Level,
     MatrixState,
@@ -98,18 +99,20 @@ def rtc_view(status: Status) -> RtcView:
 
 
 def _running(status: DitherStatus) -> DitherView | None:
-    """Return the dither that runs, if it is a sine."""
+    """Return the dither that runs."""
     request = status.request
-    if request.modes is None or request.amplitude_m is None or request.frequency_hz is None:
+    if request.modes is None or request.amplitude_m is None or request.kind is None:
         return None
     return DitherView(
         id=request.id,
         modes=request.modes,
         amplitude_m=request.amplitude_m,
-        frequency_hz=request.frequency_hz,
+        frequency_hz=request.frequency_hz or (),
         duration_s=request.duration_s or 0.0,
         start_seq=status.start_seq,
         asked_ns_utc=0,
+        kind=DitherKind(request.kind.value),
+        seed=request.seed,
     )
 
 

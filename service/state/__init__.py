@@ -4,12 +4,13 @@ from service.state.journal import Alarm, Level, LogEntry
 from service.state.measurements import MeasurementRecord, MeasurePattern, MeasureState
 from service.state.reconstructors import MatrixState, ReconstructorRecord
 from service.state.registration import HistoryEntry, Registration, Watchdog
-from service.state.rtc import CommandState, DitherView, LoopCommand, RtcView
+from service.state.rtc import CommandState, DitherKind, DitherView, LoopCommand, RtcView
 from service.state.tracker import Mode, TrackerState
 
 __all__ = [
     "Alarm",
     "CommandState",
+    "DitherKind",
     "DitherView",
     "HistoryEntry",
     "Level",

@@ -6,9 +6,19 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 
+class DitherKind(StrEnum):
+    """Shape of a dither in time."""
+
+    SINE = "sine"
+    """One line for each mode."""
+
+    BINARY = "binary"
+    """Plus or minus the amplitude in every frame, at random."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherView:
-    """A sinusoidal dither, asked for or running."""
+    """A dither, asked for or running."""
 
     id: str
     modes: tuple[int, ...]
@@ -16,12 +26,18 @@ class DitherView:
     """RMS of each mode, metres OPD."""
 
     frequency_hz: tuple[float, ...]
+    """One for each mode of a sine; a binary dither has none."""
+
     duration_s: float
     start_seq: int | None
     """First frame that contains it; None until the RTC has accepted."""
 
     asked_ns_utc: int
     """When it was asked for, then when it was accepted or adopted; 0: none of these."""
+
+    kind: DitherKind = DitherKind.SINE
+    seed: int | None = None
+    """Of a binary dither's signs; None: a sine has none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +73,7 @@ class RtcView:
     """Last frame processed when it was made; -1: not known."""
 
     dither: DitherView | None = None
-    """What is running, where it is a sine that has been announced to the frame; else None."""
+    """What is running, where it has been announced to the frame; else None."""
 
 
 class CommandState(StrEnum):

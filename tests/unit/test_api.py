@@ -732,6 +732,7 @@ DIMENSIONLESS = {
     "magnitude",
     "max_dither_modes",
     "optical_gain",
+    "seed",
     "status",
 }
 COUNTS = ("n_", "frames_", "windows_")

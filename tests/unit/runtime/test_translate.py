@@ -4,7 +4,7 @@ import pytest
 from service import events as ev
 from service.link import events as heard
 from service.runtime import translate
-from service.state import Level, MatrixState, Mode
+from service.state import DitherView, Level, MatrixState, Mode
 from service.wire import (
     Acknowledgement,
     AckState,
@@ -63,6 +63,30 @@ def test_a_running_dither_is_known_by_its_id():
     )
     running = DitherStatus(request=request, start_seq=3)
     assert translate.rtc_view(status(dither=running)).dither_id == "dither-5"
+
+
+def test_a_random_dither_is_known_by_its_seed():
+    request = DitherRequest(
+        id="dither-6",
+        action=DitherAction.START,
+        kind=DitherKind.BINARY,
+        modes=(1, 4),
+        amplitude_m=(1e-9, 2e-9),
+        duration_s=30.0,
+        seed=17,
+    )
+    view = translate.rtc_view(status(dither=DitherStatus(request=request, start_seq=3)))
+    assert view.dither == DitherView(
+        id="dither-6",
+        kind=DitherKind.BINARY,
+        modes=(1, 4),
+        amplitude_m=(1e-9, 2e-9),
+        frequency_hz=(),
+        seed=17,
+        duration_s=30.0,
+        start_seq=3,
+        asked_ns_utc=0,
+    )
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,8 +77,13 @@ class Telescope:
         )
 
 
-def build_telescope(options: Options, instrument: Instrument) -> Telescope:
+def build_telescope(
+    options: Options, instrument: Instrument, executor: Executor | None = None
+) -> Telescope:
     """Return the telescope of these options.
+
+    Optics to come are computed by ``executor``, a thread beside the loop unless given: then a
+    movement of the registration may come late.
 
     Raises
     ------
@@ -96,7 +102,9 @@ def build_telescope(options: Options, instrument: Instrument) -> Telescope:
     instrument = binned(instrument, binning)
     plant = build_plant(options, instrument, basis, plant_rng)
     optics = MovingOptics(
-        plant, build_schedule(options, instrument, alpha_rng), background_executor()
+        plant,
+        build_schedule(options, instrument, alpha_rng),
+        executor or background_executor(),
     )
     detector = build_detector(options, instrument, plant, optics.start())
     sky = build_sky(options, instrument, basis, plant, sky_rng)

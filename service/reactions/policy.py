@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,20 @@ class Policy:
 
     floor: NDArray[np.float64]
     """``(4,)`` 1 σ model error, numeric units."""
+
+    bias_memory_s: float = 3600.0
+    """After so long what was learnt of the passive estimate's bias is worth 1/e."""
+
+    flexure_per_degree: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
+    """``(4,)`` 1 σ of what a degree of elevation does to α, numeric units."""
+
+    slew_limit_deg: float = 5.0
+    """A telescope that has moved further than this makes α invalid until the next window."""
+
+    stale_sigma: NDArray[np.float64] = field(
+        default_factory=lambda: np.array([0.05, 0.05, np.deg2rad(0.1), 0.003])
+    )
+    """``(4,)`` 1 σ from which on α is stale, numeric units."""
 
     n_modes_target: int = 500
     """Modes to control once the registration is known."""

@@ -2,13 +2,25 @@
 
 from service.state.journal import Alarm, Level, LogEntry
 from service.state.measurements import MeasurementRecord, MeasurePattern, MeasureState
+from service.state.pointing import Pointing
 from service.state.reconstructors import MatrixState, ReconstructorRecord
-from service.state.registration import HistoryEntry, Registration, Watchdog
+from service.state.registration import (
+    Candidate,
+    HistoryEntry,
+    ModeGain,
+    PassiveBias,
+    Registration,
+    Source,
+    Standing,
+    Validity,
+    Watchdog,
+)
 from service.state.rtc import CommandState, DitherKind, DitherView, LoopCommand, RtcView
 from service.state.tracker import Mode, TrackerState
 
 __all__ = [
     "Alarm",
+    "Candidate",
     "CommandState",
     "DitherKind",
     "DitherView",
@@ -21,9 +33,15 @@ __all__ = [
     "MeasureState",
     "MeasurementRecord",
     "Mode",
+    "ModeGain",
+    "PassiveBias",
+    "Pointing",
     "ReconstructorRecord",
     "Registration",
     "RtcView",
+    "Source",
+    "Standing",
     "TrackerState",
+    "Validity",
     "Watchdog",
 ]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from service.state.pointing import Pointing
+
 
 class DitherKind(StrEnum):
     """Shape of a dither in time."""
@@ -74,6 +76,9 @@ class RtcView:
 
     dither: DitherView | None = None
     """What is running, where it has been announced to the frame; else None."""
+
+    pointing: Pointing | None = None
+    """Of the telescope; None: the RTC does not know."""
 
 
 class CommandState(StrEnum):

@@ -8,6 +8,7 @@ from enum import StrEnum
 from service.control.gate import GateVerdict
 from service.state.journal import Alarm, LogEntry
 from service.state.measurements import MeasurementRecord
+from service.state.pointing import Pointing
 from service.state.reconstructors import ReconstructorRecord
 from service.state.registration import HistoryEntry, Registration, Watchdog
 from service.state.rtc import DitherView, LoopCommand, RtcView
@@ -88,6 +89,15 @@ class TrackerState:
     retry_ns_utc: int = 0
     """Nothing is asked of the RTC or computed by itself before this time."""
 
+    dither_due_since_ns_utc: int | None = None
+    """Since when a dithered window is wanted before anything else is believed; None: it is not."""
+
+    dither_due_reason: str = ""
+    """Why: what makes α doubtful."""
+
+    pointing: Pointing | None = None
+    """Of the telescope, from the RTC's status or the observatory; None: nobody has told."""
+
     watchdog: Watchdog | None = None
     alarms: tuple[Alarm, ...] = ()
     log: tuple[LogEntry, ...] = ()
@@ -95,6 +105,8 @@ class TrackerState:
 
     windows_accepted: int = 0
     windows_refused: int = 0
+    windows_outlying: int = 0
+    """Believable in themselves, but so far from all others that they were not believed."""
 
     def reconstructor(self, matrix_id: str) -> ReconstructorRecord | None:
         """Return the record of this id, or None."""

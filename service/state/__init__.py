@@ -1,5 +1,6 @@
 """What the service knows: one frozen record, replaced as a whole, read by REST and metrics."""
 
+from service.state.dithering import Dithering, DitherPhase, DitherPlan, Precision
 from service.state.journal import Alarm, Level, LogEntry
 from service.state.measurements import MeasurementRecord, MeasurePattern, MeasureState
 from service.state.pointing import Pointing
@@ -23,7 +24,10 @@ __all__ = [
     "Candidate",
     "CommandState",
     "DitherKind",
+    "DitherPhase",
+    "DitherPlan",
     "DitherView",
+    "Dithering",
     "HistoryEntry",
     "Level",
     "LogEntry",
@@ -36,6 +40,7 @@ __all__ = [
     "ModeGain",
     "PassiveBias",
     "Pointing",
+    "Precision",
     "ReconstructorRecord",
     "Registration",
     "RtcView",

@@ -41,6 +41,9 @@ class DitherView:
     seed: int | None = None
     """Of a binary dither's signs; None: a sine has none."""
 
+    window_s: float | None = None
+    """Of telemetry in one estimate, where it was planned with the dither."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RtcView:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from service.control.gate import GateVerdict
+from service.state.dithering import Dithering
 from service.state.journal import Alarm, LogEntry
 from service.state.measurements import MeasurementRecord
 from service.state.pointing import Pointing
@@ -73,6 +74,12 @@ class TrackerState:
 
     dither_losses: int = 0
     """Dithers lost since the last window was accepted."""
+
+    dithering: Dithering = field(default_factory=Dithering)
+    """What the dither policy has learnt, and its account of why it dithers or does not."""
+
+    vibrations_hz: tuple[float, ...] = ()
+    """Vibration lines in the slopes, lowest first."""
 
     loop_command: LoopCommand | None = None
     """The last change of the loop that was asked of the RTC; None: none was."""

@@ -1,0 +1,104 @@
+"""What the service makes of its own dither: why it is on or off, what it costs and buys."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class DitherPhase(StrEnum):
+    """How the service dithers."""
+
+    OFF = "off"
+    """None is wanted, or none can be had."""
+
+    ACQUIRE = "acquire"
+    """α is not known, or something asks to see it again: the whole budget, without pause."""
+
+    FOLLOW = "follow"
+    """Without pause, for the flexure leaves no time for one; as weak as that allows."""
+
+    SPARSE = "sparse"
+    """One window now and then, off in between."""
+
+    OPERATOR = "operator"
+    """An operator's own, or one somebody else started."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Precision:
+    """How precise windows are, learnt from those accepted; kept from star to star."""
+
+    ratio: NDArray[np.float64]
+    """``(4,)`` measured κ of ``σ = κ / (A sqrt(T))`` over that of the table for the magnitude."""
+
+    n_windows: int
+    """Windows it was learnt from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DitherPlan:
+    """The dither that is wanted in the present state."""
+
+    total_m: float
+    """RMS of all lines together on the mirror, metres OPD."""
+
+    window_s: float
+    """Telemetry in one estimate, seconds."""
+
+    interval_s: float
+    """From one window to the next, seconds; ``window_s``: no pause."""
+
+    sigma: NDArray[np.float64]
+    """``(4,)`` 1 σ of α that is to be expected just before each window, numeric units."""
+
+    sufficient: bool
+    """Whether that is what was asked for."""
+
+    mean_cost_m: float
+    """Quadratic mean of it over time, pauses included, metres OPD."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Dithering:
+    """The dither policy's memory, and its account to the operator."""
+
+    phase: DitherPhase = DitherPhase.OFF
+    reason: str = "nothing has been decided yet"
+    """Why it is on or off."""
+
+    plan: DitherPlan | None = None
+    """None: none could be made yet."""
+
+    next_ns_utc: int | None = None
+    """When the next window is due; None: now, or never."""
+
+    precision: Precision | None = None
+    """None: no window has been accepted yet."""
+
+    avoided_hz: tuple[float, ...] = ()
+    """Vibrations the lines keep clear of."""
+
+    lines_hz: tuple[float, ...] = ()
+    """Of the last dither asked for: they stay where they are while they can."""
+
+    passive_ns_utc: int | None = None
+    """When the estimate was last renewed without a dithered window."""
+
+    n_windows_asked: int = 0
+    """Windows accepted and refused when the last dither was asked for."""
+
+    ended_ns_utc: int | None = None
+    """When the last of the service's own dithers ended; None: its windows have been counted."""
+
+    stopped_id: str | None = None
+    """The dither that was stopped because it had done its work: not to be adopted again."""
+
+    mean_square_m2: float = 0.0
+    """Mean square of what has been on the mirror, over ten minutes, metres OPD squared."""
+
+    seen_ns_utc: int | None = None
+    """Up to when that mean was taken."""

@@ -1,0 +1,335 @@
+"""The whole service against a simulated telescope, in simulated time: no network, no processes.
+
+What the service does is the service's own code: streams, worker, tracker, deeds, translation of
+the wire. Only what waits is replaced: an agenda says when each thing is over, by the frames' time,
+so a night takes as long as it computes and is the same every time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service import events as ev
+from service.errors import PyrcalError
+from service.estimation.lockin import WindowRefused
+from service.events import Command, Effect, Event
+from service.link import events as heard
+from service.reactions.policy import SECOND_NS, Policy
+from service.runtime import translate
+from service.runtime.deeds import Deeds, Publishing
+from service.runtime.following import followed, news, shape_news
+from service.runtime.streams import Streams, Window, fed, with_matrix
+from service.runtime.windows import fitted, lost, watched
+from service.state import Mode, TrackerState
+from service.tracker import step
+from service.wire import CHUNK_LIMIT, Manifest
+from service.worker import Workbench
+from studies.campaign.observatory_dome import Dome
+from studies.campaign.observatory_link import OwnHands, Shelf, ShortLink
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Latencies:
+    """How long things take at the telescope, seconds of simulated time.
+
+    The worker does one thing after the other, so that what it takes adds up.
+    """
+
+    fit_s: float = 0.5
+    make_s: float = 2.0
+    judge_s: float = 1.0
+    watch_s: float = 0.5
+    command_s: float = 0.1
+    """Until the RTC's answer is here; it acts at once."""
+
+    send_s: float = 0.1
+    """Until a matrix is staged; the RTC swaps with its next frames."""
+
+    fetch_s: float = 0.3
+    status_s: float = 0.2
+    """Between two status messages of the RTC."""
+
+    tick_s: float = 1.0
+    """Between two looks of the service at what it waits for."""
+
+    watch_interval_s: float = 10.0
+    """Between two looks of the passive watchdog."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Glance:
+    """What the service held to be true at the end of a block."""
+
+    time_s: float
+    alpha: NDArray[np.float64] | None
+    """``(4,)`` the tracker's registration, numeric units; None: not known."""
+
+    sigma: NDArray[np.float64] | None
+    """``(4,)`` 1 σ, floor included."""
+
+    alarms: tuple[str, ...]
+
+
+@dataclass(order=True, slots=True)
+class _Due:
+    """Something that will have happened."""
+
+    t_ns: int
+    number: int
+    """Of two at the same time the one first put down comes first."""
+
+    happen: Callable[[], None] = field(compare=False)
+
+
+class Observatory:
+    """A night in simulated time; ``advance`` lets it pass. Use it as a context manager."""
+
+    def __init__(
+        self,
+        options: Sequence[str],
+        policy: Policy,
+        mode: Mode,
+        workbench: Workbench,
+        *,
+        latencies: Latencies | None = None,
+        pole_radius_bound: float = 0.95,
+    ) -> None:
+        """Take the simulator's command line, ``--plant linear --seed 1``, and the policy."""
+        self.dome = Dome(options)
+        self.policy = policy
+        self.latencies = latencies or Latencies()
+        system = self.dome.computer.identity.system
+        self.state = TrackerState(system=system, mode=mode)
+        self.streams = Streams(description=workbench.describe())
+        self.glances: list[Glance] = []
+        self.events: list[tuple[float, Event]] = []
+        """All that the tracker heard and when, status and ticks left out."""
+
+        self._link = ShortLink(self.dome)
+        self._crew = OwnHands(workbench)
+        self._deeds = Deeds(
+            bridge=self._link,
+            crew=self._crew,
+            archive=Shelf(),
+            instrument=self.dome.instrument,
+            publishing=Publishing(
+                system=system, chunk_bytes=CHUNK_LIMIT, pole_radius_bound=pole_radius_bound
+            ),
+            clock_ns=lambda: self.dome.now_ns,
+        )
+        self._runner = asyncio.Runner()
+        self._agenda: list[_Due] = []
+        self._numbers = itertools.count()
+        self._worker_free_ns = 0
+        self._fitting = False
+        self._waiting: Window | None = None
+        self._begin()
+
+    def __enter__(self) -> Self:
+        """Use the night."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End it."""
+        self._runner.close()
+
+    @property
+    def time_s(self) -> float:
+        """Seconds since the night began."""
+        return self.dome.time_s
+
+    def advance(self, seconds: float) -> None:
+        """Let so much time pass.
+
+        Raises
+        ------
+        TypeError
+            If the service wants something done that no observatory here can do.
+        """
+        until_s = self.time_s + seconds
+        while self.time_s < until_s - 1e-9:
+            blocks = self.dome.play()
+            self._happen()
+            was_silent_s = self.streams.dither_silent_s
+            for block in blocks:
+                self.streams, windows = fed(self.streams, block)
+                for window in windows:
+                    self._take(window)
+            for event in news(was_silent_s, self.streams, self.state):
+                self._post(event)
+            self._acknowledged()
+            self._look()
+
+    def command(self, command: Command) -> None:
+        """Do what an operator would: raises what the tracker refuses."""
+        self._post(command)
+
+    def matrix(self, matrix_id: str) -> NDArray[np.float32]:
+        """Return one of the last reconstructors ``(n_modes, n_slopes)``."""
+        return self._deeds.matrix(matrix_id)
+
+    def restart_rtc(self) -> None:
+        """Let the RTC begin again with the matrix it started the night with."""
+        old = self.dome.computer.snapshot().session
+        self.dome.restart()
+        self._link.void()
+        self._hear(heard.SessionChanged(old=old, new=self.dome.computer.snapshot().session))
+
+    def _begin(self) -> None:
+        self._post(ev.Noted(name="service.ready", text="a night in simulated time"))
+        self._hear(heard.RtcAppeared())
+        session = self.dome.computer.snapshot().session
+        self._hear(heard.SessionChanged(old=None, new=session))
+        self._every(self.latencies.status_s, self._hear_status)
+        self._every(self.latencies.tick_s, lambda: self._post(ev.Tick()))
+        self._every(self.latencies.watch_interval_s, self._watch)
+
+    def _at(self, t_ns: int, happen: Callable[[], None]) -> None:
+        heapq.heappush(self._agenda, _Due(t_ns, next(self._numbers), happen))
+
+    def _in(self, seconds: float, happen: Callable[[], None]) -> None:
+        self._at(self.dome.now_ns + round(seconds * SECOND_NS), happen)
+
+    def _every(self, seconds: float, happen: Callable[[], None]) -> None:
+        def again() -> None:
+            happen()
+            self._in(seconds, again)
+
+        self._in(seconds, again)
+
+    def _worked(self, seconds: float) -> int:
+        """Return when the worker will be done with one more job."""
+        start_ns = max(self.dome.now_ns, self._worker_free_ns)
+        self._worker_free_ns = start_ns + round(seconds * SECOND_NS)
+        return self._worker_free_ns
+
+    def _happen(self) -> None:
+        """Let everything happen that is due."""
+        while self._agenda and self._agenda[0].t_ns <= self.dome.now_ns:
+            heapq.heappop(self._agenda).happen()
+
+    def _hear(self, event: heard.LinkEvent) -> None:
+        meant = translate.event_of(event)
+        if meant is not None:
+            self._post(meant)
+            mismatch = shape_news(self.streams, self.state)
+            if mismatch is not None:
+                self._post(mismatch)
+
+    def _hear_status(self) -> None:
+        self._hear(heard.StatusReceived(status=self.dome.status()))
+
+    def _acknowledged(self) -> None:
+        for answer in self._link.swapped():
+            self._hear(heard.AcknowledgementReceived(acknowledgement=answer, known=True))
+
+    def _look(self) -> None:
+        known = self.state.registration
+        self.glances.append(
+            Glance(
+                time_s=self.time_s,
+                alpha=None if known is None else known.alpha.vector,
+                sigma=None if known is None else known.sigma,
+                alarms=tuple(alarm.name for alarm in self.state.alarms),
+            )
+        )
+
+    def _take(self, window: Window) -> None:
+        if isinstance(window, WindowRefused):
+            self._post(ev.WindowLost(refused=window))
+            return
+        if not self._fitting:
+            self._fit(window)
+            return
+        if self._waiting is not None and not isinstance(self._waiting, WindowRefused):
+            reason = "the worker is too slow for the telemetry: a window was given up"
+            self._post(lost(self._waiting, reason))
+        self._waiting = window
+
+    def _fit(self, window: Window) -> None:
+        if isinstance(window, WindowRefused):
+            return
+        self._fitting = True
+        event = self._runner.run(fitted(window, self.state, self._crew, self._deeds))
+
+        def done() -> None:
+            self._fitting = False
+            self._post(event)
+            waiting, self._waiting = self._waiting, None
+            if waiting is not None:
+                self._fit(waiting)
+
+        self._at(self._worked(self.latencies.fit_s), done)
+
+    def _watch(self) -> None:
+        found = self._runner.run(watched(self.streams, self.state, self._crew, self.dome.now_ns))
+        if found is not None:
+            event = found
+            self._at(self._worked(self.latencies.watch_s), lambda: self._post(event))
+
+    def _post(self, event: Event) -> None:
+        """Let the tracker decide, replace the state, and set what it wants in motion."""
+        if not isinstance(event, ev.Tick | ev.StatusSeen):
+            self.events.append((self.time_s, event))
+        before = self.state
+        self.state, effects = step(before, event, self.policy, self.dome.now_ns)
+        self.streams, note = followed(self.streams, self.state, self.policy)
+        if note is not None:
+            self._post(note)
+        for effect in effects:
+            self._do(effect, self.state)
+        in_use = self.state.in_use
+        if in_use is not None and in_use != before.in_use:
+            self.streams = with_matrix(self.streams, in_use, self._deeds.matrix(in_use))
+
+    def _do(self, effect: Effect, state: TrackerState) -> None:
+        """Carry an effect out; what comes of it is heard when it would be."""
+        due_ns = self._due(effect)
+        try:
+            event = self._runner.run(self._deeds.carry_out(effect, state))
+        except PyrcalError as error:
+            event = ev.JobFailed(effect=effect, text=str(error))
+        self._at(due_ns, lambda: self._done(event))
+        while self._link.sent:
+            self._in(self.latencies.send_s, partial(self._deliver, *self._link.sent.pop()))
+
+    def _deliver(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+        for answer in self._link.deliver(manifest, matrix):
+            self._hear(heard.AcknowledgementReceived(acknowledgement=answer, known=True))
+
+    def _done(self, event: Event | None) -> None:
+        if event is not None:
+            self._post(event)
+
+    def _due(self, effect: Effect) -> int:
+        """Return when an effect has been carried out."""
+        now_ns, wait = self.dome.now_ns, self.latencies
+        match effect:
+            case ev.MakeMatrix():
+                return self._worked(wait.make_s)
+            case ev.CopyMatrix() | ev.JudgeMatrix():
+                return self._worked(wait.judge_s)
+            case ev.FetchMatrix():
+                return now_ns + round(wait.fetch_s * SECOND_NS)
+            case ev.SendMatrix() | ev.AskDither() | ev.AskNoDither() | ev.AskLoop() | ev.AskRamp():
+                return now_ns + round(wait.command_s * SECOND_NS)
+            case _:
+                raise TypeError(
+                    f"observatory: found {type(effect).__name__}; expected an effect whose "
+                    "duration is known here (studies.campaign.observatory)"
+                )

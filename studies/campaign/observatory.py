@@ -34,6 +34,7 @@ from service.state import Mode, TrackerState
 from service.tracker import step
 from service.wire import CHUNK_LIMIT, Manifest
 from service.worker import Workbench
+from studies.campaign.observatory_checks import Publication, Swap, published, true_radius
 from studies.campaign.observatory_dome import Dome
 from studies.campaign.observatory_link import OwnHands, Shelf, ShortLink
 
@@ -103,8 +104,12 @@ class Observatory:
         *,
         latencies: Latencies | None = None,
         pole_radius_bound: float = 0.95,
+        with_poles: bool = True,
     ) -> None:
-        """Take the simulator's command line, ``--plant linear --seed 1``, and the policy."""
+        """Take the simulator's command line, ``--plant linear --seed 1``, and the policy.
+
+        ``with_poles`` finds the true poles of every swap, seconds on a diffractive telescope.
+        """
         self.dome = Dome(options)
         self.policy = policy
         self.latencies = latencies or Latencies()
@@ -112,6 +117,7 @@ class Observatory:
         self.state = TrackerState(system=system, mode=mode)
         self.streams = Streams(description=workbench.describe())
         self.glances: list[Glance] = []
+        self.swaps: list[Swap] = []
         self.events: list[tuple[float, Event]] = []
         """All that the tracker heard and when, status and ticks left out."""
 
@@ -130,6 +136,7 @@ class Observatory:
         self._runner = asyncio.Runner()
         self._agenda: list[_Due] = []
         self._numbers = itertools.count()
+        self._with_poles = with_poles
         self._worker_free_ns = 0
         self._fitting = False
         self._waiting: Window | None = None
@@ -182,6 +189,16 @@ class Observatory:
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return one of the last reconstructors ``(n_modes, n_slopes)``."""
         return self._deeds.matrix(matrix_id)
+
+    def publications(self) -> list[Publication]:
+        """Return what has come of every matrix that was swapped in, so far."""
+        jumps = (*self.dome.jump_times_s, *(swap.time_s for swap in self.swaps), self.time_s)
+        return [
+            published(
+                swap, self.dome.moments, min((t for t in jumps if t > swap.time_s), default=0.0)
+            )
+            for swap in self.swaps
+        ]
 
     def restart_rtc(self) -> None:
         """Let the RTC begin again with the matrix it started the night with."""
@@ -236,7 +253,23 @@ class Observatory:
 
     def _acknowledged(self) -> None:
         for answer in self._link.swapped():
+            self._note_swap()
             self._hear(heard.AcknowledgementReceived(acknowledgement=answer, known=True))
+
+    def _note_swap(self) -> None:
+        rtc = self.dome.computer.snapshot()
+        matrix, optics = rtc.reconstructor.matrix, self.dome.optics
+        record = self.state.reconstructor(rtc.reconstructor.manifest.id)
+        swap = Swap(
+            id=rtc.reconstructor.manifest.id,
+            made_for=None if record is None else record.alpha,
+            gate=None if record is None else record.gate,
+            n_modes=len(matrix),
+            time_s=self.time_s,
+            alpha=self.dome.alpha,
+            radius=true_radius(matrix, optics, rtc) if self._with_poles else None,
+        )
+        self.swaps.append(swap)
 
     def _look(self) -> None:
         known = self.state.registration

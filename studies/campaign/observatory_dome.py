@@ -55,6 +55,8 @@ class Moment:
 
     n_controlled: int
     closed: bool
+    dither_nm: float
+    """RMS of the dither on the mirror, all modes together; 0: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,6 +114,11 @@ class Dome:
         return self.frame / self.rate_hz
 
     @property
+    def optics(self) -> TelescopeOptics:
+        """The true optics, as of the last frame."""
+        return self._optics
+
+    @property
     def alpha(self) -> Misregistration:
         """Where the mirror truly lies on the sensor, as of the last frame."""
         return self._optics.alpha
@@ -165,6 +172,7 @@ class Dome:
             cm_id=last.cm_id,
             n_controlled=last.n_controlled,
             closed=last.closed,
+            dither_nm=_dither_nm(batches),
         )
 
     def _block(self, batches: list[Batch]) -> FrameBlock:
@@ -197,6 +205,15 @@ def replayed(words: Sequence[str], orders: Sequence[Order], seconds: float) -> D
                 dome.order(what)
         dome.play()
     return dome
+
+
+def _dither_nm(batches: list[Batch]) -> float:
+    """Return the RMS of a dither: a mode's command is its own RMS over the pupil."""
+    squares = [
+        0.0 if batch.dither_m is None else float(np.mean(np.sum(batch.dither_m**2, axis=1)))
+        for batch in batches
+    ]
+    return float(np.sqrt(np.mean(squares))) * 1e9
 
 
 def _on_the_wire(batch: Batch) -> object:

@@ -22,9 +22,21 @@ def policy_of(settings: Settings) -> Policy:
     return Policy(
         dither_enabled=dither.enabled,
         dither_amplitude_m=dither.amplitude_m,
+        dither_budget_m=dither.budget_m,
+        dither_sigma=np.array(
+            [
+                dither.sigma_shift_subap,
+                dither.sigma_shift_subap,
+                np.deg2rad(dither.sigma_rotation_deg),
+                dither.sigma_magnification,
+            ]
+        ),
+        dither_avoid_hz=dither.avoid_hz,
+        longest_pause_s=dither.longest_pause_s,
         dither_modes=dither.modes,
         dither_frequencies_hz=dither.frequencies_hz,
         window_s=dither.window_s,
+        longest_window_s=dither.longest_window_s,
         drift_rate=per_minute / np.sqrt(60.0),
         floor=np.array(
             [

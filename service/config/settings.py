@@ -68,8 +68,23 @@ class DitherTable(Table):
     enabled: bool = True
     """Whether the service asks for it by itself."""
 
-    amplitude_m: float = Field(default=5e-9, gt=0.0, le=1e-7)
-    """RMS of each mode, metres OPD."""
+    budget_m: float = Field(default=10e-9, gt=0.0, le=2e-7)
+    """Largest RMS of all modes together on the mirror, metres OPD; never exceeded by itself."""
+
+    sigma_shift_subap: Positive = 0.01
+    """1 σ of each shift to be kept by as little dither as will do, subapertures."""
+
+    sigma_rotation_deg: Positive = 0.02
+    """Of the rotation, degrees."""
+
+    sigma_magnification: Positive = 0.001
+    """Of the magnification."""
+
+    longest_pause_s: float = Field(default=60.0, ge=0.0, le=3600.0)
+    """Longest time between two windows, seconds; 0: no pause at all."""
+
+    amplitude_m: float | None = Field(default=None, gt=0.0, le=1e-7)
+    """RMS of each mode, metres OPD; None: the service chooses, within the budget."""
 
     modes: Tuple[Annotated[int, Field(ge=0)]] | None = None
     """0-based basis indices; None: four the loop does not control."""
@@ -77,8 +92,14 @@ class DitherTable(Table):
     frequencies_hz: Tuple[Positive] | None = None
     """One for each mode; None: spread over 0.2-0.35 of the frame rate."""
 
+    avoid_hz: Tuple[Positive] = ()
+    """Vibrations to keep clear of besides those that are heard in the slopes."""
+
     window_s: float = Field(default=2.0, ge=0.1, le=60.0)
-    """Telemetry in one estimate, seconds; faint stars need 5 or more."""
+    """Least telemetry in one estimate, seconds."""
+
+    longest_window_s: float = Field(default=60.0, ge=0.1, le=300.0)
+    """Most of it, seconds; faint stars and small budgets need long windows."""
 
     @model_validator(mode="after")
     def _one_frequency_for_each_mode(self) -> DitherTable:
@@ -87,6 +108,17 @@ class DitherTable(Table):
             raise ValueError(
                 f"found {n_frequencies} frequencies_hz for {len(self.modes or ())} modes, "
                 "expected one for each"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _amplitude_within_the_budget(self) -> DitherTable:
+        n_modes = len(self.modes or range(4))
+        total_m = (self.amplitude_m or 0.0) * n_modes**0.5
+        if total_m > self.budget_m * (1.0 + 1e-9):
+            raise ValueError(
+                f"found amplitude_m for {1e9 * total_m:.3g} nm RMS of {n_modes} modes together, "
+                f"expected no more than budget_m, {1e9 * self.budget_m:.3g} nm"
             )
         return self
 

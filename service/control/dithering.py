@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+STRENGTH = 2.0
+"""Of a window: its own σ is the one asked for over this, where the budget allows."""
+
+NEARLY_BEST = 1.1
+"""Where the walk is too fast for what is asked: σ may be this much above the best there is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,6 +32,9 @@ class Demand:
 
     window_s: float
     """Telemetry in one estimate, seconds."""
+
+    settling_s: float = 0.0
+    """Dither before a window that comes after a pause, seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,33 +58,52 @@ class Schedule:
 
 
 def schedule(precision: Array, demand: Demand) -> Schedule:
-    """Return the schedule that keeps ``demand.sigma`` at least cost and within the budget.
+    """Return the schedule that keeps ``demand.sigma`` within the budget.
 
     ``precision`` ``(4,)`` is κ of ``σ = κ / (A sqrt(T))``, in numeric units times m sqrt(s), as
     measured on the last windows. A window of σ² = R every Δ seconds holds a random walk of rate q
     at ``P² - q²Δ P - q²Δ R = 0`` before each update, so ``Δ = P² / (q² (P + R))``. Weak dither
-    often costs less than strong dither seldom; one whose window reaches just the σ asked for
-    (R = P) costs twice the least possible and leaves the longest pauses for that.
+    often costs less than strong dither seldom, but leaves no pauses and no estimate that stands
+    alone: a window is made ``STRENGTH`` times as precise as asked, which costs
+    ``sqrt(1 + STRENGTH²)`` of the least possible. Where the walk leaves no pause, the dither is no
+    stronger than brings σ within ``NEARLY_BEST`` of the best the budget could buy.
     """
-    wanted = demand.sigma**2
-    amplitude = float(np.max(precision / (demand.sigma * np.sqrt(demand.window_s))))
-    total_m = min(amplitude, demand.budget_m)
+    total_m = min(_amplitude(precision, demand, demand.sigma / STRENGTH), demand.budget_m)
     interval_s = _longest_interval(precision, demand, total_m)
     if interval_s < demand.window_s:
-        # not even without a pause: what the budget buys is the best there is
-        total_m, interval_s = demand.budget_m, demand.window_s
-        if _longest_interval(precision, demand, total_m) >= demand.window_s:
-            total_m = _least_amplitude(precision, demand)
-    walk = demand.drift_rate**2 * interval_s
-    noise = precision**2 / (total_m**2 * demand.window_s)
-    before = 0.5 * (walk + np.sqrt(walk**2 + 4.0 * walk * noise))
+        interval_s = demand.window_s
+        total_m = _without_pause(precision, demand)
+    before = _variance_before(precision, demand, total_m, interval_s)
+    on_s = min(demand.window_s + demand.settling_s, interval_s)
     return Schedule(
         total_m=total_m,
         interval_s=interval_s,
         sigma=np.sqrt(before),
-        sufficient=bool(np.all(before <= wanted * (1.0 + 1e-9))),
-        mean_cost_m=total_m * float(np.sqrt(demand.window_s / interval_s)),
+        sufficient=bool(np.all(before <= demand.sigma**2 * (1.0 + 1e-9))),
+        mean_cost_m=total_m * float(np.sqrt(on_s / interval_s)),
     )
+
+
+def window_length(precision: Array, demand: Demand, lengths_s: tuple[float, ...]) -> float:
+    """Return the shortest window whose estimate alone is as precise as asked, on the whole budget.
+
+    Of ``lengths_s``, shortest first. Longer than it takes for α to walk as far as the noise of the
+    estimate a window is no use: the filter averages windows better than that.
+    """
+    for length_s, longer_s in pairwise(lengths_s):
+        noise = precision**2 / (demand.budget_m**2 * length_s)
+        if np.all(noise <= demand.sigma**2):
+            return length_s
+        lacking = noise > demand.sigma**2
+        walk = demand.drift_rate**2 * longer_s
+        if np.all(walk[lacking] > (noise * length_s / longer_s)[lacking]):
+            return length_s
+    return lengths_s[-1]
+
+
+def _amplitude(precision: Array, demand: Demand, sigma: Array) -> float:
+    """Return the dither of which one window has no more than this ``sigma`` in any parameter."""
+    return float(np.max(precision / (sigma * np.sqrt(demand.window_s))))
 
 
 def _longest_interval(precision: Array, demand: Demand, total_m: float) -> float:
@@ -83,11 +112,18 @@ def _longest_interval(precision: Array, demand: Demand, total_m: float) -> float
     return float(np.min(wanted**2 / (demand.drift_rate**2 * (wanted + noise))))
 
 
-def _least_amplitude(precision: Array, demand: Demand) -> float:
-    """Return the weakest dither that, without pause, holds what is asked for."""
-    wanted = demand.sigma**2
-    noise = wanted**2 / (demand.drift_rate**2 * demand.window_s) - wanted
-    return float(np.max(precision / np.sqrt(noise * demand.window_s)))
+def _variance_before(precision: Array, demand: Demand, total_m: float, interval_s: float) -> Array:
+    walk = demand.drift_rate**2 * interval_s
+    noise = precision**2 / (total_m**2 * demand.window_s)
+    return np.asarray(0.5 * (walk + np.sqrt(walk**2 + 4.0 * walk * noise)))
+
+
+def _without_pause(precision: Array, demand: Demand) -> float:
+    """Return the weakest dither that, without pause, holds what is asked for or nearly the best."""
+    best = _variance_before(precision, demand, demand.budget_m, demand.window_s)
+    allowed = np.maximum(demand.sigma**2, NEARLY_BEST**2 * best)
+    noise = allowed**2 / (demand.drift_rate**2 * demand.window_s) - allowed
+    return min(_amplitude(precision, demand, np.sqrt(noise)), demand.budget_m)
 
 
 def clear_of(

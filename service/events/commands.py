@@ -36,6 +36,8 @@ class StartDither:
     """One for each mode."""
 
     duration_s: float | None = None
+    over_budget: bool = False
+    """More than the budget of the settings is meant."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.events import Effect, FetchMatrix
-from service.reactions.dither_choice import choose_dither
+from service.reactions.dither_schedule import choose_dither
 from service.reactions.journal import WRONG_RTC
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy

@@ -50,7 +50,9 @@ def follow_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerStat
     played_s = (rtc.seq - dither.start_seq) / rtc.frame_rate_hz if rtc.seq >= 0 else elapsed_s
     # a status a second old may be the first to show the end
     if played_s >= dither.duration_s - SILENT_S:
-        state = without_alarm(replace(state, dither=None), _ALARM, now_ns)
+        dithering = replace(state.dithering, ended_ns_utc=now_ns)
+        state = replace(state, dither=None, dithering=dithering)
+        state = without_alarm(state, _ALARM, now_ns)
         return logged(state, "dither.ended", f"{dither.id} has ended", now_ns)
     text = f"the RTC's status shows no {dither.id} although it was accepted: it is asked for again"
     wait_s = 0.0 if state.dither_losses == 0 else _patience_s(state)
@@ -82,7 +84,7 @@ def _corrected(
     """Take the RTC's word on what it plays, where that is not what was asked for."""
     if running is None:
         return state
-    running = replace(running, asked_ns_utc=asked.asked_ns_utc)
+    running = replace(running, asked_ns_utc=asked.asked_ns_utc, window_s=asked.window_s)
     if running == asked:
         return state
     text = (

@@ -1,57 +1,64 @@
-"""Which dither the service asks for by itself."""
+"""Which dither is asked for: modes, lines clear of vibrations, amplitude within every limit."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
+import numpy as np
+
+from service.control.dithering import clear_of
 from service.errors import ModelError
-from service.estimation.lockin import LockInPlan
-from service.events import AskDither, AskNoDither
-from service.reactions.journal import logged, with_alarm, without_alarm
-from service.reactions.matrices import Step
-from service.reactions.policy import SECOND_NS, Policy
-from service.state import DitherView, RtcView, TrackerState
+from service.estimation.lockin import SIDE_OFFSETS_HZ, LockInPlan
+from service.reactions.policy import Policy
+from service.state import DitherKind, DitherView, RtcView
 
 LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
 """Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""
 
+LINE_RANGE = (0.2, 0.35)
+"""Of the frame rate, where lines may go to keep clear of vibrations."""
+
+CLEARANCES_HZ = (21.0, 8.0)
+"""Between a line and a vibration: beyond the side bins that measure the noise, or at least beyond
+a vibration's own width."""
+
 SETTLING_S = 0.3
 """Of the loop, after a dither has begun, before the first window."""
 
+SPARE_S = 0.3
+"""Of dither behind the last window, for one that begins late because frames were lost."""
+
+OWN_DITHER = "dither-"
+ASKED_DITHER = "operator-"
+"""How the id of a dither begins that the service has chosen, and an operator."""
+
 _N_LINES = 4
-_OWN_DITHER = "dither-"
 
 
-def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
-    """Keep a dither running while the loop is closed and its matrix known.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """What a dither is to be like, besides what settings or an operator fix."""
 
-    One that runs already, from before a restart of the service or in a replayed night, is as good
-    as a new one and the RTC plays no second one beside it.
-    """
-    wanted = policy.dither_enabled and not state.dither_stopped and state.dither is None
-    if rtc.loop != "closed" or not wanted:
-        return state, ()
-    usable = rtc.dither is not None and rtc.dither.id != state.dither_lost
-    if usable and rtc.dither is not None and why_unusable(rtc.dither, rtc, policy) is None:
-        state = replace(state, dither=replace(rtc.dither, asked_ns_utc=now_ns))
-        text = f"{rtc.dither.id} runs since frame {rtc.dither.start_seq}"
-        state = without_alarm(state, "dither", now_ns)
-        return logged(state, "dither.adopted", text, now_ns), ()
-    if state.in_use is None or now_ns < state.retry_ns_utc:
-        return state, ()
-    if rtc.dither_id is not None and rtc.dither_id.startswith(_OWN_DITHER):
-        # left behind by this service when its window had another length
-        return replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS), (AskNoDither(),)
-    dither = plan_dither(rtc, policy, now_ns)
-    reason = why_unusable(dither, rtc, policy)
-    if reason is not None:
-        state = replace(state, retry_ns_utc=now_ns + 60 * SECOND_NS)
-        return with_alarm(state, "dither", f"no usable dither: {reason}", now_ns), ()
-    return replace(state, dither=dither), (AskDither(dither=dither),)
+    total_m: float
+    """RMS of all lines together, metres OPD."""
+
+    window_s: float
+    """Telemetry in one estimate."""
+
+    n_windows: int
+    """Windows it must last for."""
+
+    avoid_hz: tuple[float, ...] = ()
+    """Vibrations."""
+
+    last_hz: tuple[float, ...] = ()
+    """Lines it need not leave without reason."""
 
 
 def why_unusable(dither: DitherView, rtc: RtcView, policy: Policy) -> str | None:
-    """Return why the lines of a dither cannot be told apart in this policy's windows, or None."""
+    """Return why the lines of a dither cannot be told apart in its windows, or None."""
+    if dither.kind is not DitherKind.SINE:
+        return f"{dither.id} is {dither.kind}, not a sine"
     try:
         lock_in_plan(dither, rtc, policy.window_s)
     except ModelError as error:
@@ -64,6 +71,7 @@ def plan_dither(
     policy: Policy,
     now_ns: int,
     *,
+    choice: Choice | None = None,
     modes: tuple[int, ...] | None = None,
     amplitude_m: float | None = None,
     frequency_hz: tuple[float, ...] | None = None,
@@ -72,41 +80,93 @@ def plan_dither(
     """Return the dither to ask for: what is not given is the policy's own choice.
 
     The lines are rounded to whole periods in a window. The modes are ones the loop does not and
-    will not control: nothing there amplifies the dither or the noise.
+    will not control: nothing there amplifies the dither or the noise. Without a ``choice`` it is
+    the whole budget for as long as the policy allows.
     """
-    chosen = modes or policy.dither_modes or _uncontrolled_modes(rtc, policy)
-    chosen = chosen[: rtc.max_dither_modes]
+    asked = any(wish is not None for wish in (modes, amplitude_m, frequency_hz, duration_s))
+    n_windows = int((policy.dither_duration_s - SETTLING_S - SPARE_S) / policy.window_s)
+    choice = choice or Choice(
+        total_m=policy.dither_budget_m, window_s=policy.window_s, n_windows=max(n_windows, 1)
+    )
+    chosen = (modes or policy.dither_modes or _uncontrolled_modes(rtc, policy))[
+        : rtc.max_dither_modes
+    ]
     lines = frequency_hz or policy.dither_frequencies_hz
     if lines is None:
-        lines = tuple(f * rtc.frame_rate_hz for f in LINE_FRACTIONS[: len(chosen)])
-    amplitude = min(amplitude_m or policy.dither_amplitude_m, rtc.max_dither_m)
+        lines = clear_lines(rtc, len(chosen), choice)
+    amplitude = amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))
+    lasting_s = SETTLING_S + choice.n_windows * choice.window_s + SPARE_S
+    step_hz = _step_hz(rtc, choice.window_s)
     return DitherView(
-        id=f"{_OWN_DITHER}{now_ns}",
+        id=f"{ASKED_DITHER if asked else OWN_DITHER}{now_ns}",
         modes=chosen,
-        amplitude_m=(amplitude,) * len(chosen),
-        frequency_hz=tuple(round(f * policy.window_s) / policy.window_s for f in lines),
-        duration_s=duration_s or policy.dither_duration_s,
+        amplitude_m=(float(min(amplitude, rtc.max_dither_m)),) * len(chosen),
+        frequency_hz=tuple(round(f / step_hz) * step_hz for f in lines),
+        duration_s=duration_s or lasting_s,
         start_seq=None,
         asked_ns_utc=now_ns,
+        window_s=choice.window_s,
     )
+
+
+def total_m(dither: DitherView) -> float:
+    """Return the RMS of all lines of a dither together, metres OPD."""
+    return float(np.sqrt(np.sum(np.square(dither.amplitude_m))))
 
 
 def lock_in_plan(dither: DitherView, rtc: RtcView, window_s: float) -> LockInPlan:
     """Return how a dither is demodulated, from where the loop has settled.
 
+    Its own window counts; ``window_s`` is for a dither that was planned without one.
+
     Raises
     ------
     ModelError
-        If its lines cannot be told apart in a window of ``window_s``.
+        If its lines cannot be told apart in a window.
     """
     return LockInPlan(
         modes=dither.modes,
         frequencies_hz=dither.frequency_hz,
         amplitude_m=dither.amplitude_m,
         frame_rate_hz=rtc.frame_rate_hz,
-        n_frames=round(window_s * rtc.frame_rate_hz),
+        n_frames=round((dither.window_s or window_s) * rtc.frame_rate_hz),
         first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
     )
+
+
+def clear_lines(rtc: RtcView, n_lines: int, choice: Choice) -> tuple[float, ...]:
+    """Return lines in the band that wind leaves alone, as clear of vibrations as these allow.
+
+    Those of the last dither stay while none of them is on a vibration.
+    """
+    last = choice.last_hz
+    near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
+    if len(last) == n_lines and min(near, default=np.inf) >= CLEARANCES_HZ[-1]:
+        return last
+    rate, step = rtc.frame_rate_hz, _step_hz(rtc, choice.window_s)
+    fractions = LINE_FRACTIONS[:n_lines]
+    if n_lines > _N_LINES:
+        fractions = tuple(np.linspace(*LINE_RANGE, n_lines).tolist())
+    wanted = tuple(fraction * rate for fraction in fractions)
+    edge = float(SIDE_OFFSETS_HZ.max()) + step
+    band = (max(LINE_RANGE[0] * rate, edge), min(LINE_RANGE[1] * rate, rate / 2 - edge))
+    for clearance_hz in (*CLEARANCES_HZ, 4.0 * step):
+        found = clear_of(
+            wanted, choice.avoid_hz, clearance_hz=clearance_hz, step_hz=step, range_hz=band
+        )
+        if found is not None:
+            return found
+    return wanted
+
+
+def n_lines(rtc: RtcView, policy: Policy) -> int:
+    """Return how many modes the service dithers by itself."""
+    return min(len(policy.dither_modes or range(_N_LINES)), rtc.max_dither_modes)
+
+
+def _step_hz(rtc: RtcView, window_s: float) -> float:
+    """Return the frequency of one period in a window."""
+    return rtc.frame_rate_hz / max(round(window_s * rtc.frame_rate_hz), 1)
 
 
 def _uncontrolled_modes(rtc: RtcView, policy: Policy) -> tuple[int, ...]:

@@ -28,6 +28,9 @@ MEASUREMENTS_KEPT = 200
 STROKE_M = 20e-9
 """RMS of a push or pull, metres OPD: small enough for a pyramid, far above its noise."""
 
+TONE_M = 5e-9
+"""RMS of each mode of a sine, metres OPD, where the settings fix no amplitude of the dither."""
+
 N_AVERAGE = 10
 N_TONES = 40
 """Modes of a sine measurement that names none."""
@@ -169,7 +172,8 @@ def _planned(command: ev.Measure, rtc: RtcView, policy: Policy, now_ns: int) -> 
     modes = command.modes or tuple(range(rtc.n_controlled))
     if sine and command.modes is None:
         modes = modes[:: -(-len(modes) // N_TONES)]
-    stroke_m = command.amplitude_m or (policy.dither_amplitude_m if sine else STROKE_M)
+    tone_m = policy.dither_amplitude_m or TONE_M
+    stroke_m = command.amplitude_m or (tone_m if sine else STROKE_M)
     duration_s = (command.duration_s or TONES_LAST_S) if sine else None
     lines = command.frequency_hz
     if duration_s is not None and lines is None:

@@ -8,7 +8,7 @@ from service import events as ev
 from service.errors import CommandError
 from service.events import Event
 from service.reactions.dither import found_again
-from service.reactions.dither_choice import plan_dither, why_unusable
+from service.reactions.dither_choice import plan_dither, total_m, why_unusable
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send
 from service.reactions.policy import Policy
@@ -82,10 +82,14 @@ def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, no
     reason = why_unusable(dither, rtc, policy)
     if reason is not None:
         raise CommandError(f"dither: {reason}")
+    found_nm, budget_nm = 1e9 * total_m(dither), 1e9 * policy.dither_budget_m
+    cost = f"{found_nm:.3g} nm RMS in all, budget {budget_nm:.3g} nm"
+    over = found_nm > budget_nm * (1.0 + 1e-9)
+    if over and not event.over_budget:
+        raise CommandError(f"dither: {cost}; say over_budget if that is meant")
     state = replace(state, dither=dither, dither_stopped=False)
-    return logged(state, "dither.asked", f"modes {dither.modes}", now_ns), (
-        ev.AskDither(dither=dither),
-    )
+    text = f"modes {dither.modes}, {cost}" + (": over budget, as asked" if over else "")
+    return logged(state, "dither.asked", text, now_ns), (ev.AskDither(dither=dither),)
 
 
 def _refit(state: TrackerState, n_modes: int | None, now_ns: int) -> Step:

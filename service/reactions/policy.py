@@ -15,8 +15,22 @@ class Policy:
     """The settings of the tracker."""
 
     dither_enabled: bool = True
-    dither_amplitude_m: float = 5e-9
-    """RMS of each dithered mode, metres OPD."""
+    dither_amplitude_m: float | None = None
+    """RMS of each dithered mode, metres OPD; None: as little as serves."""
+
+    dither_budget_m: float = 10e-9
+    """Largest RMS of all modes together, metres OPD."""
+
+    dither_sigma: NDArray[np.float64] = field(
+        default_factory=lambda: np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
+    )
+    """``(4,)`` 1 σ of α to be kept by dithering, numeric units, model error not included."""
+
+    dither_avoid_hz: tuple[float, ...] = ()
+    """Vibrations the dither keeps clear of, besides those that are heard."""
+
+    longest_pause_s: float = 60.0
+    """Between two windows; 0: no pause at all."""
 
     dither_modes: tuple[int, ...] | None = None
     """None: four modes the loop will not control."""
@@ -25,9 +39,14 @@ class Policy:
     """None: spread over 0.2-0.35 of the frame rate."""
 
     dither_duration_s: float = 120.0
-    """Of one request; it is repeated, so that a dead service leaves no dither behind."""
+    """Of a request of an operator's who does not say."""
 
     window_s: float = 2.0
+    """Shortest window of dithered telemetry."""
+
+    longest_window_s: float = 60.0
+    """Longest one; faint stars and small budgets need long windows."""
+
     drift_rate: NDArray[np.float64]
     """``(4,)`` random walk σ after one second, numeric units."""
 

@@ -70,6 +70,9 @@ class Dithering:
     reason: str = "nothing has been decided yet"
     """Why it is on or off."""
 
+    budget_m: float = 0.0
+    """Largest RMS of all lines together that settings and RTC allow, metres OPD."""
+
     plan: DitherPlan | None = None
     """None: none could be made yet."""
 
@@ -89,10 +92,11 @@ class Dithering:
     """When the estimate was last renewed without a dithered window."""
 
     n_windows_asked: int = 0
-    """Windows accepted and refused when the last dither was asked for."""
+    """Windows accepted when the last dither was asked for."""
 
     ended_ns_utc: int | None = None
-    """When the last of the service's own dithers ended; None: its windows have been counted."""
+    """When the last of the service's own dithers ended by itself; None: one runs, or it was
+    stopped."""
 
     stopped_id: str | None = None
     """The dither that was stopped because it had done its work: not to be adopted again."""

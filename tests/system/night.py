@@ -28,6 +28,9 @@ floor_rotation_deg = 0.04
 floor_magnification = 0.0007
 [dither]
 window_s = 1.0
+longest_window_s = 1.0
+longest_pause_s = 0
+budget_m = 40e-9
 amplitude_m = 20e-9
 [control]
 n_modes_target = {N_TARGET}

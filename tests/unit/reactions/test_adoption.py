@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service import events as ev
-from service.reactions.dither_choice import plan_dither
+from service.reactions.dither_choice import plan_dither, why_unusable
 from service.runtime.translate import rtc_view
 from service.wire import (
     DitherAction,
@@ -82,7 +82,7 @@ def test_an_operator_who_stopped_the_dither_is_obeyed():
 
 
 def test_lines_that_do_not_fit_a_window_are_not_adopted_and_the_services_own_is_stopped():
-    odd = replace(RUNNING, frequency_hz=(211.3, 239.0, 283.0, 331.0))
+    odd = replace(RUNNING, frequency_hz=(211.317, 239.0, 283.0, 331.0))
     story = Story().meet(**with_dither(odd))
     assert story.state.dither is None
     assert story.asked(ev.AskNoDither)
@@ -106,7 +106,7 @@ def test_only_a_sine_of_the_status_can_be_demodulated(kind, frequency_hz, seed):
     view = rtc_view(status(request))
     assert view.dither_id == "d-1"
     if kind is DitherKind.BINARY:
-        assert view.dither is None
+        assert why_unusable(view.dither, view, POLICY) == "d-1 is binary, not a sine"
     else:
         assert (view.dither.modes, view.dither.start_seq) == ((501, 520), 4000)
         assert view.dither.frequency_hz == frequency_hz

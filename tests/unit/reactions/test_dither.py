@@ -8,7 +8,7 @@ import pytest
 from service import events as ev
 from service.reactions.dither import LONGEST_PATIENCE_S, PATIENCE_S
 from service.state import Mode
-from tests.unit.reactions.situations import POLICY, Story, of_kind, rtc
+from tests.unit.reactions.situations import Story, of_kind, rtc
 
 START = 1000
 
@@ -49,7 +49,7 @@ class TestTheStatusShowsNone:
         assert not story.alarms
 
     def test_one_that_has_run_its_time_has_ended(self, story):
-        stop_seq = START + round(POLICY.dither_duration_s * 1000)
+        stop_seq = START + round(story.state.dither.duration_s * 1000)
         status(story, stop_seq - 1500)
         assert "dither-lost" in story.alarms
         story = Story(Mode.HOLD).meet(seq=900)

@@ -1,0 +1,186 @@
+"""How much dither is wanted now, and when: from the σ asked for, the noise seen and the flexure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.dithering import Demand, Schedule, schedule, window_length
+from service.control.precision import tabulated
+from service.reactions.dither_choice import SETTLING_S, SPARE_S, Choice, n_lines
+from service.reactions.policy import SECOND_NS, Policy
+from service.state import DitherPhase, DitherPlan, Registration, RtcView, TrackerState
+
+MIN_WINDOWS = 3
+"""Windows that must agree before the dither is less than the whole budget, or pauses."""
+
+LASTING_S = 30.0
+"""Of a request without pause: no longer does a dead service leave a dither behind."""
+
+SHORTEST_PAUSE_S = 3.0
+"""A shorter one is not worth the settling of the next dither."""
+
+WATCHED_WITHIN_S = 25.0
+"""A passive estimate younger than this is watching: two of its looks, and some."""
+
+FAINT_MAGNITUDE = 11.5
+FAINT_WINDOW_S = 5.0
+"""On a faint star a shorter window biases the rotation (0.08 deg at magnitude 12.5 in 1 s)."""
+
+LADDER = (1.0, 2.5, 5.0, 10.0, 30.0)
+"""Lengths of windows, in units of the shortest."""
+
+CHANGE = 1.25
+"""The amplitude stays while the best one is within this factor of it."""
+
+_SLOWEST = 1e-9
+"""Random walk after a second, numeric units: nothing on a telescope stands stiller."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wish:
+    """The dither that is wanted."""
+
+    phase: DitherPhase
+    reason: str
+    choice: Choice
+    next_ns_utc: int
+    """When; now or earlier: at once."""
+
+
+def wanted(
+    state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
+) -> tuple[Wish, DitherPlan]:
+    """Return the dither that is wanted in this state, and the plan behind it."""
+    kappa = precision(state, rtc)
+    demand = _demand(kappa, state, rtc, policy, now_ns)
+    found = schedule(kappa, demand)
+    phase, reason, next_ns = _paced(state, demand, policy, now_ns)
+    strength_m = demand.budget_m
+    if phase is not DitherPhase.ACQUIRE and policy.dither_amplitude_m is None:
+        strength_m = _steady(state, found, demand)
+    lasting = max(int((LASTING_S - SETTLING_S - SPARE_S) / demand.window_s), 1)
+    choice = Choice(
+        total_m=strength_m,
+        window_s=demand.window_s,
+        n_windows=1 if phase is DitherPhase.SPARSE else lasting,
+        avoid_hz=(*policy.dither_avoid_hz, *state.vibrations_hz),
+        last_hz=state.dithering.lines_hz,
+    )
+    plan = DitherPlan(
+        total_m=strength_m,
+        window_s=demand.window_s,
+        interval_s=found.interval_s,
+        sigma=found.sigma,
+        sufficient=found.sufficient,
+        mean_cost_m=found.mean_cost_m,
+    )
+    return Wish(phase=phase, reason=reason, choice=choice, next_ns_utc=next_ns), plan
+
+
+def precision(state: TrackerState, rtc: RtcView) -> NDArray[np.float64]:
+    """Return κ ``(4,)`` of ``σ = κ / (A sqrt(T))`` as far as it has been learnt."""
+    table, known = tabulated(rtc.magnitude), state.dithering.precision
+    return table if known is None else table * known.ratio
+
+
+def budget_m(rtc: RtcView, policy: Policy) -> float:
+    """Return the largest RMS of all lines together that policy, settings and RTC allow, metres."""
+    n = n_lines(rtc, policy)
+    largest = min(rtc.max_dither_m, policy.dither_amplitude_m or np.inf)
+    return float(min(policy.dither_budget_m, largest * np.sqrt(max(n, 1))))
+
+
+def window_lengths_s(policy: Policy) -> tuple[float, ...]:
+    """Return how long a window may be, shortest first."""
+    lengths = [policy.window_s * step for step in LADDER]
+    return tuple(s for s in lengths if s <= policy.longest_window_s) or (policy.window_s,)
+
+
+def _demand(
+    kappa: NDArray[np.float64], state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
+) -> Demand:
+    demand = Demand(
+        sigma=policy.dither_sigma,
+        drift_rate=np.sqrt(np.maximum(_walk_rate(state, policy, now_ns), _SLOWEST**2)),
+        budget_m=budget_m(rtc, policy),
+        window_s=policy.window_s,
+        settling_s=SETTLING_S,
+    )
+    lengths = window_lengths_s(policy)
+    if rtc.magnitude is not None and rtc.magnitude >= FAINT_MAGNITUDE:
+        lengths = tuple(s for s in lengths if s >= FAINT_WINDOW_S) or lengths[-1:]
+    return replace(demand, window_s=window_length(kappa, demand, lengths))
+
+
+def _walk_rate(state: TrackerState, policy: Policy, now_ns: int) -> NDArray[np.float64]:
+    """Return ``(4,)`` variance that α gains in a second: the drift, or the flexure of a slew."""
+    known, base = state.registration, policy.drift_rate**2
+    if known is None:
+        return base
+    age_s = (now_ns - known.arrived_ns_utc) / SECOND_NS
+    return np.maximum(base, known.grown / age_s) if age_s >= 1.0 else base
+
+
+def _paced(
+    state: TrackerState, demand: Demand, policy: Policy, now_ns: int
+) -> tuple[DitherPhase, str, int]:
+    """Return how to dither, why, and when the next window is due."""
+    known = state.registration
+    if known is None:
+        return DitherPhase.ACQUIRE, "α is not known", now_ns
+    if state.dither_due_since_ns_utc is not None:
+        return DitherPhase.ACQUIRE, state.dither_due_reason or "α is in doubt", now_ns
+    if known.n_windows < MIN_WINDOWS:
+        text = f"{known.n_windows} of {MIN_WINDOWS} windows agree"
+        return DitherPhase.ACQUIRE, text, now_ns
+    if policy.longest_pause_s == 0.0:
+        return DitherPhase.FOLLOW, "the settings allow no pause", now_ns
+    window_ns = known.window_ns_utc or known.arrived_ns_utc
+    longest_ns = window_ns + round(policy.longest_pause_s * SECOND_NS)
+    passive_ns = state.dithering.passive_ns_utc
+    if passive_ns is not None and now_ns - passive_ns < WATCHED_WITHIN_S * SECOND_NS:
+        return _watched(known, demand, longest_ns, now_ns)
+    return _unwatched(known, demand, longest_ns)
+
+
+def _watched(
+    known: Registration, demand: Demand, longest_ns: int, now_ns: int
+) -> tuple[DitherPhase, str, int]:
+    """Pace by what the filter makes of dithered windows and ordinary telemetry together."""
+    enough = bool(np.all(np.diag(known.covariance) <= demand.sigma**2))
+    if enough:
+        return DitherPhase.SPARSE, "ordinary telemetry keeps σ between windows", longest_ns
+    if known.arrived_ns_utc > known.window_ns_utc:
+        return DitherPhase.SPARSE, "ordinary telemetry alone keeps σ no longer", now_ns
+    return DitherPhase.FOLLOW, "a window alone does not bring σ to what is asked", now_ns
+
+
+def _unwatched(
+    known: Registration, demand: Demand, longest_ns: int
+) -> tuple[DitherPhase, str, int]:
+    """Pace by how far α may have walked since the last window."""
+    room = demand.sigma**2 - np.diag(known.covariance)
+    on_s = demand.settling_s + demand.window_s + SPARE_S
+    pause_s = float(np.min(room / demand.drift_rate**2)) - on_s
+    if pause_s < SHORTEST_PAUSE_S:
+        text = "α walks too fast for a pause, or no window brings σ to what is asked"
+        return DitherPhase.FOLLOW, text, known.arrived_ns_utc
+    due_ns = known.arrived_ns_utc + round(min(pause_s, 1e6) * SECOND_NS)
+    return (
+        DitherPhase.SPARSE,
+        "α cannot have walked far since the last window",
+        min(due_ns, longest_ns),
+    )
+
+
+def _steady(state: TrackerState, found: Schedule, demand: Demand) -> float:
+    """Return the amplitude, left as it is while the best one is near."""
+    before = state.dithering.plan
+    settled = state.dithering.phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE}
+    if before is None or not settled or before.total_m > demand.budget_m:
+        return found.total_m
+    ratio = found.total_m / before.total_m
+    return before.total_m if 1.0 / CHANGE <= ratio <= CHANGE else found.total_m

@@ -1,0 +1,188 @@
+"""Whether a dither is asked for, left alone, or stopped because it has done its work."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from service.control.precision import forgetting_mean, measured_ratio
+from service.estimation.instrumental import WindowEstimate
+from service.events import AskDither, AskNoDither
+from service.reactions.dither_choice import OWN_DITHER, plan_dither, total_m, why_unusable
+from service.reactions.dither_pace import (
+    SHORTEST_PAUSE_S,
+    Wish,
+    budget_m,
+    wanted,
+    window_lengths_s,
+)
+from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.matrices import Step
+from service.reactions.policy import SECOND_NS, Policy
+from service.state import (
+    DitherKind,
+    DitherPhase,
+    DitherView,
+    Precision,
+    RtcView,
+    TrackerState,
+)
+
+RESULT_WITHIN_S = 10.0
+"""For the estimate of a window whose dither has ended."""
+
+SOON_OVER_S = 2.0
+"""A dither that ends by itself so soon is not worth a command."""
+
+MEMORY_S = 600.0
+"""Of the mean cost that is shown."""
+
+
+def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+    """Dither as much and as often as the policy asks while the loop is closed, its matrix known.
+
+    A dither that runs already, from before a restart of the service or in a replayed night, is as
+    good as a new one and the RTC plays no second one beside it.
+    """
+    state = _accounted(state, rtc, policy, now_ns)
+    dither = state.dither
+    if dither is not None and not _own(dither):
+        return _shown(state, DitherPhase.OPERATOR, f"{dither.id} runs"), ()
+    forbidden = _why_none(state, rtc, policy)
+    if forbidden is not None:
+        return _shown(state, DitherPhase.OFF, forbidden), ()
+    wish, plan = wanted(state, rtc, policy, now_ns)
+    later_ns = wish.next_ns_utc if wish.next_ns_utc > now_ns else None
+    dithering = replace(state.dithering, plan=plan, next_ns_utc=later_ns)
+    dithering = replace(dithering, avoided_hz=wish.choice.avoid_hz)
+    state = _shown(replace(state, dithering=dithering), wish.phase, wish.reason)
+    if dither is not None:
+        return _running(state, dither, wish, now_ns)
+    adopted = _adopted(state, rtc, policy, now_ns)
+    if adopted is not None:
+        return adopted, ()
+    if now_ns < state.retry_ns_utc:
+        return state, ()
+    if rtc.dither_id is not None and rtc.dither_id.startswith(OWN_DITHER):
+        # left behind by this service: its window had another length, or it is to stop
+        return replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS), (AskNoDither(),)
+    if now_ns < wish.next_ns_utc or _awaits_a_result(state, wish, now_ns):
+        return state, ()
+    return _ask(state, rtc, policy, wish, now_ns)
+
+
+def learnt(before: TrackerState, after: TrackerState, estimate: WindowEstimate) -> TrackerState:
+    """Return the state after a window, with what it says of the precision of windows."""
+    accepted = after.windows_accepted > before.windows_accepted
+    if not accepted or estimate.dither_m <= 0.0 or after.rtc is None:
+        return after
+    magnitude, known = after.rtc.magnitude, after.dithering.precision
+    ratio = measured_ratio(estimate.covariance, estimate.dither_m, estimate.window_s, magnitude)
+    n_windows = 0 if known is None else known.n_windows
+    mean = forgetting_mean(None if known is None else known.ratio, n_windows, ratio)
+    precision = Precision(ratio=mean, n_windows=n_windows + 1)
+    return replace(after, dithering=replace(after.dithering, precision=precision))
+
+
+def _own(dither: DitherView) -> bool:
+    return dither.id.startswith(OWN_DITHER) and dither.kind is DitherKind.SINE
+
+
+def _accounted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState:
+    """Keep count of what the dither costs, and of who has looked at α last."""
+    dithering, known, dither = state.dithering, state.registration, state.dither
+    on = dither is not None and dither.start_seq is not None
+    power = total_m(dither) ** 2 if dither is not None and on else 0.0
+    since_ns = now_ns if dithering.seen_ns_utc is None else dithering.seen_ns_utc
+    share = -np.expm1(-max(now_ns - since_ns, 0) / (MEMORY_S * SECOND_NS))
+    passive_ns = dithering.passive_ns_utc
+    if known is not None and known.window_ns_utc and known.arrived_ns_utc > known.window_ns_utc:
+        passive_ns = known.arrived_ns_utc
+    dithering = replace(
+        dithering,
+        budget_m=budget_m(rtc, policy),
+        mean_square_m2=float(dithering.mean_square_m2 * (1.0 - share) + power * share),
+        seen_ns_utc=now_ns,
+        passive_ns_utc=passive_ns,
+    )
+    return replace(state, dithering=dithering)
+
+
+def _shown(state: TrackerState, phase: DitherPhase, reason: str) -> TrackerState:
+    dithering = replace(state.dithering, phase=phase, reason=reason)
+    if phase in {DitherPhase.OFF, DitherPhase.OPERATOR}:
+        dithering = replace(dithering, next_ns_utc=None)
+    return replace(state, dithering=dithering)
+
+
+def _why_none(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
+    if state.dither_stopped:
+        return "stopped by the operator"
+    if not policy.dither_enabled and state.dither is None:
+        return "the settings forbid it"
+    if rtc.loop != "closed":
+        return f"the loop is {rtc.loop}"
+    if state.in_use is None and state.dither is None and rtc.dither is None:
+        return "the reconstructor in use is not known yet"
+    return None
+
+
+def _running(state: TrackerState, dither: DitherView, wish: Wish, now_ns: int) -> Step:
+    """Stop a dither that has done its work, or is too weak for what has come up meanwhile."""
+    left_s = dither.duration_s - (now_ns - dither.asked_ns_utc) / SECOND_NS
+    if dither.start_seq is None or left_s < SOON_OVER_S:
+        return state, ()
+    known = state.registration
+    seen = known is not None and known.window_ns_utc > dither.asked_ns_utc
+    pause_s = (wish.next_ns_utc - now_ns) / SECOND_NS
+    done = seen and wish.phase is DitherPhase.SPARSE and pause_s >= SHORTEST_PAUSE_S
+    weak = wish.phase is DitherPhase.ACQUIRE and 2.0 * total_m(dither) < wish.choice.total_m
+    if not (done or weak):
+        return state, ()
+    text = f"{dither.id}: {wish.reason}" if done else f"{dither.id} is too weak: {wish.reason}"
+    dithering = replace(state.dithering, stopped_id=dither.id, ended_ns_utc=None)
+    state = replace(state, dither=None, dithering=dithering)
+    state = replace(state, retry_ns_utc=max(state.retry_ns_utc, now_ns + SECOND_NS))
+    return logged(state, "dither.stopped", text, now_ns), (AskNoDither(),)
+
+
+def _adopted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState | None:
+    """Take over a dither that runs, if it can be read; None: there is none."""
+    running = rtc.dither
+    if running is None or running.id in {state.dither_lost, state.dithering.stopped_id}:
+        return None
+    if _own(running) and total_m(running) > 1.001 * state.dithering.budget_m:
+        return None
+    for window_s in window_lengths_s(policy):
+        dither = replace(running, asked_ns_utc=now_ns, window_s=window_s)
+        if why_unusable(dither, rtc, policy) is None:
+            text = f"{running.id} runs since frame {running.start_seq}"
+            state = without_alarm(replace(state, dither=dither), "dither", now_ns)
+            return logged(state, "dither.adopted", text, now_ns)
+    return None
+
+
+def _awaits_a_result(state: TrackerState, wish: Wish, now_ns: int) -> bool:
+    """Return whether the window of the dither that ended last may still be on its way."""
+    dithering = state.dithering
+    if wish.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
+        return False
+    late = now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
+    return not late and state.windows_accepted == dithering.n_windows_asked
+
+
+def _ask(state: TrackerState, rtc: RtcView, policy: Policy, wish: Wish, now_ns: int) -> Step:
+    dither = plan_dither(rtc, policy, now_ns, choice=wish.choice)
+    reason = why_unusable(dither, rtc, policy)
+    if reason is not None:
+        state = replace(state, retry_ns_utc=now_ns + 60 * SECOND_NS)
+        return with_alarm(state, "dither", f"no usable dither: {reason}", now_ns), ()
+    dithering = replace(
+        state.dithering,
+        lines_hz=dither.frequency_hz,
+        n_windows_asked=state.windows_accepted,
+        ended_ns_utc=None,
+        next_ns_utc=None,
+    )
+    return replace(state, dither=dither, dithering=dithering), (AskDither(dither=dither),)

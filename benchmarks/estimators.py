@@ -1,0 +1,254 @@
+"""What the streaming estimators cost for every frame, at the size of FLAO.
+
+One core, processor time, 1408 slopes, 594 modes of which 400 are controlled, telemetry in blocks
+as the link delivers them. Beside them stand the same sums written the plain way, frame by frame.
+Run: ``python -m benchmarks.estimators``; ``--block 30`` is what a service at 1 kHz sees.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from service.config import load_instrument
+from service.estimation import lockin, loopcheck, passive, randomdither, vibration
+from service.estimation.edge import Actuators, EdgeHealth, EdgeWatch, edge_watch, observe_edge
+from service.estimation.frames import FrameBlock
+from service.estimation.health import LoopHealth, observe
+from service.estimation.lockin import LockIn, LockInPlan
+from service.estimation.loopcheck import LoopCheck, LoopTerms
+from service.estimation.passive import Passive
+from service.estimation.randomdither import RandomDither, RandomPlan
+from service.model.instrument import Mirror
+from service.model.modes import karhunen_loeve_basis
+
+N_SLOPES, N_MODES, N_CONTROLLED = 1408, 594, 400
+RATE_HZ = 1000.0
+WINDOW_FRAMES = 5000
+LINES_HZ = (211.0, 239.0, 283.0, 331.0)
+DITHERED = (409, 427, 445, 463)
+AMPLITUDE_M = 5e-9
+TARGET_US = 50.0
+
+TOGETHER = ("lock-in, 4 lines", "random dither, 4 modes", "passive, 400 modes")
+"""The three estimators of the target."""
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Part:
+    """One thing that looks at every frame."""
+
+    name: str
+    begin: Any
+    """Its state before the first frame."""
+
+    feed: Callable[[Any, FrameBlock], Any]
+    """State after one more block."""
+
+
+def main() -> None:
+    """Print the table; exit with 1 when the three estimators together miss the target."""
+    given = _arguments()
+    with threadpool_limits(1):
+        blocks = list(_blocks(given.block, given.frames))
+        costs = {part.name: _cost_us(part, blocks, given.repeats) for part in _parts()}
+        few = list(_blocks(1, 200))
+        plain = {part.name: _cost_us(part, few, given.repeats) for part in _plain()}
+    sys.stdout.write(_table(costs, plain, given.block))
+    raise SystemExit(1 if sum(costs[name] for name in TOGETHER) > TARGET_US else 0)
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.estimators")
+    parser.add_argument("--block", type=int, default=30, help="frames per block (default: 30)")
+    parser.add_argument("--frames", type=int, default=3000, help="per repeat (default: 3000)")
+    parser.add_argument("--repeats", type=int, default=5, help="the fastest counts (default: 5)")
+    return parser.parse_args()
+
+
+def _blocks(n_block: int, n_frames: int) -> Iterator[FrameBlock]:
+    """Yield contiguous telemetry of a dithered loop: what it holds does not change its cost."""
+    rng = np.random.default_rng(1)
+    shape = (max(n_block, 200), N_SLOPES)
+    slopes = (1e-2 * rng.standard_normal(shape)).astype(np.float32)
+    commands = (1e-8 * rng.standard_normal((len(slopes), N_MODES))).astype(np.float32)
+    for first_seq in range(0, n_frames, n_block):
+        # rows of a long array in turn, or the caches would hold all there is
+        rows = (first_seq + np.arange(n_block)) % len(slopes)
+        dither = np.zeros((n_block, N_MODES), np.float32)
+        turns = np.outer(first_seq + np.arange(n_block), LINES_HZ) / RATE_HZ
+        dither[:, DITHERED] = AMPLITUDE_M * np.sqrt(2.0) * np.sin(2 * np.pi * turns)
+        yield FrameBlock(
+            session="benchmark",
+            first_seq=first_seq,
+            t0_ns_utc=round(first_seq * 1e9 / RATE_HZ),
+            dt_ns=round(1e9 / RATE_HZ),
+            slopes=slopes[rows],
+            commands_m=commands[rows] + dither,
+            dither_m=dither,
+            cm_id="cm",
+        )
+
+
+def _parts() -> Iterator[Part]:
+    """Yield all that looks at the telemetry of a running service, and the two kinds of dither."""
+    lock_in = LockIn(
+        plan=LockInPlan(
+            modes=DITHERED,
+            frequencies_hz=LINES_HZ,
+            amplitude_m=(AMPLITUDE_M,) * 4,
+            frame_rate_hz=RATE_HZ,
+            n_frames=WINDOW_FRAMES,
+            first_seq=0,
+        )
+    )
+    yield Part(name=TOGETHER[0], begin=lock_in, feed=lambda s, b: lockin.accumulate(s, b)[0])
+    yield Part(name=TOGETHER[1], begin=_random(DITHERED), feed=_random_fed)
+    watched = Passive(n_modes=N_CONTROLLED, memory_frames=1e4)
+    yield Part(name=TOGETHER[2], begin=watched, feed=passive.accumulate)
+    everything = _random(tuple(range(N_CONTROLLED)))
+    yield Part(name="random dither, 400 modes", begin=everything, feed=_random_fed)
+    yield from _watchers()
+
+
+def _random(modes: tuple[int, ...]) -> RandomDither:
+    amplitude_m = (AMPLITUDE_M / len(modes) ** 0.5,) * len(modes)
+    plan = RandomPlan(modes=modes, amplitude_m=amplitude_m, n_frames=WINDOW_FRAMES, first_seq=0)
+    return RandomDither(plan=plan)
+
+
+def _random_fed(state: RandomDither, block: FrameBlock) -> RandomDither:
+    return randomdither.accumulate(state, block)[0]
+
+
+def _watchers() -> Iterator[Part]:
+    """Yield what guards the loop."""
+    instrument = load_instrument("flao-lbt")
+    basis = karhunen_loeve_basis(instrument)
+    variance = basis.variance_m2
+    yield Part(
+        name="loop health",
+        begin=LoopHealth(),
+        feed=lambda state, block: observe(state, block, variance, N_CONTROLLED),
+    )
+    watch = _edge_watch(instrument.mirror, basis.mode_to_actuator, variance)
+    yield Part(
+        name="edge of the mirror",
+        begin=EdgeHealth(),
+        feed=lambda state, block: observe_edge(state, block, watch),
+    )
+    terms = LoopTerms(
+        cm_id="cm",
+        reconstructor=np.ones((N_CONTROLLED, N_SLOPES), np.float32),
+        gains=np.full(N_CONTROLLED, 0.5, np.float32),
+        leak=0.999,
+        delay_frames=2.0,
+        frame_rate_hz=RATE_HZ,
+    )
+    yield Part(
+        name="commands obey the loop",
+        begin=LoopCheck(),
+        feed=lambda state, block: loopcheck.observe(state, block, terms),
+    )
+    listening = vibration.Vibrations(views=vibration.views_of(N_SLOPES))
+    yield Part(name="vibrations", begin=listening, feed=vibration.listen)
+
+
+def _edge_watch(mirror: object, strokes: Array, variance: Array) -> EdgeWatch:
+    if not isinstance(mirror, Mirror):
+        raise TypeError(f"benchmark: found {type(mirror).__name__}; expected a mirror of actuators")
+    actuators = Actuators(positions=mirror.positions_m, strokes=strokes)
+    watch = edge_watch(actuators, variance, N_CONTROLLED)
+    if watch is None:
+        raise TypeError("benchmark: found no edge to watch; expected the ring of 400 modes")
+    return watch
+
+
+def _plain() -> Iterator[Part]:
+    """Yield the sums of the estimators as one would first write them: a frame at a time."""
+    bins_hz = (np.array(LINES_HZ)[:, None] + np.append(lockin.SIDE_OFFSETS_HZ, 0.0)).ravel()
+    sums = np.zeros((len(bins_hz), N_SLOPES + 2 * N_MODES), np.complex64)
+
+    def demodulate(_: None, block: FrameBlock) -> None:
+        rows = np.hstack([block.slopes, block.commands_m, _dither(block)])
+        for k, row in enumerate(rows, start=block.first_seq):
+            hann = 0.5 - 0.5 * np.cos(2 * np.pi * (k + 0.5) / WINDOW_FRAMES)
+            phasor = hann * np.exp(-2j * np.pi * bins_hz / RATE_HZ * k)
+            sums[...] += np.outer(phasor.astype(np.complex64), row)
+
+    yield Part(name=TOGETHER[0], begin=None, feed=demodulate)
+    signs = np.zeros((N_SLOPES, len(DITHERED)), np.float32)
+
+    def correlate(_: None, block: FrameBlock) -> None:
+        for slopes, dither in zip(block.slopes, _dither(block), strict=True):
+            signs[...] += np.outer(slopes, dither[list(DITHERED)])
+
+    yield Part(name=TOGETHER[1], begin=None, feed=correlate)
+    cross = np.zeros((N_SLOPES, N_CONTROLLED), np.float32)
+    power = np.zeros((N_CONTROLLED, N_CONTROLLED), np.float32)
+
+    def watch(before: FrameBlock | None, block: FrameBlock) -> FrameBlock:
+        if before is not None:
+            moved = block.commands_m[0, :N_CONTROLLED] - before.commands_m[0, :N_CONTROLLED]
+            cross[...] += np.outer(block.slopes[0] - before.slopes[0], moved)
+            power[...] += np.outer(moved, moved)
+        return block
+
+    yield Part(name=TOGETHER[2], begin=None, feed=watch)
+
+
+def _dither(block: FrameBlock) -> Array:
+    return block.commands_m[:0] if block.dither_m is None else block.dither_m
+
+
+def _cost_us(part: Part, blocks: list[FrameBlock], repeats: int) -> float:
+    """Return processor time per frame, the fastest of a few passes; the first one warms up."""
+    n_frames = sum(block.n_frames for block in blocks)
+    state, costs = part.begin, []
+    for k in range(repeats + 1):
+        shifted = [_later(block, k * n_frames) for block in blocks]
+        start_s = time.process_time()
+        for block in shifted:
+            state = part.feed(state, block)
+        costs.append((time.process_time() - start_s) / n_frames)
+    return 1e6 * min(costs[1:])
+
+
+def _later(block: FrameBlock, n_frames: int) -> FrameBlock:
+    """Return the block ``n_frames`` further on, so that a second pass goes on from the first."""
+    return replace(
+        block,
+        first_seq=block.first_seq + n_frames,
+        t0_ns_utc=block.t0_ns_utc + n_frames * block.dt_ns,
+    )
+
+
+def _table(costs: dict[str, float], plain: dict[str, float], n_block: int) -> str:
+    """Return the table in Markdown."""
+    lines = [
+        f"| blocks of {n_block} frames | us per frame | frame by frame | ratio |",
+        "| --- | --- | --- | --- |",
+    ]
+    for name, cost in costs.items():
+        beside = f"{plain[name]:.0f} | {plain[name] / cost:.0f}" if name in plain else "- | -"
+        lines.append(f"| {name} | {cost:.1f} | {beside} |")
+    three = sum(costs[name] for name in TOGETHER)
+    lines.append(f"| **the three estimators together** | **{three:.1f}** | - | - |")
+    rest = sum(cost for name, cost in itertools.islice(costs.items(), 4, None))
+    lines.append(f"| everything else on every frame | {rest:.1f} | - | - |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.estimation.frames import FrameBlock
-from service.estimation.span import Span, advanced, opened, why_broken, without_rest
+from service.estimation.span import Steps, Window, advanced, cut
+from service.estimation.span import WindowRefused as WindowRefused
 
 Array = NDArray[Any]
 
@@ -99,28 +100,18 @@ class Spectra:
     """``(n_lines, n_modes)`` its known dither part at the lines, metres."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WindowRefused:
-    """A window that gave no estimate."""
-
-    reason: str
-    """What was found, and what to do about it."""
-
-    t_ns_utc: int
-    """When it was given up."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LockIn:
     """Windows under way: feed it blocks with ``accumulate``."""
 
     plan: LockInPlan
-    window: _Window | None = None
+    window: Window[_Sums] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Window:
-    span: Span
+class _Sums:
+    """As in :class:`Spectra`."""
+
     slopes: Array
     commands: Array
     dither: Array
@@ -128,69 +119,37 @@ class _Window:
 
 def accumulate(lock_in: LockIn, block: FrameBlock) -> tuple[LockIn, list[Spectra | WindowRefused]]:
     """Add a block of frames; return the new state and the windows that ended in it."""
-    ended: list[Spectra | WindowRefused] = []
-    done = 0
-    while done < block.n_frames:
-        lock_in, used, outcome = _advance(lock_in, block, done)
-        done += used
-        if outcome is not None:
-            ended.append(outcome)
-    return lock_in, ended
+    window, ended = cut(lock_in.plan, lock_in.window, block, _STEPS)
+    return replace(lock_in, window=window), ended
 
 
-def _advance(
-    lock_in: LockIn, block: FrameBlock, start: int
-) -> tuple[LockIn, int, Spectra | WindowRefused | None]:
-    """Consume rows of the block from ``start``: into the open window, or up to the next one."""
-    plan, window = lock_in.plan, lock_in.window
-    seq = block.first_seq + start
-    if window is None:
-        if seq < plan.first_seq:
-            return lock_in, min(plan.first_seq - seq, block.n_frames - start), None
-        if block.dither_m is None:
-            return lock_in, block.n_frames - start, None
-        window = _open(plan, block, start)
-    reason = why_broken(window.span, plan.n_frames, block, start)
-    if reason is not None:
-        refused = WindowRefused(reason=reason, t_ns_utc=window.span.next_t_ns)
-        return replace(lock_in, window=None), 0, refused
-    end_seq = window.span.first_seq + plan.n_frames
-    stop = min(block.n_frames, end_seq - block.first_seq)
-    rows = slice(start, max(stop, start))
-    window = _add(plan, window, block, rows)
-    if window.span.next_seq < end_seq:
-        return replace(lock_in, window=window), rows.stop - rows.start, None
-    return replace(lock_in, window=None), rows.stop - rows.start, _close(plan, window)
-
-
-def _open(plan: LockInPlan, block: FrameBlock, start: int) -> _Window:
+def _begin(plan: LockInPlan, block: FrameBlock) -> _Sums:
     shape = plan.bins_hz.shape
-    return _Window(
-        span=opened(block, start),
+    return _Sums(
         slopes=np.zeros((*shape, block.slopes.shape[1]), np.complex64),
         commands=np.zeros((*shape, block.commands_m.shape[1]), np.complex64),
         dither=np.zeros((shape[0], block.commands_m.shape[1]), np.complex64),
     )
 
 
-def _add(plan: LockInPlan, window: _Window, block: FrameBlock, rows: slice) -> _Window:
+def _add(plan: LockInPlan, window: Window[_Sums], block: FrameBlock, rows: slice) -> Window[_Sums]:
     n_rows = rows.stop - rows.start
-    if n_rows == 0:  # the block begins behind the window's end
-        return replace(window, span=without_rest(window.span, plan.n_frames, block.dt_ns))
     index = np.arange(n_rows) + (block.first_seq + rows.start - window.span.first_seq)
     hann = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / plan.n_frames)
     turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, index)
     phasors = (hann * np.exp(-2j * np.pi * turns)).astype(np.complex64)
     lines = phasors.reshape(*plan.bins_hz.shape, n_rows)[:, 0]
-    # why_broken lets no block without dither columns come this far
+    # no block without dither columns comes this far
     dither = block.commands_m[:0] if block.dither_m is None else block.dither_m
-    shape = plan.bins_hz.shape
+    shape, sums = plan.bins_hz.shape, window.sums
     return replace(
         window,
         span=advanced(window.span, block, rows),
-        slopes=window.slopes + _project(phasors, block.slopes[rows]).reshape(*shape, -1),
-        commands=window.commands + _project(phasors, block.commands_m[rows]).reshape(*shape, -1),
-        dither=window.dither + _project(lines, dither[rows]),
+        sums=_Sums(
+            slopes=sums.slopes + _project(phasors, block.slopes[rows]).reshape(*shape, -1),
+            commands=sums.commands + _project(phasors, block.commands_m[rows]).reshape(*shape, -1),
+            dither=sums.dither + _project(lines, dither[rows]),
+        ),
     )
 
 
@@ -199,10 +158,11 @@ def _project(phasors: Array, columns: Array) -> Array:
     return np.asarray(phasors.real @ columns + 1j * (phasors.imag @ columns))
 
 
-def _close(plan: LockInPlan, window: _Window) -> Spectra | WindowRefused:
+def _close(plan: LockInPlan, window: Window[_Sums]) -> Spectra | WindowRefused:
     """Return the finished window, or why its dither is not the one asked for."""
+    sums = window.sums
     weight = 0.5 * plan.n_frames / np.sqrt(2.0)
-    applied = np.abs(window.dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
+    applied = np.abs(sums.dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
     ratio = applied / np.array(plan.amplitude_m)
     if ratio.min() < MIN_AMPLITUDE_RATIO:
         weakest = int(ratio.argmin())
@@ -217,9 +177,12 @@ def _close(plan: LockInPlan, window: _Window) -> Spectra | WindowRefused:
         session=window.span.session,
         cm_id=window.span.cm_id,
         first_seq=window.span.first_seq,
-        t_end_ns_utc=window.span.next_t_ns - round(1e9 / plan.frame_rate_hz),
+        t_end_ns_utc=window.span.next_t_ns - window.dt_ns,
         n_missing=window.span.n_missing,
-        slopes=window.slopes,
-        commands=window.commands,
-        dither=window.dither,
+        slopes=sums.slopes,
+        commands=sums.commands,
+        dither=sums.dither,
     )
+
+
+_STEPS = Steps(begin=_begin, add=_add, close=_close)

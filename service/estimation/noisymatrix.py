@@ -1,4 +1,4 @@
-"""The noisy interaction matrix of one window of random dither, and the registration in it."""
+"""The noisy interaction matrix of a random dither, and the registration in it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.lockin import WindowRefused
+from service.estimation.estimator import RANDOM, Determines
 from service.estimation.randomdither import Correlated, Correlations
+from service.estimation.span import WindowRefused
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
@@ -21,10 +22,16 @@ N_STEPS = 4
 SIGNIFICANT = 5.0
 """σ of a response that counts as seen."""
 
+WHITE_PARTS = 24
+"""What is known beforehand of the scatter, that noise is nearly white, counts as so many parts."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoisyMatrix:
-    """An interaction matrix as measured, with the noise of each of its elements."""
+    """An interaction matrix as measured, with the noise of each of its elements.
+
+    For fits and for looking at: at magnitude 10 its elements are no larger than their noise.
+    """
 
     modes: tuple[int, ...]
     """0-based basis index of each column."""
@@ -38,6 +45,18 @@ class NoisyMatrix:
     slope_memory: float
     """Lag-1 correlation of the slopes that was taken out before correlating, -1..1."""
 
+    @property
+    def snr_of_modes(self) -> NDArray[np.float64]:
+        """``(n_dithered,)`` RMS signal of a column's elements over their noise; 0: none seen."""
+        power = np.mean((self.matrix / self.noise) ** 2, axis=0) - 1.0
+        return np.asarray(np.sqrt(np.maximum(power, 0.0)))
+
+    @property
+    def snr(self) -> float:
+        """RMS signal of an element over its noise, over the whole matrix."""
+        power = float(np.mean((self.matrix / self.noise) ** 2)) - 1.0
+        return float(np.sqrt(max(power, 0.0)))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RandomEstimate:
@@ -45,10 +64,16 @@ class RandomEstimate:
 
     alpha: Misregistration
     covariance: NDArray[np.float64]
-    """``(4, 4)`` numeric units, from the scatter of the window's batches; no model error in it."""
+    """``(4, 4)`` numeric units, from the scatter of the window's parts; no model error in it."""
 
     optical_gain: NDArray[np.float64]
     """``(n_dithered,)`` gain of each mode against the model."""
+
+    gain_sigma: NDArray[np.float64]
+    """``(n_dithered,)`` 1 σ of it."""
+
+    lag_frames: NDArray[np.float64]
+    """``(1,)`` share of the response that comes one frame late; 0 when the columns are aligned."""
 
     misfit: float
     """Residual power over what the elements' noise explains; 1: the model explains the data."""
@@ -61,21 +86,29 @@ class RandomEstimate:
 
     cm_id: str | None
     session: str
+    modes: tuple[int, ...]
+    """0-based basis index of each gain."""
+
+    @property
+    def determines(self) -> Determines:
+        """Which of the four parameters it can tell."""
+        return RANDOM
 
 
 def noisy_matrix(window: Correlated) -> NoisyMatrix:
     """Return the interaction matrix that a window's correlations hold.
 
-    ``e[k] = s[k] - ρ s[k-1]`` with ρ the lag-1 correlation of the slopes whitens the turbulence;
-    then ``D = sum e[k] u[k]^T (sum u u^T)^-1``.
+    ``D = sum e[k] u[k]^T (sum u u^T)^-1`` with ``e[k] = s[k] - ρ s[k-1]``, in which most of the
+    turbulence is gone.
     """
     sums = window.sums
-    memory = _memory(sums)
     power = np.linalg.inv(sums.dither_power.sum(axis=0))
-    cross = sums.same.sum(axis=0, dtype=float) - memory * sums.before.sum(axis=0, dtype=float)
-    noise = np.sqrt(np.outer(_whitened_variance(sums, memory), np.diag(power)))
+    noise = np.sqrt(np.outer(_noise_variance(sums), np.diag(power)))
     return NoisyMatrix(
-        modes=window.plan.modes, matrix=cross @ power, noise=noise, slope_memory=memory
+        modes=window.plan.modes,
+        matrix=sums.response.sum(axis=0, dtype=float) @ power,
+        noise=noise,
+        slope_memory=sums.memory,
     )
 
 
@@ -83,9 +116,9 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     """Estimate α and a free gain per mode from one window, to first order.
 
     Variable projection (Kaufman 1975) on the noisy matrix, each slope weighted by its noise. The
-    covariance is that of the scores of the window's batches, so that turbulence correlated over
-    slopes and frames counts for what it is. Refused when the mirror answers a frame late: the
-    columns are then misaligned and the matrix is not clean.
+    covariance is from the scatter of the scores of the window's batches or, where there are many
+    modes, of the modes: turbulence correlated over slopes then counts for what it is. Refused when
+    the mirror answers a frame late: the columns are then misaligned and the matrix is not clean.
     """
     noisy, sums = noisy_matrix(window), window.sums
     columns = list(noisy.modes)
@@ -93,31 +126,36 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     problem = _Problem(
         matrix=linearisation.matrix[:, columns].astype(float),
         derivatives=linearisation.derivatives[:, :, columns].astype(float),
-        weight=np.outer(1.0 / _whitened_variance(sums, noisy.slope_memory), np.diag(power)),
+        variance=_noise_variance(sums),
+        power=np.diag(power),
     )
-    late = _why_late(sums, noisy, problem)
-    if late is not None:
-        return WindowRefused(reason=late, t_ns_utc=window.t_end_ns_utc)
+    seen = _Seen.of(window, noisy, problem)
+    if seen.trouble is not None:
+        return WindowRefused(reason=seen.trouble, t_ns_utc=window.t_end_ns_utc)
     step = np.zeros(4)
     for _ in range(N_STEPS):
         gains, jacobian, residual = problem.at(step, noisy.matrix)
-        normal = np.einsum("jsm,sm,ism->ji", jacobian, problem.weight, jacobian)
-        score = np.einsum("jsm,sm,sm->j", jacobian, problem.weight, residual)
+        normal, score = problem.equations(jacobian, residual)
         step = step + np.linalg.solve(normal, score)
     gains, jacobian, residual = problem.at(step, noisy.matrix)
-    explained = gains * problem.response(step)
     n_free = residual.size - len(gains) - len(step)
     inverse = np.linalg.inv(normal)
-    spread = _scatter_of_batches(sums, noisy.slope_memory, explained, jacobian, problem.weight)
+    parts = [residual]
+    if window.plan.n_batches > 1:
+        parts = _residuals_of_batches(sums, gains * problem.response(step))
+    spread = _scatter(_scores(parts, jacobian, problem.weight), normal)
     return RandomEstimate(
         alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
         covariance=inverse @ spread @ inverse.T,
         optical_gain=gains,
+        gain_sigma=_gain_sigma(parts, problem, step),
+        lag_frames=np.array([seen.lag_frames]),
         misfit=float(np.sum(problem.weight * residual**2) / n_free),
         step=step,
         t_ns_utc=window.t_end_ns_utc,
         cm_id=window.cm_id,
         session=window.session,
+        modes=noisy.modes,
     )
 
 
@@ -127,7 +165,16 @@ class _Problem:
 
     matrix: Array
     derivatives: Array
-    weight: Array
+    variance: Array
+    """``(n_slopes,)`` of a slope's noise in one frame."""
+
+    power: Array
+    """``(n_dithered,)`` sum of the dither's square, metres²."""
+
+    @property
+    def weight(self) -> Array:
+        """``(n_slopes, n_dithered)`` inverse variance of each element."""
+        return np.outer(1.0 / self.variance, self.power)
 
     def response(self, step: Array) -> Array:
         return np.asarray(self.matrix + np.tensordot(step, self.derivatives, axes=1))
@@ -135,54 +182,123 @@ class _Problem:
     def at(self, step: Array, measured: Array) -> tuple[Array, Array, Array]:
         """Return gains, the projected Jacobian ``(4, n_slopes, n_modes)`` and the residual."""
         response = self.response(step)
-        norm = np.einsum("sm,sm,sm->m", response, self.weight, response)
-        gains = np.einsum("sm,sm,sm->m", response, self.weight, measured) / norm
-        along = np.einsum("sm,sm,jsm->jm", response, self.weight, self.derivatives) / norm
+        weighted = self.weight * response
+        norm = np.einsum("sm,sm->m", response, weighted)
+        gains = np.einsum("sm,sm->m", weighted, measured) / norm
+        along = np.einsum("sm,jsm->jm", weighted, self.derivatives) / norm
         jacobian = gains * (self.derivatives - along[:, None] * response)
         return gains, jacobian, measured - gains * response
 
-
-def _memory(sums: Correlations) -> float:
-    return float(sums.slope_memory.sum() / sums.slope_power.sum())
-
-
-def _whitened_variance(sums: Correlations, memory: float) -> Array:
-    """Return ``(n_slopes,)`` variance of ``s[k] - ρ s[k-1]``; a silent slope gets the mean."""
-    power = (1.0 + memory**2) * sums.slope_power - 2.0 * memory * sums.slope_memory
-    return np.where(power > 0.0, power, power.mean()) / sums.n_pairs
+    def equations(self, jacobian: Array, residual: Array) -> tuple[Array, Array]:
+        """Return the normal matrix ``(4, 4)`` and the score ``(4,)``."""
+        flat = (jacobian * np.sqrt(self.weight)).reshape(len(jacobian), -1)
+        return flat @ flat.T, flat @ (residual * np.sqrt(self.weight)).ravel()
 
 
-def _scatter_of_batches(
-    sums: Correlations, memory: float, explained: Array, jacobian: Array, weight: Array
-) -> Array:
-    """Return the covariance of the whole window's score from that of its batches, ``(4, 4)``."""
-    total = np.linalg.inv(sums.dither_power.sum(axis=0))
-    scores = []
-    for same, before, power in zip(sums.same, sums.before, sums.dither_power, strict=True):
-        residual = (same - memory * before - explained @ power) @ total
-        scores.append(np.einsum("jsm,sm,sm->j", jacobian, weight, residual))
-    own = np.array(scores) - np.mean(scores, axis=0)
-    n = len(own)
-    return np.asarray(own.T @ own * n / (n - 1))
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Seen:
+    """How strongly the slopes answer the dither, and when."""
+
+    lag_frames: float
+    trouble: str | None
+    """Why lag 0 is not the first that responds; None: it is."""
+
+    @classmethod
+    def of(cls, window: Correlated, noisy: NoisyMatrix, problem: _Problem) -> _Seen:
+        """Compare the answers in the dither's own row and in the next, on a few of the modes.
+
+        A loop of less than two frames answers the next row itself, against the mirror: a negative
+        share is its reply, and no lag.
+        """
+        sums, some = window.sums, window.plan.late_columns
+        power = np.diag(sums.dither_power.sum(axis=0))[some]
+        matrix, weight = problem.matrix[:, some], problem.weight[:, some]
+        along = weight * matrix
+        norm = float(np.vdot(along, matrix))
+        at_once = float(np.vdot(along, noisy.matrix[:, some])) / norm
+        later = float(np.vdot(along, sums.late / power)) / norm
+        whole = float(np.einsum("sm,sm,sm->", problem.matrix, problem.weight, noisy.matrix))
+        seen = whole / np.sqrt(
+            np.einsum("sm,sm,sm->", problem.matrix, problem.weight, problem.matrix)
+        )
+        # the late response was not whitened: its noise is that of the slopes as they are
+        louder = np.sqrt(sums.slope_power.sum() / sums.noise_power.sum())
+        late = later * np.sqrt(norm) / louder
+        lag = max(later / (at_once + later), 0.0) if at_once + later > 0.0 else 0.0
+        return cls(lag_frames=min(lag, 1.0), trouble=_trouble(seen, late))
 
 
-def _why_late(sums: Correlations, noisy: NoisyMatrix, problem: _Problem) -> str | None:
-    """Return why lag 0 is not the first that responds, or None."""
-    power = np.linalg.inv(sums.dither_power.sum(axis=0))
-    late = (sums.after - noisy.slope_memory * sums.same.sum(axis=0)) @ power
-    norm = np.einsum("sm,sm,sm->", problem.matrix, problem.weight, problem.matrix)
-    at_once, later = (
-        float(np.einsum("sm,sm,sm->", problem.matrix, problem.weight, d) / np.sqrt(norm))
-        for d in (noisy.matrix, late)
-    )
-    if at_once > SIGNIFICANT:
+def _trouble(seen: float, late: float) -> str | None:
+    """Return why there is nothing to fit, from the significance of both answers, in σ."""
+    if seen > SIGNIFICANT:
         return None
-    if later > SIGNIFICANT:
+    if late > SIGNIFICANT:
         return (
-            f"columns misaligned: the slopes answer the dither one frame late ({later:.0f} sigma, "
-            f"{at_once:.0f} in the same row)"
+            f"columns misaligned: the slopes answer the dither one frame late ({late:.0f} sigma, "
+            f"{seen:.0f} in the same row)"
         )
     return (
-        f"the dither is not seen in the slopes ({at_once:.1f} sigma): raise its amplitude or the "
+        f"the dither is not seen in the slopes ({seen:.1f} sigma): raise its amplitude or the "
         "window's length"
     )
+
+
+def _noise_variance(sums: Correlations) -> Array:
+    """Return ``(n_slopes,)`` variance of what the dither does not explain of ``s[k] - ρ s[k-1]``.
+
+    A silent slope gets the mean.
+    """
+    power, response = sums.dither_power.sum(axis=0), sums.response.sum(axis=0, dtype=float)
+    explained = np.einsum("sm,ms->s", response, np.linalg.solve(power, response.T))
+    left = sums.noise_power - explained
+    # of a noise-free sensor nothing but rounding is left
+    left = np.maximum(left, 1e-12 * sums.noise_power)
+    variance = np.where(left > 0.0, left, left.mean()) / max(sums.n_pairs - len(power), 1)
+    return np.asarray(variance)
+
+
+def _residuals_of_batches(sums: Correlations, explained: Array) -> list[Array]:
+    """Return each batch's part of the whole window's residual, ``(n_slopes, n_dithered)``."""
+    total = np.linalg.inv(sums.dither_power.sum(axis=0))
+    return [
+        (response - explained @ power) @ total
+        for response, power in zip(sums.response, sums.dither_power, strict=True)
+    ]
+
+
+def _scores(parts: list[Array], jacobian: Array, weight: Array) -> Array:
+    """Return independent parts of the score, ``(n, 4)``: of the batches, or of the modes."""
+    if len(parts) == 1:
+        return np.asarray(np.einsum("jsm,sm,sm->mj", jacobian, weight, parts[0]))
+    weighted = jacobian * weight
+    return np.array([np.einsum("jsm,sm->j", weighted, part) for part in parts])
+
+
+def _scatter(scores: Array, normal: Array) -> Array:
+    """Return the covariance ``(4, 4)`` of the sum of independent scores ``(n, 4)``.
+
+    The shape of the covariance of so few is itself uncertain: it is drawn toward that of white
+    noise, which is ``normal``.
+    """
+    n, own = len(scores), scores - scores.mean(axis=0)
+    found = own.T @ own * n / (n - 1)
+    inflation = float(np.trace(np.linalg.solve(normal, found))) / len(normal)
+    return np.asarray((WHITE_PARTS * inflation * normal + n * found) / (WHITE_PARTS + n))
+
+
+def _gain_sigma(parts: list[Array], problem: _Problem, step: Array) -> Array:
+    """Return 1 σ of each mode's gain, ``(n_dithered,)``.
+
+    Turbulence looks like modes: it is louder along a mode's own slopes than its white part says.
+    The noise of every column is of the same kind, so all of them show how loud it is there.
+    """
+    response, root = problem.response(step), np.sqrt(problem.power)
+    along = response / problem.variance[:, None]
+    seen = np.zeros((len(root), len(root)))
+    for part in parts:
+        seen += (along.T @ (part * root)) ** 2
+    if len(parts) == 1:
+        # a column's own gain has taken out what it had along its own slopes
+        np.fill_diagonal(seen, np.nan)
+    norm = np.einsum("sm,sm->m", along, response)
+    return np.asarray(np.sqrt(np.nanmean(seen, axis=1)) / (root * norm))

@@ -1,13 +1,38 @@
-"""How much of a window has come: one session, one reconstructor, one clock."""
+"""Cutting telemetry into windows: one session, one reconstructor, one clock each."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeVar
 
 from service.estimation.frames import FrameBlock
 
 MAX_MISSING_FRACTION = 0.05
 """A window with more frames missing than this is refused."""
+
+
+class Plan(Protocol):
+    """What is known of a window before it begins."""
+
+    @property
+    def n_frames(self) -> int:
+        """Length of a window."""
+
+    @property
+    def first_seq(self) -> int:
+        """No window starts before this frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowRefused:
+    """A window that gave no estimate."""
+
+    reason: str
+    """What was found, and what to do about it."""
+
+    t_ns_utc: int
+    """When it was given up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,6 +50,74 @@ class Span:
 
     n_missing: int = 0
     """Frames before ``next_seq`` that never came."""
+
+
+P = TypeVar("P", bound=Plan)
+S = TypeVar("S")
+F = TypeVar("F")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Window(Generic[S]):
+    """A window under way."""
+
+    span: Span
+    dt_ns: int
+    sums: S
+    """What the estimator has made of the frames so far."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Steps(Generic[P, S, F]):
+    """What an estimator does with the frames of a window."""
+
+    begin: Callable[[P, FrameBlock], S]
+    """Returns empty sums for frames like these."""
+
+    add: Callable[[P, Window[S], FrameBlock, slice], Window[S]]
+    """Returns the window with these rows of a block in its span and in its sums."""
+
+    close: Callable[[P, Window[S]], F | WindowRefused]
+    """Returns what came of it, or why its dither is not the one asked for."""
+
+
+def cut(
+    plan: P, window: Window[S] | None, block: FrameBlock, steps: Steps[P, S, F]
+) -> tuple[Window[S] | None, list[F | WindowRefused]]:
+    """Add a block to the open window; return the one then open and those that ended in it."""
+    ended: list[F | WindowRefused] = []
+    done = 0
+    while done < block.n_frames:
+        window, used, more = _advance(plan, window, block, done, steps)
+        done += used
+        ended += more
+    return window, ended
+
+
+def _advance(
+    plan: P, window: Window[S] | None, block: FrameBlock, start: int, steps: Steps[P, S, F]
+) -> tuple[Window[S] | None, int, list[F | WindowRefused]]:
+    """Consume rows of the block from ``start``: into the open window, or up to the next one."""
+    seq, left = block.first_seq + start, block.n_frames - start
+    if window is None:
+        if seq < plan.first_seq:
+            return None, min(plan.first_seq - seq, left), []
+        if block.dither_m is None:
+            return None, left, []
+        begun = steps.begin(plan, block)
+        window = Window(span=opened(block, start), dt_ns=block.dt_ns, sums=begun)
+    reason = why_broken(window.span, plan.n_frames, block, start)
+    if reason is not None:
+        return None, 0, [WindowRefused(reason=reason, t_ns_utc=window.span.next_t_ns)]
+    end_seq = window.span.first_seq + plan.n_frames
+    if seq >= end_seq:  # the window's last frames never came
+        span = without_rest(window.span, plan.n_frames, window.dt_ns)
+        return None, 0, [steps.close(plan, replace(window, span=span))]
+    n_rows = min(left, end_seq - seq)
+    window = steps.add(plan, window, block, slice(start, start + n_rows))
+    if window.span.next_seq < end_seq:
+        return window, n_rows, []
+    return None, n_rows, [steps.close(plan, window)]
 
 
 def opened(block: FrameBlock, start: int) -> Span:

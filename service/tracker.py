@@ -9,7 +9,8 @@ from __future__ import annotations
 from service import events as ev
 from service.events import Command, Event
 from service.reactions.decision import decide
-from service.reactions.dither import on_dither, on_silence
+from service.reactions.dither import on_dither, on_silence, on_vibrations
+from service.reactions.dither_schedule import learnt
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.loop import close_again, on_loop
 from service.reactions.matrices import (
@@ -29,7 +30,9 @@ from service.reactions.rtc import (
     on_tick,
     on_vanished,
 )
-from service.reactions.windows import on_watchdog, on_window, refuse_window
+from service.reactions.validity import aged
+from service.reactions.watchdog import on_watchdog
+from service.reactions.windows import on_window, refuse_window
 from service.state import TrackerState
 
 __all__ = ["Command", "Event", "Policy", "step"]
@@ -57,7 +60,7 @@ def _react(  # noqa: C901 - one line for each event
 ) -> Step:
     match event:
         case ev.Tick():
-            return close_again(on_tick(state, now_ns), now_ns)
+            return close_again(aged(on_tick(state, now_ns), policy, now_ns), now_ns)
         case ev.StatusSeen(rtc=rtc):
             return on_status(state, rtc, now_ns), ()
         case ev.SessionStarted(session=session):
@@ -81,11 +84,12 @@ def _react(  # noqa: C901 - one line for each event
         case ev.WindowFitted() if state.measuring is not None:
             return refuse_window(state, MEASURING, now_ns), ()
         case ev.WindowFitted(estimate=estimate):
-            return on_window(state, estimate, policy, now_ns), ()
+            after = on_window(state, estimate, policy, now_ns)
+            return learnt(state, after, estimate), ()
         case ev.WindowLost(refused=refused):
             return refuse_window(state, refused.reason, now_ns), ()
         case ev.Watched():
-            return on_watchdog(state, event, now_ns), ()
+            return on_watchdog(state, event, policy, now_ns), ()
         case _:
             return _react_to_matrices(state, event, policy, now_ns)
 
@@ -104,6 +108,8 @@ def _react_to_matrices(state: TrackerState, event: Event, policy: Policy, now_ns
             return on_dither(state, event, now_ns), ()
         case ev.DitherSilent():
             return on_silence(state, event, now_ns), ()
+        case ev.Vibrations():
+            return on_vibrations(state, event, now_ns), ()
         case ev.JobFailed(effect=effect, text=text):
             return on_failure(state, effect, text, now_ns), ()
         case _:

@@ -66,6 +66,17 @@ class WindowEstimate:
 
     cm_id: str | None
     session: str
+    modes: tuple[int, ...] = ()
+    """Dithered mode of each line; empty: not known."""
+
+    gain_sigma: NDArray[np.float64] | None = None
+    """``(n_lines,)`` 1 σ of each gain's modulus, from the side bins; None: not known."""
+
+    dither_m: float = 0.0
+    """RMS of all lines together as they were on the mirror, metres OPD; 0: not known."""
+
+    window_s: float = 0.0
+    """Length of the window, seconds; 0: not known."""
 
 
 def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> WindowEstimate:
@@ -90,7 +101,8 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> Wi
     normal, _ = _normal_equations(slopes, seen, known, gains, step)
     spread, misfit = _side_bins(spectra, linearisation, seen, known, gains, step)
     inverse = np.linalg.inv(normal)
-    covariance = (inverse @ spread @ inverse.T)[:4, :4]
+    every = inverse @ spread @ inverse.T
+    covariance = every[:4, :4]
     turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
     return WindowEstimate(
         alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
@@ -102,6 +114,10 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> Wi
         t_ns_utc=spectra.t_end_ns_utc,
         cm_id=spectra.cm_id,
         session=spectra.session,
+        modes=spectra.plan.modes,
+        gain_sigma=_modulus_sigma(gains, every[4:, 4:]),
+        dither_m=_total_dither_m(spectra),
+        window_s=spectra.plan.n_frames / spectra.plan.frame_rate_hz,
     )
 
 
@@ -148,6 +164,22 @@ def _apply(operator: Array, vectors: Array) -> Array:
     single = vectors.astype(np.complex64)
     real = operator @ single.real.T
     return np.asarray(np.swapaxes(real + 1j * (operator @ single.imag.T), -1, -2), complex)
+
+
+def _modulus_sigma(gains: Array, covariance: Array) -> Array:
+    """Return ``(n_lines,)`` 1 σ of ``|γ|``, from the covariance of every gain's two parts."""
+    found = []
+    for line, gain in enumerate(gains):
+        part = slice(2 * line, 2 * line + 2)
+        along = np.array([gain.real, gain.imag]) / abs(gain)
+        found.append(np.sqrt(along @ covariance[part, part] @ along))
+    return np.array(found)
+
+
+def _total_dither_m(spectra: Spectra) -> float:
+    """Return the RMS of all lines together, from the dither columns of the window."""
+    amplitudes = np.abs(spectra.dither).max(axis=1) * np.sqrt(2.0) / (0.5 * spectra.plan.n_frames)
+    return float(np.sqrt(np.sum(amplitudes**2)))
 
 
 def _projected_gain(slopes: Array, seen: Array, known: Array) -> complex:

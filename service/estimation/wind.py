@@ -1,8 +1,11 @@
-"""The registration and the wind's bias of its passive estimate, followed together.
+"""The registration and the bias of its passive estimate, followed together.
 
 Under frozen flow the passive watchdog reads ``α + b``: it scatters by 0.1 to 0.3 % of a subaperture
 and is wrong by up to 16 %, steadily, until wind, flux or gain change. A dithered window reads α
 alone. Between them b is learnt, and a sparse dither then suffices.
+
+b has four parts. Those of rotation and magnification are small, but no more than the shifts' do
+they average out over consecutive looks, as a noise would.
 """
 
 from __future__ import annotations
@@ -12,21 +15,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.kalman import JUMP_INFLATION, JUMP_THRESHOLD
+from service.estimation.passive import BIAS_FLOOR
 
 Array = NDArray[np.float64]
 
-N_BIAS = 2
-"""Shifts are biased by the wind; rotation and magnification hardly."""
+JUMP_THRESHOLD = 23.5
+"""Normalised innovation squared that four degrees of freedom exceed once in 10 000."""
 
-BIAS_SIGMA_SUBAP = 0.10
-"""1 σ of the bias while nothing is known of it: 16 % of a subaperture at 25 m/s at most."""
+JUMP_INFLATION = 10.0
+"""After a jump each parameter may have moved by this many σ of the innovation."""
 
-PASSIVE_FLOOR = np.array([0.0, 0.0, np.deg2rad(0.02), 0.0007])
-"""1 σ that no integration removes from a passive estimate, besides b (numeric units)."""
-
-_DITHERED = np.hstack([np.eye(4), np.zeros((4, N_BIAS))])
-_PASSIVE = np.hstack([np.eye(4), np.eye(4)[:, :N_BIAS]])
+_DITHERED = np.hstack([np.eye(4), np.zeros((4, 4))])
+_PASSIVE = np.hstack([np.eye(4), np.eye(4)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,19 +34,10 @@ class Joint:
     """The random walk of α, and the bias that forgets itself."""
 
     mean: Array
-    """``(6,)`` α in numeric units, then the bias of the two shifts, subapertures."""
+    """``(8,)`` α in numeric units, then the bias of the passive estimate."""
 
     covariance: Array
-    """``(6, 6)``."""
-
-    t_s: float
-    """When it was last brought forward."""
-
-    innovation: float = 0.0
-    """Normalised innovation squared of the last measurement, expected value 4."""
-
-    jumped: bool = False
-    """Whether that was too large: α has moved at once, or the wind has."""
+    """``(8, 8)``."""
 
     @property
     def alpha(self) -> Array:
@@ -59,8 +50,8 @@ class Joint:
         return self.covariance[:4, :4]
 
     @property
-    def bias_subap(self) -> Array:
-        """``(2,)`` what the wind adds to the passive shifts."""
+    def bias(self) -> Array:
+        """``(4,)`` what a passive estimate reads more than α."""
         return self.mean[4:]
 
 
@@ -72,58 +63,80 @@ class Drift:
     """``(4,)`` random walk σ after one second, numeric units."""
 
     bias_memory_s: float = 3600.0
-    """Time after which what was learnt of the wind's bias is worth 1/e."""
+    """Time after which what was learnt of the bias is worth 1/e."""
 
 
-def begin_joint(measured: Array, covariance: Array, t_s: float) -> Joint:
+def begin_joint(measured: Array, covariance: Array) -> Joint:
     """Return the estimate after a first dithered measurement: nothing is known of the bias."""
-    full = np.zeros((4 + N_BIAS, 4 + N_BIAS))
+    full = np.zeros((8, 8))
     full[:4, :4] = covariance
-    full[4:, 4:] = BIAS_SIGMA_SUBAP**2 * np.eye(N_BIAS)
-    return Joint(mean=np.concatenate([measured, np.zeros(N_BIAS)]), covariance=full, t_s=t_s)
+    return forgotten(Joint(mean=np.concatenate([measured, np.zeros(4)]), covariance=full))
 
 
-def predicted(joint: Joint, drift: Drift, t_s: float) -> Joint:
-    """Bring the estimate forward: α walks, the bias decays towards knowing nothing of it."""
-    elapsed = max(t_s - joint.t_s, 0.0)
-    keep = np.ones(4 + N_BIAS)
-    keep[4:] = np.exp(-elapsed / drift.bias_memory_s)
-    growth = np.zeros(4 + N_BIAS)
-    growth[:4] = drift.alpha_rate**2 * elapsed
-    growth[4:] = BIAS_SIGMA_SUBAP**2 * (1.0 - keep[4:] ** 2)
-    covariance = joint.covariance * np.outer(keep, keep) + np.diag(growth)
-    return replace(joint, mean=keep * joint.mean, covariance=covariance, t_s=max(t_s, joint.t_s))
+def forgotten(joint: Joint) -> Joint:
+    """Return the estimate with nothing known of the bias any more; α stands."""
+    covariance = joint.covariance.copy()
+    covariance[4:] = covariance[:, 4:] = 0.0
+    covariance[4:, 4:] = np.diag(BIAS_FLOOR**2)
+    return Joint(mean=np.concatenate([joint.alpha, np.zeros(4)]), covariance=covariance)
 
 
-def with_dithered(
-    joint: Joint, measured: Array, noise: Array, *, drift: Drift, t_s: float
-) -> Joint:
-    """Fold in a dithered window ``(4,)`` with its covariance ``(4, 4)``.
+def predicted(joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | None = None) -> Joint:
+    """Bring the estimate forward: α walks, the bias decays towards knowing nothing of it.
 
-    After a jump of α the bias is kept: the wind has not moved with the mirror.
+    ``flexure`` ``(4,)`` is the 1 σ of what the telescope's own motion has added meanwhile.
     """
-    prior = predicted(joint, drift, t_s)
+    elapsed = max(elapsed_s, 0.0)
+    keep = np.ones(8)
+    keep[4:] = np.exp(-elapsed / drift.bias_memory_s)
+    growth = np.zeros(8)
+    growth[:4] = drift.alpha_rate**2 * elapsed
+    if flexure is not None:
+        growth[:4] += flexure**2
+    growth[4:] = BIAS_FLOOR**2 * (1.0 - keep[4:] ** 2)
+    covariance = joint.covariance * np.outer(keep, keep) + np.diag(growth)
+    return replace(joint, mean=keep * joint.mean, covariance=covariance)
+
+
+def dithered_innovation(prior: Joint, measured: Array, noise: Array) -> float:
+    """Return how far a dithered window lies from the prior: squared, normalised, expected 4."""
+    return _innovation(prior, measured, noise, _DITHERED)
+
+
+def passive_innovation(prior: Joint, measured: Array, noise: Array) -> float:
+    """Return the same of a passive estimate, the bias allowed for."""
+    return _innovation(prior, measured, noise, _PASSIVE)
+
+
+def with_dithered(prior: Joint, measured: Array, noise: Array) -> Joint:
+    """Fold in a dithered window ``(4,)`` with its covariance ``(4, 4)``."""
     return _corrected(prior, measured, noise, _DITHERED)
 
 
-def with_passive(
-    joint: Joint, measured: Array, scatter: Array, *, drift: Drift, t_s: float
-) -> Joint:
-    """Fold in a passive estimate ``(4,)`` with the covariance of its scatter ``(4, 4)``.
+def with_passive(prior: Joint, measured: Array, noise: Array) -> Joint:
+    """Fold in a passive estimate ``(4,)`` with the covariance of its scatter ``(4, 4)``."""
+    return _corrected(prior, measured, noise, _PASSIVE)
 
-    An innovation that is too large is not believed, for it may be the wind: what was learnt of the
-    bias is forgotten, α keeps its value, and ``jumped`` asks for a dither.
+
+def widened(prior: Joint, noise: Array) -> Joint:
+    """Return what is known when α has moved at once, by how much the next measurement must tell.
+
+    The bias is kept: the wind has not moved with the mirror.
     """
-    prior = predicted(joint, drift, t_s)
-    noise = scatter + np.diag(PASSIVE_FLOOR**2)
-    innovation = _innovation(prior, measured, noise, _PASSIVE)
-    if innovation <= JUMP_THRESHOLD:
-        return _corrected(prior, measured, noise, _PASSIVE)
-    forgotten = prior.covariance.copy()
-    forgotten[4:] = forgotten[:, 4:] = 0.0
-    forgotten[4:, 4:] = BIAS_SIGMA_SUBAP**2 * np.eye(N_BIAS)
-    mean = np.concatenate([prior.alpha, np.zeros(N_BIAS)])
-    return replace(prior, mean=mean, covariance=forgotten, innovation=innovation, jumped=True)
+    moved = np.zeros(8)
+    moved[:4] = np.diag(prior.covariance)[:4] + np.diag(noise)
+    return replace(prior, covariance=prior.covariance + JUMP_INFLATION**2 * np.diag(moved))
+
+
+def correlation_factor(since_last_s: float, memory_s: float) -> float:
+    """Return the factor on the variance of a passive look whose telemetry was partly seen before.
+
+    Sums that forget with ``memory_s`` make the errors of looks Δt apart correlate by
+    ``ρ = exp(-Δt / memory_s)``. With variances ``(1 + ρ) / (1 - ρ)`` times as large a chain of
+    looks, treated as independent, weighs what it is worth.
+    """
+    rho = float(np.exp(-max(since_last_s, 0.0) / memory_s))
+    return np.inf if rho >= 1.0 else (1.0 + rho) / (1.0 - rho)
 
 
 def _innovation(prior: Joint, measured: Array, noise: Array, sees: Array) -> float:
@@ -133,20 +146,11 @@ def _innovation(prior: Joint, measured: Array, noise: Array, sees: Array) -> flo
 
 
 def _corrected(prior: Joint, measured: Array, noise: Array, sees: Array) -> Joint:
-    innovation = _innovation(prior, measured, noise, sees)
-    jumped, covariance = innovation > JUMP_THRESHOLD, prior.covariance
-    if jumped:
-        moved = np.zeros(4 + N_BIAS)
-        moved[:4] = np.diag(prior.covariance)[:4] + np.diag(noise)
-        covariance = covariance + JUMP_INFLATION**2 * np.diag(moved)
-    total = sees @ covariance @ sees.T + noise
-    gain = np.linalg.solve(total, sees @ covariance).T
-    keep = np.eye(4 + N_BIAS) - gain @ sees
-    posterior = keep @ covariance @ keep.T + gain @ noise @ gain.T
-    return replace(
-        prior,
+    total = sees @ prior.covariance @ sees.T + noise
+    gain = np.linalg.solve(total, sees @ prior.covariance).T
+    keep = np.eye(8) - gain @ sees
+    posterior = keep @ prior.covariance @ keep.T + gain @ noise @ gain.T
+    return Joint(
         mean=prior.mean + gain @ (measured - sees @ prior.mean),
         covariance=(posterior + posterior.T) / 2,
-        innovation=innovation,
-        jumped=jumped,
     )

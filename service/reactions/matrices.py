@@ -37,7 +37,8 @@ def on_matrix(
     state = logged(
         state, "reconstructor.made", f"{record.id}, {record.n_modes} modes, {verdict}", now_ns
     )
-    if why_unsendable(state) is None and (wanted or state.mode is Mode.AUTO):
+    believed = state.registration is None or state.registration.usable
+    if why_unsendable(state) is None and (wanted or (state.mode is Mode.AUTO and believed)):
         return send(state, record.id, now_ns)
     return state, ()
 
@@ -68,6 +69,8 @@ def why_unsendable(state: TrackerState) -> str | None:
     """Return why nothing may be published now, or None."""
     if state.rtc is None:
         return "no RTC is there"
+    if state.registration is not None and state.registration.candidate is not None:
+        return "a jump is suspected: the next window of telemetry decides"
     return next((alarm.text for alarm in state.alarms if alarm.name in WRONG_RTC), None)
 
 

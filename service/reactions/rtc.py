@@ -15,9 +15,6 @@ from service.state import Level, MatrixState, RtcView, TrackerState
 ACKNOWLEDGE_WITHIN_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
 
-STALE_AFTER_S = 60.0
-"""A simulated RTC may be ten times slower than its timestamps: a window then takes 20 s."""
-
 FORGOTTEN_AFTER_S = 15.0
 """An alarm the link repeats while it lasts is over after this much silence."""
 
@@ -43,28 +40,12 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
         silent_ns = now_ns - alarm.seen_ns_utc
         if alarm.name in _RENEWED and silent_ns > FORGOTTEN_AFTER_S * SECOND_NS:
             state = without_alarm(state, alarm.name, now_ns)
-    state = _watch_age(state, now_ns)
     since_ns = state.making_since_ns_utc
     if since_ns is not None and now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
         state = replace(state, making_since_ns_utc=None)
         text = f"no reconstructor came within {COMPUTE_WITHIN_S:.0f} s"
         state = logged(state, "reconstructor.lost", text, now_ns, Level.WARNING)
     return state
-
-
-def _watch_age(state: TrackerState, now_ns: int) -> TrackerState:
-    """Raise an alarm when a dither runs and still nothing comes of it."""
-    known, dither = state.registration, state.dither
-    if dither is None:
-        return without_alarm(state, "estimate-stale", now_ns)
-    since_ns = max(known.arrived_ns_utc if known else 0, dither.asked_ns_utc)
-    if now_ns - since_ns < STALE_AFTER_S * SECOND_NS:
-        return state
-    text = (
-        f"no window was accepted for {STALE_AFTER_S:.0f} s although a dither runs: α may have "
-        "moved; see the log for the reasons"
-    )
-    return with_alarm(state, "estimate-stale", text, now_ns)
 
 
 def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
@@ -75,7 +56,9 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
         rtc=rtc,
         basis_id=state.basis_id or rtc.basis_id,
         config_id=state.config_id or rtc.config_id,
+        pointing=rtc.pointing or state.pointing,
     )
+    state = _of_this_basis(state, now_ns)
     if rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None:
         state = with_in_use(state, rtc.cm_id)
     measuring = state.measuring
@@ -84,6 +67,18 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     else:
         state = without_alarm(state, "loop-open", now_ns)
     return follow_status(state, rtc, now_ns)
+
+
+def _of_this_basis(state: TrackerState, now_ns: int) -> TrackerState:
+    """Drop an α that was restored from a night with another basis or configuration."""
+    known = state.registration
+    if known is None or known.basis_id is None or known.config_id is None:
+        return state
+    found, expected = (known.basis_id, known.config_id), (state.basis_id, state.config_id)
+    if found == expected:
+        return state
+    text = f"α was measured with {found[0]}, {found[1]}; the RTC has {expected[0]}, {expected[1]}"
+    return logged(replace(state, registration=None), "registration.void", text, now_ns)
 
 
 def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerState:

@@ -40,6 +40,8 @@ def choose_update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
     registration = state.registration
     if state.mode is Mode.HOLD or registration is None or registration.n_windows < MIN_WINDOWS:
         return state, ()
+    if not registration.usable:
+        return state, ()
     if rtc.loop != "closed" or state.making_since_ns_utc is not None:
         return state, ()
     if _busy(state, policy) or now_ns < max(_next_attempt_ns(state, policy), state.retry_ns_utc):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import reduce
 from itertools import pairwise
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation import kalman, lockin
+from service.estimation import lockin, wind
 from service.estimation.health import LoopHealth, observe
 from tests.numerics import block_of, part, sines
 
@@ -71,42 +70,45 @@ covariances = st.builds(covariance, st.integers(0, 2**32 - 1), st.floats(1e-4, 1
 
 @given(vectors, covariances, st.lists(st.tuples(vectors, covariances), min_size=1, max_size=8))
 def test_the_filters_covariance_stays_symmetric_and_positive(mean, prior, measurements):
-    """Joseph's form, whatever arrives; 1e-9 of its largest axis is rounding."""
-
-    def fold(found, measurement):
-        return kalman.update(
-            found.mean, found.covariance, *measurement, drift_rate=np.full(4, 1e-3), elapsed_s=1.0
-        )
-
-    found = reduce(fold, measurements, kalman.begin(mean, prior))
+    """Joseph's form, whatever arrives, dithered and passive in turn; 1e-9 of its largest axis is
+    rounding."""
+    drift = wind.Drift(alpha_rate=np.full(4, 1e-3))
+    found = wind.begin_joint(mean, prior)
+    for measured, noise in measurements:
+        found = wind.predicted(found, drift, 1.0)
+        found = wind.with_passive(wind.with_dithered(found, measured, noise), measured, noise)
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     power = np.linalg.eigvalsh(found.covariance)
     assert power[0] > -1e-9 * power[-1]
 
 
 @given(vectors, covariances, vectors, covariances)
-def test_a_measurement_that_is_no_jump_never_adds_uncertainty(mean, prior, measured, noise):
-    found = kalman.update(mean, prior, measured, noise, drift_rate=np.zeros(4), elapsed_s=1.0)
-    if not found.jumped:
-        slack = 1e-9 * np.trace(prior + noise)
-        assert np.linalg.eigvalsh(prior - found.covariance)[0] > -slack
-        assert np.linalg.eigvalsh(noise - found.covariance)[0] > -slack
+def test_a_measurement_never_adds_uncertainty(mean, prior, measured, noise):
+    begun = wind.begin_joint(mean, prior)
+    found = wind.with_dithered(begun, measured, noise).alpha_covariance
+    slack = 1e-9 * np.trace(prior + noise)
+    assert np.linalg.eigvalsh(prior - found)[0] > -slack
+    assert np.linalg.eigvalsh(noise - found)[0] > -slack
 
 
 @given(vectors, covariances, vectors, covariances)
 def test_the_innovation_does_not_depend_on_the_units(mean, prior, measured, noise):
     units = np.diag([100.0, 0.01, 57.3, 3.0])
-    plain = kalman.update(mean, prior, measured, noise, drift_rate=np.zeros(4), elapsed_s=1.0)
-    scaled = kalman.update(
-        units @ mean,
-        units @ prior @ units,
-        units @ measured,
-        units @ noise @ units,
-        drift_rate=np.zeros(4),
-        elapsed_s=1.0,
+    plain = wind.begin_joint(mean, prior)
+    scaled = wind.begin_joint(units @ mean, units @ prior @ units)
+    there, noisier = units @ measured, units @ noise @ units
+    np.testing.assert_allclose(
+        wind.dithered_innovation(scaled, there, noisier),
+        wind.dithered_innovation(plain, measured, noise),
+        rtol=1e-6,
+        atol=1e-12,
     )
-    np.testing.assert_allclose(scaled.innovation, plain.innovation, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(scaled.mean, units @ plain.mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        wind.with_dithered(scaled, there, noisier).alpha,
+        units @ wind.with_dithered(plain, measured, noise).alpha,
+        rtol=1e-5,
+        atol=1e-6,
+    )
 
 
 @given(st.lists(st.floats(0.0, 50.0), min_size=1, max_size=30))

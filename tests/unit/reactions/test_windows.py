@@ -6,9 +6,7 @@ import pytest
 
 from service import events as ev
 from service.estimation.lockin import WindowRefused
-from service.estimation.passive import PassiveEstimate
-from service.model.misregistration import Misregistration
-from service.reactions.windows import HISTORY_LENGTH
+from service.reactions.tracking import HISTORY_LENGTH
 from service.state import Level, Mode
 from tests.unit.reactions.situations import ALPHA, PRECISE, START_NS, Story, estimate, moved
 
@@ -53,18 +51,6 @@ def test_the_history_is_bounded(story):
     story.see(moved(shift_x_subap=0.001))
     assert len(story.state.history) == HISTORY_LENGTH
     assert story.state.history[-1].measured.shift_x_subap == pytest.approx(0.121)
-
-
-def test_a_jump_is_followed_at_once_and_counting_starts_again(story):
-    story.see(n_windows=3)
-    there = moved(shift_x_subap=0.1)
-    story.see(there)
-    known = story.state.registration
-    assert known.n_windows == 1
-    assert known.alpha.shift_x_subap == pytest.approx(there.shift_x_subap, abs=0.002)
-    entry = story.state.log[-1]
-    assert (entry.name, entry.level) == ("registration.jump", Level.WARNING)
-    assert "+0.100" in entry.text
 
 
 def test_a_window_from_before_the_estimate_does_not_shrink_its_uncertainty_below_zero(story):
@@ -125,28 +111,6 @@ def test_a_lost_window_is_a_warning_unless_the_service_itself_cut_it_short(story
     story.tell(ev.WindowLost(refused=WindowRefused(reason=reason, t_ns_utc=START_NS)))
     assert story.state.windows_refused == 1
     assert story.state.log[-1].level is level
-
-
-def watched(alpha):
-    sigma = np.array([0.1, 0.1, 5e-4, 5e-4])
-    return PassiveEstimate(alpha=alpha, sigma=sigma, gains=np.full(400, 0.6), step=np.zeros(4))
-
-
-def test_the_watchdog_only_reports_while_there_is_nothing_to_compare_with(story):
-    story.tell(ev.Watched(estimate=watched(Misregistration()), t_ns_utc=START_NS))
-    assert story.state.watchdog.consistent
-    assert "no dithered estimate" in story.state.watchdog.text
-    assert not story.alarms
-
-
-def test_the_watchdog_barks_while_it_disagrees(story):
-    story.see()
-    story.tell(ev.Watched(estimate=watched(moved(rotation_rad=0.01)), t_ns_utc=START_NS))
-    assert not story.state.watchdog.consistent
-    assert "watchdog" in story.alarms
-    story.tell(ev.Watched(estimate=watched(moved(shift_x_subap=0.2)), t_ns_utc=START_NS))
-    assert story.state.watchdog.consistent
-    assert "watchdog" not in story.alarms
 
 
 def test_by_day_a_mirror_seen_twice_shows_twice_the_gain_and_the_window_counts():

@@ -1,0 +1,182 @@
+"""Jumps and outliers: what one window far out may do, and what it takes two for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.errors import CommandError
+from service.state import Level, MatrixState, Mode, Source, Validity
+from tests.unit.reactions.situations import (
+    ALPHA,
+    POLICY,
+    PRECISE,
+    SECOND,
+    START_NS,
+    Story,
+    estimate,
+    moved,
+    of_kind,
+    rtc,
+)
+
+THERE = moved(shift_x_subap=0.1)
+
+
+@pytest.fixture
+def story():
+    story = Story(Mode.AUTO).meet()
+    story.see(n_windows=3)
+    return story
+
+
+class TestSuspicion:
+    """One window far out."""
+
+    def test_it_is_flagged_at_once_and_does_not_move_the_registration(self, story):
+        before = story.state.registration
+        story.see(THERE)
+        known = story.state.registration
+        assert known.alpha == before.alpha
+        assert known.candidate.alpha == THERE
+        assert "jump-suspected" in story.alarms
+        entry = next(e for e in story.state.log if e.name == "registration.jump-suspected")
+        assert entry.level is Level.WARNING
+        assert "+0.100" in entry.text
+        assert story.state.windows_accepted == 3
+
+    def test_nothing_may_be_made_from_it(self, story):
+        story.use("cm-1", 400)
+        story.wait(10)
+        story.see(n_windows=2)
+        made = len(story.asked(ev.MakeMatrix))
+        story.see(THERE)
+        assert story.state.registration.standing.validity is Validity.INVALID
+        assert not story.state.registration.usable
+        story.wait(20)
+        assert len(story.asked(ev.MakeMatrix)) == made
+
+    def test_a_matrix_under_way_when_it_comes_is_kept_but_not_sent(self, story):
+        story.see(THERE)
+        assert not of_kind(story.make("cm-1"), ev.SendMatrix)
+        assert story.matrix_state("cm-1") is MatrixState.PROPOSED
+        with pytest.raises(CommandError, match="jump is suspected"):
+            story.tell(ev.Approve(id="cm-1"))
+
+    def test_a_dither_is_due_until_a_window_has_decided(self, story):
+        story.see(THERE)
+        assert story.state.dither_due_since_ns_utc == story.now_ns
+        assert "jump" in story.state.dither_due_reason
+        story.see()
+        assert story.state.dither_due_since_ns_utc is None
+
+    def test_nobody_waits_for_the_deciding_window_for_ever(self, story):
+        story.see(THERE)
+        story.wait(61)
+        assert story.state.registration.candidate is None
+        assert story.state.registration.standing.validity is Validity.INVALID
+
+
+class TestDecision:
+    """The window after it."""
+
+    def test_one_that_agrees_makes_it_a_jump_with_both_windows_in_the_estimate(self, story):
+        story.see(THERE)
+        story.see(moved(THERE, shift_x_subap=0.002))
+        known = story.state.registration
+        assert known.alpha.shift_x_subap == pytest.approx(THERE.shift_x_subap + 0.001, abs=1e-3)
+        assert known.n_windows == 2
+        assert known.candidate is None
+        assert known.usable
+        assert "jump-suspected" not in story.alarms
+        entry = next(e for e in story.state.log if e.name == "registration.jump")
+        assert entry.level is Level.WARNING
+        assert story.state.windows_accepted == 5
+        # half the variance of one, and the walk between the two
+        walked = 2.0 * story.policy.drift_rate[0] ** 2
+        assert PRECISE[0, 0] / 2 < known.covariance[0, 0] < (PRECISE[0, 0] + walked) / 2
+
+    def test_then_a_matrix_is_made_for_the_new_place_at_once(self):
+        """Flagged within 5 s, a matrix wanted within two windows of 2 s: 11 s remain for it."""
+        story = Story(Mode.AUTO, replace(POLICY, n_modes_target=400)).meet()
+        story.see(n_windows=2)
+        story.use("cm-1", 400)
+        story.see(n_windows=5)
+        jumped_ns = story.now_ns
+        assert not of_kind(story.see(THERE), ev.MakeMatrix)
+        assert "jump-suspected" in story.alarms
+        assert story.now_ns - jumped_ns <= 5 * SECOND
+        (made,) = of_kind(story.see(THERE), ev.MakeMatrix)
+        assert made.why.startswith("moved by +0.1")
+        assert story.now_ns - jumped_ns <= 4 * SECOND
+
+    def test_one_that_agrees_with_all_before_makes_it_an_outlier(self, story):
+        story.see(THERE)
+        story.see()
+        known = story.state.registration
+        np.testing.assert_allclose(known.alpha.vector, ALPHA.vector, atol=1e-12)
+        assert known.n_windows == 4
+        assert (story.state.windows_accepted, story.state.windows_outlying) == (4, 1)
+        assert "window.outlier" in story.logged
+        assert "registration.jump" not in story.logged
+        assert not story.alarms
+
+    def test_one_that_agrees_with_neither_is_held_in_its_place(self, story):
+        story.see(THERE)
+        story.see(moved(shift_y_subap=-0.2))
+        known = story.state.registration
+        assert known.candidate.alpha == moved(shift_y_subap=-0.2)
+        assert known.alpha == story.state.history[2].filtered
+        assert story.state.windows_outlying == 1
+        assert not known.usable
+
+    def test_the_window_in_which_it_jumped_is_between_both_places_and_decides_nothing(self, story):
+        story.see(moved(shift_x_subap=0.05))
+        story.see(THERE, n_windows=2)
+        known = story.state.registration
+        assert known.alpha.shift_x_subap == pytest.approx(THERE.shift_x_subap, abs=0.002)
+        assert known.n_windows == 2
+
+    def test_outliers_in_a_row_never_move_it_while_no_two_agree(self, story):
+        rng = np.random.default_rng(2)
+        for _ in range(20):
+            far = dict(
+                zip(("shift_x_subap", "shift_y_subap"), rng.uniform(-0.5, 0.5, 2), strict=True)
+            )
+            story.see(moved(**far))
+        known = story.state.registration
+        assert np.abs(known.alpha.vector - ALPHA.vector).max() < 1e-6 or known.candidate is not None
+
+    def test_the_history_says_which_windows_entered(self, story):
+        story.see(THERE)
+        story.see()
+        assert [entry.entered for entry in story.state.history] == [True, True, True, False, True]
+        assert {entry.source for entry in story.state.history} == {Source.LOCK_IN}
+
+
+class TestTime:
+    """Which clock tells how old α is."""
+
+    def test_a_clock_set_back_does_not_stop_the_walk(self, story):
+        """An hour earlier by the RTC, a minute later by arrival: a minute has passed."""
+        before = story.state.registration
+        story.now_ns += 60 * SECOND
+        early = estimate(t_ns=START_NS - 3600 * SECOND, covariance=1e6 * PRECISE)
+        story.tell(ev.WindowFitted(estimate=replace(early, covariance=PRECISE * 100.0)))
+        after = story.state.registration
+        walked = before.covariance[0, 0] + 60.0 * story.policy.drift_rate[0] ** 2
+        expected = 1.0 / (1.0 / walked + 1.0 / (100.0 * PRECISE[0, 0]))
+        assert after.covariance[0, 0] == pytest.approx(expected, rel=0.02)
+
+    def test_after_a_long_silence_a_window_stands_alone(self, story):
+        story.wait(300)
+        story.see(moved(shift_x_subap=0.05))
+        assert story.state.registration.n_windows == 1
+
+    def test_an_alpha_of_another_basis_is_dropped_when_the_rtc_names_its_own(self, story):
+        known = replace(story.state.registration, basis_id="kl-300")
+        story.state = replace(story.state, registration=known)
+        story.tell(ev.StatusSeen(rtc=rtc()))
+        assert story.state.registration is None
+        assert "kl-300" in next(e.text for e in story.state.log if e.name == "registration.void")

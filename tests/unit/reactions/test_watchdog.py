@@ -1,0 +1,197 @@
+"""Ordinary telemetry between dithers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.estimation.passive import BIAS_FLOOR, PassiveEstimate
+from service.model.misregistration import Misregistration
+from service.reactions.tracking import PASSIVE_BLIND_S
+from service.state import Mode, Source, Validity
+from tests.unit.reactions.situations import (
+    ALPHA,
+    POLICY,
+    SECOND,
+    START_NS,
+    Story,
+    moved,
+    of_kind,
+    rtc,
+)
+
+SCATTER = np.array([0.003, 0.003, 1e-4, 1e-4])
+
+
+def watched(alpha, scatter=SCATTER):
+    return PassiveEstimate(
+        alpha=alpha,
+        sigma=np.hypot(scatter, BIAS_FLOOR),
+        gains=np.full(400, 0.6),
+        step=np.zeros(4),
+    )
+
+
+def watch(story, alpha, after_s=10.0, scatter=SCATTER):
+    """A look of the watchdog; the RTC's clock tells when."""
+    now_ns = story.now_ns + round(after_s * SECOND)
+    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=now_ns)))
+    return story.tell(ev.Watched(estimate=watched(alpha, scatter), t_ns_utc=now_ns), after_s)
+
+
+@pytest.fixture
+def story():
+    story = Story(Mode.AUTO).meet()
+    story.see(n_windows=3)
+    return story
+
+
+def learnt(story, off=0.06, n_looks=20):
+    """A night in which windows and looks alternate: the passive shift is off by so much."""
+    for _ in range(n_looks):
+        story.see(every_s=5.0)
+        watch(story, moved(shift_x_subap=off), after_s=5.0)
+    return story
+
+
+def test_it_only_reports_while_there_is_nothing_to_compare_with():
+    story = Story(Mode.AUTO).meet()
+    watch(story, Misregistration())
+    assert story.state.watchdog.consistent
+    assert "no dithered estimate" in story.state.watchdog.text
+    assert story.state.registration is None
+
+
+def test_before_a_bias_is_learnt_a_shift_is_worth_ten_percent_and_says_so(story):
+    before = story.state.registration
+    watch(story, moved(shift_x_subap=0.06))
+    after = story.state.registration
+    assert np.all(story.state.watchdog.sigma[:2] >= 0.1)
+    assert after.alpha.shift_x_subap == pytest.approx(before.alpha.shift_x_subap, abs=0.005)
+    assert after.n_windows == before.n_windows
+    assert after.window_ns_utc == before.window_ns_utc
+
+
+def test_the_bias_is_learnt_between_windows_and_shown(story):
+    known = learnt(story).state.registration
+    assert known.bias.offset[0] == pytest.approx(0.06, abs=0.004)
+    assert story.state.watchdog.bias[0] == pytest.approx(0.06, abs=0.004)
+    assert story.state.watchdog.sigma[0] < 0.02
+    assert known.alpha.shift_x_subap == pytest.approx(ALPHA.shift_x_subap, abs=0.003)
+
+
+def test_once_learnt_it_follows_a_drift_without_any_window(story):
+    """2 % of a subaperture in 40 s, four looks: followed to a quarter of it, and σ says so."""
+    learnt(story)
+    for k in range(1, 5):
+        watch(story, moved(shift_x_subap=0.06 + 0.005 * k))
+    known = story.state.registration
+    assert known.alpha.shift_x_subap == pytest.approx(ALPHA.shift_x_subap + 0.02, abs=0.005)
+    silent = story.policy.drift_rate[0] * np.sqrt(40.0)
+    assert known.sigma[0] < silent / 2
+    assert story.state.history[-1].source is Source.PASSIVE
+
+
+def test_looks_close_together_tell_no_more_than_their_telemetry_holds():
+    """Of α + b, at rest: after a first look 100 in 10 s say what one says after 10 s.
+
+    With ρ the correlation of two looks their variance counts (1 + ρ) / (1 - ρ) times: 2.16 for one
+    e-folding, 200 for a hundredth of it. So R (1 + 1/2.16)^-1 = 0.68 R, and 0.67 R.
+    """
+    still = replace(POLICY, drift_rate=np.zeros(4), bias_memory_s=1e12)
+    found = []
+    for n_looks in (1, 100):
+        story = Story(Mode.HOLD, still).meet()
+        story.see()
+        watch(story, ALPHA)
+        for _ in range(n_looks):
+            watch(story, ALPHA, 10.0 / n_looks)
+        known = story.state.registration
+        both = known.covariance + known.bias.covariance + known.bias.shared + known.bias.shared.T
+        found.append(both[0, 0] / SCATTER[0] ** 2)
+    np.testing.assert_allclose(found, [0.684, 0.667], rtol=0.01)
+
+
+class TestBark:
+    """An estimate that fits neither α nor what is known of its bias."""
+
+    @pytest.fixture
+    def barking(self, story):
+        learnt(story)
+        self.before = story.state.registration
+        watch(story, moved(shift_x_subap=0.30))
+        return story
+
+    def test_it_is_seen_and_a_dither_is_due(self, barking):
+        assert "watchdog" in barking.alarms
+        assert "registration.passive-jump" in barking.logged
+        assert barking.state.dither_due_since_ns_utc == barking.now_ns
+        assert "wind" in barking.state.dither_due_reason
+        assert not barking.state.watchdog.consistent
+
+    def test_alpha_stands_the_bias_is_forgotten_and_nothing_is_made_of_it(self, barking):
+        known = barking.state.registration
+        assert known.alpha == self.before.alpha
+        np.testing.assert_array_equal(known.bias.offset, 0.0)
+        assert known.standing.validity is Validity.INVALID
+        assert not of_kind(barking.wait(30), ev.MakeMatrix)
+        assert not of_kind(barking.make("cm-1"), ev.SendMatrix)
+
+    def test_another_look_does_not_end_the_doubt(self, barking):
+        watch(barking, moved(shift_x_subap=0.30))
+        assert barking.state.registration.standing.validity is Validity.INVALID
+        assert "watchdog" in barking.alarms
+
+    def test_a_window_at_the_old_place_ends_it(self, barking):
+        barking.see()
+        assert barking.state.registration.usable
+        assert barking.state.dither_due_since_ns_utc is None
+        assert not barking.alarms & {"watchdog", "estimate-stale"}
+
+    def test_a_window_far_away_is_a_jump_only_when_the_next_confirms_it(self, barking):
+        barking.see(moved(shift_x_subap=0.24))
+        assert "jump-suspected" in barking.alarms
+        barking.see(moved(shift_x_subap=0.24))
+        shift = barking.state.registration.alpha.shift_x_subap
+        assert shift == pytest.approx(ALPHA.shift_x_subap + 0.24, abs=0.005)
+
+
+class TestJump:
+    """While the sums still hold telemetry from before a jump."""
+
+    def test_they_are_not_used(self, story):
+        learnt(story)
+        there = moved(shift_x_subap=0.15)
+        story.see(there, n_windows=2)
+        before = story.state.registration
+        watch(story, moved(shift_x_subap=0.10))
+        assert story.state.registration.alpha == before.alpha
+        assert "both sides of a jump" in story.state.watchdog.text
+
+    def test_later_they_are(self, story):
+        learnt(story)
+        there = moved(shift_x_subap=0.15)
+        story.see(there, n_windows=2)
+        story.see(there, every_s=PASSIVE_BLIND_S)
+        watch(story, moved(there, shift_x_subap=0.06))
+        assert story.state.history[-1].source is Source.PASSIVE
+
+    def test_nor_while_one_is_suspected(self, story):
+        story.see(moved(shift_x_subap=0.15))
+        before = story.state.registration
+        watch(story, moved(shift_x_subap=0.15))
+        assert story.state.registration.covariance is before.covariance
+
+
+def test_without_an_rtc_its_own_time_counts(story):
+    story.tell(ev.RtcVanished())
+    event = ev.Watched(estimate=watched(ALPHA), t_ns_utc=START_NS + 60 * SECOND)
+    story.tell(event, after_s=1.0)
+    assert story.state.registration.t_ns_utc == START_NS + 60 * SECOND
+
+
+def test_a_registration_without_a_bias_knows_nothing_of_it(story):
+    story.state = replace(story.state, registration=replace(story.state.registration, bias=None))
+    watch(story, moved(shift_x_subap=0.08))
+    assert story.state.registration.bias.offset[0] > 0.05

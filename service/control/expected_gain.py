@@ -1,0 +1,204 @@
+"""What a reconstructor for the present registration would win over the one in use.
+
+The linear model of the loop: turbulence ``φ`` on every mode of the basis, slopes
+``s = D(α) G (φ + c) + n``, integrator ``c = -H g R s`` with ``H = z^-d / (1 - leak z^-1)``. With
+the coupling ``B = g R D G = V Λ V^-1`` of the controlled modes and ``B_h`` of those beyond, what is
+left of the controlled modes is
+
+    ``e = V [1/(1 + HΛ)] V^-1 φ - V [H/(1 + HΛ)] V^-1 (B_h φ_h + g R n)``.
+
+Its variance is summed over a frame's frequencies for the reconstructor in use and for the inverse
+of the present D. Modes are taken to be independent: under frozen flow a reconstructor shifted along
+the wind foresees the turbulence and wins what it loses when shifted against it, and the model
+gives the mean of both (docs/results/update_policy.md). Neither swings of the optical gain nor
+slipping segments are in it: the gate keeps a loop safe, this only says whether a new matrix is
+worth the swap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.stability import pole_radius
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+N_FREQUENCIES = 96
+"""Between a thousandth and half of the frame rate: twice as many change nothing in 1e-3."""
+
+_N_GROUPS = 10
+"""Of modes that share one temporal spectrum."""
+
+_CORNER = 0.3
+"""Corner frequency over ``(n + 1) v / D`` of a mode of radial order n (Conan et al. 1995)."""
+
+_FALL = -11.0 / 6.0
+"""Power of a mode's number that its variance follows."""
+
+_STEEPNESS = 17.0 / 3.0
+"""Power of the temporal spectrum above its corner (the same)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sky:
+    """What the loop works against."""
+
+    variance_m2: Array
+    """``(n_basis,)`` variance of the turbulence on each mode, metres² OPD."""
+
+    beyond_m2: float
+    """Variance of the turbulence that no mode of the basis holds, metres²."""
+
+    crossing_hz: float
+    """Wind speed over telescope diameter."""
+
+    slope_noise: float
+    """1 σ of one slope in one frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Timing:
+    """How the loop moves in time."""
+
+    frame_rate_hz: float
+    delay_frames: float
+    leak: float
+    gains: Array
+    """``(n_controlled,)`` integrator gain of each mode."""
+
+    optical_gain: Array
+    """``(n_basis,)`` how much of the model's response the sensor shows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExpectedGain:
+    """What is lost with the reconstructor in use, by the linear model of the loop."""
+
+    loss_m: float
+    """Wavefront error above that with a new reconstructor, metres RMS; infinite: unstable."""
+
+    wavefront_m: float
+    """Wavefront error with a new reconstructor, metres RMS."""
+
+    pole_radius: float
+    """Largest closed-loop pole radius at the present registration, no uncertainty added."""
+
+    fresh_pole_radius: float
+    """The same with a new reconstructor."""
+
+
+def beyond_m2(variance_m2: Array) -> float:
+    """Return the variance of the turbulence beyond a basis, metres².
+
+    That of mode m falls as ``m^(-11/6)`` (Kolmogorov's in two dimensions): the last third of the
+    basis says how much is left.
+    """
+    n = len(variance_m2)
+    last = np.arange(2 * n // 3, n)
+    scale = variance_m2[last].sum() / np.sum((last + 1.0) ** _FALL)
+    return float(scale * (n + 0.5) ** (1.0 + _FALL) / -(1.0 + _FALL))
+
+
+def expected_gain(
+    in_use: NDArray[np.float32],
+    fresh: NDArray[np.float32],
+    interaction_matrix: NDArray[np.float32],
+    timing: Timing,
+    sky: Sky,
+) -> ExpectedGain:
+    """Return what ``fresh`` would win over ``in_use``, both ``(n_controlled, n_slopes)``.
+
+    ``interaction_matrix`` ``(n_slopes, n_basis)`` is the sensor's at the present registration.
+    """
+    seen = interaction_matrix * timing.optical_gain.astype(np.float32)
+    spectra = _Spectra(timing, sky)
+    now_m2, radius = _left(in_use, seen, timing, sky, spectra)
+    then_m2, fresh_radius = _left(fresh, seen, timing, sky, spectra)
+    rest_m2 = float(sky.variance_m2[len(in_use) :].sum()) + sky.beyond_m2
+    wavefront = float(np.sqrt(then_m2 + rest_m2))
+    loss = float(np.sqrt(now_m2 + rest_m2)) - wavefront if radius < 1.0 else float("inf")
+    return ExpectedGain(
+        loss_m=loss, wavefront_m=wavefront, pole_radius=radius, fresh_pole_radius=fresh_radius
+    )
+
+
+def explained_by_noise(loss_m: float, step: Array, covariance: Array) -> float:
+    """Return how much of a loss pure noise of the two registrations would show, metres.
+
+    ``step`` ``(4,)`` is what separates them, ``covariance`` ``(4, 4)`` that of the step. A loss
+    grows as the square of the step: of noise alone its mean is that at a squared distance of 4,
+    one for each parameter, where all four weigh alike.
+    """
+    distance2 = float(step @ np.linalg.solve(covariance, step))
+    if distance2 <= len(step):
+        return loss_m
+    return loss_m * len(step) / distance2
+
+
+class _Spectra:
+    """Frequencies of a frame, their weights, and the temporal spectrum of groups of modes."""
+
+    def __init__(self, timing: Timing, sky: Sky) -> None:
+        edges = np.geomspace(1e-3, 0.5, N_FREQUENCIES + 1)
+        per_frame = np.sqrt(edges[1:] * edges[:-1])
+        z: Complex = np.exp(-2j * np.pi * per_frame)
+        self.integrator: Complex = z**timing.delay_frames / (1.0 - timing.leak * z)
+        self.widths: Array = np.diff(edges)
+        corners = _CORNER * (radial_order(len(sky.variance_m2)) + 1.0) * sky.crossing_hz
+        bounds = np.geomspace(corners[0] * 0.999, corners[-1] * 1.001, _N_GROUPS + 1)
+        self.group: NDArray[np.intp] = np.searchsorted(bounds, corners) - 1
+        self.shapes: Array = np.zeros((_N_GROUPS, N_FREQUENCIES))
+        for k in range(_N_GROUPS):
+            if np.any(self.group == k):
+                corner = float(corners[self.group == k].mean()) / timing.frame_rate_hz
+                shape = 1.0 / (1.0 + (per_frame / corner) ** _STEEPNESS)
+                self.shapes[k] = shape * self.widths / (shape @ self.widths)
+
+
+def radial_order(n_modes: int) -> Array:
+    """Return the radial order ``(n_modes,)`` of modes numbered like Zernike's, without piston."""
+    modes = np.arange(2, n_modes + 2)
+    return np.asarray(np.ceil((np.sqrt(8.0 * modes + 1.0) - 3.0) / 2.0))
+
+
+def _left(
+    reconstructor: NDArray[np.float32],
+    seen: NDArray[np.float32],
+    timing: Timing,
+    sky: Sky,
+    spectra: _Spectra,
+) -> tuple[float, float]:
+    """Return the variance left on the controlled modes, metres², and the largest pole radius."""
+    n = len(reconstructor)
+    gains = timing.gains[:, None]
+    coupling = gains * (reconstructor @ seen).astype(float)
+    eigenvalues, vectors = np.linalg.eig(coupling[:, :n])
+    radius = pole_radius(eigenvalues, leak=timing.leak, delay_frames=timing.delay_frames).max()
+    inverse = np.linalg.inv(vectors)
+    rejected = 1.0 / (1.0 + spectra.integrator[:, None] * eigenvalues)
+    passed = spectra.integrator[:, None] * rejected
+    metric = vectors.conj().T @ vectors
+    aliased, amplitude = inverse @ coupling[:, n:], np.sqrt(sky.variance_m2)
+    total = 0.0
+    for k, shape in enumerate(spectra.shapes):
+        own, other = spectra.group[:n] == k, spectra.group[n:] == k
+        if own.any():
+            total += _power(inverse[:, own] * amplitude[:n][own], rejected, shape, metric)
+        if other.any():
+            total += _power(aliased[:, other] * amplitude[n:][other], passed, shape, metric)
+    noise = inverse @ (gains * reconstructor) * sky.slope_noise
+    # white: its power within a frame's frequencies is 1, half of it on each side of zero
+    return total + _power(noise, passed, 2.0 * spectra.widths, metric), float(radius)
+
+
+def _power(
+    driven: NDArray[Any], response: NDArray[Any], weights: Array, metric: NDArray[Any]
+) -> float:
+    """Return the variance of ``V [response] driven x``, x of unit variance and this spectrum."""
+    mean = (response.T * weights) @ response.conj()
+    return float(np.sum((driven @ driven.conj().T) * mean * metric.T).real)

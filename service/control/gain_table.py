@@ -1,0 +1,138 @@
+"""The optical gain of every mode from that of a few, and the table of loop gains that undoes it.
+
+A pyramid in a residual of structure function D responds as behind an incoherent source of mutual
+coherence ``exp(-D/2)``: the logarithm of a mode's optical gain is the strength of the residual
+times a shape that the modulation and the mode's spatial frequency fix. The shape is read off the
+diffractive telescope (docs/results/optical_gain.md); its strength, a common factor and a smooth
+departure are found from the modes that were dithered, as a Gaussian process whose uncertainty
+grows away from them.
+
+The table stands beside a reconstructor and is never folded into it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+
+Array = NDArray[np.float64]
+
+REFERENCE_MODES = (0, 12, 20, 36, 64, 112, 150, 195, 257, 340, 449, 501, 593)
+REFERENCE_GAINS = (
+    0.516, 0.511, 0.504, 0.502, 0.543, 0.578, 0.608, 0.628, 0.648, 0.681, 0.710, 0.722, 0.787,
+)  # fmt: skip
+"""Optical gains of FLAO's modes at 1" of seeing: the shape."""
+
+STRENGTH_SIGMA = 0.5
+"""1 σ of the residual's strength before anything is measured: 1 is the reference's."""
+
+COMMON_SIGMA = 0.05
+"""Of a factor common to all modes: the mirror's stroke, the model's absolute scale."""
+
+SHAPE_SIGMA = 0.06
+"""Of a smooth departure from the shape, far from any measured mode."""
+
+SHAPE_SCALE = 0.7
+"""Over which such a departure changes, in units of the logarithm of the mode's number."""
+
+LEAST_SIGMA = 0.02
+"""Of one measured mode, relative: the response is not diagonal."""
+
+TWO_PASSES_ABOVE = 1.1
+"""A median above this is light that met the mirror twice: twice an optical gain."""
+
+FACTOR_BOUNDS = (0.5, 2.0)
+"""No mode's loop gain is changed by more than these against the mean of all."""
+
+GATE_SIGMA = 2.0
+GATE_SWING = 0.05
+"""Relative swing of the gain with the seeing, from one window to the next."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GainTable:
+    """The optical gain of the first modes of the basis, and what loop gains undo it."""
+
+    optical_gain: Array
+    """``(n_modes,)`` how much of the model's response the sensor shows; up to 2 by day."""
+
+    relative_sigma: Array
+    """``(n_modes,)`` 1 σ of it, as a share of it."""
+
+    measured_modes: tuple[int, ...]
+    """Those it was found from; empty: only what is expected at 1" of seeing."""
+
+    @property
+    def factors(self) -> Array:
+        """``(n_modes,)`` by which to multiply one loop gain for all: mean 1, bounded."""
+        inverse = 1.0 / self.optical_gain
+        return np.asarray(np.clip(inverse / inverse.mean(), *FACTOR_BOUNDS))
+
+    @property
+    def highest(self) -> Array:
+        """``(n_modes,)`` optical gain that a loop must bear: two σ up, with the seeing's swing."""
+        sigma = np.hypot(self.relative_sigma, GATE_SWING)
+        return np.asarray(self.optical_gain * np.exp(GATE_SIGMA * sigma))
+
+    def loop_gains(self, in_effect: float) -> Array:
+        """Return ``(n_modes,)`` integrator gains that act as about ``in_effect`` on every mode."""
+        mean = in_effect * float(np.mean(1.0 / self.optical_gain))
+        return np.asarray(mean * self.factors)
+
+
+def gain_table(
+    modes: NDArray[Any], gains: NDArray[Any], sigma: NDArray[Any], n_modes: int
+) -> GainTable:
+    """Return the table of ``n_modes`` modes from the gains ``(n,)`` of those measured.
+
+    ``sigma`` ``(n,)`` is 1 σ of each gain.
+
+    Raises
+    ------
+    ModelError
+        If the three differ in length, or a gain is not a positive number.
+    """
+    modes = np.asarray(modes, dtype=np.intp)
+    found, spread = np.asarray(gains, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
+    if not len(modes) == len(found) == len(spread):
+        raise ModelError(
+            f"gain table: found {len(found)} gains and {len(spread)} sigmas for {len(modes)} "
+            "modes; expected one of each"
+        )
+    if not (np.all(np.isfinite(found) & (found > 0.0)) and np.all(spread >= 0.0)):
+        raise ModelError(
+            f"gain table: found gains {found.tolist()} and sigmas {spread.tolist()}; expected "
+            "positive numbers"
+        )
+    everywhere = np.arange(n_modes)
+    passes = 2.0 if len(found) and np.median(found) > TWO_PASSES_ABOVE else 1.0
+    expected, covariance = _expected(everywhere) + np.log(passes), _covariance(everywhere, modes)
+    variance = np.diag(_covariance(everywhere, everywhere)).copy()
+    if len(modes):
+        noise = (spread / found) ** 2 + LEAST_SIGMA**2
+        weights = np.linalg.solve(_covariance(modes, modes) + np.diag(noise), covariance.T).T
+        expected = expected + weights @ (np.log(found) - np.log(passes) - _expected(modes))
+        variance -= np.einsum("ij,ij->i", weights, covariance)
+    return GainTable(
+        optical_gain=np.exp(expected),
+        relative_sigma=np.sqrt(np.maximum(variance, 0.0)),
+        measured_modes=tuple(int(mode) for mode in modes),
+    )
+
+
+def _expected(modes: NDArray[np.intp]) -> Array:
+    """Return the logarithm of the reference's optical gain of these modes."""
+    place = np.log1p(np.array(REFERENCE_MODES))
+    return np.asarray(np.interp(np.log1p(modes), place, np.log(REFERENCE_GAINS)))
+
+
+def _covariance(one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
+    """Return the prior covariance of the logarithms, ``(len(one), len(other))``."""
+    strength = STRENGTH_SIGMA**2 * np.outer(_expected(one), _expected(other))
+    apart = (np.log1p(one)[:, None] - np.log1p(other)) / SHAPE_SCALE
+    return np.asarray(strength + COMMON_SIGMA**2 + SHAPE_SIGMA**2 * np.exp(-0.5 * apart**2))

@@ -1,0 +1,132 @@
+"""Against closed forms, a direct solution per frequency, and a loop run frame by frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.control.expected_gain import (
+    Sky,
+    Timing,
+    beyond_m2,
+    expected_gain,
+    explained_by_noise,
+    radial_order,
+)
+from service.control.reconstructor import invert
+from service.model.misregistration import Misregistration
+from tests.numerics import N_CONTROLLED, N_MODES, small_basis, small_model
+
+NOISE = 0.05
+SKY = Sky(
+    variance_m2=small_basis().variance_m2[:N_MODES],
+    beyond_m2=0.0,
+    crossing_hz=1.5,
+    slope_noise=NOISE,
+)
+TIMING = Timing(
+    frame_rate_hz=500.0,
+    delay_frames=2.0,
+    leak=1.0,
+    gains=np.full(N_CONTROLLED, 0.4),
+    optical_gain=np.ones(N_MODES),
+)
+
+
+def matrix_at(alpha):
+    return small_model().interaction_matrix(alpha)
+
+
+def shifted(by):
+    return Misregistration(shift_x_subap=by)
+
+
+def judged(alpha, sky=SKY, timing=TIMING):
+    in_use = invert(matrix_at(Misregistration()), N_CONTROLLED).matrix
+    fresh = invert(matrix_at(alpha), N_CONTROLLED).matrix
+    return expected_gain(in_use, fresh, matrix_at(alpha), timing, sky)
+
+
+def test_a_matrix_that_fits_has_nothing_to_gain():
+    found = judged(Misregistration())
+    assert found.loss_m == pytest.approx(0.0, abs=1e-15)
+    assert found.pole_radius == pytest.approx(found.fresh_pole_radius)
+
+
+def test_the_loss_grows_about_as_the_square_of_a_shift():
+    one, two = judged(shifted(0.1)).loss_m, judged(shifted(0.2)).loss_m
+    # without a linear term: the next one is of the fourth order
+    assert two == pytest.approx(4 * one, rel=0.25)
+    assert one > 0.0
+
+
+def test_the_margin_shrinks_with_a_shift_and_a_new_matrix_has_all_of_it():
+    near, far = judged(shifted(0.1)), judged(shifted(0.2))
+    assert near.fresh_pole_radius == pytest.approx(np.sqrt(0.4), rel=1e-3)  # z^2 - z + 0.4
+    assert near.fresh_pole_radius < near.pole_radius < far.pole_radius
+
+
+def test_what_is_unstable_loses_everything():
+    fast = replace(TIMING, gains=np.full(N_CONTROLLED, 1.2))
+    assert judged(shifted(0.3), timing=fast).loss_m == float("inf")
+
+
+def test_noise_alone_leaves_what_the_closed_form_says():
+    """An integrator of delay 1 passes a share g / (2 - g) of white noise."""
+    quiet = replace(SKY, variance_m2=np.full(N_MODES, 1e-30))
+    found = judged(Misregistration(), quiet, replace(TIMING, delay_frames=1.0))
+    rows = invert(matrix_at(Misregistration()), N_CONTROLLED).matrix.astype(float)
+    expected = NOISE * np.linalg.norm(rows) * np.sqrt(0.4 / 1.6)
+    # frequencies below a thousandth of the frame rate are left out
+    assert found.wavefront_m == pytest.approx(expected, rel=5e-3)
+
+
+def test_the_optical_gain_acts_like_the_loop_gain_on_the_turbulence():
+    still = replace(SKY, slope_noise=1e-12, variance_m2=SKY.variance_m2.copy())
+    still.variance_m2[N_CONTROLLED:] = 1e-30
+    dim = replace(TIMING, optical_gain=np.full(N_MODES, 0.5))
+    low = replace(TIMING, gains=np.full(N_CONTROLLED, 0.2))
+    one, other = judged(shifted(0.1), still, dim), judged(shifted(0.1), still, low)
+    assert one.wavefront_m == pytest.approx(other.wavefront_m, rel=1e-6)
+    assert one.loss_m == pytest.approx(other.loss_m, rel=1e-4)
+
+
+def test_it_is_what_a_loop_leaves_when_run_frame_by_frame():
+    """White slope noise through a mis-registered loop of 4000 frames."""
+    alpha = shifted(0.2)
+    in_use = invert(matrix_at(Misregistration()), N_CONTROLLED).matrix.astype(float)
+    sensor = matrix_at(alpha)[:, :N_CONTROLLED].astype(float)
+    rng = np.random.default_rng(5)
+    command, power = np.zeros((4002, N_CONTROLLED)), 0.0
+    for k in range(4000):
+        slopes = sensor @ command[k] + NOISE * rng.standard_normal(len(sensor))
+        command[k + 2] = command[k + 1] - 0.4 * in_use @ slopes
+    power = float(np.sum(command[200:4000] ** 2, axis=1).mean())
+    calm = replace(SKY, variance_m2=np.full(N_MODES, 1e-30))
+    found = judged(alpha, calm)
+    left = found.wavefront_m + found.loss_m
+    # 30 modes of some 1000 independent samples: 1 % of the RMS
+    assert left == pytest.approx(np.sqrt(power), rel=0.02)
+
+
+def test_the_tail_of_a_power_law_is_its_integral():
+    modes = np.arange(1, 301)
+    law = modes ** (-11 / 6)
+    beyond = np.sum(np.arange(301, 2_000_000) ** (-11 / 6))
+    assert beyond_m2(law) == pytest.approx(beyond, rel=2e-3)
+
+
+def test_radial_orders_count_like_zernikes_without_piston():
+    assert radial_order(9).tolist() == [1, 1, 2, 2, 2, 3, 3, 3, 3]
+
+
+class TestNoise:
+    """How much of a loss is only the registration's own uncertainty."""
+
+    def test_a_step_of_two_sigma_in_one_parameter_is_all_noise(self):
+        assert explained_by_noise(1e-9, np.array([2.0, 0, 0, 0]), np.eye(4)) == 1e-9
+
+    def test_a_large_step_is_hardly_any(self):
+        assert explained_by_noise(1e-9, np.array([20.0, 0, 0, 0]), np.eye(4)) == pytest.approx(
+            1e-11
+        )

@@ -1,0 +1,179 @@
+"""Nights of the whole service in simulated time: drift, jumps, what the dither costs.
+
+Run: ``python -m studies.campaign.system_nights --cases drift,jump --plant linear --seeds 0:4
+--output var/system.jsonl --table table.md``; nights that are there already are not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from service.config import load_instrument, load_settings
+from service.config.policy import policy_of
+from service.state import Mode
+from service.wire import DitherRequest
+from service.worker import Compute, Workbench
+from studies.campaign.observatory import Observatory
+from studies.campaign.observatory_dome import replayed
+from studies.campaign.system_cases import Case, Plan
+from studies.campaign.system_measures import Row, row_of, wavefront_rms_nm
+from studies.campaign.system_table import table
+
+
+def main() -> int:
+    """Run what is missing, then print the table."""
+    given = _parser().parse_args()
+    rows = _read(given.output)
+    done = {_key(row) for row in rows}
+    plans = [plan for plan in _plans(given) if _key(asdict(plan)) not in done]
+    started = time.monotonic()
+    with given.output.open("a") as file:
+        for k, row in enumerate(_played(plans, given.workers), start=1):
+            rows.append(row)
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+            spent_min = (time.monotonic() - started) / 60.0
+            sys.stderr.write(f"\r{k} of {len(plans)} nights in {spent_min:.0f} min   ")
+    sys.stderr.write("\n")
+    text = table(rows)
+    sys.stdout.write(text)
+    if given.table is not None:
+        command = "python -m studies.campaign.system_nights " + " ".join(sys.argv[1:])
+        given.table.write_text(f"Made by `{command}`.\n\n{text}")
+    return 0
+
+
+def play(plan: Plan) -> Row:
+    """Run one night, and again without its dithers where that is the question."""
+    with threadpool_limits(1):
+        settings = load_settings(None, {}, _settings(plan))
+        bench = _bench(plan.instrument)
+        begun = time.monotonic()
+        with Observatory(plan.words, policy_of(settings), Mode.AUTO, bench) as night:
+            if plan.restart_s is not None:
+                night.advance(plan.restart_s)
+                night.restart_rtc()
+            night.advance(plan.seconds - night.time_s)
+            row = row_of(night, plan.jump_times_s)
+            if plan.case is Case.BUDGET:
+                row["twin_nm"] = _without_dither_nm(night, plan, row["steady_from_s"])
+    return asdict(plan) | row | {"took_s": time.monotonic() - begun}
+
+
+def _settings(plan: Plan) -> dict[str, object]:
+    """Return the service's settings: as many modes as at the start, and what was asked for."""
+    given: dict[str, object] = {"control.n_modes_target": plan.n_controlled}
+    for text in plan.settings:
+        key, _, value = text.partition("=")
+        given[key] = json.loads(value)
+    return given
+
+
+def _without_dither_nm(night: Observatory, plan: Plan, begin_s: float) -> float | None:
+    """Return the wavefront error of the same night, matrices swapped at the same frames."""
+    orders = [o for o in night.dome.orders if not isinstance(o.what, DitherRequest)]
+    twin = replayed(plan.words, orders, plan.seconds)
+    return wavefront_rms_nm([m for m in twin.moments if m.time_s >= begin_s])
+
+
+@cache
+def _bench(instrument: str) -> Workbench:
+    """One model per process: it takes longer to make than most of what it does."""
+    return Workbench(load_instrument(instrument), Compute(threads=1))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.campaign.system_nights",
+        description="Runs nights of the whole service and compares what it did with the truth.",
+    )
+    parser.add_argument("--output", type=Path, default=Path("system.jsonl"), help="rows, resumed")
+    parser.add_argument("--table", type=Path, metavar="FILE.md")
+    parser.add_argument(
+        "--cases", type=_words, default=("drift",), metavar="NAME,NAME...", help=", ".join(Case)
+    )
+    parser.add_argument("--seeds", type=_range, default=range(2), metavar="FIRST:END")
+    parser.add_argument("--magnitudes", type=_floats, default=(10.0,), metavar="R,R...")
+    parser.add_argument("--truths", type=_words, default=("ideal",), metavar="NAME,NAME...")
+    parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
+    parser.add_argument("--instrument", default="flao-lbt", metavar="NAME|FILE")
+    parser.add_argument("--gain", type=float, default=0.6)
+    parser.add_argument("--n-controlled", type=int, default=400)
+    parser.add_argument("--seconds", type=float, default=90.0, help="of each night")
+    parser.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a setting of the service, like dither.window_s=5; may be repeated",
+    )
+    parser.add_argument("--workers", type=int, default=1)
+    return parser
+
+
+def _plans(given: argparse.Namespace) -> Iterator[Plan]:
+    """Yield every night of the grid."""
+    grid = itertools.product(given.seeds, given.cases, given.truths, given.magnitudes)
+    for seed, case, truth, magnitude in grid:
+        yield Plan(
+            case=Case(case),
+            plant=given.plant,
+            truth=truth,
+            magnitude=magnitude,
+            seed=seed,
+            gain=given.gain,
+            n_controlled=given.n_controlled,
+            seconds=given.seconds,
+            instrument=given.instrument,
+            settings=tuple(given.settings),
+        )
+
+
+def _played(plans: Iterable[Plan], workers: int) -> Iterator[Row]:
+    if workers == 1:
+        yield from map(play, plans)
+        return
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as executor:
+        for finished in as_completed([executor.submit(play, plan) for plan in plans]):
+            yield finished.result()
+
+
+def _read(path: Path) -> list[Row]:
+    if not path.exists():
+        return []
+    return [json.loads(text) for text in path.read_text().splitlines()]
+
+
+def _key(row: dict[str, Any]) -> str:
+    return json.dumps([row[name] for name in asdict(Plan(case=Case.DRIFT))])
+
+
+def _range(text: str) -> range:
+    first, end = text.split(":")
+    return range(int(first), int(end))
+
+
+def _floats(text: str) -> tuple[float, ...]:
+    return tuple(float(word) for word in text.split(","))
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(text.split(","))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

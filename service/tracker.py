@@ -88,6 +88,8 @@ def _react(  # noqa: C901 - one line for each event
             return learnt(state, after, estimate), ()
         case ev.WindowLost(refused=refused):
             return refuse_window(state, refused.reason, now_ns), ()
+        case ev.Vibrations():
+            return on_vibrations(state, event, now_ns), ()
         case ev.Watched():
             return on_watchdog(state, event, policy, now_ns), ()
         case _:
@@ -108,8 +110,6 @@ def _react_to_matrices(state: TrackerState, event: Event, policy: Policy, now_ns
             return on_dither(state, event, now_ns), ()
         case ev.DitherSilent():
             return on_silence(state, event, now_ns), ()
-        case ev.Vibrations():
-            return on_vibrations(state, event, now_ns), ()
         case ev.JobFailed(effect=effect, text=text):
             return on_failure(state, effect, text, now_ns), ()
         case _:

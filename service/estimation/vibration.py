@@ -22,6 +22,9 @@ LINE_RATIO = 8.0
 """Power of a line over its neighbourhood's median: a mean of eight spectra of noise never gets
 there, so that what does is worth moving a dither for."""
 
+LOOK_SEGMENTS = 4
+"""Spectra between two looks for lines: a look costs as much as hundreds of frames."""
+
 _NEIGHBOURHOOD = 20
 _MEMORY_SEGMENTS = 32.0
 _N_PATTERNS = 4
@@ -43,6 +46,46 @@ class Vibrations:
     session: str = ""
     collected: NDArray[np.float32] | None = None
     """``(n, n_views)`` of the segment under way."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Hearing:
+    """What is heard while no dither plays, and under one.
+
+    Apart, because only a pause tells a vibration from a dither that plays on it.
+    """
+
+    quiet: Vibrations
+    dithered: Vibrations
+    dither_hz: tuple[float, ...] = ()
+    """Lines of the dither that ``dithered`` was heard under."""
+
+    lines_hz: tuple[float, ...] = ()
+    """Vibration lines as of the last look, lowest first."""
+
+
+def hearing(n_slopes: int) -> Hearing:
+    """Return the hearing of slopes of which nothing has been heard yet."""
+    deaf = Vibrations(views=views_of(n_slopes))
+    return Hearing(quiet=deaf, dithered=deaf)
+
+
+def heard(state: Hearing, block: FrameBlock, dither_hz: tuple[float, ...]) -> Hearing:
+    """Add a block of frames, played under these dither lines; look for lines now and then."""
+    before = state.quiet.n_segments + state.dithered.n_segments
+    if block.dither_m is None:
+        state = replace(state, quiet=listen(state.quiet, block))
+    else:
+        if dither_hz != state.dither_hz:
+            deaf = Vibrations(views=state.dithered.views)
+            state = replace(state, dithered=deaf, dither_hz=dither_hz)
+        state = replace(state, dithered=listen(state.dithered, block))
+    n_segments = state.quiet.n_segments + state.dithered.n_segments
+    if n_segments == before or n_segments % LOOK_SEGMENTS:
+        return state
+    quiet = lines_hz(state.quiet)
+    under = lines_hz(state.dithered, (*state.dither_hz, *quiet))
+    return replace(state, lines_hz=tuple(sorted((*quiet, *under))))
 
 
 def views_of(n_slopes: int) -> NDArray[np.float32]:

@@ -135,6 +135,14 @@ class DitherSilent:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Vibrations:
+    """The vibration lines in the slopes are others than before."""
+
+    lines_hz: tuple[float, ...]
+    """Lowest first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LoopAnswered:
     """The RTC accepted or refused a change of its loop, or a gain ramp."""
 
@@ -175,6 +183,7 @@ Event = (
     | Acknowledged
     | DitherAnswered
     | DitherSilent
+    | Vibrations
     | LoopAnswered
     | MatrixMeasured
     | JobFailed

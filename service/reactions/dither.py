@@ -20,6 +20,8 @@ LONGEST_PATIENCE_S = 60.0
 _ON_ITS_WAY_S = 2.0
 """For a status made before the dither began, where it does not tell its own frame."""
 
+_SAME_LINE_HZ = 2.5
+
 _ALARM = "dither-lost"
 
 
@@ -35,6 +37,18 @@ def on_dither(state: TrackerState, event: ev.DitherAnswered, now_ns: int) -> Tra
         return logged(without_alarm(state, "dither", now_ns), "dither.started", text, now_ns)
     state = replace(state, dither=None, retry_ns_utc=now_ns + 10 * SECOND_NS)
     return with_alarm(state, "dither", f"the RTC refused the dither: {event.reason}", now_ns)
+
+
+def on_vibrations(state: TrackerState, event: ev.Vibrations, now_ns: int) -> TrackerState:
+    """Note where the slopes vibrate; the next dither keeps clear of it."""
+    before, lines = state.vibrations_hz, event.lines_hz
+    state = replace(state, vibrations_hz=lines)
+    # a line between two bins of the spectrum shows now in one, now in the other
+    near = (any(abs(line - known) < _SAME_LINE_HZ for known in before) for line in lines)
+    if all(near):
+        return state
+    text = f"vibrations at {', '.join(f'{line:.0f}' for line in lines)} Hz"
+    return logged(state, "vibrations", text, now_ns)
 
 
 def follow_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:

@@ -47,6 +47,9 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
     due = silent_s >= SILENT_S and int(2 * silent_s) > int(2 * was_silent_s)
     if dither is not None and due:
         found.append(ev.DitherSilent(id=dither.id, silent_s=silent_s))
+    lines = () if streams.hearing is None else streams.hearing.lines_hz
+    if streams.hearing is not None and lines != state.vibrations_hz:
+        found.append(ev.Vibrations(lines_hz=lines))
     for name, trouble, over in troubles(streams):
         known = any(alarm.name == name for alarm in state.alarms)
         if (trouble is not None) is not known:

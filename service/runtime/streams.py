@@ -14,6 +14,7 @@ from service.estimation.health import LoopHealth, observe
 from service.estimation.lockin import LockIn, Spectra, WindowRefused
 from service.estimation.loopcheck import LoopCheck, LoopTerms, Obedience
 from service.estimation.passive import Passive
+from service.estimation.vibration import Hearing, heard, hearing
 from service.reactions.dither_choice import SETTLING_S, lock_in_plan
 from service.reactions.journal import OFF_LOOP
 from service.state import DitherView, RtcView
@@ -50,6 +51,9 @@ class Streams:
     dither_silent_s: float = 0.0
     """For how long the last frames should have held it and did not."""
 
+    hearing: Hearing | None = None
+    """Of vibrations; None: no RTC is there."""
+
     passive: Passive | None = None
     health: LoopHealth = field(default_factory=LoopHealth)
     edge_watch: EdgeWatch | None = None
@@ -74,6 +78,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     if rtc is None:
         return replace(
             streams,
+            hearing=None,
             passive=None,
             lock_in=None,
             dither=None,
@@ -88,7 +93,8 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None)
     memory = Passive(n_modes=rtc.n_controlled, memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz)
     if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
-        return replace(streams, passive=memory, lock_in=None, dither=None)
+        ears = hearing(rtc.n_slopes)
+        return replace(streams, hearing=ears, passive=memory, lock_in=None, dither=None)
     return replace(streams, passive=memory, lock_in=_cut(streams.lock_in, rtc))
 
 
@@ -194,7 +200,10 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     if streams.lock_in is not None:
         lock_in, ended = lockin.accumulate(streams.lock_in, block)
         windows = [_obeying(streams, window) for window in ended]
-        streams = replace(streams, lock_in=lock_in)
+        streams = replace(streams, lock_in=_within_the_dither(streams, rtc, lock_in))
+    if streams.hearing is not None and rtc.loop == "closed":
+        lines = () if streams.dither is None else streams.dither.frequency_hz
+        streams = replace(streams, hearing=heard(streams.hearing, block, lines))
     if streams.passive is not None and rtc.loop == "closed":
         streams = replace(streams, passive=passive.accumulate(streams.passive, block))
     variance = streams.description.mode_variance_m2
@@ -204,6 +213,15 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
         edge = observe_edge(streams.edge, block, streams.edge_watch)
         streams = replace(streams, edge=edge)
     return streams, windows
+
+
+def _within_the_dither(streams: Streams, rtc: RtcView, lock_in: LockIn) -> LockIn | None:
+    """Begin no window that the end of the dither would cut."""
+    dither, window = streams.dither, lock_in.window
+    if dither is None or window is None:
+        return lock_in
+    stop_seq = (dither.start_seq or 0) + round(dither.duration_s * rtc.frame_rate_hz)
+    return None if window.span.first_seq + lock_in.plan.n_frames > stop_seq else lock_in
 
 
 def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -10,6 +12,8 @@ from service.estimation.vibration import (
     MIN_SEGMENTS,
     SEGMENT_FRAMES,
     Vibrations,
+    heard,
+    hearing,
     lines_hz,
     listen,
     views_of,
@@ -30,7 +34,7 @@ def slopes(seed: int, vibrations: dict[float, float], n_segments: int = 12) -> n
     return noise
 
 
-def heard(rows: np.ndarray, batch: int = 50) -> Vibrations:
+def listened(rows: np.ndarray, batch: int = 50) -> Vibrations:
     block = block_of(rows, np.zeros((len(rows), 1)), None)
     state = Vibrations(views=views_of(N_SLOPES))
     for start in range(0, len(rows), batch):
@@ -40,23 +44,23 @@ def heard(rows: np.ndarray, batch: int = 50) -> Vibrations:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_noise_alone_has_no_line(seed):
-    assert lines_hz(heard(slopes(seed, {}))) == ()
+    assert lines_hz(listened(slopes(seed, {}))) == ()
 
 
 def test_lines_are_found_to_a_bin():
     """Bins are 0.98 Hz wide; a sine between two of them shows in either."""
-    found = lines_hz(heard(slopes(1, {61.0: 0.5, 240.0: 0.3})))
+    found = lines_hz(listened(slopes(1, {61.0: 0.5, 240.0: 0.3})))
     assert len(found) == 2
     np.testing.assert_allclose(found, [61.0, 240.0], atol=1.0)
 
 
 def test_the_dithers_own_lines_are_not_vibrations():
-    found = lines_hz(heard(slopes(1, {61.0: 0.5, 240.0: 0.3})), known_hz=(240.0,))
+    found = lines_hz(listened(slopes(1, {61.0: 0.5, 240.0: 0.3})), known_hz=(240.0,))
     np.testing.assert_allclose(found, [61.0], atol=1.0)
 
 
 def test_nothing_is_said_before_enough_has_been_heard():
-    young = heard(slopes(1, {61.0: 0.5}, n_segments=MIN_SEGMENTS - 1))
+    young = listened(slopes(1, {61.0: 0.5}, n_segments=MIN_SEGMENTS - 1))
     assert lines_hz(young) == ()
 
 
@@ -68,3 +72,41 @@ def test_a_gap_starts_the_segment_anew():
     state = listen(state, part(block, 1010, 2010))
     assert state.n_segments == 0
     assert listen(state, part(block, 2010, 2048)).n_segments == 1
+
+
+DITHER_HZ = (211.0, 239.0)
+
+
+def overheard(parts: list[tuple[dict[str, float], bool, int]]) -> tuple[float, ...]:
+    """Lines found after parts of a night, each with its lines, whether dithered, how many spectra.
+
+    The dither's lines show in the slopes as any vibration does.
+    """
+    state, first = hearing(N_SLOPES), 0
+    for seed, (vibrations, dithered, n_segments) in enumerate(parts):
+        lines = vibrations | (dict.fromkeys(DITHER_HZ, 0.3) if dithered else {})
+        rows = slopes(seed, lines, n_segments)
+        dither = np.zeros((len(rows), 1)) if dithered else None
+        block = replace(block_of(rows, np.zeros((len(rows), 1)), dither), first_seq=first)
+        for start in range(0, len(rows), 50):
+            piece = part(block, start, min(start + 50, len(rows)))
+            state = heard(state, piece, DITHER_HZ if dithered else ())
+        first += len(rows)
+    return state.lines_hz
+
+
+def test_a_dither_is_no_vibration_and_what_vibrates_beside_it_is_heard():
+    assert overheard([({}, True, 12)]) == ()
+    np.testing.assert_allclose(overheard([({61.0: 0.5}, True, 12)]), [61.0], atol=1.0)
+
+
+def test_a_vibration_on_the_dither_is_heard_in_a_pause():
+    on_it = {239.0: 0.3}
+    assert overheard([(on_it, True, 12)]) == ()
+    found = overheard([(on_it, True, 12), (on_it, False, 12)])
+    np.testing.assert_allclose(found, [239.0], atol=1.0)
+
+
+def test_what_was_heard_in_two_ways_is_told_once():
+    found = overheard([({61.0: 0.5}, True, 12), ({61.0: 0.5}, False, 12)])
+    np.testing.assert_allclose(found, [61.0], atol=1.0)

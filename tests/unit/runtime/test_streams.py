@@ -3,10 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service import events as ev
 from service.errors import ModelError
 from service.estimation.edge import Actuators
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra, WindowRefused
+from service.runtime.following import news
 from service.runtime.streams import (
     Streams,
     fed,
@@ -16,7 +18,7 @@ from service.runtime.streams import (
     with_matrix,
     with_rtc,
 )
-from service.state import DitherView
+from service.state import DitherView, TrackerState
 from service.worker import Description
 from tests.unit.reactions.situations import rtc
 
@@ -341,3 +343,42 @@ def test_an_edge_that_has_slipped_is_named_until_the_loop_is_closed_anew():
 
 def told(streams):
     return [(name, text) for name, text, _ in troubles(streams)]
+
+
+def test_no_window_is_begun_that_the_end_of_the_dither_would_cut(streams):
+    streams = with_dither(streams, replace(DITHER, duration_s=1.1), WINDOW_S)
+    streams, windows = play(streams, 0, 9)
+    assert [w.first_seq for w in windows] == [300]
+    assert streams.lock_in is None
+    _, windows = play(streams, 900, 10, dither=False)
+    assert not windows
+
+
+def test_the_window_a_dither_was_planned_with_counts(streams):
+    planned = replace(DITHER, id="dither-2", window_s=0.25)
+    _, windows = play(with_dither(streams, planned, WINDOW_S), 0, 9)
+    assert [w.first_seq for w in windows] == [300, 550]
+
+
+class TestVibrations:
+    def shaken(self, first_seq, n=100):
+        turns = 0.13 * (first_seq + np.arange(n))
+        slopes = block(first_seq, n).slopes
+        slopes[:, : N_SLOPES // 2] += 3 * np.sin(2 * np.pi * turns)[:, None].astype(np.float32)
+        return replace(block(first_seq, n, dither=False), slopes=slopes, dither_m=None)
+
+    def test_a_line_is_heard_within_seconds_and_told_once(self, streams):
+        streams = with_dither(streams, None, WINDOW_S)
+        state = TrackerState(system="flao", rtc=RTC)
+        for number in range(130):
+            streams, _ = fed(streams, self.shaken(100 * number))
+        (told,) = [e for e in news(0.0, streams, state) if isinstance(e, ev.Vibrations)]
+        np.testing.assert_allclose(told.lines_hz, [130.0], atol=1.0)
+        known = replace(state, vibrations_hz=told.lines_hz)
+        assert not [e for e in news(0.0, streams, known) if isinstance(e, ev.Vibrations)]
+
+    def test_an_open_loop_is_not_listened_to(self, streams):
+        streams = with_rtc(streams, replace(RTC, loop="open"))
+        for number in range(130):
+            streams, _ = fed(streams, self.shaken(100 * number))
+        assert streams.hearing.lines_hz == ()

@@ -122,12 +122,12 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     """
     noisy, sums = noisy_matrix(window), window.sums
     columns = list(noisy.modes)
-    power = sums.dither_power.sum(axis=0)
+    uncertain = np.diag(np.linalg.inv(sums.dither_power.sum(axis=0)))
     problem = _Problem(
         matrix=linearisation.matrix[:, columns].astype(float),
         derivatives=linearisation.derivatives[:, :, columns].astype(float),
         variance=_noise_variance(sums),
-        power=np.diag(power),
+        power=1.0 / uncertain,
     )
     seen = _Seen.of(window, noisy, problem)
     if seen.trouble is not None:
@@ -169,7 +169,8 @@ class _Problem:
     """``(n_slopes,)`` of a slope's noise in one frame."""
 
     power: Array
-    """``(n_dithered,)`` sum of the dither's square, metres²."""
+    """``(n_dithered,)`` sum of the square of each mode's dither, of what no other mode's explains
+    of it, metres²."""
 
     @property
     def weight(self) -> Array:

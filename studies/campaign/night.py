@@ -189,7 +189,7 @@ def _windows(
         batches = [computer.next_batch() for _ in range(BLOCK_BATCHES)]
         if batches[0].seq0 >= plan.first_seq:
             errors_nm += error.rms_nm(batches)
-        for block in troubled(_blocks(batches, telescope), night.trouble, rng):
+        for block in troubled(blocks_of(batches, telescope), night.trouble, rng):
             if not quiet:
                 sums, ended = accumulate(sums, block)
                 yield from ended
@@ -201,7 +201,7 @@ def _windows(
             n_frames = 0
 
 
-def _blocks(batches: list[Batch], telescope: Telescope) -> list[FrameBlock]:
+def blocks_of(batches: list[Batch], telescope: Telescope) -> list[FrameBlock]:
     """Return batches as the link delivers them: joined while nothing changes."""
     dt_ns = round(1e9 / telescope.settings.frame_rate_hz)
     kept = [(b.session, b.cm_id, b.dither_m is None) for b in batches]

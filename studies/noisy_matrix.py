@@ -12,7 +12,6 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +51,10 @@ def main() -> None:
         total: Correlated | None = None
         start = Misregistration()
         for window, wavefront_nm in _windows(given, telescope, options.frame_rate_hz):
-            outcome = window
-            if isinstance(window, Correlated):
+            outcome: RandomEstimate | WindowRefused
+            if isinstance(window, WindowRefused):
+                outcome = window
+            else:
                 total = window if total is None else joined(total, window)
                 outcome = bench.fit_random(window, start)
             rows.append(_row(outcome, true) | {"wavefront_nm": wavefront_nm})
@@ -152,11 +153,9 @@ def _started(given: argparse.Namespace, computer: RealTimeComputer, rate_hz: flo
     )
 
 
-def _row(
-    outcome: Correlated | RandomEstimate | WindowRefused, true: Misregistration
-) -> dict[str, Any]:
-    if not isinstance(outcome, RandomEstimate):
-        return {"refused": getattr(outcome, "reason", "not fitted")}
+def _row(outcome: RandomEstimate | WindowRefused, true: Misregistration) -> dict[str, Any]:
+    if isinstance(outcome, WindowRefused):
+        return {"refused": outcome.reason}
     error = (outcome.alpha.vector - true.vector) * BOUNDARY_SCALE
     sigma = np.sqrt(np.diag(outcome.covariance)) * BOUNDARY_SCALE
     return {
@@ -180,8 +179,7 @@ def _signal(total: Correlated) -> dict[str, Any]:
 
 def _keep(path: Path, total: Correlated) -> None:
     sums = {name: getattr(total.sums, name) for name in total.sums.__slots__}
-    plan = replace(total.plan)
-    np.savez(path, modes=plan.modes, amplitude_m=plan.amplitude_m, **sums)
+    np.savez(path, modes=total.plan.modes, amplitude_m=total.plan.amplitude_m, **sums)
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds, Publishing
 from service.runtime.fitting import FitDesk, FitLimits
+from service.runtime.resuming import taken_up
 from service.runtime.supervisor import Supervisor
 from service.state import TrackerState
 from service.worker import Compute, start_worker
@@ -246,6 +247,7 @@ def _supervisor(
         ),
         clock_ns=time.time_ns,
     )
+    policy = policy_of(settings)
     state = TrackerState(
         system=system,
         mode=settings.service.mode,
@@ -255,8 +257,8 @@ def _supervisor(
         config_id=instrument.config_id,
     )
     return Supervisor(
-        state=state,
-        policy=policy_of(settings),
+        state=taken_up(archive, state, policy, time.time_ns()),
+        policy=policy,
         bridge=bridge,
         crew=crew,
         archive=archive,

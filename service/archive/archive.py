@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from service.archive.index import AuditEntry, Index
 from service.archive.measured import MeasuredArchive
 from service.archive.product import Provenance, read_matrix, read_product, write_product
+from service.archive.tracking import TrackingFile
 from service.errors import ArchiveError, UnknownIdError
 from service.state import ReconstructorRecord
 from service.wire import checked_id, checksum
@@ -38,6 +39,8 @@ class Archive:
         self._index = Index(directory / "index.sqlite")
         self.measured = MeasuredArchive(directory / "interaction_matrices", self._index)
         """Interaction matrices the RTC has measured."""
+        self.tracking = TrackingFile(directory / "tracking.json")
+        """What is known of the registration, for the service after this one."""
         self._lock: IO[str] | None = None
 
     def __enter__(self) -> Self:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Coroutine
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from service.runtime.asking import why_not
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.runtime.following import followed, news, shape_news
+from service.runtime.resuming import SAVE_INTERVAL_S, has_news, leave
 from service.runtime.streams import Streams, fed, with_matrix
 from service.runtime.windows import fitted, watched
 from service.state import Level, LogEntry, MeasureState, TrackerState
@@ -116,8 +118,16 @@ class Supervisor:
 
     async def run(self) -> None:
         """Work until cancelled: prepare the model, then listen, tick, fit, watch and record."""
+        self._tell(replace(self._state, log=()))
+        try:
+            await self._work()
+        finally:
+            self._leave(self._state)
+
+    async def _work(self) -> None:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._record())
+            group.create_task(self._save())
             description = await self._described()
             self._streams = Streams(description=description)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"
@@ -287,7 +297,7 @@ class Supervisor:
 
     async def _record(self) -> None:
         """Keep the archive in step with the state: reconstructors and the audit trail."""
-        recorded = self._state
+        recorded = replace(self._state, log=())
         while True:
             await self._unrecorded.wait()
             self._unrecorded.clear()
@@ -296,6 +306,21 @@ class Supervisor:
                 await asyncio.to_thread(_write, self._archive, before, recorded)
             except PyrcalError as error:
                 self._log.error("archive.failed", text=str(error))
+
+    async def _save(self) -> None:
+        """Keep what the service after this one needs; never more often than the disk likes."""
+        saved = self._state
+        while True:
+            await asyncio.sleep(SAVE_INTERVAL_S)
+            if has_news(saved, self._state):
+                saved = self._state
+                await asyncio.to_thread(self._leave, saved)
+
+    def _leave(self, state: TrackerState) -> None:
+        try:
+            leave(self._archive, state, time.time_ns())
+        except PyrcalError as error:
+            self._log.error("archive.failed", text=str(error))
 
 
 def _new_entries(before: TrackerState, after: TrackerState) -> list[LogEntry]:

@@ -1,5 +1,6 @@
 """What the service knows: one frozen record, replaced as a whole, read by REST and metrics."""
 
+from service.state.acquisition import Acquisition, AcquisitionStage, LoopFound
 from service.state.dithering import Dithering, DitherPhase, DitherPlan, Precision
 from service.state.journal import Alarm, Level, LogEntry
 from service.state.measurements import MeasurementRecord, MeasurePattern, MeasureState
@@ -17,10 +18,15 @@ from service.state.registration import (
     Watchdog,
 )
 from service.state.rtc import CommandState, DitherKind, DitherView, LoopCommand, RtcView
+from service.state.saved import Saved
 from service.state.tracker import Mode, TrackerState
+from service.state.updates import Assessment, ModeLimit
 
 __all__ = [
+    "Acquisition",
+    "AcquisitionStage",
     "Alarm",
+    "Assessment",
     "Candidate",
     "CommandState",
     "DitherKind",
@@ -32,18 +38,21 @@ __all__ = [
     "Level",
     "LogEntry",
     "LoopCommand",
+    "LoopFound",
     "MatrixState",
     "MeasurePattern",
     "MeasureState",
     "MeasurementRecord",
     "Mode",
     "ModeGain",
+    "ModeLimit",
     "PassiveBias",
     "Pointing",
     "Precision",
     "ReconstructorRecord",
     "Registration",
     "RtcView",
+    "Saved",
     "Source",
     "Standing",
     "TrackerState",

@@ -22,7 +22,7 @@ class DitherPhase(StrEnum):
     """Without pause, for the flexure leaves no time for one; as weak as that allows."""
 
     SPARSE = "sparse"
-    """One window now and then, off in between."""
+    """A sitting of a few windows now and then, off in between."""
 
     OPERATOR = "operator"
     """An operator's own, or one somebody else started."""
@@ -50,10 +50,10 @@ class DitherPlan:
     """Telemetry in one estimate, seconds."""
 
     interval_s: float
-    """From one window to the next, seconds; ``window_s``: no pause."""
+    """From one sitting to the next, seconds; ``window_s``: no pause."""
 
     sigma: NDArray[np.float64]
-    """``(4,)`` 1 σ of α that is to be expected just before each window, numeric units."""
+    """``(4,)`` 1 σ of α that is to be expected just before each sitting, numeric units."""
 
     sufficient: bool
     """Whether that is what was asked for."""
@@ -77,7 +77,7 @@ class Dithering:
     """None: none could be made yet."""
 
     next_ns_utc: int | None = None
-    """When the next window is due; None: now, or never."""
+    """When the next sitting is due; None: now, or never."""
 
     precision: Precision | None = None
     """None: no window has been accepted yet."""
@@ -91,8 +91,8 @@ class Dithering:
     passive_ns_utc: int | None = None
     """When the estimate was last renewed without a dithered window."""
 
-    n_windows_asked: int = 0
-    """Windows accepted when the last dither was asked for."""
+    results_due: int = 0
+    """Windows accepted in all, once the last dither has told what it was asked for."""
 
     ended_ns_utc: int | None = None
     """When the last of the service's own dithers ended by itself; None: one runs, or it was

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from service.state.pointing import Pointing
@@ -76,6 +76,10 @@ class RtcView:
 
     seq: int = -1
     """Last frame processed when it was made; -1: not known."""
+
+    flux: bytes | None = field(default=None, repr=False, compare=False)
+    """``<f4`` ``[4, n_subapertures, n_subapertures]`` mean counts of the pupil images; None: not
+    told."""
 
     dither: DitherView | None = None
     """What is running, where it has been announced to the frame; else None."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from service.control.gate import GateVerdict
+from service.state.acquisition import Acquisition
 from service.state.dithering import Dithering
 from service.state.journal import Alarm, LogEntry
 from service.state.measurements import MeasurementRecord
@@ -13,6 +14,7 @@ from service.state.pointing import Pointing
 from service.state.reconstructors import ReconstructorRecord
 from service.state.registration import HistoryEntry, Registration, Watchdog
 from service.state.rtc import DitherView, LoopCommand, RtcView
+from service.state.updates import Assessment, ModeLimit
 
 
 class Mode(StrEnum):
@@ -54,6 +56,12 @@ class TrackerState:
     margin: GateVerdict | None = None
     """The gate's verdict on the matrix in use at the current α ± 3σ; None: not known yet."""
 
+    assessment: Assessment | None = None
+    """What the matrix in use loses against a new one; None: not known yet."""
+
+    mode_limit: ModeLimit | None = None
+    """How many modes the gate lets be controlled; None: as many as are wanted."""
+
     rtc: RtcView | None = None
     """None until the first status, and again when the RTC has vanished."""
 
@@ -80,6 +88,9 @@ class TrackerState:
 
     vibrations_hz: tuple[float, ...] = ()
     """Vibration lines in the slopes, lowest first."""
+
+    acquisition: Acquisition = field(default_factory=Acquisition)
+    """Finding α from nothing: under way, or how the last one ended."""
 
     loop_command: LoopCommand | None = None
     """The last change of the loop that was asked of the RTC; None: none was."""

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import socket
+import time
 from dataclasses import replace
 
 import pytest
@@ -13,10 +14,11 @@ from service.errors import CommandError
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds, Publishing
+from service.runtime.resuming import taken_up
 from service.runtime.supervisor import Supervisor
-from service.state import Mode, TrackerState
+from service.state import Level, LogEntry, Mode, TrackerState
 from service.worker import start_worker
-from tests.unit.reactions.situations import POLICY, record
+from tests.unit.reactions.situations import POLICY, Story, record
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 pytestmark = pytest.mark.timeout(60)
@@ -146,3 +148,45 @@ async def test_cancelled_it_ends_at_once(supervisor):
     async with running(supervisor):
         began = asyncio.get_running_loop().time()
     assert asyncio.get_running_loop().time() - began < 1.0
+
+
+async def test_alpha_outlives_the_service_that_measured_it(supervisor, archive):
+    """As __main__ does it: what one has left, the next takes up from the same directory."""
+    before = told(Story(Mode.HOLD).meet(), n_windows=3)
+    supervisor._state = replace(supervisor._state, registration=before)
+    async with running(supervisor):
+        assert archive.tracking.read() is None
+    again = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
+    assert again.registration.alpha == before.alpha
+    assert again.registration.n_windows == 0
+
+
+async def test_a_damaged_file_costs_alpha_and_not_the_start(archive, tmp_path):
+    (tmp_path / "tracking.json").write_text("{")
+    state = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
+    assert state.registration is None
+    assert "damaged" in state.log[-1].text
+    assert (tmp_path / "tracking.damaged").exists()
+
+
+async def test_what_was_restored_is_on_record(supervisor, archive):
+    supervisor._state = replace(
+        supervisor._state, log=(LogEntry(t_ns_utc=1, level=Level.INFO, name="old", text="news"),)
+    )
+    async with running(supervisor):
+        await until(lambda: any(e.name == "old" for e in archive.audit_trail()))
+
+
+async def test_it_is_saved_while_the_service_runs_and_not_only_at_its_end(
+    supervisor, archive, monkeypatch
+):
+    monkeypatch.setattr("service.runtime.supervisor.SAVE_INTERVAL_S", 0.01)
+    async with running(supervisor):
+        known = told(Story(Mode.HOLD).meet(), n_windows=1)
+        supervisor._state = replace(supervisor._state, registration=known)
+        await until(lambda: archive.tracking.read() is not None)
+
+
+def told(story, n_windows):
+    story.see(n_windows=n_windows)
+    return story.state.registration

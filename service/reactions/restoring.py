@@ -1,0 +1,60 @@
+"""Taking up a night where the service before this one left it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service.reactions.journal import logged
+from service.reactions.policy import SECOND_NS, Policy
+from service.reactions.validity import aged
+from service.state import Level, Saved, TrackerState
+
+CLOCKS_AGREE_S = 60.0
+"""A state from further in the future than this was saved under another clock."""
+
+
+def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
+    """Return what is worth keeping of a state; None: nothing is known yet."""
+    if state.registration is None:
+        return None
+    return Saved(
+        system=state.system,
+        saved_ns_utc=now_ns,
+        session=state.rtc.session if state.rtc is not None else None,
+        in_use=state.in_use,
+        pointing=state.pointing,
+        registration=replace(state.registration, candidate=None),
+    )
+
+
+def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> TrackerState:
+    """Return the state with α taken over, σ grown by the time away, and no window to confirm it.
+
+    It is a start for the fit and something to judge the matrix in use with; until windows of this
+    run agree with it nothing is made from it.
+    """
+    reason = _why_not(state, saved, now_ns)
+    if reason is not None:
+        text = f"the α saved before the restart is not taken over: {reason}"
+        return logged(state, "registration.not-restored", text, now_ns, Level.WARNING)
+    away_s = max(now_ns - saved.registration.arrived_ns_utc, 0) / SECOND_NS
+    known = replace(saved.registration, n_windows=0, restored_ns_utc=now_ns)
+    text = f"α of {away_s:.0f} s ago; {saved.in_use or 'no known matrix'} was in use then"
+    state = logged(replace(state, registration=known), "registration.restored", text, now_ns)
+    return aged(state, policy, now_ns)
+
+
+def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:
+    if saved.system != state.system:
+        return f"it is of system {saved.system}, this is {state.system}"
+    ahead_s = (saved.saved_ns_utc - now_ns) / SECOND_NS
+    if ahead_s > CLOCKS_AGREE_S:
+        return f"it was saved {ahead_s:.0f} s in the future: is this machine's clock right?"
+    known = saved.registration
+    for name, found, expected in (
+        ("basis", known.basis_id, state.basis_id),
+        ("configuration", known.config_id, state.config_id),
+    ):
+        if expected is not None and found != expected:
+            return f"it is of {name} {found}, the instrument file has {expected}"
+    return None

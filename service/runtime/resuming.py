@@ -1,0 +1,46 @@
+"""What a service leaves on the disk of its tracking, and how the next one takes it up."""
+
+from __future__ import annotations
+
+from service.archive import Archive
+from service.errors import ArchiveError
+from service.reactions.journal import logged
+from service.reactions.policy import Policy
+from service.reactions.restoring import resumed, saved_of
+from service.state import Level, TrackerState
+
+SAVE_INTERVAL_S = 5.0
+"""Least time between two writes; an α that old is as good as a new one."""
+
+
+def taken_up(archive: Archive, state: TrackerState, policy: Policy, now_ns: int) -> TrackerState:
+    """Return the state with the registration that was saved, if there is one and it fits.
+
+    A damaged file costs the α in it and nothing else.
+    """
+    try:
+        saved = archive.tracking.read()
+    except ArchiveError as error:
+        return logged(state, "registration.not-restored", str(error), now_ns, Level.WARNING)
+    return state if saved is None else resumed(state, saved, policy, now_ns)
+
+
+def leave(archive: Archive, state: TrackerState, now_ns: int) -> None:
+    """Save what the next service needs; blocks until it is on the disk.
+
+    Raises
+    ------
+    ArchiveError
+        If the disk refuses.
+    """
+    saved = saved_of(state, now_ns)
+    if saved is not None:
+        archive.tracking.write(saved)
+
+
+def has_news(before: TrackerState, after: TrackerState) -> bool:
+    """Return whether something has been measured that is not saved yet."""
+    old, new = before.registration, after.registration
+    if old is None or new is None:
+        return new is not None
+    return (old.t_ns_utc, old.doubt) != (new.t_ns_utc, new.doubt)

@@ -1,0 +1,119 @@
+"""What outlives a service of its tracking: one file, whole or put aside."""
+
+import json
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from service.archive import Archive
+from service.archive.tracking import TrackingFile
+from service.errors import ArchiveError
+from service.reactions.restoring import saved_of
+from service.state import Mode, Pointing, Registration
+from tests.unit.reactions.situations import START_NS, Story, moved
+from tests.unit.reactions.test_watchdog import learnt, watch
+
+
+@pytest.fixture(scope="module")
+def saved():
+    """What a night with windows, looks and a known pointing has left."""
+    story = Story(Mode.AUTO).meet()
+    story.state = replace(story.state, pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0))
+    story.see(n_windows=3, modes=(501, 509, 517, 525), gain_sigma=np.full(4, 0.01))
+    learnt(story, n_looks=3)
+    watch(story, moved(shift_x_subap=0.06))
+    return saved_of(story.state, story.now_ns)
+
+
+@pytest.fixture
+def file(tmp_path):
+    return TrackingFile(tmp_path / "tracking.json")
+
+
+def same(one, other):
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other)
+    if hasattr(one, "__dataclass_fields__"):
+        return all(same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+    return one == other
+
+
+def test_there_is_nothing_before_the_first_night(file):
+    assert file.read() is None
+
+
+def test_what_is_read_is_what_was_written_but_for_what_depends_on_the_time(file, saved):
+    file.write(saved)
+    found = file.read()
+    fresh = {f.name: f.default for f in fields(Registration) if f.name in {"standing", "candidate"}}
+    expected = replace(saved, registration=replace(saved.registration, grown=np.zeros(4), **fresh))
+    for f in fields(Registration):
+        left, right = getattr(found.registration, f.name), getattr(expected.registration, f.name)
+        assert same(left, right), f.name
+    assert same(found, expected)
+    assert found.registration.bias is not None
+    assert len(found.registration.optical_gains) == 4
+
+
+def test_the_newest_replaces_what_was_there(file, saved, tmp_path):
+    file.write(saved)
+    file.write(replace(saved, saved_ns_utc=START_NS + 1))
+    assert file.read().saved_ns_utc == START_NS + 1
+    assert [path.name for path in tmp_path.iterdir()] == ["tracking.json"]
+
+
+def changed(**values):
+    def change(text):
+        return json.dumps({**json.loads(text), **values})
+
+    return change
+
+
+def with_registration(**values):
+    def change(text):
+        found = json.loads(text)
+        found["registration"] |= values
+        return json.dumps(found)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: "[]",
+        changed(version=7),
+        changed(registration=None),
+        changed(shoe_size=43),
+        with_registration(alpha=[0.1, 0.2, 0.3]),
+        with_registration(alpha=[0.1, 0.2, float("nan"), 1.0]),
+        with_registration(covariance=np.diag([1.0, 1.0, -1.0, 1.0]).tolist()),
+        with_registration(t_ns_utc="yesterday"),
+        with_registration(optical_gains=[{"mode": 3}]),
+    ],
+)
+def test_a_damaged_file_is_put_aside_and_the_next_can_be_written(file, saved, tmp_path, damage):
+    file.write(saved)
+    path = tmp_path / "tracking.json"
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(ArchiveError, match="α is measured anew"):
+        file.read()
+    assert sorted(found.name for found in tmp_path.iterdir()) == ["tracking.damaged"]
+    assert file.read() is None
+    file.write(saved)
+    assert file.read() is not None
+
+
+def test_a_disk_that_refuses_is_named(tmp_path, saved):
+    with pytest.raises(ArchiveError, match="cannot be written"):
+        TrackingFile(tmp_path / "nowhere" / "tracking.json").write(saved)
+
+
+def test_it_lies_in_the_archives_directory(tmp_path, saved):
+    with Archive(tmp_path) as archive:
+        archive.open()
+        archive.tracking.write(saved)
+    assert (tmp_path / "tracking.json").exists()

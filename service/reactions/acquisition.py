@@ -1,0 +1,162 @@
+"""From nothing known to tracking: open, look from afar, confirm, close on few modes, widen.
+
+Nothing is assumed of the registration. The loop is opened, for one that is closed far from
+registration slips; smooth modes lead to α and other modes must confirm it; a reconstructor for as
+many modes as the gate accepts everywhere in α ± 3σ closes the loop; then ordinary windows sharpen
+α and more modes follow. What does not come true within its time begins anew with the loop opened
+again, a few times, and then ends in a state that says why.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service import events as ev
+from service.errors import CommandError
+from service.events import Event
+from service.reactions.acquisition_closed import closed_stage, on_made
+from service.reactions.acquisition_ends import abort, again, fail, without_dither
+from service.reactions.acquisition_far import far_stage, on_far, on_missed
+from service.reactions.acquisition_plan import (
+    begun,
+    why_needed,
+    why_not_now,
+)
+from service.reactions.journal import logged, without_alarm
+from service.reactions.matrices import Step
+from service.reactions.policy import SECOND_NS, Policy
+from service.reactions.windows import EXPECTED
+from service.state import Acquisition, AcquisitionStage, Mode, TrackerState
+
+PATIENCE_S = 180.0
+"""In one stage: a simulated RTC may be ten times slower than its timestamps."""
+
+_LATER = (
+    ev.StartDither,
+    ev.Refit,
+    ev.Approve,
+    ev.Publish,
+    ev.Rollback,
+    ev.SetLoop,
+    ev.Ramp,
+    ev.Measure,
+)
+"""What an operator cannot have while the loop is the acquisition's."""
+
+
+def refuse_meanwhile(state: TrackerState, event: Event) -> None:
+    """Refuse what would disturb an acquisition under way.
+
+    Raises
+    ------
+    CommandError
+        If that is what an operator asks for.
+    """
+    if state.acquisition.under_way and isinstance(event, _LATER):
+        raise CommandError(
+            f"{type(event).__name__}: an acquisition is under way ({state.acquisition.text}); "
+            "wait for it, or abort it"
+        )
+
+
+def on_acquire(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
+    """Begin or abort an acquisition because an operator says so.
+
+    Raises
+    ------
+    CommandError
+        If there is none to abort, or none can begin now.
+    """
+    if isinstance(event, ev.AbortAcquisition):
+        if not state.acquisition.under_way:
+            raise CommandError("acquisition: none is under way")
+        return abort(state, "by the operator", now_ns)
+    reason = why_not_now(state, policy)
+    if state.rtc is None or reason is not None:
+        raise CommandError(f"acquisition: {reason}")
+    state = replace(state, dither_stopped=False)
+    return _begin(state, policy, now_ns, "the operator asks", commanded=True)
+
+
+def acquire(
+    before: TrackerState, state: TrackerState, event: Event, policy: Policy, now_ns: int
+) -> Step:
+    """Take an acquisition further after an event, or begin one where the service needs it.
+
+    ``before`` is the state before anybody else had seen the event.
+    """
+    acquisition = state.acquisition
+    if not acquisition.under_way:
+        if state.windows_accepted > before.windows_accepted:
+            state = replace(state, acquisition=replace(acquisition, misses=0))
+        why = why_needed(state, policy, now_ns)
+        if why is None:
+            return state, ()
+        return _begin(state, policy, now_ns, why, commanded=False)
+    ended = _ended_by(state, event, now_ns)
+    if ended is not None:
+        return ended
+    state, effects = _heard(state, event, policy, now_ns)
+    if effects or not state.acquisition.under_way or state.rtc is None:
+        return state, effects
+    if state.acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
+        return closed_stage(state, state.rtc, policy, now_ns)
+    return far_stage(state, state.rtc, policy, now_ns)
+
+
+def _begin(state: TrackerState, policy: Policy, now_ns: int, why: str, *, commanded: bool) -> Step:
+    rtc = state.rtc
+    if rtc is None:
+        return state, ()
+    state, effects = without_dither(without_alarm(state, "acquisition", now_ns))
+    state = begun(state, rtc, policy, now_ns, why=why, commanded=commanded)
+    state = logged(state, "acquisition.begun", why, now_ns)
+    state, more = far_stage(state, rtc, policy, now_ns)
+    return state, (*effects, *more)
+
+
+def _ended_by(state: TrackerState, event: Event, now_ns: int) -> Step | None:
+    """Return what an event makes of an acquisition that cannot go on, or None."""
+    acquisition = state.acquisition
+    match event:
+        case ev.StopDither():
+            return abort(state, "because the dither was stopped", now_ns)
+        case ev.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
+            return abort(state, f"because the mode is {mode}", now_ns)
+        case ev.RtcVanished():
+            return fail(state, "the RTC vanished: restart it", now_ns)
+        case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
+            return again(state, "the RTC began a new session", now_ns)
+        case ev.Tick() if _late(acquisition, now_ns):
+            return again(state, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s", now_ns)
+        case _:
+            return _ended_by_answer(state, event, now_ns)
+
+
+def _ended_by_answer(state: TrackerState, event: Event, now_ns: int) -> Step | None:
+    asked = state.acquisition.command
+    match event:
+        case ev.LoopAnswered(id=command, accepted=False, reason=reason) if command == asked:
+            return fail(state, f"the RTC will not change its loop: {reason}", now_ns)
+        case ev.JobFailed(effect=ev.AskLoop(id=command), text=text) if command == asked:
+            return again(state, text, now_ns)
+        case _:
+            return None
+
+
+def _late(acquisition: Acquisition, now_ns: int) -> bool:
+    return now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
+
+
+def _heard(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
+    match event:
+        case ev.FarFitted(found=found):
+            return on_far(state, found, policy, now_ns)
+        case ev.WindowLost(refused=refused) if not refused.reason.startswith(EXPECTED):
+            return on_missed(state, refused.reason, now_ns)
+        case ev.DitherAnswered(accepted=False, reason=reason):
+            return on_missed(state, f"the RTC refused the dither: {reason}", now_ns)
+        case ev.MatrixMade(record=record):
+            return on_made(state, record, now_ns)
+        case _:
+            return state, ()

@@ -1,0 +1,134 @@
+"""The stages of an acquisition that close the loop: on few modes first, then on more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service import events as ev
+from service.control.continuation import fewer
+from service.reactions.acquisition_ends import again, entered, fail, told
+from service.reactions.acquisition_plan import OUT_OF_HAND, gains_for
+from service.reactions.dither_schedule import choose_dither
+from service.reactions.journal import without_alarm
+from service.reactions.matrices import Step, send, why_unsendable
+from service.reactions.policy import SECOND_NS, Policy
+from service.reactions.worth import moved
+from service.state import (
+    Acquisition,
+    AcquisitionStage,
+    MatrixState,
+    ReconstructorRecord,
+    RtcView,
+    TrackerState,
+)
+
+ENOUGH_WINDOWS = 2
+"""Ordinary windows that must have held with the last reconstructor."""
+
+_LOST = (MatrixState.REJECTED, MatrixState.FAILED)
+
+
+def closed_stage(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+    """Make, send, close; then let ordinary windows sharpen α and go on to more modes."""
+    acquisition = state.acquisition
+    record = state.reconstructor(acquisition.matrix) if acquisition.matrix else None
+    if record is not None and record.state in _LOST:
+        return again(state, f"{record.id} was not applied: {record.reason}", now_ns)
+    if acquisition.stage is AcquisitionStage.WIDENING:
+        return _widened(state, rtc, record, policy, now_ns)
+    if record is None:
+        return _make(state, acquisition.n_modes, rtc, now_ns)
+    if rtc.cm_id != record.id:
+        return state, ()
+    if rtc.loop == "open":
+        if acquisition.command is not None:
+            return state, ()
+        return told(state, ev.SetLoop(closed=True), now_ns)
+    state = replace(state, acquisition=replace(acquisition, windows=state.windows_accepted))
+    text = f"closed on {record.n_modes} modes: sharpening the registration"
+    return entered(state, AcquisitionStage.WIDENING, text, now_ns), ()
+
+
+def on_made(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> Step:
+    """Send a reconstructor that has passed the gate, with the gains it was judged with."""
+    acquisition, rtc = state.acquisition, state.rtc
+    if acquisition.stage not in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
+        return state, ()
+    if record.state is MatrixState.REFUSED:
+        return _refused(state, record, now_ns)
+    reason = why_unsendable(state)
+    found = acquisition.found
+    if rtc is None or found is None or reason is not None:
+        return again(state, f"{record.id} cannot be sent: {reason}", now_ns)
+    state, _ = send(state, record.id, now_ns)
+    acquisition = replace(acquisition, matrix=record.id, n_modes=record.n_modes, sent=True)
+    gains = gains_for(found, record.n_modes, rtc.n_modes)
+    effect = ev.SendMatrix(id=record.id, n_modes=record.n_modes, gains=gains)
+    return replace(state, acquisition=acquisition), (effect,)
+
+
+def _refused(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> Step:
+    """Try fewer modes; with the loop closed, be content with those there are."""
+    acquisition = state.acquisition
+    n_modes = fewer(record.n_modes)
+    if acquisition.stage is AcquisitionStage.WIDENING:
+        most = max(n_modes or 0, acquisition.n_modes)
+        return replace(state, acquisition=replace(acquisition, most_modes=most)), ()
+    if n_modes is None:
+        reason = record.gate.reason if record.gate is not None else record.reason
+        return fail(state, f"not even {record.n_modes} modes pass the gate: {reason}", now_ns)
+    return replace(state, acquisition=replace(acquisition, n_modes=n_modes)), ()
+
+
+def _widened(
+    state: TrackerState,
+    rtc: RtcView,
+    record: ReconstructorRecord | None,
+    policy: Policy,
+    now_ns: int,
+) -> Step:
+    acquisition = state.acquisition
+    slipped = next((alarm.name for alarm in state.alarms if alarm.name in OUT_OF_HAND), None)
+    if slipped is not None:
+        return again(state, f"{slipped} with {acquisition.n_modes} modes", now_ns, slipped=True)
+    if rtc.loop == "open":
+        return again(state, "somebody opened the loop", now_ns)
+    if record is None or rtc.cm_id != record.id or state.making_since_ns_utc is not None:
+        return choose_dither(state, rtc, policy, now_ns)
+    if record.applied_frame_seq is not None and acquisition.applied != record.id:
+        acquisition = replace(acquisition, applied=record.id, windows=state.windows_accepted)
+        state = replace(state, acquisition=acquisition)
+    seen = state.windows_accepted - acquisition.windows
+    goal = _goal(acquisition)
+    if seen >= 1 and (record.n_modes < goal or moved(state, record, policy)):
+        return _make(state, goal, rtc, now_ns)
+    if seen >= ENOUGH_WINDOWS:
+        return _done(state, record, now_ns), ()
+    return choose_dither(state, rtc, policy, now_ns)
+
+
+def _make(state: TrackerState, n_modes: int, rtc: RtcView, now_ns: int) -> Step:
+    found = state.acquisition.found
+    if state.making_since_ns_utc is not None or found is None or now_ns < state.retry_ns_utc:
+        return state, ()
+    effect = ev.MakeMatrix(
+        n_modes=n_modes,
+        why=f"acquisition: {n_modes} modes",
+        gains=gains_for(found, n_modes, rtc.n_modes),
+    )
+    return replace(state, making_since_ns_utc=now_ns), (effect,)
+
+
+def _goal(acquisition: Acquisition) -> int:
+    goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
+    return goal if acquisition.most_modes is None else min(goal, acquisition.most_modes)
+
+
+def _done(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> TrackerState:
+    acquisition = state.acquisition
+    goal = acquisition.found.n_controlled if acquisition.found is not None else record.n_modes
+    took_s = (now_ns - acquisition.started_ns_utc) / SECOND_NS
+    modes = f"{record.n_modes} modes" if record.n_modes >= goal else f"{record.n_modes} of {goal}"
+    text = f"tracking after {took_s:.0f} s, {modes} controlled"
+    state = entered(state, AcquisitionStage.TRACKING, text, now_ns)
+    return without_alarm(state, "acquisition", now_ns)

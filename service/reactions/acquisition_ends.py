@@ -1,0 +1,113 @@
+"""How an acquisition goes from stage to stage, begins anew, and ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service import events as ev
+from service.control.continuation import fewer
+from service.reactions.acquisition_plan import OUT_OF_HAND
+from service.reactions.journal import logged, with_alarm
+from service.reactions.loop import on_loop
+from service.reactions.matrices import Step
+from service.state import AcquisitionStage, Level, TrackerState
+
+MOST_ATTEMPTS = 3
+"""Times the loop is opened for one acquisition."""
+
+_CLOSED = (AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING)
+
+
+def entered(state: TrackerState, stage: AcquisitionStage, text: str, now_ns: int) -> TrackerState:
+    """Return the state at the beginning of a stage."""
+    acquisition = replace(
+        state.acquisition, stage=stage, text=text, since_ns_utc=now_ns, misses=0, command=None
+    )
+    level = Level.WARNING if stage is AcquisitionStage.FAILED else Level.INFO
+    state = replace(state, acquisition=acquisition)
+    return logged(state, f"acquisition.{stage}", text, now_ns, level)
+
+
+def told(state: TrackerState, command: ev.SetLoop, now_ns: int) -> Step:
+    """Tell the RTC to change its loop, and remember that it was told."""
+    state, effects = on_loop(state, command, now_ns)
+    asked = state.loop_command
+    acquisition = replace(state.acquisition, command=None if asked is None else asked.id)
+    return replace(state, acquisition=acquisition), effects
+
+
+def without_dither(state: TrackerState) -> Step:
+    """Stop the dither that runs, if one does; nobody takes it for a dither to be adopted."""
+    running = state.dither.id if state.dither is not None else None
+    if running is None and state.rtc is not None:
+        running = state.rtc.dither_id
+    if running is None:
+        return state, ()
+    dithering = replace(state.dithering, stopped_id=running)
+    return replace(state, dither=None, dithering=dithering), (ev.AskNoDither(),)
+
+
+def again(state: TrackerState, reason: str, now_ns: int, *, slipped: bool = False) -> Step:
+    """Begin anew with the loop opened again, a few times; then give up.
+
+    A loop that has slipped is closed on fewer modes next time.
+    """
+    acquisition = state.acquisition
+    if acquisition.attempt >= MOST_ATTEMPTS:
+        return fail(state, f"{reason}, after {acquisition.attempt} attempts", now_ns)
+    most = acquisition.most_modes
+    if slipped:
+        most = fewer(acquisition.n_modes) or acquisition.n_modes
+    goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
+    state, effects = without_dither(state)
+    state = replace(
+        state,
+        registration=None,
+        acquisition=replace(
+            acquisition,
+            attempt=acquisition.attempt + 1,
+            alpha=None,
+            covariance=None,
+            matrix=None,
+            most_modes=most,
+            n_modes=min(acquisition.n_modes, most or goal),
+        ),
+    )
+    text = f"opening the loop again: {reason}"
+    return entered(state, AcquisitionStage.OPENING, text, now_ns), effects
+
+
+def fail(state: TrackerState, reason: str, now_ns: int) -> Step:
+    """Give up: the loop stays as it is, but one that is out of hand is opened."""
+    closed = state.rtc is not None and state.rtc.loop != "open"
+    out_of_hand = any(alarm.name in OUT_OF_HAND for alarm in state.alarms)
+    state, effects = without_dither(state)
+    state = replace(state, registration=None)
+    if closed and out_of_hand:
+        state, more = told(state, ev.SetLoop(closed=False), now_ns)
+        effects = (*effects, *more)
+    text = (
+        f"no registration was acquired: {reason}; see the log, then acquire again, or close the "
+        "loop on a matrix of your own"
+    )
+    state = entered(state, AcquisitionStage.FAILED, text, now_ns)
+    return with_alarm(state, "acquisition", text, now_ns), effects
+
+
+def abort(state: TrackerState, why: str, now_ns: int) -> Step:
+    """End it at once: the loop as it was found, if it held then and nothing was sent; else as is.
+
+    As is means open, or closed on a reconstructor that has passed the gate.
+    """
+    acquisition = state.acquisition
+    found = acquisition.found
+    state, effects = without_dither(state)
+    if acquisition.stage not in _CLOSED:
+        state = replace(state, registration=None)
+    restored = found is not None and found.closed and found.held and not acquisition.sent
+    if restored and state.rtc is not None:
+        state, more = told(state, ev.SetLoop(closed=True), now_ns)
+        effects = (*effects, *more)
+    left = "closed as it was found" if restored else "left as it is"
+    text = f"ended {why}; the loop is {left}"
+    return entered(state, AcquisitionStage.ABORTED, text, now_ns), effects

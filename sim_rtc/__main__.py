@@ -85,6 +85,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
                 clock=clock,
                 detector=telescope.detector,
                 magnitude=options.magnitude,
+                elevation=options.sky.elevation,
                 rehearsal=Rehearsal(plan=plan, recorder=recorder, seed=options.seed),
             )
         )

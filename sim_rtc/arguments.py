@@ -13,6 +13,7 @@ import numpy as np
 from service.errors import ModelError
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from sim_rtc.atmosphere import Layer
+from sim_rtc.elevation import Elevation
 from sim_rtc.imperfections import SETS
 from sim_rtc.scene import Spiders
 from sim_rtc.schedule import Drift, Flexure, Jump, Walk
@@ -146,6 +147,25 @@ def walk(text: str) -> Walk:
         rotation_deg=rotation_deg,
         magnification=magnification,
     )
+
+
+def elevation(text: str) -> Elevation:
+    """Read an elevation, and its change per minute where it has one."""
+    expected = "DEG or DEG,DEG_PER_MIN, 0 to 90 degrees and at most 10 per minute either way"
+    start_deg, *rate = _numbers(text, (1, 2), expected)
+    rate_deg_per_minute = rate[0] if rate else 0.0
+    if not 0.0 <= start_deg <= 90.0 or abs(rate_deg_per_minute) > 10.0:
+        raise _refusal(text, expected)
+    return Elevation(start_deg=start_deg, rate_deg_per_minute=rate_deg_per_minute)
+
+
+def slew(text: str) -> tuple[float, float]:
+    """Read when a slew begins and how far up it goes, ``T:DEG``."""
+    expected = "T:DEG, T > 0 seconds and at most 90 degrees either way"
+    time_s, by_deg = _numbers(text.replace(":", ",", 1), (2,), expected)
+    if ":" not in text or time_s <= 0.0 or abs(by_deg) > 90.0:
+        raise _refusal(text, expected)
+    return time_s, by_deg
 
 
 def seeing_at(text: str) -> tuple[float, float]:

@@ -22,6 +22,7 @@ from sim_rtc.answers import Answers
 from sim_rtc.clock import FrameClock
 from sim_rtc.computer import RealTimeComputer
 from sim_rtc.detector import Detector
+from sim_rtc.elevation import Elevation
 from sim_rtc.faults import FaultPlan
 from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.intake import Intake
@@ -74,6 +75,7 @@ class Link:
         clock: FrameClock,
         detector: Detector,
         magnitude: float,
+        elevation: Elevation | None = None,
         rehearsal: Rehearsal | None = None,
     ) -> None:
         rehearsal = rehearsal or Rehearsal(plan=FaultPlan())
@@ -87,6 +89,7 @@ class Link:
         self._clock = clock
         self._detector = detector
         self._magnitude = magnitude
+        self._elevation = elevation or Elevation()
         self._keys = Keys(computer.identity.system)
         self._backlog: deque[_Outgoing] = deque()
         self._ready = threading.Condition()
@@ -221,5 +224,6 @@ class Link:
                 detector=self._detector,
                 magnitude=self._magnitude,
                 basis_id=self._faults.basis_id(self._computer.identity.basis_id, time_s),
+                pointing=self._elevation.at(time_s),
             )
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from service.wire import FrameHeader, Status
+from service.wire import FrameHeader, PointingStatus, Status
 from sim_rtc.clock import FrameClock
 from sim_rtc.detector import Detector
 from sim_rtc.telemetry import Batch, Identity, Snapshot
@@ -42,6 +42,7 @@ def status_of(
     detector: Detector,
     magnitude: float,
     basis_id: str,
+    pointing: PointingStatus | None = None,
 ) -> Status:
     """Return the status; ``basis_id`` is the one to be named, which a fault may have changed."""
     settings, manifest = snapshot.settings, snapshot.reconstructor.manifest
@@ -66,4 +67,5 @@ def status_of(
         max_dither_modes=snapshot.limits.most_modes,
         magnitude=magnitude,
         flux=detector.counts(snapshot.images).astype("<f4").tobytes(),
+        pointing=pointing,
     )

@@ -10,6 +10,7 @@ from typing import Any
 from service.errors import ConfigurationError
 from sim_rtc import arguments
 from sim_rtc.atmosphere import Layer
+from sim_rtc.elevation import Elevation
 from sim_rtc.imperfections import SETS, Imperfections
 from sim_rtc.profiles import PROFILES
 from sim_rtc.scene import Scene, SceneKind
@@ -63,6 +64,9 @@ class SceneOptions:
     vibrations: tuple[VibrationLine, ...]
     flexure: Flexure
     walk: Walk
+    elevation: Elevation
+    """Of the telescope, as the status tells it."""
+
     truth: Path | None
     """File of the truth."""
 
@@ -108,6 +112,7 @@ def scene_options(found: argparse.Namespace) -> SceneOptions:
         vibrations=lines,
         flexure=found.flexure,
         walk=found.walk,
+        elevation=replace(found.elevation, slews=tuple(found.slew or ())),
         truth=files[0] if files else None,
     )
 
@@ -194,6 +199,21 @@ def add_motion(group: argparse._ArgumentGroup) -> None:
         default=Walk(),
         metavar="X,Y,ROT_DEG,MAG",
         help="random walk: standard deviations after a minute",
+    )
+    group.add_argument(
+        "--elevation",
+        type=arguments.elevation,
+        default=Elevation(),
+        metavar="DEG[,DEG_PER_MIN]",
+        help="of the telescope, in the status; what it does to the registration is yours to say "
+        "with --drift, --jump or --flexure (default: 60)",
+    )
+    group.add_argument(
+        "--slew",
+        type=arguments.slew,
+        action="append",
+        metavar="T:DEG",
+        help="change of elevation that begins at T seconds, 1 deg/s; may be repeated",
     )
 
 

@@ -13,6 +13,7 @@ from service.events.commands import (
     Rollback,
     SetLoop,
     SetMode,
+    SetPointing,
     StartDither,
     StopDither,
 )
@@ -89,6 +90,7 @@ __all__ = [
     "SessionStarted",
     "SetLoop",
     "SetMode",
+    "SetPointing",
     "StartDither",
     "StatusSeen",
     "StopDither",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.state import MeasurePattern, Mode
+from service.state import MeasurePattern, Mode, Pointing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,6 +105,13 @@ class GiveUp:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SetPointing:
+    """The observatory says where the telescope looks."""
+
+    pointing: Pointing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GainGroup:
     """One gain for a range of modes."""
 
@@ -159,5 +166,6 @@ Command = (
     | Measure
     | GiveUp
     | SetLoop
+    | SetPointing
     | Ramp
 )

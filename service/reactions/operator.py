@@ -30,6 +30,8 @@ def on_command(  # noqa: C901 - one line for each command
     match event:
         case ev.SetMode(mode=mode):
             return logged(replace(state, mode=mode), "mode", f"mode is {mode}", now_ns), ()
+        case ev.SetPointing(pointing=pointing):
+            return replace(state, pointing=pointing), ()
         case ev.StopDither():
             state = found_again(replace(state, dither=None, dither_stopped=True), now_ns)
             return logged(state, "dither.stopped", "by the operator", now_ns), (ev.AskNoDither(),)

@@ -94,7 +94,8 @@ class Supervisor:
         running = set(self._running)
         effects = self._post(command)
         now_ns, name = time.time_ns(), type(command).__name__
-        await asyncio.to_thread(self._archive.audit, now_ns, "operator", name, str(command))
+        if not isinstance(command, ev.SetPointing):  # told every second, and decides nothing
+            await asyncio.to_thread(self._archive.audit, now_ns, "operator", name, str(command))
         if isinstance(command, ev.Measure | ev.SetLoop | ev.Ramp):
             asked = self._running - running
             if asked:  # a quick refusal may be here before the audit trail is written

@@ -13,6 +13,7 @@ from service.state import (
     MeasurementRecord,
     MeasurePattern,
     MeasureState,
+    Pointing,
     ReconstructorRecord,
     RtcView,
     TrackerState,
@@ -25,6 +26,7 @@ from service.wire import (
     MeasuredManifest,
     MeasureRequest,
     Pattern,
+    PointingStatus,
     StateMessage,
     Status,
 )
@@ -95,7 +97,14 @@ def rtc_view(status: Status) -> RtcView:
         dither=None if status.dither is None else _running(status.dither),
         t_ns_utc=status.t_ns,
         seq=status.seq,
+        pointing=_pointing(status.pointing),
     )
+
+
+def _pointing(status: PointingStatus | None) -> Pointing | None:
+    if status is None:
+        return None
+    return Pointing(elevation_deg=status.elevation_deg, azimuth_deg=status.azimuth_deg)
 
 
 def _running(status: DitherStatus) -> DitherView | None:

@@ -179,6 +179,13 @@ class Fields:
         """Return what ``read`` makes of the key, or None where it is nil."""
         return None if self.get(key) is None else read(key)
 
+    def extension(self, key: str, read: Callable[[str], _T]) -> _T | None:
+        """Return what ``read`` makes of the key, or None where it is nil or not there at all.
+
+        For keys that came after the contract: who does not know them need not send them.
+        """
+        return None if self._values.get(key) is None else read(key)
+
     def integers(self, key: str, low: int = 0, high: int = INTEGER_LIMIT) -> tuple[int, ...]:
         """Return a list of integers."""
         return tuple(self._integer(key, v, low, high) for v in self._list(key))

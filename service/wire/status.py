@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
 from typing import Final
 
@@ -28,6 +28,17 @@ class DitherStatus:
 
     start_seq: int
     """First frame whose exposure contains it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointingStatus:
+    """Where the telescope looks, as far as the RTC knows."""
+
+    elevation_deg: float
+    """Above the horizon."""
+
+    azimuth_deg: float
+    """From north over east."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +83,9 @@ class Status:
 
     flux: bytes | None
     """``<f4`` ``[4, n_subapertures, n_subapertures]``, counts per frame averaged over a second."""
+
+    pointing: PointingStatus | None = None
+    """An extension: an RTC that does not know it may leave the key out."""
 
     @property
     def flux_images(self) -> NDArray[np.float32] | None:
@@ -159,7 +173,8 @@ def encode_status(status: Status) -> bytes:
     if playing is not None:
         request = {f.name: getattr(playing.request, f.name) for f in fields(playing.request)}
         dither = {**request, "start_seq": playing.start_seq}
-    data = pack(status, dither=dither)
+    pointing = None if status.pointing is None else asdict(status.pointing)
+    data = pack(status, dither=dither, pointing=pointing)
     decode_status(data)
     return data
 
@@ -197,6 +212,14 @@ def decode_status(data: bytes) -> Status:
         max_dither_modes=message.integer("max_dither_modes"),
         magnitude=message.optional("magnitude", message.number),
         flux=message.optional("flux", lambda key: _flux(message, key)),
+        pointing=message.extension("pointing", lambda key: _pointing(message.child(key))),
+    )
+
+
+def _pointing(message: Fields) -> PointingStatus:
+    return PointingStatus(
+        elevation_deg=message.number("elevation_deg", -90.0, 90.0),
+        azimuth_deg=message.number("azimuth_deg", -720.0, 720.0),
     )
 
 

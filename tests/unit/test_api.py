@@ -25,6 +25,7 @@ from service.events import (
     Reject,
     Rollback,
     SetMode,
+    SetPointing,
     StartDither,
     StopDither,
 )
@@ -43,6 +44,7 @@ from service.state import (
     MeasurePattern,
     MeasureState,
     Mode,
+    Pointing,
     ReconstructorRecord,
     Registration,
     RtcView,
@@ -412,6 +414,12 @@ async def test_a_damaged_matrix_is_a_problem_that_says_so(client, service):
         ("POST", "/v1/reconstructors/cm-1/publish", {}, Publish(id="cm-1")),
         ("POST", "/v1/rollback", None, Rollback()),
         ("PUT", "/v1/mode", {"mode": "auto"}, SetMode(mode=Mode.AUTO)),
+        (
+            "PUT",
+            "/v1/pointing",
+            {"elevation_deg": 61.5, "azimuth_deg": -20.0},
+            SetPointing(pointing=Pointing(elevation_deg=61.5, azimuth_deg=-20.0)),
+        ),
     ],
 )
 async def test_a_command_is_handed_on_and_answered_202(
@@ -430,6 +438,12 @@ async def test_a_command_is_handed_on_and_answered_202(
     ("method", "path", "body", "words"),
     [
         ("POST", "/v1/refit", {"n_mode": 5}, ["body.n_mode: unknown"]),
+        (
+            "PUT",
+            "/v1/pointing",
+            {"elevation_deg": 91.0, "azimuth_deg": 0.0},
+            ["body.elevation_deg: found 91.0"],
+        ),
         ("POST", "/v1/refit", {"n_modes": 0}, ["body.n_modes: found 0, expected greater than or"]),
         ("POST", "/v1/refit", {"n_modes": "5"}, ["body.n_modes: found '5', expected a valid int"]),
         ("POST", "/v1/refit", {"n_modes": 5.5}, ["body.n_modes: found 5.5"]),
@@ -683,6 +697,7 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
         "POST /v1/reconstructors/{id}/publish",
         "POST /v1/rollback",
         "PUT /v1/mode",
+        "PUT /v1/pointing",
         "GET /healthz",
         "GET /readyz",
         "GET /metrics",

@@ -25,6 +25,7 @@ from service.wire import (
     MeasuredManifest,
     MeasureRequest,
     Pattern,
+    PointingStatus,
     RampRequest,
     Role,
     Status,
@@ -234,9 +235,21 @@ def test_a_status_keeps_everything_it_says():
     assert STATUS.flux_images[3, 1, 1] == 15.0
 
 
+def test_an_rtc_may_say_where_the_telescope_looks_or_know_nothing_of_it():
+    looking = replace(STATUS, pointing=PointingStatus(elevation_deg=61.5, azimuth_deg=-20.0))
+    assert decode_status(encode_status(looking)) == looking
+    for unknown in (..., None):
+        assert decode_status(changed(encode_status(looking), pointing=unknown)) == STATUS
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"pointing": {"elevation_deg": 60.0}}, "missing: key 'azimuth_deg' in 'pointing'"),
+        (
+            {"pointing": {"elevation_deg": 91.0, "azimuth_deg": 0.0}},
+            "elevation_deg is 91.0 .*, expected a finite number from -90 to 90",
+        ),
         ({"magnitude": ...}, "missing: key 'magnitude' in a status"),
         ({"gains": [0.4, 0.4]}, "gains is a list of 2 .*, expected one for each of 3 modes"),
         ({"gains": [0.4, float("nan"), 0.1]}, "gains is nan"),

@@ -4,7 +4,7 @@ import pytest
 from service import events as ev
 from service.link import events as heard
 from service.runtime import translate
-from service.state import DitherView, Level, MatrixState, Mode
+from service.state import DitherView, Level, MatrixState, Mode, Pointing
 from service.wire import (
     Acknowledgement,
     AckState,
@@ -13,6 +13,7 @@ from service.wire import (
     DitherRequest,
     DitherStatus,
     Loop,
+    PointingStatus,
     Status,
     layout_of,
 )
@@ -49,6 +50,12 @@ def test_a_status_becomes_the_view_of_the_rtc():
     assert isinstance(event, ev.StatusSeen)
     assert (event.rtc.loop, event.rtc.cm_id, event.rtc.n_slopes) == ("closed", "cm-1", 6)
     assert event.rtc.dither_id is None
+
+
+def test_where_the_telescope_looks_is_taken_over_when_the_rtc_knows():
+    assert translate.rtc_view(status()).pointing is None
+    looking = status(pointing=PointingStatus(elevation_deg=61.5, azimuth_deg=-20.0))
+    assert translate.rtc_view(looking).pointing == Pointing(elevation_deg=61.5, azimuth_deg=-20.0)
 
 
 def test_a_running_dither_is_known_by_its_id():

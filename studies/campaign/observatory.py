@@ -13,8 +13,6 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +91,7 @@ class _Due:
 
 
 class Observatory:
-    """A night in simulated time; ``advance`` lets it pass. Use it as a context manager."""
+    """A night in simulated time; ``advance`` lets it pass."""
 
     def __init__(
         self,
@@ -133,7 +131,6 @@ class Observatory:
             ),
             clock_ns=lambda: self.dome.now_ns,
         )
-        self._runner = asyncio.Runner()
         self._agenda: list[_Due] = []
         self._numbers = itertools.count()
         self._with_poles = with_poles
@@ -141,19 +138,6 @@ class Observatory:
         self._fitting = False
         self._waiting: Window | None = None
         self._begin()
-
-    def __enter__(self) -> Self:
-        """Use the night."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End it."""
-        self._runner.close()
 
     @property
     def time_s(self) -> float:
@@ -298,7 +282,7 @@ class Observatory:
         if isinstance(window, WindowRefused):
             return
         self._fitting = True
-        event = self._runner.run(fitted(window, self.state, self._crew, self._deeds))
+        event = asyncio.run(fitted(window, self.state, self._crew, self._deeds))
 
         def done() -> None:
             self._fitting = False
@@ -310,7 +294,7 @@ class Observatory:
         self._at(self._worked(self.latencies.fit_s), done)
 
     def _watch(self) -> None:
-        found = self._runner.run(watched(self.streams, self.state, self._crew, self.dome.now_ns))
+        found = asyncio.run(watched(self.streams, self.state, self._crew, self.dome.now_ns))
         if found is not None:
             event = found
             self._at(self._worked(self.latencies.watch_s), lambda: self._post(event))
@@ -334,7 +318,7 @@ class Observatory:
         """Carry an effect out; what comes of it is heard when it would be."""
         due_ns = self._due(effect)
         try:
-            event = self._runner.run(self._deeds.carry_out(effect, state))
+            event = asyncio.run(self._deeds.carry_out(effect, state))
         except PyrcalError as error:
             event = ev.JobFailed(effect=effect, text=str(error))
         self._at(due_ns, lambda: self._done(event))

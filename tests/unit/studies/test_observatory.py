@@ -1,0 +1,210 @@
+"""The whole service against a small simulated telescope, in simulated time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from service import events as ev
+from service.config import load_settings
+from service.config.policy import policy_of
+from service.errors import CommandError
+from service.state import MatrixState, Mode
+from service.wire import DitherRequest
+from service.worker import Workbench
+from studies.campaign.observatory import Latencies, Observatory
+from studies.campaign.observatory_checks import Outcome, Swap, published, true_radius
+from studies.campaign.observatory_dome import START_NS, Dome, replayed
+from studies.campaign.system_measures import row_of
+from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
+
+WORDS = [
+    f"--instrument={INSTRUMENT}",
+    "--plant=linear",
+    "--imperfections=ideal",
+    "--optical-gain=0.7,0.9",
+    f"--n-controlled={N_CONTROLLED}",
+    "--seed=1",
+    "--alpha=0.05,-0.03,0.1,1.002",
+]
+JUMP_S, JUMP_SUBAP = 10.0, 0.1
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    with threadpool_limits(1):
+        yield
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Workbench(small_instrument(), COMPUTE)
+
+
+@pytest.fixture(scope="module")
+def policy():
+    given = {
+        "dither.amplitude_m": 5e-9,
+        "dither.window_s": 1.0,
+        "dither.longest_pause_s": 0.0,
+        "control.n_modes_target": N_CONTROLLED,
+    }
+    return policy_of(load_settings(None, {}, given))
+
+
+@pytest.fixture(scope="module")
+def night(bench, policy):
+    """Twenty seconds on auto, with a jump of a tenth of a subaperture in the middle."""
+    words = [*WORDS, f"--jump={JUMP_S}:{JUMP_SUBAP},0,0,0"]
+    night = Observatory(words, policy, Mode.AUTO, bench)
+    night.advance(20.0)
+    return night
+
+
+def short(bench, policy, seconds, mode=Mode.AUTO, **changes):
+    night = Observatory(WORDS, policy, mode, bench, **changes)
+    night.advance(seconds)
+    return night
+
+
+def times_s(night, name):
+    return [(e.t_ns_utc - START_NS) * 1e-9 for e in night.state.log if e.name == name]
+
+
+def test_the_service_finds_the_registration_by_itself(night):
+    before_jump = [
+        (g.alpha - m.alpha.vector) / g.sigma
+        for g, m in zip(night.glances, night.dome.moments, strict=True)
+        if g.alpha is not None and 5.0 < g.time_s < JUMP_S
+    ]
+    assert np.abs(before_jump).max() < 4.0
+
+
+def test_a_matrix_is_made_sent_and_applied_each_in_its_time(night):
+    published_s, applied_s = (
+        times_s(night, f"reconstructor.{name}")[0] for name in ("published", "applied")
+    )
+    first = next(r for r in night.state.reconstructors if r.published_ns_utc is not None)
+    asked_s = (first.created_ns_utc - START_NS) * 1e-9
+    wait = night.latencies
+    assert published_s - asked_s >= wait.make_s
+    assert wait.send_s <= applied_s - published_s <= wait.send_s + 0.15
+    swap = night.swaps[0]
+    assert swap.id == first.id
+    assert swap.time_s == pytest.approx(applied_s)
+
+
+def test_a_jump_is_flagged_and_a_corrected_matrix_follows(night):
+    (jump,) = row_of(night, (JUMP_S,))["jumps"]
+    assert 0.0 < jump["flagged_s"] <= 5.0
+    assert jump["flagged_s"] < jump["corrected_s"] <= 15.0 - 5.0
+
+
+def test_what_the_gate_let_through_held_the_loop(night):
+    publications = night.publications()
+    assert len(publications) >= 2
+    for publication in publications:
+        assert publication.swap.gate.accepted
+        assert publication.swap.radius < 0.95
+        assert publication.outcome is Outcome.HELD
+
+
+def test_the_truth_moves_when_it_should_and_by_as_much(night):
+    x = {round(m.time_s, 2): m.alpha.shift_x_subap for m in night.dome.moments}
+    assert x[JUMP_S + 0.05] - x[JUMP_S] == pytest.approx(JUMP_SUBAP)
+
+
+def test_the_same_orders_make_the_same_night_and_without_dither_a_calmer_one(bench, policy):
+    night = short(bench, policy, 3.0)
+    errors = [m.wavefront_nm for m in night.dome.moments]
+    again = replayed(WORDS, night.dome.orders, 3.0)
+    assert [m.wavefront_nm for m in again.moments] == errors
+    calm = [o for o in night.dome.orders if not isinstance(o.what, DitherRequest)]
+    twin = replayed(WORDS, calm, 3.0)
+    assert max(m.dither_nm for m in twin.moments) == 0.0
+    added = np.mean(np.square(errors)) - np.mean([m.wavefront_nm**2 for m in twin.moments])
+    dithers = np.mean([m.dither_nm**2 for m in night.dome.moments])
+    assert added == pytest.approx(dithers, rel=0.5)
+
+
+def test_two_nights_of_one_seed_are_one_night(bench, policy):
+    first, second = (short(bench, policy, 2.5) for _ in range(2))
+    assert [m.wavefront_nm for m in first.dome.moments] == [
+        m.wavefront_nm for m in second.dome.moments
+    ]
+    assert first.state.registration is not None
+    assert np.array_equal(
+        first.state.registration.alpha.vector, second.state.registration.alpha.vector
+    )
+
+
+def test_an_rtc_that_restarts_brings_its_first_matrix_back(bench, policy):
+    night = short(bench, policy, 1.0)
+    first, session = night.state.in_use, night.state.rtc.session
+    night.restart_rtc()
+    assert night.state.rtc is None
+    night.advance(1.0)
+    assert night.state.rtc.session != session
+    assert night.state.rtc.seq < 1000
+    assert night.state.in_use == first
+    assert night.state.dither.start_seq < 1000
+
+
+def test_a_worker_too_slow_for_the_telemetry_gives_windows_up(bench, policy):
+    slow = Latencies(fit_s=2.5)
+    night = short(bench, policy, 7.0, Mode.HOLD, latencies=slow)
+    refusals = [e.text for e in night.state.log if e.name == "window.refused"]
+    assert any("too slow" in text for text in refusals)
+    assert night.state.windows_accepted >= 1
+
+
+def test_an_operator_is_told_what_cannot_be_done(bench, policy):
+    night = short(bench, policy, 0.5, Mode.HOLD)
+    with pytest.raises(CommandError):
+        night.command(ev.Refit())
+
+
+def test_an_effect_of_unknown_duration_is_refused_aloud(bench, policy):
+    night = short(bench, policy, 0.1)
+    with pytest.raises(TypeError, match="expected an effect whose duration is known"):
+        night._do(object(), night.state)
+
+
+def test_a_matrix_that_breaks_the_loop_is_called_so():
+    dome = Dome([*WORDS, "--gain=0.4"])
+    while dome.time_s < 2.0:
+        dome.play()
+    rtc = dome.computer.snapshot()
+    bad = replace(rtc.reconstructor, matrix=-rtc.reconstructor.matrix)
+    radius = true_radius(bad.matrix, dome.optics, rtc)
+    assert radius > 1.0
+    assert true_radius(rtc.reconstructor.matrix, dome.optics, rtc) < 0.95
+    dome.stage(bad)
+    swapped_s = dome.time_s
+    while dome.time_s < 4.0:
+        dome.play()
+    # by the wavefront alone: nobody has looked at the poles
+    swap = Swap(
+        id="bad",
+        n_modes=N_CONTROLLED,
+        time_s=swapped_s,
+        alpha=dome.alpha,
+        made_for=None,
+        gate=None,
+        radius=None,
+    )
+    found = published(swap, dome.moments, 4.0)
+    assert found.outcome is Outcome.DIVERGED
+    assert found.after_nm > 10.0 * found.before_nm
+    before = replace(swap, time_s=1.5)
+    assert published(before, dome.moments, 1.7).outcome is Outcome.UNTESTED
+
+
+def test_nothing_is_published_that_nobody_approved(bench, policy):
+    night = short(bench, policy, 8.0, Mode.PROPOSE)
+    assert not night.swaps
+    (proposed,) = [r for r in night.state.reconstructors if r.state is MatrixState.PROPOSED]
+    night.command(ev.Approve(id=proposed.id))
+    night.advance(0.5)
+    assert [swap.id for swap in night.swaps] == [proposed.id]

@@ -307,6 +307,7 @@ def _compute(settings: Settings) -> Compute:
         method=settings.control.method,
         max_condition=settings.control.max_condition,
         slope_noise=settings.control.slope_noise,
+        wind_m_s=settings.control.wind_m_s,
     )
 
 

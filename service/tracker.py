@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from service import events as ev
 from service.events import Command, Event
+from service.reactions.acquisition import acquire, on_acquire, refuse_meanwhile
 from service.reactions.decision import decide
 from service.reactions.dither import on_dither, on_silence, on_vibrations
 from service.reactions.dither_schedule import learnt
@@ -19,6 +20,7 @@ from service.reactions.matrices import (
     on_fetched,
     on_margin,
     on_matrix,
+    shelved,
 )
 from service.reactions.measurements import MEASURING, meanwhile, on_measurement
 from service.reactions.operator import on_command
@@ -48,8 +50,14 @@ def step(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step
     UnknownIdError
         If it names a reconstructor nobody has heard of.
     """
+    refuse_meanwhile(state, event)
+    before = state
     state, effects = _react(meanwhile(state, event, now_ns), event, policy, now_ns)
     if state.measuring is not None:
+        return state, effects
+    state, more = acquire(before, state, event, policy, now_ns)
+    effects = (*effects, *more)
+    if state.acquisition.under_way:
         return state, effects
     state, more = decide(state, policy, now_ns)
     return state, (*effects, *more)
@@ -81,6 +89,12 @@ def _react(  # noqa: C901 - one line for each event
             return on_loop(state, event, now_ns)
         case ev.JobFailed(effect=ev.AskLoop() | ev.AskRamp()):
             return on_loop(state, event, now_ns)
+        case ev.Acquire() | ev.AbortAcquisition():
+            return on_acquire(state, event, policy, now_ns)
+        case ev.FarFitted():
+            return state, ()
+        case ev.MatrixMade(record=record) if state.acquisition.under_way:
+            return shelved(state, record, now_ns), ()
         case ev.WindowFitted() if state.measuring is not None:
             return refuse_window(state, MEASURING, now_ns), ()
         case ev.WindowFitted(estimate=estimate):
@@ -98,12 +112,12 @@ def _react(  # noqa: C901 - one line for each event
 
 def _react_to_matrices(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
     match event:
-        case ev.MatrixMade(record=record, wanted=wanted):
-            return on_matrix(state, record, wanted=wanted, now_ns=now_ns)
+        case ev.MatrixMade():
+            return on_matrix(state, event, now_ns)
         case ev.MatrixFetched(record=record):
             return on_fetched(state, record, now_ns), ()
-        case ev.MarginJudged(id=matrix_id, verdict=verdict):
-            return on_margin(state, matrix_id, verdict, now_ns), ()
+        case ev.MarginJudged():
+            return on_margin(state, event, now_ns), ()
         case ev.Acknowledged():
             return on_acknowledgement(state, event, now_ns), ()
         case ev.DitherAnswered():

@@ -22,13 +22,16 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.control.edge import Outer
+from service.control.expected_gain import ExpectedGain, Sky, Timing, beyond_m2, expected_gain
 from service.control.gate import GateVerdict, LoopSettings, judge
+from service.control.noise import noise_of_star
 from service.control.recipe import Method, Recipe, reconstruct
 from service.control.reconstructor import MAX_CONDITION
 from service.control.regularised import Prior
 from service.errors import ModelError
 from service.estimation import passive
 from service.estimation.edge import Actuators
+from service.estimation.faraway import FarEstimate, Search, find
 from service.estimation.instrumental import Loop, WindowEstimate, fit_window
 from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.noisymatrix import RandomEstimate, fit_random
@@ -39,6 +42,7 @@ from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, modal_basis
 from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo, working_point
+from service.registration.start import far_starts
 
 SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
 """A step shorter than this (numeric units) leaves a linearisation error below 1e-4 of its unit."""
@@ -51,6 +55,9 @@ REACH = 4.0
 
 CONTRACTION = 0.5
 """A step longer than this share of the last one is not Newton's any more: the fit has failed."""
+
+FAR_SAMPLING = 1
+"""The same of the model that leads from afar: biased by some per cent of a subaperture."""
 
 COARSE_SAMPLING = 2
 """Pupil points per subaperture and nodes of the coarse model: biased by 0.05 % of a subaperture,
@@ -81,7 +88,10 @@ class Compute:
     """Of a truncated SVD."""
 
     slope_noise: float = 0.05
-    """Of a MAP inversion: 1 σ of one slope in one frame."""
+    """1 σ of one slope in one frame: of a MAP inversion, and of a star of unknown magnitude."""
+
+    wind_m_s: float = 15.0
+    """At which the expected loss of a reconstructor is computed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,6 +116,8 @@ class Made:
 
     condition_number: float
     gate: GateVerdict
+    why_fewer: str = ""
+    """What the gate said of more modes, where it has fewer than were asked for."""
 
 
 class Workbench:
@@ -141,6 +153,7 @@ class Workbench:
         self._start = instrument.start
         self._linearisation: Linearisation | None = None
         self._compute = compute
+        self._far: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
 
     def describe(self) -> Description:
         """Return what telemetry must look like, and prepare for the first fit."""
@@ -174,18 +187,54 @@ class Workbench:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
         return estimate if _settled(estimate) else _unsettled(spectra)
 
+    def find(
+        self, spectra: Spectra, start: Misregistration | None, flux: bytes | None
+    ) -> FarEstimate | WindowRefused:
+        """Find α in a window with the loop open; without a start from anywhere in the range.
+
+        ``flux`` is the RTC's: where the pupil images move with the mirror's they are a start.
+        """
+        modes = spectra.plan.modes
+        if modes not in self._far:
+            basis = self._model.basis.subset(np.array(modes))
+            self._far[modes] = tuple(
+                RtcInteractionModel(
+                    self._model.instrument,
+                    basis,
+                    pupil_sampling=sampling,
+                    detector_nodes=sampling,
+                    mapper=self._threads.map,
+                )
+                for sampling in (FAR_SAMPLING, COARSE_SAMPLING)
+            )
+        far, near = self._far[modes]
+        starts = (start,) if start is not None else far_starts(self._model.instrument, flux)
+        try:
+            return find(spectra, Search(far=far, near=near, nominal=self._start, starts=starts))
+        except np.linalg.LinAlgError as error:
+            return WindowRefused(
+                reason=f"registration not found: {error}", t_ns_utc=spectra.t_end_ns_utc
+            )
+
     def fit_random(
-        self, window: Correlated, start: Misregistration
+        self, window: Correlated, start: Misregistration | None
     ) -> RandomEstimate | WindowRefused:
-        """Estimate α from one window of random dither, about the linearisation near ``start``."""
-        estimate = fit_random(window, self._near(start))
-        for _ in range(MAX_APPROACHES):
-            if isinstance(estimate, WindowRefused) or _settled(estimate):
-                return estimate
-            if np.any(np.abs(estimate.alpha.vector - self._start.vector) > FIT_RANGE):
-                break
-            estimate = fit_random(window, self._linearise(estimate.alpha))
+        """Estimate α from one window of random dither, from ``start`` as in :meth:`fit`."""
+        try:
+            estimate = fit_random(window, self._near(start or self._start))
+            for _ in range(MAX_APPROACHES):
+                if isinstance(estimate, WindowRefused) or _settled(estimate):
+                    return estimate
+                if np.any(np.abs(estimate.alpha.vector - self._start.vector) > FIT_RANGE):
+                    break
+                estimate = fit_random(window, self._linearise(estimate.alpha))
+        except np.linalg.LinAlgError as error:
+            return WindowRefused(reason=f"no fit: {error}", t_ns_utc=window.t_end_ns_utc)
         return _unsettled(window)
+
+    def response(self, alpha: Misregistration) -> NDArray[np.float32]:
+        """Return D(α) of the sensor as it works, ``(n_slopes, n_modes)``, slope per metre OPD."""
+        return self._sensor.interaction_matrix(alpha)
 
     def _approach(
         self, spectra: Spectra, loop: Loop, estimate: WindowEstimate
@@ -208,14 +257,55 @@ class Workbench:
         covariance: NDArray[np.float64],
         loop: LoopSettings,
         bound: float,
+        fewer: tuple[int, ...] = (),
     ) -> Made:
-        """Compute the reconstructor for α, as many modes as the loop has gains, and judge it."""
+        """Compute the reconstructor for α, as many modes as the loop has gains, and judge it.
+
+        Where the gate refuses it, the most of ``fewer`` modes, largest first, that pass; none
+        passes: the one asked for.
+        """
         matrix = self._model.interaction_matrix(alpha)
-        inversion = reconstruct(matrix, self._recipe(len(loop.gains)))
-        verdict = self.judge(inversion.matrix, alpha, covariance, loop, bound)
-        return Made(
-            matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
+
+        def judged(n_modes: int) -> Made:
+            inversion = reconstruct(matrix, self._recipe(n_modes))
+            verdict = self.judge(inversion.matrix, alpha, covariance, loop.of_first(n_modes), bound)
+            return Made(
+                matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
+            )
+
+        return _most(len(loop.gains), fewer, judged)
+
+    def assess(
+        self,
+        in_use: NDArray[np.float32],
+        alpha: Misregistration,
+        timing: Timing,
+        magnitude: float | None,
+    ) -> ExpectedGain:
+        """Return what a new reconstructor would win over the one in use.
+
+        ``magnitude`` is the star's; None: the noise of the settings.
+        """
+        model, n_modes = self._model, len(in_use)
+        seen = self._near(alpha).matrix_at(alpha)
+        flat = seen if self._sensor is model else model.interaction_matrix(alpha)
+        fresh = reconstruct(flat, self._recipe(n_modes)).matrix
+        noise = self._compute.slope_noise
+        if magnitude is not None:
+            of_star = noise_of_star(
+                model.instrument,
+                magnitude=magnitude,
+                frame_rate_hz=timing.frame_rate_hz,
+                n_valid=model.n_slopes // 2,
+            )
+            noise = float(of_star[0])
+        sky = Sky(
+            variance_m2=model.basis.variance_m2,
+            beyond_m2=beyond_m2(model.basis.variance_m2),
+            crossing_hz=self._compute.wind_m_s / model.instrument.diameter_m,
+            slope_noise=noise,
         )
+        return expected_gain(in_use, fresh, seen, timing, sky)
 
     def _recipe(self, n_modes: int) -> Recipe:
         prior = None
@@ -259,6 +349,24 @@ class Workbench:
     def _linearise(self, alpha: Misregistration) -> Linearisation:
         self._linearisation = self._sensor.linearise(alpha)
         return self._linearisation
+
+
+def _most(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -> Made:
+    """Return what passes with most modes: fewer are never less stable, so halves are enough."""
+    asked = judged(n_modes)
+    if asked.gate.accepted:
+        return asked
+    found, refused, first, end = None, asked, 0, len(fewer)
+    while first < end:
+        middle = (first + end) // 2
+        tried = judged(fewer[middle])
+        if tried.gate.accepted:
+            found, end = tried, middle
+        else:
+            refused, first = tried, middle + 1
+    if found is None:
+        return asked
+    return replace(found, why_fewer=f"{len(refused.matrix)} modes: {refused.gate.reason}")
 
 
 def _actuators(model: RtcInteractionModel) -> Actuators | None:

@@ -16,6 +16,7 @@ from service.state import (
     MeasurementRecord,
     MeasurePattern,
     MeasureState,
+    ModeGain,
     ReconstructorRecord,
 )
 
@@ -30,6 +31,7 @@ def record_to_json(record: ReconstructorRecord) -> str:
         values["sigma"] = dict(zip(PARAMETERS, sigma.tolist(), strict=True))
     if record.gate is not None:
         values["gate"] = asdict(record.gate)
+    values["optical_gains"] = [asdict(gain) for gain in record.optical_gains]
     return json.dumps(values)
 
 
@@ -49,6 +51,7 @@ def record_from_json(text: str) -> ReconstructorRecord:
         alpha=None if alpha is None else Misregistration.from_boundary(alpha),
         sigma=None if sigma is None else _numeric(sigma),
         gate=None if gate is None else GateVerdict(**gate),
+        optical_gains=tuple(ModeGain(**gain) for gain in values.get("optical_gains", ())),
     )
 
 

@@ -68,7 +68,7 @@ class DitherTable(Table):
     enabled: bool = True
     """Whether the service asks for it by itself."""
 
-    budget_m: float = Field(default=10e-9, gt=0.0, le=2e-7)
+    budget_m: float = Field(default=8e-9, gt=0.0, le=2e-7)
     """Largest RMS of all modes together on the mirror, metres OPD; never exceeded by itself."""
 
     sigma_shift_subap: Positive = 0.01
@@ -98,7 +98,7 @@ class DitherTable(Table):
     window_s: float = Field(default=2.0, ge=0.1, le=60.0)
     """Least telemetry in one estimate, seconds."""
 
-    longest_window_s: float = Field(default=60.0, ge=0.1, le=300.0)
+    longest_window_s: float = Field(default=20.0, ge=0.1, le=300.0)
     """Most of it, seconds; faint stars and small budgets need long windows."""
 
     @model_validator(mode="after")
@@ -144,6 +144,42 @@ class TrackingTable(Table):
     floor_magnification: float = Field(default=0.001, ge=0.0)
     """Of the magnification."""
 
+    bias_memory_s: Positive = 3600.0
+    """How long the wind's bias of the passive estimate lasts: after it, what was learnt is worth
+    1/e."""
+
+    flexure_subap_per_degree: float = Field(default=0.02, ge=0.0)
+    """What a degree of elevation does to a shift, 1 σ, subapertures."""
+
+    flexure_deg_per_degree: float = Field(default=0.01, ge=0.0)
+    """To the rotation, degrees."""
+
+    flexure_magnification_per_degree: float = Field(default=1e-4, ge=0.0)
+    """To the magnification."""
+
+    slew_limit_deg: Positive = 5.0
+    """A telescope that has moved further since the last window makes α invalid, degrees."""
+
+    stale_shift_subap: Positive = 0.05
+    """1 σ of a shift from which on α is stale, subapertures."""
+
+    stale_rotation_deg: Positive = 0.1
+    """Of the rotation, degrees."""
+
+    stale_magnification: Positive = 0.003
+    """Of the magnification."""
+
+
+class AcquisitionTable(Table):
+    """``[acquisition]``: finding α from nothing, with the loop open."""
+
+    auto: bool = True
+    """Whether it begins by itself, in mode auto, when the loop diverges or α is out of reach."""
+
+    amplitude_m: float = Field(default=50e-9, gt=0.0, le=2e-7)
+    """RMS of each of up to eight modes dithered meanwhile, metres OPD, as far as the RTC allows;
+    the budget is that of a closed loop."""
+
 
 class ControlTable(Table):
     """``[control]``: when a reconstructor is made and what it must withstand."""
@@ -163,14 +199,23 @@ class ControlTable(Table):
     slope_noise: Positive = 0.05
     """map: 1 sigma of one slope in one frame; the turbulence is the instrument's ``[modes]``."""
 
-    update_shift_subap: Positive = 0.01
-    """Change of a shift that makes a new reconstructor worthwhile, subapertures."""
+    update_gain_nm: Positive = 0.5
+    """Expected loss of wavefront error that makes a new reconstructor worthwhile, nanometres."""
 
-    update_rotation_deg: Positive = 0.02
+    update_margin: float = Field(default=0.08, gt=0.0, lt=1.0)
+    """Loss of stability margin that does, as a share of what a new one would have."""
+
+    update_shift_subap: Positive = 0.08
+    """Change of a shift that makes a new reconstructor whatever it wins, subapertures."""
+
+    update_rotation_deg: Positive = 0.08
     """Of the rotation, degrees."""
 
-    update_magnification: Positive = 0.001
+    update_magnification: Positive = 0.005
     """Of the magnification."""
+
+    wind_m_s: Positive = 15.0
+    """Wind at which the expected loss is computed, metres per second."""
 
     minimum_interval_s: float = Field(default=5.0, ge=0.0)
     """Least time between two reconstructors, seconds."""
@@ -217,6 +262,7 @@ class Settings(Table):
     api: ApiTable = ApiTable()
     dither: DitherTable = DitherTable()
     tracking: TrackingTable = TrackingTable()
+    acquisition: AcquisitionTable = AcquisitionTable()
     control: ControlTable = ControlTable()
     compute: ComputeTable = ComputeTable()
     fits: FitsTable = FitsTable()

@@ -48,11 +48,21 @@ class LoopSettings:
 
     leak: float
     delay_frames: float
-    optical_gain: float = 1.0
-    """How much of the model's response the sensor shows: below 1 on sky, up to 2 in double pass."""
+    optical_gain: float | NDArray[np.float64] = 1.0
+    """How much of the model's response the sensor shows, of all modes or ``(n_controlled,)``:
+    below 1 on sky, up to 2 in double pass."""
 
     outer: Outer | None = None
     """The mirror's outermost ring; None: the modes are measured, it is not known."""
+
+    def of_first(self, n_modes: int) -> LoopSettings:
+        """Return the same loop with only its first modes controlled."""
+        gain = self.optical_gain
+        return replace(
+            self,
+            gains=self.gains[:n_modes],
+            optical_gain=gain if isinstance(gain, float) else gain[:n_modes],
+        )
 
 
 def judge(

@@ -1,6 +1,8 @@
 """What can happen to the service, what an operator can ask, and what is to be done about it."""
 
 from service.events.commands import (
+    AbortAcquisition,
+    Acquire,
     Approve,
     Command,
     GainGroup,
@@ -35,6 +37,7 @@ from service.events.heard import (
     DitherAnswered,
     DitherSilent,
     Event,
+    FarFitted,
     JobFailed,
     LoopAnswered,
     MarginJudged,
@@ -54,7 +57,9 @@ from service.events.heard import (
 )
 
 __all__ = [
+    "AbortAcquisition",
     "Acknowledged",
+    "Acquire",
     "Approve",
     "AskDither",
     "AskLoop",
@@ -67,6 +72,7 @@ __all__ = [
     "DitherSilent",
     "Effect",
     "Event",
+    "FarFitted",
     "FetchMatrix",
     "GainGroup",
     "GiveUp",

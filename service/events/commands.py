@@ -139,6 +139,9 @@ class SetLoop:
     n_controlled: int | None = None
     """Takes effect with the next reconstructor of that many modes."""
 
+    effective_gain: float | None = None
+    """Gains that act as this on every mode, by the table of optical gains, if the gate agrees."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ramp:
@@ -154,8 +157,23 @@ class Ramp:
     """How long each is tried, settling included."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acquire:
+    """Find the registration from nothing: open the loop, look, and close it step by step.
+
+    Its reconstructors need no further approval, in any mode.
+    """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AbortAcquisition:
+    """End an acquisition under way; the loop is left safe."""
+
+
 Command = (
-    SetMode
+    Acquire
+    | AbortAcquisition
+    | SetMode
     | Refit
     | StartDither
     | StopDither

@@ -13,6 +13,11 @@ class MakeMatrix:
 
     n_modes: int
     why: str
+    gains: tuple[float, ...] | None = None
+    """``(n_modes of the basis,)`` gains it is to run with; None: those in force."""
+
+    fewer: tuple[int, ...] = ()
+    """Tried instead, largest first, where the gate refuses ``n_modes``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,6 +82,8 @@ class AskLoop:
 
     leak: float | None = None
     n_controlled: int | None = None
+    judged: bool = False
+    """Only if the gate lets the matrix in use run with these gains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

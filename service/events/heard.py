@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
+from service.estimation.faraway import FarEstimate
 from service.estimation.instrumental import WindowEstimate
 from service.estimation.lockin import WindowRefused
+from service.estimation.noisymatrix import RandomEstimate
 from service.estimation.passive import PassiveEstimate
 from service.events.commands import Command
 from service.events.effects import Effect
+from service.model.misregistration import Misregistration
 from service.state import Level, MatrixState, MeasurementRecord, ReconstructorRecord, RtcView
 
 
@@ -60,7 +64,14 @@ class Noted:
 class WindowFitted:
     """The worker estimated α from one window."""
 
-    estimate: WindowEstimate
+    estimate: WindowEstimate | RandomEstimate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FarFitted:
+    """The worker found α from afar, in a window with the loop open."""
+
+    found: FarEstimate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +97,12 @@ class MatrixMade:
     wanted: bool
     """An operator asked for this very matrix: no further approval is needed."""
 
+    asked_modes: int | None = None
+    """Modes it should have had; None: nobody asked for a number."""
+
+    why_fewer: str = ""
+    """Why it has fewer than were asked for: the gate's words."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatrixFetched:
@@ -100,6 +117,11 @@ class MarginJudged:
 
     id: str
     verdict: GateVerdict
+    alpha: Misregistration | None = None
+    """The registration it was judged at; None: not told."""
+
+    expected: ExpectedGain | None = None
+    """What a new one would win; None: not computed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,6 +197,7 @@ Event = (
     | Trouble
     | Noted
     | WindowFitted
+    | FarFitted
     | WindowLost
     | Watched
     | MatrixMade

@@ -8,6 +8,7 @@ from itertools import pairwise
 from service import events as ev
 from service.errors import CommandError
 from service.events import Event
+from service.reactions.gain_tables import table_of
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, extended_gains
 from service.reactions.policy import SECOND_NS
@@ -72,11 +73,15 @@ def _set(state: TrackerState, command: ev.SetLoop, now_ns: int) -> Step:
     n_controlled = command.n_controlled
     if n_controlled is not None and not 1 <= n_controlled <= rtc.n_modes:
         raise CommandError(f"loop: found {n_controlled} modes; expected 1 to {rtc.n_modes}")
-    groups = command.gains
+    groups, n_modes = command.gains, n_controlled or rtc.n_controlled
+    gains = None if groups is None else _gains(rtc, groups, n_modes)
+    if command.effective_gain is not None:
+        gains = _compensated(state, rtc, command.effective_gain, n_modes)
     effect = ev.AskLoop(
         id=f"loop-{now_ns}",
         closed=command.closed,
-        gains=None if groups is None else _gains(rtc, groups, n_controlled or rtc.n_controlled),
+        gains=gains,
+        judged=command.effective_gain is not None,
         leak=command.leak,
         n_controlled=n_controlled,
     )
@@ -102,6 +107,20 @@ def _gains(rtc: RtcView, groups: tuple[ev.GainGroup, ...], n_modes: int) -> tupl
     for group in groups:
         gains[group.first : group.last + 1] = [group.gain] * (group.last - group.first + 1)
     return tuple(gains)
+
+
+def _compensated(
+    state: TrackerState, rtc: RtcView, in_effect: float, n_modes: int
+) -> tuple[float, ...]:
+    """Return the gains that act alike on every controlled mode; the others stay at 0."""
+    known = state.registration
+    if known is None or not known.optical_gains:
+        raise CommandError(
+            "loop: found no measured optical gain; expected a dithered window before gains are "
+            "compensated for it"
+        )
+    gains = table_of(known.optical_gains, n_modes).loop_gains(in_effect)
+    return (*gains.tolist(), *(0.0,) * (rtc.n_modes - n_modes))
 
 
 def _ramp(state: TrackerState, command: ev.Ramp, now_ns: int) -> Step:
@@ -142,6 +161,8 @@ def _check_ranges(what: str, ranges: tuple[tuple[int, int], ...], n_modes: int) 
 def _said(command: ev.SetLoop) -> str:
     said = {True: ["close"], False: ["open"], None: []}[command.closed]
     said += [f"gain {g.gain:g} on modes {g.first} to {g.last}" for g in command.gains or ()]
+    if command.effective_gain is not None:
+        said.append(f"gain {command.effective_gain:g} in effect on every mode, by the gain table")
     if command.leak is not None:
         said.append(f"leak {command.leak:g}")
     if command.n_controlled is not None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service import events as ev
-from service.control.gate import GateVerdict
 from service.errors import CommandError
 from service.events import Effect
 from service.reactions.journal import WRONG_RTC, logged, with_alarm, without_alarm
+from service.reactions.mode_ladder import with_limit
 from service.reactions.shelf import (
     known_record,
     with_changed,
@@ -16,15 +16,35 @@ from service.reactions.shelf import (
     with_record,
     with_state,
 )
-from service.state import Level, MatrixState, Mode, ReconstructorRecord, RtcView, TrackerState
+from service.state import (
+    Assessment,
+    Level,
+    MatrixState,
+    Mode,
+    ReconstructorRecord,
+    RtcView,
+    TrackerState,
+)
 
 Step = tuple[TrackerState, tuple[Effect, ...]]
 
 
-def on_matrix(
-    state: TrackerState, record: ReconstructorRecord, *, wanted: bool, now_ns: int
-) -> Step:
+def on_matrix(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
     """Shelve a new reconstructor; send it if it passed the gate and nobody need approve."""
+    record, wanted = made.record, made.wanted
+    state = shelved(state, record, now_ns)
+    if made.asked_modes is not None:
+        state = with_limit(state, record, made.asked_modes, made.why_fewer, now_ns)
+    if record.state is MatrixState.REFUSED:
+        return state, ()
+    believed = state.registration is None or state.registration.usable
+    if why_unsendable(state) is None and (wanted or (state.mode is Mode.AUTO and believed)):
+        return send(state, record.id, now_ns)
+    return state, ()
+
+
+def shelved(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> TrackerState:
+    """Put a new reconstructor on the shelf in place of any proposal."""
     state = replace(state, making_since_ns_utc=None)
     for older in state.reconstructors:
         if older.state is MatrixState.PROPOSED:
@@ -33,14 +53,9 @@ def on_matrix(
     verdict = record.gate.reason if record.gate is not None else "not judged: α is unknown"
     if record.state is MatrixState.REFUSED:
         text = f"{record.id}: {verdict}"
-        return logged(state, "reconstructor.refused", text, now_ns, Level.WARNING), ()
-    state = logged(
-        state, "reconstructor.made", f"{record.id}, {record.n_modes} modes, {verdict}", now_ns
-    )
-    believed = state.registration is None or state.registration.usable
-    if why_unsendable(state) is None and (wanted or (state.mode is Mode.AUTO and believed)):
-        return send(state, record.id, now_ns)
-    return state, ()
+        return logged(state, "reconstructor.refused", text, now_ns, Level.WARNING)
+    text = f"{record.id}, {record.n_modes} modes, {verdict}"
+    return logged(state, "reconstructor.made", text, now_ns)
 
 
 def send(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
@@ -49,10 +64,12 @@ def send(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
     Raises
     ------
     CommandError
-        If no RTC is there, or it may be the wrong one.
+        If no RTC is there, it may be the wrong one, or the gate's latest verdict is no.
     """
     record, rtc = known_record(state, matrix_id), state.rtc
     reason = why_unsendable(state)
+    if record.gate is not None and not record.gate.accepted:
+        reason = record.gate.reason
     if rtc is None or reason is not None:
         raise CommandError(f"{matrix_id} cannot be sent: {reason}")
     state = with_changed(
@@ -121,17 +138,22 @@ def on_fetched(state: TrackerState, record: ReconstructorRecord, now_ns: int) ->
     return logged(state, "reconstructor.adopted", text, now_ns)
 
 
-def on_margin(
-    state: TrackerState, matrix_id: str, verdict: GateVerdict, now_ns: int
-) -> TrackerState:
-    """Note the margin of the matrix in use; raise an alarm when it is short."""
+def on_margin(state: TrackerState, judged: ev.MarginJudged, now_ns: int) -> TrackerState:
+    """Note margin and loss of the matrix in use; raise an alarm when the margin is short."""
+    matrix_id, verdict = judged.id, judged.verdict
     record = state.reconstructor(matrix_id)
     if record is None:
         return state
     state = with_changed(state, replace(record, gate=verdict))
     if matrix_id != state.in_use:
         return state
-    state = replace(state, margin=verdict)
+    state = replace(state, margin=verdict, assessment=_assessment(judged, now_ns))
     if verdict.accepted:
         return without_alarm(state, "margin", now_ns)
     return with_alarm(state, "margin", f"{matrix_id}: {verdict.reason}", now_ns)
+
+
+def _assessment(judged: ev.MarginJudged, now_ns: int) -> Assessment | None:
+    if judged.alpha is None or judged.expected is None:
+        return None
+    return Assessment(id=judged.id, alpha=judged.alpha, expected=judged.expected, t_ns_utc=now_ns)

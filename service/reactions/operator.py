@@ -13,7 +13,7 @@ from service.reactions.journal import logged
 from service.reactions.matrices import Step, send
 from service.reactions.policy import Policy
 from service.reactions.shelf import known_record, with_state
-from service.reactions.update_choice import moved
+from service.reactions.worth import outdated
 from service.state import MatrixState, Mode, TrackerState
 
 
@@ -57,7 +57,7 @@ def on_command(  # noqa: C901 - one line for each command
 def _approve(state: TrackerState, matrix_id: str, policy: Policy, now_ns: int) -> Step:
     """Send a proposal, unless its verdict is of a registration that is no longer true."""
     _proposed(state, matrix_id)
-    if moved(state, known_record(state, matrix_id), policy):
+    if outdated(state, known_record(state, matrix_id)):
         raise CommandError(f"{matrix_id} was judged for another α than the present one: refit")
     return send(state, matrix_id, now_ns)
 

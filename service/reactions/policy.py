@@ -18,7 +18,7 @@ class Policy:
     dither_amplitude_m: float | None = None
     """RMS of each dithered mode, metres OPD; None: as little as serves."""
 
-    dither_budget_m: float = 10e-9
+    dither_budget_m: float = 8e-9
     """Largest RMS of all modes together, metres OPD."""
 
     dither_sigma: NDArray[np.float64] = field(
@@ -44,7 +44,7 @@ class Policy:
     window_s: float = 2.0
     """Shortest window of dithered telemetry."""
 
-    longest_window_s: float = 60.0
+    longest_window_s: float = 20.0
     """Longest one; faint stars and small budgets need long windows."""
 
     drift_rate: NDArray[np.float64]
@@ -67,11 +67,23 @@ class Policy:
     )
     """``(4,)`` 1 σ from which on α is stale, numeric units."""
 
+    acquires: bool = False
+    """Whether the service finds α from nothing by itself, in mode auto."""
+
+    acquisition_amplitude_m: float = 50e-9
+    """RMS of each mode dithered while the loop is open for it, metres OPD."""
+
     n_modes_target: int = 500
     """Modes to control once the registration is known."""
 
     update_threshold: NDArray[np.float64]
-    """``(4,)`` change of α that makes a new reconstructor worthwhile, numeric units."""
+    """``(4,)`` change of α that makes a new reconstructor whatever it wins, numeric units."""
+
+    update_gain_m: float = 0.5e-9
+    """Expected loss of wavefront error that makes a new reconstructor worthwhile, metres."""
+
+    update_margin: float = 0.08
+    """The same of the stability margin: share of a new one's that is lost."""
 
     minimum_interval_s: float = 5.0
     """Least time between two reconstructors."""

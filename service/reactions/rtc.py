@@ -62,7 +62,8 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     if rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None:
         state = with_in_use(state, rtc.cm_id)
     measuring = state.measuring
-    if rtc.loop == "open" and not (measuring is not None and measuring.opens_loop):
+    opened = state.acquisition.under_way or (measuring is not None and measuring.opens_loop)
+    if rtc.loop == "open" and not opened:
         state = with_alarm(state, "loop-open", "the loop is open: close it to calibrate", now_ns)
     else:
         state = without_alarm(state, "loop-open", now_ns)
@@ -93,6 +94,7 @@ def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerSta
         dither=None,
         in_use=None,
         margin=None,
+        assessment=None,
         judged_ns_utc=None,
         retry_ns_utc=0,
         registration=registration and replace(registration, n_windows=0),

@@ -74,4 +74,4 @@ def with_in_use(state: TrackerState, matrix_id: str) -> TrackerState:
         if record.id != matrix_id and record.state is MatrixState.APPLIED:
             state = with_state(state, record.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
     state = with_state(state, matrix_id, MatrixState.APPLIED, known_record(state, matrix_id).reason)
-    return replace(state, in_use=matrix_id, margin=None, judged_ns_utc=None)
+    return replace(state, in_use=matrix_id, margin=None, assessment=None, judged_ns_utc=None)

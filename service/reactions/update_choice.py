@@ -7,80 +7,79 @@ from dataclasses import replace
 import numpy as np
 
 from service.events import JudgeMatrix, MakeMatrix
-from service.model.misregistration import BOUNDARY_SCALE
 from service.reactions.matrices import Step
+from service.reactions.mode_ladder import fewer_than, more_to_try
 from service.reactions.policy import SECOND_NS, Policy
-from service.state import MatrixState, Mode, ReconstructorRecord, RtcView, TrackerState
+from service.reactions.worth import outdated, why_worthwhile
+from service.state import MatrixState, Mode, Registration, RtcView, TrackerState
 
 MIN_WINDOWS = 2
 """Windows that must agree before anything is made from them."""
 
 JUDGE_INTERVAL_S = 10.0
-"""Least time between two looks at the margin of the matrix in use."""
+"""Least time between two looks at the margin of the matrix in use, while α stays."""
+
+JUDGE_AGAIN_S = 2.0
+"""The same when α has moved."""
+
+NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
+"""A move of α that calls for a look at once (numeric units), if it is more than 1 σ."""
 
 _SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
 
 
 def judge_in_use(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
-    """Look at the margin of the matrix in use once α is known, and now and then."""
-    if state.registration is None or state.in_use is None:
+    """Look at the margin of the matrix in use once α is known, when it moves, and now and then."""
+    known = state.registration
+    if known is None or state.in_use is None or not _settled(known):
         return state, ()
-    if state.registration.n_windows < MIN_WINDOWS or state.making_since_ns_utc is not None:
-        return state, ()
-    waited = state.judged_ns_utc is None or (
-        now_ns - state.judged_ns_utc > JUDGE_INTERVAL_S * SECOND_NS
-    )
-    if not waited:
+    if state.making_since_ns_utc is not None or not _judgement_due(state, known, now_ns):
         return state, ()
     return replace(state, judged_ns_utc=now_ns), (JudgeMatrix(id=state.in_use),)
 
 
+def _judgement_due(state: TrackerState, known: Registration, now_ns: int) -> bool:
+    if state.judged_ns_utc is None:
+        return True
+    waited_s = (now_ns - state.judged_ns_utc) / SECOND_NS
+    last = state.assessment
+    if waited_s > JUDGE_INTERVAL_S or last is None:
+        return waited_s > JUDGE_INTERVAL_S
+    moved = np.abs(known.alpha.vector - last.alpha.vector)
+    noise = np.sqrt(np.diag(known.covariance))
+    return waited_s > JUDGE_AGAIN_S and bool(np.any(moved > np.maximum(NOTICED, noise)))
+
+
+def _settled(known: Registration) -> bool:
+    """Return whether α may be believed: windows agree, and none of them hints at a jump."""
+    return known.n_windows >= MIN_WINDOWS and known.candidate is None and known.usable
+
+
 def choose_update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
-    """Compute a reconstructor when the one in use no longer fits α, or could command more modes."""
-    registration = state.registration
-    if state.mode is Mode.HOLD or registration is None or registration.n_windows < MIN_WINDOWS:
-        return state, ()
-    if not registration.usable:
+    """Compute a reconstructor when it is worthwhile, or could command more modes."""
+    known = state.registration
+    if state.mode is Mode.HOLD or known is None or not _settled(known):
         return state, ()
     if rtc.loop != "closed" or state.making_since_ns_utc is not None:
         return state, ()
-    if _busy(state, policy) or now_ns < max(_next_attempt_ns(state, policy), state.retry_ns_utc):
+    if _busy(state) or now_ns < max(_next_attempt_ns(state, policy), state.retry_ns_utc):
         return state, ()
     in_use = state.reconstructor(state.in_use) if state.in_use else None
     if in_use is None:
         return state, ()
-    target = min(policy.n_modes_target, rtc.n_modes)
-    if moved(state, in_use, policy):
-        effect = MakeMatrix(n_modes=rtc.n_controlled, why=_why_moved(state, in_use))
-    elif rtc.n_controlled < target:
-        effect = MakeMatrix(n_modes=target, why=f"{rtc.n_controlled} of {target} modes controlled")
+    why, n_now = why_worthwhile(state, in_use, policy, now_ns), rtc.n_controlled
+    more = () if why is not None else more_to_try(state, rtc, policy, now_ns)
+    if why is not None:
+        effect = MakeMatrix(n_modes=n_now, why=why, fewer=fewer_than(n_now))
+    elif more:
+        why = f"{n_now} of {more[0]} modes controlled"
+        effect = MakeMatrix(n_modes=more[0], why=why, fewer=more[1:])
     else:
         return state, ()
     return replace(state, making_since_ns_utc=now_ns), (effect,)
 
 
-def moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
-    """Return whether α has moved from what this reconstructor was made for, beyond noise."""
-    if state.registration is None:
-        return False
-    if record.alpha is None or record.sigma is None:
-        return True
-    distance = np.abs(state.registration.alpha.vector - record.alpha.vector)
-    noise = np.sqrt(np.diag(state.registration.covariance))
-    return bool(np.any(distance > np.maximum(policy.update_threshold, 3.0 * noise)))
-
-
-def _why_moved(state: TrackerState, record: ReconstructorRecord) -> str:
-    if record.alpha is None or state.registration is None:
-        return f"{record.id} was not made for a known registration"
-    step = (state.registration.alpha.vector - record.alpha.vector) * BOUNDARY_SCALE
-    return (
-        f"moved by {step[0]:+.3f}, {step[1]:+.3f} subap, {step[2]:+.3f} deg, {step[3]:+.4f} "
-        f"since {record.id}"
-    )
-
-
-def _busy(state: TrackerState, policy: Policy) -> bool:
+def _busy(state: TrackerState) -> bool:
     """Return whether a reconstructor is on its way, or one that fits α awaits an operator.
 
     In auto nobody is going to decide on a proposal left from another mode or an absent RTC.
@@ -90,7 +89,7 @@ def _busy(state: TrackerState, policy: Policy) -> bool:
         or (
             r.state is MatrixState.PROPOSED
             and state.mode is not Mode.AUTO
-            and not moved(state, r, policy)
+            and not outdated(state, r)
         )
         for r in state.reconstructors
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service import __version__
 from service import events as ev
 from service.archive import Archive
-from service.control.gate import LoopSettings
+from service.control.gate import GateVerdict
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.events import Effect, Event
 from service.link.events import MeasuredMatrix
@@ -24,6 +24,7 @@ from service.rtc_bridge import Bridge
 from service.runtime import translate
 from service.runtime.asking import Question, ask
 from service.runtime.crew import Crew
+from service.runtime.loops import loop_settings, timing
 from service.state import (
     MatrixState,
     ReconstructorRecord,
@@ -33,9 +34,6 @@ from service.state import (
 )
 from service.wire import LoopRequest, checksum, layout_of
 from service.worker import Workbench
-
-GAIN_SAFETY = 1.1
-"""The gate assumes optical gains this much above the measured ones, for modes not dithered."""
 
 UNKNOWN_PARENT = "unknown"
 """Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""
@@ -95,6 +93,8 @@ class Deeds:
                 return await self._fetch(matrix_id)
             case ev.SendMatrix():
                 return await self._send(effect, state)
+            case ev.AskLoop(judged=True):
+                return await self._ask_judged(effect, state)
             case _:
                 return await self._ask(effect)
 
@@ -152,17 +152,18 @@ class Deeds:
 
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
-        gains = extended_gains(rtc, effect.n_modes)[: effect.n_modes]
+        gains = (effect.gains or extended_gains(rtc, effect.n_modes))[: effect.n_modes]
         made = await self._crew.call(
             Workbench.make,
             registration.alpha,
             registration.total_covariance,
-            _loop_settings(rtc, gains, registration),
+            loop_settings(rtc, gains, registration),
             self._publishing.pole_radius_bound,
+            effect.fewer,
         )
         accepted = made.gate.accepted
         parent = state.in_use or UNKNOWN_PARENT
-        record = self._record(effect.n_modes, effect.why, registration, parent)
+        record = self._record(len(made.matrix), effect.why, registration, parent)
         record = replace(
             record,
             state=MatrixState.PROPOSED if accepted else MatrixState.REFUSED,
@@ -171,7 +172,9 @@ class Deeds:
             sha256=checksum(made.matrix),
         )
         await self._keep(record, made.matrix, registration, effect.why)
-        return ev.MatrixMade(record=record, wanted=False)
+        return ev.MatrixMade(
+            record=record, wanted=False, asked_modes=effect.n_modes, why_fewer=made.why_fewer
+        )
 
     async def _copy(self, effect: ev.CopyMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), state.registration
@@ -180,14 +183,7 @@ class Deeds:
         gate = None
         if registration is not None:
             gains = extended_gains(rtc, len(matrix))[: len(matrix)]
-            gate = await self._crew.call(
-                Workbench.judge,
-                matrix,
-                registration.alpha,
-                registration.total_covariance,
-                _loop_settings(rtc, gains, registration),
-                self._publishing.pole_radius_bound,
-            )
+            gate = await self._verdict(matrix, gains, rtc, registration)
         refused = gate is not None and not gate.accepted
         record = replace(
             self._record(len(matrix), effect.why, None, effect.source),
@@ -196,6 +192,7 @@ class Deeds:
             sigma=None if source is None else source.sigma,
             condition_number=None if source is None else source.condition_number,
             gate=gate,
+            optical_gains=() if registration is None else registration.optical_gains,
             sha256=checksum(matrix),
         )
         await self._keep(record, matrix, None, effect.why)
@@ -204,15 +201,44 @@ class Deeds:
     async def _judge(self, matrix_id: str, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
         matrix = await asyncio.to_thread(self.matrix, matrix_id)
-        verdict = await self._crew.call(
+        verdict = await self._verdict(matrix, rtc.gains[: len(matrix)], rtc, registration)
+        expected = await self._crew.call(
+            Workbench.assess,
+            matrix,
+            registration.alpha,
+            timing(rtc, len(matrix), registration),
+            rtc.magnitude,
+        )
+        return ev.MarginJudged(
+            id=matrix_id, verdict=verdict, alpha=registration.alpha, expected=expected
+        )
+
+    async def _verdict(
+        self,
+        matrix: NDArray[np.float32],
+        gains: tuple[float, ...],
+        rtc: RtcView,
+        registration: Registration,
+    ) -> GateVerdict:
+        return await self._crew.call(
             Workbench.judge,
             matrix,
             registration.alpha,
             registration.total_covariance,
-            _loop_settings(rtc, rtc.gains[: len(matrix)], registration),
+            loop_settings(rtc, gains, registration),
             self._publishing.pole_radius_bound,
         )
-        return ev.MarginJudged(id=matrix_id, verdict=verdict)
+
+    async def _ask_judged(self, effect: ev.AskLoop, state: TrackerState) -> Event | None:
+        """Ask for gains only if the gate lets the matrix in use run with them."""
+        rtc, registration = _there(state), _registered(state)
+        if state.in_use is None or effect.gains is None:
+            raise CommandError("the reconstructor in use is not known: its gains cannot be judged")
+        matrix = await asyncio.to_thread(self.matrix, state.in_use)
+        verdict = await self._verdict(matrix, effect.gains[: len(matrix)], rtc, registration)
+        if not verdict.accepted:
+            return ev.LoopAnswered(id=effect.id, accepted=False, reason=verdict.reason)
+        return await self._ask(effect)
 
     async def _fetch(self, matrix_id: str) -> Event:
         manifest, matrix = await self._bridge.fetch_applied()
@@ -260,6 +286,7 @@ class Deeds:
             alpha=None if registration is None else registration.alpha,
             sigma=None if registration is None else registration.sigma,
             parent=parent,
+            optical_gains=() if registration is None else registration.optical_gains,
             reason=why,
         )
 
@@ -310,15 +337,3 @@ def _registered(state: TrackerState) -> Registration:
     if state.registration is None:
         raise CommandError("α is not known")
     return state.registration
-
-
-def _loop_settings(
-    rtc: RtcView, gains: tuple[float, ...], registration: Registration
-) -> LoopSettings:
-    measured = registration.optical_gain
-    return LoopSettings(
-        gains=np.array(gains),
-        leak=rtc.leak,
-        delay_frames=rtc.delay_frames,
-        optical_gain=1.0 if measured is None else GAIN_SAFETY * measured,
-    )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
+from service.state.registration import ModeGain
 
 
 class MatrixState(StrEnum):
@@ -76,6 +77,9 @@ class ReconstructorRecord:
 
     gate: GateVerdict | None = None
     """The stability gate's latest verdict; None: not judged yet."""
+
+    optical_gains: tuple[ModeGain, ...] = ()
+    """Measured when it was made, for the table of loop gains beside it; never folded in."""
 
     reason: str = ""
     """Why it is in this state: the RTC's or the operator's words."""

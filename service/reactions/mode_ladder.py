@@ -1,0 +1,91 @@
+"""How many modes to control: fewer where the gate will not have more, and more again later."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service.reactions.journal import logged
+from service.reactions.policy import SECOND_NS, Policy
+from service.state import (
+    Level,
+    MatrixState,
+    ModeLimit,
+    ReconstructorRecord,
+    RtcView,
+    TrackerState,
+)
+
+LADDER = (594, 500, 400, 300, 200, 150, 100, 60, 30)
+"""Numbers of modes that are tried: each leaves the mirror a good deal calmer than the last."""
+
+FIRST_WAIT_S = 60.0
+"""After modes were lowered, before more are tried."""
+
+LONGEST_WAIT_S = 1800.0
+
+FORGIVEN_AFTER_S = 3600.0
+"""A limit found again later than this has nothing to do with the last one."""
+
+COMFORT = 1.5
+"""More modes are tried only while there is this times the margin that the gate asks for."""
+
+
+def fewer_than(n_modes: int) -> tuple[int, ...]:
+    """Return the rungs below ``n_modes``, largest first."""
+    return tuple(rung for rung in LADDER if rung < n_modes)
+
+
+def more_to_try(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> tuple[int, ...]:
+    """Return the numbers of modes above the present one that may be tried now, largest first."""
+    target = min(policy.n_modes_target, rtc.n_modes)
+    limit = state.mode_limit
+    if limit is not None and (now_ns < limit.until_ns_utc or not _comfortable(state)):
+        target = min(target, limit.n_modes)
+    rungs = {target, *fewer_than(target)}
+    return tuple(sorted((rung for rung in rungs if rung > rtc.n_controlled), reverse=True))
+
+
+def _comfortable(state: TrackerState) -> bool:
+    margin = state.margin
+    if margin is None or not margin.accepted:
+        return False
+    return 1.0 - margin.worst_pole_radius >= COMFORT * (1.0 - margin.bound)
+
+
+def with_limit(
+    state: TrackerState, record: ReconstructorRecord, asked: int, why_fewer: str, now_ns: int
+) -> TrackerState:
+    """Note what a reconstructor asked to have ``asked`` modes says of how many are possible."""
+    n_now = state.rtc.n_controlled if state.rtc is not None else record.n_modes
+    if record.state is MatrixState.REFUSED:
+        if asked <= n_now:
+            return state
+        reason = record.gate.reason if record.gate is not None else record.reason
+        return _limited(state, n_now, reason, now_ns)
+    if record.n_modes < asked:
+        state = _limited(state, record.n_modes, why_fewer, now_ns)
+    if record.n_modes < n_now:
+        text = f"{n_now} modes lowered to {record.n_modes}: {why_fewer}"
+        return logged(state, "modes.lowered", text, now_ns, Level.WARNING)
+    if record.n_modes > n_now:
+        state = logged(state, "modes.raised", f"{n_now} modes to {record.n_modes}", now_ns)
+    limit = state.mode_limit
+    if limit is not None and record.n_modes > limit.n_modes:
+        # kept: a limit found again soon must be waited out longer
+        state = replace(state, mode_limit=replace(limit, n_modes=record.n_modes))
+    return state
+
+
+def _limited(state: TrackerState, n_modes: int, reason: str, now_ns: int) -> TrackerState:
+    before, wait_s = state.mode_limit, FIRST_WAIT_S
+    if before is not None and now_ns - before.since_ns_utc < FORGIVEN_AFTER_S * SECOND_NS:
+        wait_s = min(2.0 * before.wait_s, LONGEST_WAIT_S)
+    limit = ModeLimit(
+        n_modes=n_modes,
+        since_ns_utc=now_ns,
+        until_ns_utc=now_ns + round(wait_s * SECOND_NS),
+        wait_s=wait_s,
+        reason=reason,
+    )
+    text = f"no more than {n_modes} modes for {wait_s:.0f} s: {reason}"
+    return logged(replace(state, mode_limit=limit), "modes.limited", text, now_ns)

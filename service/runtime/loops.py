@@ -1,0 +1,47 @@
+"""The loop as the gate and the expected gain see it: the RTC's settings, the sensor's gains."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.expected_gain import Timing
+from service.control.gate import LoopSettings
+from service.reactions.gain_tables import table_of
+from service.state import Registration, RtcView
+
+GAIN_SAFETY = 1.1
+"""Above a mean optical gain that nobody says which modes it is of."""
+
+
+def loop_settings(
+    rtc: RtcView, gains: tuple[float, ...], registration: Registration
+) -> LoopSettings:
+    """Return the loop the gate is to judge, with the largest optical gains it may have."""
+    return LoopSettings(
+        gains=np.array(gains),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        optical_gain=_highest(registration, len(gains)),
+    )
+
+
+def timing(rtc: RtcView, n_controlled: int, registration: Registration) -> Timing:
+    """Return the loop as it is expected to run."""
+    optical_gain = np.full(rtc.n_modes, registration.optical_gain or 1.0)
+    if registration.optical_gains:
+        optical_gain = table_of(registration.optical_gains, rtc.n_modes).optical_gain
+    return Timing(
+        frame_rate_hz=rtc.frame_rate_hz,
+        delay_frames=rtc.delay_frames,
+        leak=rtc.leak,
+        gains=np.array(rtc.gains[:n_controlled]),
+        optical_gain=optical_gain,
+    )
+
+
+def _highest(registration: Registration, n_modes: int) -> float | NDArray[np.float64]:
+    if registration.optical_gains:
+        return table_of(registration.optical_gains, n_modes).highest
+    mean = registration.optical_gain
+    return 1.0 if mean is None else GAIN_SAFETY * mean

@@ -94,6 +94,20 @@ class RandomEstimate:
         """Which of the four parameters it can tell."""
         return RANDOM
 
+    def gains_by_group(self, n_groups: int) -> tuple[tuple[int, ...], Array, Array]:
+        """Return modes, gains and their 1 σ of at most so many groups of neighbours, in order.
+
+        One mode among hundreds says little of its gain, and neighbours have nearly the same: they
+        are averaged by their noise, and the middle one stands for all.
+        """
+        order = np.argsort(self.modes)
+        groups = [g for g in np.array_split(order, min(n_groups, len(order))) if len(g)]
+        weights = self.gain_sigma**-2.0
+        gains = [float(np.average(self.optical_gain[g], weights=weights[g])) for g in groups]
+        sigma = [float(weights[g].sum() ** -0.5) for g in groups]
+        modes = tuple(self.modes[g[len(g) // 2]] for g in groups)
+        return modes, np.array(gains), np.array(sigma)
+
 
 def noisy_matrix(window: Correlated) -> NoisyMatrix:
     """Return the interaction matrix that a window's correlations hold.

@@ -8,6 +8,7 @@ import numpy as np
 
 from service.control.precision import forgetting_mean, measured_ratio
 from service.estimation.instrumental import WindowEstimate
+from service.estimation.noisymatrix import RandomEstimate
 from service.events import AskDither, AskNoDither
 from service.reactions.dither_choice import OWN_DITHER, plan_dither, total_m, why_unusable
 from service.reactions.dither_pace import (
@@ -72,9 +73,13 @@ def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
     return _ask(state, rtc, policy, wish, now_ns)
 
 
-def learnt(before: TrackerState, after: TrackerState, estimate: WindowEstimate) -> TrackerState:
+def learnt(
+    before: TrackerState, after: TrackerState, estimate: WindowEstimate | RandomEstimate
+) -> TrackerState:
     """Return the state after a window, with what it says of the precision of windows."""
     accepted = after.windows_accepted > before.windows_accepted
+    if isinstance(estimate, RandomEstimate):
+        return after
     if not accepted or estimate.dither_m <= 0.0 or after.rtc is None:
         return after
     magnitude, known = after.rtc.magnitude, after.dithering.precision

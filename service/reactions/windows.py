@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
+from service.estimation.noisymatrix import RandomEstimate
+from service.model.misregistration import Misregistration
 from service.reactions.dither import found_again
 from service.reactions.journal import OFF_LOOP, logged, with_alarm, without_alarm
 from service.reactions.modal_gain import followed_gains
@@ -14,6 +18,8 @@ from service.reactions.policy import Policy
 from service.reactions.tracking import Measured, with_window
 from service.reactions.validity import USELESS_SIGMA
 from service.state import Level, Source, TrackerState
+
+Array = NDArray[Any]
 
 CAPTURE_RANGE = np.array([0.8, 0.8, np.deg2rad(2.0), 0.02])
 """Beyond this, one linearised fit with high modes cannot be trusted (numeric units)."""
@@ -26,6 +32,9 @@ GAIN_RANGE = (0.1, 3.0)
 mirror is seen twice."""
 
 
+GAIN_GROUPS = 16
+"""A random dither on more modes than this is believed on the gains of neighbours together."""
+
 _OUT_OF_HAND = {
     "loop-diverging": "the loop was diverging",
     "edge-slip": "the edge had slipped",
@@ -35,32 +44,40 @@ _OUT_OF_HAND = {
 
 
 def on_window(
-    state: TrackerState, estimate: WindowEstimate, policy: Policy, now_ns: int
+    state: TrackerState, estimate: WindowEstimate | RandomEstimate, policy: Policy, now_ns: int
 ) -> TrackerState:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     reason = _why_useless(state, estimate)
     if reason is not None:
         return refuse_window(state, reason, now_ns)
     state = without_alarm(found_again(state, now_ns), "columns-misaligned", now_ns)
-    known, gains = state.registration, np.abs(estimate.optical_gain)
+    known, random = state.registration, isinstance(estimate, RandomEstimate)
+    modes, gains, gain_sigma = _gains_of(estimate)
     measured = Measured(
         alpha=estimate.alpha,
         covariance=estimate.covariance,
         t_ns_utc=estimate.t_ns_utc,
-        source=Source.LOCK_IN,
+        source=Source.RANDOM if random else Source.LOCK_IN,
         optical_gain=float(gains.mean()),
         optical_gains=followed_gains(
             () if known is None else known.optical_gains,
-            estimate.modes,
-            gains[: len(estimate.modes)],
-            estimate.gain_sigma,
+            modes,
+            gains[: len(modes)],
+            gain_sigma,
             estimate.t_ns_utc,
         ),
     )
     return with_window(state, measured, policy, now_ns)
 
 
-def _why_useless(state: TrackerState, estimate: WindowEstimate) -> str | None:
+def _gains_of(estimate: WindowEstimate | RandomEstimate) -> tuple[tuple[int, ...], Array, Any]:
+    """Return modes, moduli of their gains, and 1 σ of them where it is known."""
+    if isinstance(estimate, RandomEstimate):
+        return estimate.gains_by_group(GAIN_GROUPS)
+    return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
+
+
+def _why_useless(state: TrackerState, estimate: WindowEstimate | RandomEstimate) -> str | None:
     """Return why a window's estimate must not be used, or None."""
     if state.rtc is None or estimate.session != state.rtc.session:
         return "the RTC has restarted since"
@@ -70,7 +87,7 @@ def _why_useless(state: TrackerState, estimate: WindowEstimate) -> str | None:
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
         return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
-    gains = np.abs(estimate.optical_gain)
+    _, gains, _ = _gains_of(estimate)
     if gains.min() < GAIN_RANGE[0] or gains.max() > GAIN_RANGE[1]:
         return (
             f"optical gains of {gains.min():.2f} to {gains.max():.2f}, expected {GAIN_RANGE[0]} "
@@ -79,7 +96,9 @@ def _why_useless(state: TrackerState, estimate: WindowEstimate) -> str | None:
     sigma = np.sqrt(np.diag(estimate.covariance))
     if np.any(sigma > USELESS_SIGMA):
         return "too uncertain: raise the dither's amplitude or the window's length"
-    distance = np.abs(estimate.alpha.vector - [0.0, 0.0, 0.0, 1.0])
+    known = state.registration
+    near = Misregistration() if known is None else known.alpha
+    distance = np.abs(estimate.alpha.vector - near.vector)
     if np.any(distance > CAPTURE_RANGE):
         return f"outside the capture range: {estimate.alpha.to_boundary()}"
     return None

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation import lockin, loopcheck, passive
+from service.estimation import lockin, loopcheck, passive, randomdither
 from service.estimation.edge import EdgeHealth, EdgeWatch, edge_watch, observe_edge
 from service.estimation.frames import FrameBlock
 from service.estimation.health import LoopHealth, observe
 from service.estimation.lockin import LockIn, Spectra, WindowRefused
 from service.estimation.loopcheck import LoopCheck, LoopTerms, Obedience
 from service.estimation.passive import Passive
+from service.estimation.randomdither import Correlated, RandomDither
 from service.estimation.vibration import Hearing, heard, hearing
 from service.reactions.dither_choice import SETTLING_S, lock_in_plan
 from service.reactions.journal import OFF_LOOP
-from service.state import DitherView, RtcView
+from service.reactions.random_dither import random_plan
+from service.state import DitherKind, DitherView, RtcView
 from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0
@@ -40,7 +43,10 @@ class Streams:
     """The loop the frames come from."""
 
     lock_in: LockIn | None = None
-    """None while no dither runs."""
+    """None while no sine is dithered."""
+
+    random: RandomDither | None = None
+    """None while no random signs are dithered."""
 
     dither: DitherView | None = None
     """The one whose windows are under way, or cannot be."""
@@ -68,7 +74,7 @@ class Streams:
     """How the commands fail to obey the loop; None: they obey, or nobody knows."""
 
 
-Window = Spectra | WindowRefused
+Window = Spectra | Correlated | WindowRefused
 
 
 def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
@@ -81,6 +87,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
             hearing=None,
             passive=None,
             lock_in=None,
+            random=None,
             dither=None,
             check=LoopCheck(),
             off=None,
@@ -94,8 +101,9 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     memory = Passive(n_modes=rtc.n_controlled, memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz)
     if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
         ears = hearing(rtc.n_slopes)
-        return replace(streams, hearing=ears, passive=memory, lock_in=None, dither=None)
-    return replace(streams, passive=memory, lock_in=_cut(streams.lock_in, rtc))
+        streams = replace(streams, lock_in=None, random=None, dither=None)
+        return replace(streams, hearing=ears, passive=memory)
+    return _cut(replace(streams, passive=memory), rtc)
 
 
 def _watching_the_edge(streams: Streams, rtc: RtcView) -> Streams:
@@ -107,17 +115,21 @@ def _watching_the_edge(streams: Streams, rtc: RtcView) -> Streams:
     return replace(streams, edge_watch=watch)
 
 
-def _cut(lock_in: LockIn | None, rtc: RtcView) -> LockIn | None:
+def _cut(streams: Streams, rtc: RtcView) -> Streams:
     """Give up the open window; the next begins when the changed loop has settled.
 
     Counted from the status' own frame, not from when it was read, so that a recorded night is cut
     at the same frames again.
     """
-    if lock_in is None:
-        return None
     settled_seq = rtc.seq + round(SETTLING_S * rtc.frame_rate_hz)
-    plan = replace(lock_in.plan, first_seq=max(lock_in.plan.first_seq, settled_seq))
-    return LockIn(plan=plan)
+    lock_in, random = streams.lock_in, streams.random
+    if lock_in is not None:
+        sines = replace(lock_in.plan, first_seq=max(lock_in.plan.first_seq, settled_seq))
+        return replace(streams, lock_in=LockIn(plan=sines))
+    if random is not None:
+        signs = replace(random.plan, first_seq=max(random.plan.first_seq, settled_seq))
+        return replace(streams, random=RandomDither(plan=signs))
+    return streams
 
 
 def _same_loop(before: RtcView, after: RtcView) -> bool:
@@ -171,19 +183,26 @@ def with_dither(streams: Streams, dither: DitherView | None, window_s: float) ->
     Raises
     ------
     ModelError
-        If its lines cannot be told apart in a window of ``window_s``.
+        If its lines, or its modes, cannot be told apart in a window of ``window_s``.
     """
     rtc = streams.rtc
     if dither is None or dither.start_seq is None or rtc is None:
-        return replace(streams, lock_in=None, dither=None, dither_silent_s=0.0)
+        return replace(streams, lock_in=None, random=None, dither=None, dither_silent_s=0.0)
     dither = replace(dither, asked_ns_utc=0)
     if dither == streams.dither:
         return streams
     # a status may announce a dither that began long ago
     seen_seq = max(dither.start_seq or 0, rtc.seq)
     streams = replace(
-        streams, lock_in=None, dither=dither, dither_seen_seq=seen_seq, dither_silent_s=0.0
+        streams,
+        lock_in=None,
+        random=None,
+        dither=dither,
+        dither_seen_seq=seen_seq,
+        dither_silent_s=0.0,
     )
+    if dither.kind is DitherKind.BINARY:
+        return replace(streams, random=RandomDither(plan=random_plan(dither, rtc, window_s)))
     return replace(streams, lock_in=LockIn(plan=lock_in_plan(dither, rtc, window_s)))
 
 
@@ -196,11 +215,8 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     if terms is not None:
         streams = replace(streams, check=loopcheck.observe(streams.check, block, terms))
     streams = _listening(streams, rtc, block)
-    windows: list[Window] = []
-    if streams.lock_in is not None:
-        lock_in, ended = lockin.accumulate(streams.lock_in, block)
-        windows = [_obeying(streams, window) for window in ended]
-        streams = replace(streams, lock_in=_within_the_dither(streams, rtc, lock_in))
+    streams, ended = _dithered(streams, rtc, block)
+    windows = [_obeying(streams, window) for window in ended]
     if streams.hearing is not None and rtc.loop == "closed":
         lines = () if streams.dither is None else streams.dither.frequency_hz
         streams = replace(streams, hearing=heard(streams.hearing, block, lines))
@@ -215,13 +231,28 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     return streams, windows
 
 
-def _within_the_dither(streams: Streams, rtc: RtcView, lock_in: LockIn) -> LockIn | None:
-    """Begin no window that the end of the dither would cut."""
-    dither, window = streams.dither, lock_in.window
+def _dithered(
+    streams: Streams, rtc: RtcView, block: FrameBlock
+) -> tuple[Streams, Sequence[Window]]:
+    """Feed whichever estimator reads the dither that runs."""
+    if streams.lock_in is not None:
+        lock_in, spectra = lockin.accumulate(streams.lock_in, block)
+        over = _beyond_the_dither(streams, rtc, lock_in)
+        return replace(streams, lock_in=None if over else lock_in), spectra
+    if streams.random is not None:
+        random, correlated = randomdither.accumulate(streams.random, block)
+        over = _beyond_the_dither(streams, rtc, random)
+        return replace(streams, random=None if over else random), correlated
+    return streams, ()
+
+
+def _beyond_the_dither(streams: Streams, rtc: RtcView, reading: LockIn | RandomDither) -> bool:
+    """Return whether the end of the dither would cut the window that has begun."""
+    dither, window = streams.dither, reading.window
     if dither is None or window is None:
-        return lock_in
+        return False
     stop_seq = (dither.start_seq or 0) + round(dither.duration_s * rtc.frame_rate_hz)
-    return None if window.span.first_seq + lock_in.plan.n_frames > stop_seq else lock_in
+    return window.span.first_seq + reading.plan.n_frames > stop_seq
 
 
 def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:
@@ -238,8 +269,10 @@ def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:
 
 def _obeying(streams: Streams, window: Window) -> Window:
     """Return a window, or why its commands are not what the loop makes of its slopes."""
-    terms = _terms(streams, window.cm_id) if isinstance(window, Spectra) else None
-    if terms is None or isinstance(window, WindowRefused):
+    if isinstance(window, WindowRefused):
+        return window
+    terms = _terms(streams, window.cm_id)
+    if terms is None:
         return window
     last_seq = window.first_seq + window.plan.n_frames - 1
     _, found = loopcheck.obedience(streams.check, terms, window.first_seq, last_seq, WINDOW_SAMPLES)

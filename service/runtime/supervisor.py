@@ -17,6 +17,7 @@ from service import events as ev
 from service.archive import Archive
 from service.errors import PyrcalError, WorkerError
 from service.estimation.lockin import Spectra, WindowRefused
+from service.estimation.randomdither import Correlated
 from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
 from service.reactions.policy import Policy
@@ -28,7 +29,7 @@ from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.runtime.following import followed, news, shape_news
 from service.runtime.resuming import SAVE_INTERVAL_S, has_news, leave
-from service.runtime.streams import Streams, fed, with_matrix
+from service.runtime.streams import Streams, Window, fed, with_matrix
 from service.runtime.windows import fitted, watched
 from service.state import Level, LogEntry, MeasureState, TrackerState
 from service.tracker import step
@@ -70,7 +71,7 @@ class Supervisor:
         self._archive = archive
         self._deeds = deeds
         self._streams: Streams | None = None
-        self._windows: asyncio.Queue[Spectra] = asyncio.Queue(WINDOWS_WAITING)
+        self._windows: asyncio.Queue[Spectra | Correlated] = asyncio.Queue(WINDOWS_WAITING)
         self._unrecorded = asyncio.Event()
         self._running: set[asyncio.Task[None]] = set()
         self._started_ns = time.time_ns()
@@ -176,7 +177,7 @@ class Supervisor:
         for event in news(was_silent_s, self._streams, self._state):
             self._post(event)
 
-    def _take(self, window: Spectra | WindowRefused) -> None:
+    def _take(self, window: Window) -> None:
         if isinstance(window, WindowRefused):
             self._post(ev.WindowLost(refused=window))
             return
@@ -209,8 +210,8 @@ class Supervisor:
 
     async def _fit(self) -> None:
         while True:
-            spectra = await self._windows.get()
-            self._post(await fitted(spectra, self._state, self._crew, self._deeds))
+            window = await self._windows.get()
+            self._post(await fitted(window, self._state, self._crew, self._deeds))
 
     async def _watch(self) -> None:
         while True:

@@ -8,8 +8,10 @@ import numpy as np
 
 from service import events as ev
 from service.errors import PyrcalError
+from service.estimation.estimator import Window
 from service.estimation.instrumental import Loop
 from service.estimation.lockin import Spectra, WindowRefused
+from service.estimation.randomdither import Correlated
 from service.events import Event
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
@@ -18,8 +20,30 @@ from service.state import Level, TrackerState
 from service.worker import Workbench
 
 
-async def fitted(spectra: Spectra, state: TrackerState, crew: Crew, deeds: Deeds) -> Event:
+async def fitted(
+    window: Spectra | Correlated, state: TrackerState, crew: Crew, deeds: Deeds
+) -> Event:
     """Return what becomes of one window: an estimate, or why there is none."""
+    if isinstance(window, Correlated):
+        return await _correlated(window, state, crew)
+    return await _demodulated(window, state, crew, deeds)
+
+
+async def _correlated(window: Correlated, state: TrackerState, crew: Crew) -> Event:
+    """Return what a window of random dither says; it needs no reconstructor."""
+    known = state.registration
+    try:
+        start = None if known is None else known.alpha
+        outcome = await crew.call(Workbench.fit_random, window, start)
+    except PyrcalError as error:
+        return lost(window, str(error))
+    if isinstance(outcome, WindowRefused):
+        return ev.WindowLost(refused=outcome)
+    return ev.WindowFitted(estimate=outcome)
+
+
+async def _demodulated(spectra: Spectra, state: TrackerState, crew: Crew, deeds: Deeds) -> Event:
+    """Return what a window of sines says of the registration."""
     rtc, known = state.rtc, state.registration
     if rtc is None or spectra.cm_id is None:
         return lost(spectra, "the RTC or its reconstructor is not known")
@@ -54,7 +78,7 @@ async def watched(
     return None if estimate is None else ev.Watched(estimate=estimate, t_ns_utc=now_ns)
 
 
-def lost(spectra: Spectra, reason: str) -> Event:
+def lost(window: Window, reason: str) -> Event:
     """Return what becomes of a window that cannot be fitted."""
-    refused = WindowRefused(reason=reason, t_ns_utc=spectra.t_end_ns_utc)
+    refused = WindowRefused(reason=reason, t_ns_utc=window.t_end_ns_utc)
     return ev.WindowLost(refused=refused)

@@ -4,6 +4,7 @@ from service.state.acquisition import Acquisition, AcquisitionStage, LoopFound
 from service.state.dithering import Dithering, DitherPhase, DitherPlan, Precision
 from service.state.journal import Alarm, Level, LogEntry
 from service.state.measurements import MeasurementRecord, MeasurePattern, MeasureState
+from service.state.noisy import ModeSet, NoisyFinding, NoisyRecord, NoisyState
 from service.state.pointing import Pointing
 from service.state.reconstructors import MatrixState, ReconstructorRecord
 from service.state.registration import (
@@ -46,6 +47,10 @@ __all__ = [
     "Mode",
     "ModeGain",
     "ModeLimit",
+    "ModeSet",
+    "NoisyFinding",
+    "NoisyRecord",
+    "NoisyState",
     "PassiveBias",
     "Pointing",
     "Precision",

@@ -1,0 +1,82 @@
+"""What a window of random dither does to the registration."""
+
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.estimation.noisymatrix import RandomEstimate
+from service.state import Source
+from tests.unit.reactions.situations import ALPHA, PRECISE, Story, moved
+
+
+def random_estimate(alpha=ALPHA, *, t_ns=0, n_modes=400, **changes):
+    values = {
+        "alpha": alpha,
+        "covariance": PRECISE,
+        "optical_gain": np.full(n_modes, 0.6),
+        "gain_sigma": np.full(n_modes, 0.04),
+        "lag_frames": np.zeros(1),
+        "misfit": 1.0,
+        "step": np.zeros(4),
+        "t_ns_utc": t_ns,
+        "cm_id": "initial",
+        "session": "s1",
+        "modes": tuple(range(n_modes)),
+    }
+    return RandomEstimate(**(values | changes))
+
+
+def see(story, **changes):
+    story.now_ns += 5_000_000_000
+    return story.tell(ev.WindowFitted(estimate=random_estimate(t_ns=story.now_ns, **changes)))
+
+
+def test_a_window_of_random_dither_enters_the_registration_like_any_other():
+    story = Story().meet()
+    see(story)
+    known = story.state.registration
+    np.testing.assert_allclose(known.alpha.vector, ALPHA.vector)
+    assert story.state.history[-1].source is Source.RANDOM
+    assert known.optical_gain == pytest.approx(0.6)
+
+
+def test_gains_of_hundreds_of_modes_are_kept_as_those_of_a_few_groups():
+    story = Story().meet()
+    see(story)
+    gains = story.state.registration.optical_gains
+    assert 4 <= len(gains) <= 32
+    assert gains[0].mode < 50 < 350 < gains[-1].mode
+
+
+def test_one_noisy_gain_among_hundreds_is_no_reason_to_refuse_a_window():
+    story = Story().meet()
+    gains = np.full(400, 0.6)
+    gains[7] = -0.2
+    see(story, optical_gain=gains, gain_sigma=np.full(400, 0.3))
+    assert story.state.windows_accepted == 1
+
+
+def test_a_dither_nobody_sees_is_refused_for_its_gains():
+    story = Story().meet()
+    see(story, optical_gain=np.full(400, 0.02))
+    assert story.state.windows_refused == 1
+    assert "optical gains of 0.02 to 0.02" in story.state.log[-1].text
+
+
+def test_neighbours_are_averaged_by_their_noise():
+    """Two modes of gain 1 ± 0.1 and 0 ± 0.2: 0.8, ± 0.0894."""
+    pair = random_estimate(
+        n_modes=2, optical_gain=np.array([1.0, 0.0]), gain_sigma=np.array([0.1, 0.2])
+    )
+    modes, gains, sigma = pair.gains_by_group(1)
+    assert modes == (1,)
+    assert gains[0] == pytest.approx(0.8)
+    assert sigma[0] == pytest.approx(1 / np.sqrt(125))
+
+
+def test_a_jump_seen_by_random_signs_needs_a_second_window():
+    story = Story().meet()
+    for _ in range(3):
+        see(story)
+    see(story, alpha=moved(shift_x_subap=0.1))
+    assert story.state.registration.candidate is not None

@@ -1,0 +1,138 @@
+"""Random dither in the streams of a running service."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.errors import CommandError, ModelError
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import WindowRefused
+from service.estimation.randomdither import Correlated
+from service.reactions.random_dither import Asked, plan_random
+from service.runtime.streams import Streams, fed, with_dither, with_rtc
+from service.state import DitherKind, DitherView, ModeSet
+from service.worker import Description
+from tests.unit.reactions.situations import POLICY, rtc
+
+N_SLOPES, N_MODES = 6, 8
+DESCRIPTION = Description(
+    n_slopes=N_SLOPES, n_modes=N_MODES, mode_variance_m2=np.full(N_MODES, 1e-16)
+)
+RTC = rtc(4, n_modes=N_MODES, n_slopes=N_SLOPES, gains=(0.4,) * 4 + (0.0,) * 4)
+DITHER = DitherView(
+    id="noisy-1",
+    kind=DitherKind.BINARY,
+    modes=(1, 6),
+    amplitude_m=(2e-9, 2e-9),
+    frequency_hz=(),
+    seed=5,
+    duration_s=1.2,
+    window_s=0.4,
+    start_seq=0,
+    asked_ns_utc=0,
+)
+
+
+def block(first_seq, n=100, *, dither=True, cm_id="initial"):
+    rng = np.random.default_rng(first_seq)
+    added = np.zeros((n, N_MODES), np.float32)
+    added[:, [1, 6]] = 2e-9 * rng.choice([-1.0, 1.0], (n, 2))
+    return FrameBlock(
+        session="s1",
+        first_seq=first_seq,
+        t0_ns_utc=first_seq * 1_000_000,
+        dt_ns=1_000_000,
+        slopes=rng.standard_normal((n, N_SLOPES)).astype(np.float32),
+        commands_m=added + 1e-9 * rng.standard_normal((n, N_MODES)).astype(np.float32),
+        dither_m=added if dither else None,
+        cm_id=cm_id,
+    )
+
+
+@pytest.fixture
+def streams():
+    return with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), DITHER, 2.0)
+
+
+def play(streams, first_seq, n_blocks, **changes):
+    windows = []
+    for index in range(n_blocks):
+        streams, ended = fed(streams, block(first_seq + 100 * index, **changes))
+        windows += ended
+    return streams, windows
+
+
+def test_random_signs_are_correlated_in_windows_of_the_dithers_own_length(streams):
+    streams, windows = play(streams, 0, 12)
+    assert [(type(w), w.first_seq) for w in windows] == [(Correlated, 300), (Correlated, 700)]
+    assert windows[0].plan.modes == (1, 6)
+    # a third window would be cut by the end of the dither: it is never begun
+    assert streams.random is None
+    assert streams.lock_in is None
+
+
+def test_another_loop_makes_the_open_window_void(streams):
+    streams, _ = play(streams, 0, 5)
+    streams = with_rtc(streams, replace(RTC, leak=0.99, seq=499))
+    assert streams.random.window is None
+    assert streams.random.plan.first_seq == 799
+
+
+def test_a_sine_after_random_signs_is_read_as_a_sine(streams):
+    sine = replace(
+        DITHER, id="d-2", kind=DitherKind.SINE, modes=(6,), amplitude_m=(5e-9,), seed=None
+    )
+    sine = replace(sine, frequency_hz=(240.0,), window_s=0.5, duration_s=60.0)
+    streams = with_dither(streams, sine, 2.0)
+    assert streams.random is None
+    assert streams.lock_in.plan.modes == (6,)
+
+
+def test_a_window_too_short_for_its_modes_is_refused_with_how_long_it_must_be(streams):
+    with pytest.raises(ModelError, match="found windows of 100 frames, expected at least 192"):
+        with_dither(streams, replace(DITHER, id="d-3", window_s=0.1), 2.0)
+
+
+def test_a_new_reconstructor_inside_a_window_cuts_it_short(streams):
+    streams, _ = play(streams, 0, 5)
+    _, (refused, whole) = play(streams, 500, 5, cm_id="cm-1")
+    assert isinstance(refused, WindowRefused)
+    assert (whole.first_seq, whole.cm_id) == (500, "cm-1")
+
+
+def test_all_modes_of_a_basis_may_share_a_few_nanometres():
+    """5 nm on 594 modes: 0.205 nm each; windows of 594 modes at 1 kHz last 4.75 s at least."""
+    dither = plan_random(
+        Asked(id="noisy-1", modes=ModeSet.ALL, total_m=5e-9, duration_s=30.0), rtc(), POLICY, 77
+    )
+    assert dither.modes == tuple(range(594))
+    assert np.sqrt(np.sum(np.square(dither.amplitude_m))) == pytest.approx(5e-9)
+    assert (dither.kind, dither.seed, dither.frequency_hz) == (DitherKind.BINARY, 77, ())
+    assert dither.window_s == pytest.approx(5.0)
+    assert dither.duration_s >= 30.0
+
+
+def test_the_controlled_modes_are_those_in_the_loop():
+    asked = Asked(id="n", modes=ModeSet.CONTROLLED, total_m=5e-9, duration_s=30.0)
+    assert plan_random(asked, rtc(), POLICY, 0).modes == tuple(range(400))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"modes": (3, 594)}, "found mode 594; expected 0 to 593"),
+        ({"modes": (3,), "total_m": 1e-6}, r"found 1e\+03 nm on each of 1 modes"),
+        ({"duration_s": 1.0}, "found 1 s; 400 modes need windows of 3.2 s"),
+    ],
+)
+def test_a_dither_that_cannot_be_played_is_refused_before_it_is_asked_for(changes, words):
+    values = {"id": "n", "modes": ModeSet.CONTROLLED, "total_m": 5e-9, "duration_s": 30.0}
+    with pytest.raises(CommandError, match=words):
+        plan_random(Asked(**(values | changes)), rtc(), POLICY, 0)
+
+
+def test_more_modes_than_the_rtc_dithers_are_refused():
+    asked = Asked(id="n", modes=ModeSet.ALL, total_m=5e-9, duration_s=30.0)
+    with pytest.raises(CommandError, match="found 594 modes; the RTC dithers at most 64"):
+        plan_random(asked, rtc(max_dither_modes=64), POLICY, 0)

@@ -64,7 +64,7 @@ COARSE_SAMPLING = 2
 four times as fast."""
 
 FIT_RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
-"""An estimate further than this from the nominal rotation has diverged (numeric units)."""
+"""An estimate further than this from its start has diverged (numeric units)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,7 +176,7 @@ class Workbench:
         try:
             estimate = fit_window(spectra, self._near(start or self._start), loop)
             if not _settled(estimate):
-                near = self._approach(spectra, loop, estimate)
+                near = self._approach(spectra, loop, estimate, start or self._start)
                 if near is None:
                     return _unsettled(spectra)
                 estimate = fit_window(spectra, self._linearise(near), loop)
@@ -225,7 +225,8 @@ class Workbench:
             for _ in range(MAX_APPROACHES):
                 if isinstance(estimate, WindowRefused) or _settled(estimate):
                     return estimate
-                if np.any(np.abs(estimate.alpha.vector - self._start.vector) > FIT_RANGE):
+                begun = start or self._start
+                if np.any(np.abs(estimate.alpha.vector - begun.vector) > FIT_RANGE):
                     break
                 estimate = fit_random(window, self._linearise(estimate.alpha))
         except np.linalg.LinAlgError as error:
@@ -237,11 +238,15 @@ class Workbench:
         return self._sensor.interaction_matrix(alpha)
 
     def _approach(
-        self, spectra: Spectra, loop: Loop, estimate: WindowEstimate
+        self,
+        spectra: Spectra,
+        loop: Loop,
+        estimate: WindowEstimate,
+        start: Misregistration,
     ) -> Misregistration | None:
         """Return where the coarse model's steps lead; None when they do not shrink."""
         for _ in range(MAX_APPROACHES):
-            if np.any(np.abs(estimate.alpha.vector - self._start.vector) > FIT_RANGE):
+            if np.any(np.abs(estimate.alpha.vector - start.vector) > FIT_RANGE):
                 return None
             before = _length(estimate)
             estimate = fit_window(spectra, self._coarse.linearise(estimate.alpha), loop)

@@ -30,16 +30,12 @@ RUNGS = (20, 60, 150, 400)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reach:
-    """A band of modes that is dithered with the loop open, and how far it sees."""
+    """A band of modes that is dithered with the loop open."""
 
     first: int
     """Lowest mode, of a basis in which modes get finer."""
 
     last: int
-
-    capture: NDArray[np.float64]
-    """``(4,)`` from where steps on these modes lead home, numeric units."""
-
     floor: NDArray[np.float64]
     """``(4,)`` 1 σ of the model's error with the loop open, numeric units: the response that an
     uncorrected wavefront leaves is not the model's."""
@@ -48,7 +44,6 @@ class Reach:
 SMOOTH = Reach(
     first=0,
     last=28,
-    capture=np.array([1.8, 1.8, np.deg2rad(7.0), 0.06]),
     floor=np.array([0.06, 0.06, np.deg2rad(0.25), 0.025]),
 )
 """Leads from anywhere in the range."""
@@ -56,7 +51,6 @@ SMOOTH = Reach(
 FINER = Reach(
     first=36,
     last=99,
-    capture=np.array([0.6, 0.6, np.deg2rad(2.0), 0.04]),
     floor=np.array([0.02, 0.02, np.deg2rad(0.06), 0.008]),
 )
 """Confirms with other modes, three times as precisely."""

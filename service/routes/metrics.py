@@ -13,9 +13,9 @@ from prometheus_client.registry import Collector
 
 from service import __version__
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.routes.schemas import age_s
+from service.routes.registration_views import age_s
 from service.routes.service import Link, Snapshot
-from service.state import MatrixState, MeasurePattern, Mode, TrackerState
+from service.state import MatrixState, MeasurePattern, Mode, TrackerState, Validity
 
 _LINK_COUNTERS = {
     "batches_received": "Telemetry batches taken in",
@@ -83,7 +83,11 @@ def _of_link(link: Link) -> Iterator[Metric]:
 
 def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     tracker = snapshot.tracker
-    windows = {"accepted": tracker.windows_accepted, "refused": tracker.windows_refused}
+    windows = {
+        "accepted": tracker.windows_accepted,
+        "refused": tracker.windows_refused,
+        "outlying": tracker.windows_outlying,
+    }
     yield _labelled_counter("windows", "Windows of telemetry, by verdict", "verdict", windows)
     registration = tracker.registration
     if registration is None:
@@ -91,6 +95,10 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     yield from _four("alpha", "Registration", registration.alpha.vector)
     yield from _four("alpha_sigma", "1 sigma, floor included", registration.sigma)
     yield _gauge("alpha_age_seconds", "Age of the estimate", age_s(registration, snapshot))
+    valid = {str(kind): kind is registration.standing.validity for kind in Validity}
+    yield _labelled_gauge("alpha_validity", "1 for what the estimate is worth", "validity", valid)
+    due = tracker.dither_due_since_ns_utc is not None
+    yield _gauge("dither_due", "1 while a dithered window is wanted before all else", due)
     gain = "Mean optical gain of the dithered modes"
     yield _gauge("optical_gain_ratio", gain, registration.optical_gain)
 

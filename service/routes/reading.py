@@ -15,10 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.errors import UnknownIdError
 from service.routes.problems import INVALID, UNKNOWN, problem, problem_response
+from service.routes.registration_views import AlphaView, HistoryView
 from service.routes.schemas import (
-    AlphaView,
     EventsView,
-    HistoryView,
     ReconstructorsView,
     ReconstructorView,
     StateView,

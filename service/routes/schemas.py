@@ -2,98 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-from pydantic import Field
-
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.routes.registration_views import AlphaView, PointingView, WatchdogView
 from service.routes.rtc_views import DitherView, LoopCommandView, MeasuringView, RtcView
 from service.routes.service import Snapshot
 from service.routes.views import FourView, Number, View
-from service.state import Level, MatrixState, Mode, Registration
-
-
-class AlphaView(View):
-    """The current estimate of the registration."""
-
-    alpha: FourView
-    """The estimate."""
-
-    sigma: FourView
-    """1 σ, model-error floor included."""
-
-    floor: FourView
-    """1 σ of the model error alone, which no integration removes."""
-
-    covariance: list[list[Number]] = Field(min_length=4, max_length=4)
-    """4 x 4, floor included, in the units of the names and the order of ``parameters``."""
-
-    parameters: tuple[str, ...] = PARAMETERS
-    """Order of rows and columns of the covariance."""
-
-    t_ns_utc: int
-    """End of the last window that entered it, the RTC's clock."""
-
-    age_s: float
-    """Since then, seconds."""
-
-    n_windows: int
-    """Windows that entered it."""
-
-    optical_gain: Number
-    """Mean optical gain of the dithered modes; null: not measured."""
-
-    @classmethod
-    def of(cls, registration: Registration, snapshot: Snapshot) -> AlphaView:
-        """Return the view of the registration at the time of the snapshot."""
-        covariance = registration.total_covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)
-        return cls.model_validate(
-            {
-                "alpha": registration.alpha,
-                "sigma": registration.sigma,
-                "floor": registration.floor,
-                "covariance": covariance.tolist(),
-                "t_ns_utc": registration.t_ns_utc,
-                "age_s": age_s(registration, snapshot),
-                "n_windows": registration.n_windows,
-                "optical_gain": registration.optical_gain,
-            }
-        )
-
-
-def age_s(registration: Registration, snapshot: Snapshot) -> float:
-    """Return the age of the estimate, seconds."""
-    arrival_ns = snapshot.estimate_arrival_ns
-    then_ns = registration.t_ns_utc if arrival_ns is None else arrival_ns
-    return (snapshot.now_ns - then_ns) / 1e9
-
-
-class HistoryEntryView(View):
-    """One window's own estimate and the filtered one after it."""
-
-    t_ns_utc: int
-    """End of the window."""
-
-    measured: FourView
-    """What this window alone says."""
-
-    measured_sigma: FourView
-    """1 σ of it."""
-
-    filtered: FourView
-    """The estimate after it."""
-
-    filtered_sigma: FourView
-    """1 σ of it, floor included."""
-
-    innovation: Number
-    """Normalised innovation squared (4 degrees of freedom)."""
-
-
-class HistoryView(View):
-    """The estimates of the last windows."""
-
-    entries: tuple[HistoryEntryView, ...]
-    """Oldest first."""
+from service.state import Level, MatrixState, Mode
 
 
 class VerdictView(View):
@@ -172,19 +85,6 @@ class ReconstructorsView(View):
 
     reconstructors: tuple[ReconstructorView, ...]
     """Oldest first."""
-
-
-class WatchdogView(View):
-    """The passive estimate, from ordinary telemetry."""
-
-    alpha: FourView
-    sigma: FourView
-    t_ns_utc: int
-    consistent: bool
-    """False: it contradicts the current estimate."""
-
-    text: str
-    """What to know about it."""
 
 
 class AlarmView(View):
@@ -269,6 +169,9 @@ class StateView(View):
     rtc: RtcView | None
     """Null: no RTC has been heard, or it has vanished."""
 
+    pointing: PointingView | None
+    """Of the telescope; null: nobody has told."""
+
     basis_id: str | None
     config_id: str | None
     dither: DitherView | None
@@ -278,10 +181,19 @@ class StateView(View):
     loop_command: LoopCommandView | None
     """Null: none was asked for."""
 
+    dither_due_since_ns_utc: int | None
+    """Since when a dithered window is wanted before anything else is believed; null: it is not."""
+
+    dither_due_reason: str
+    """Why."""
+
     watchdog: WatchdogView | None
     alarms: tuple[AlarmView, ...]
     windows_accepted: int
     windows_refused: int
+    windows_outlying: int
+    """Believable in themselves, but too far from all others to be believed."""
+
     link: LinkView
 
     @classmethod

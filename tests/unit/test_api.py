@@ -33,6 +33,7 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.state import (
     Alarm,
+    Candidate,
     CommandState,
     DitherView,
     HistoryEntry,
@@ -44,11 +45,15 @@ from service.state import (
     MeasurePattern,
     MeasureState,
     Mode,
+    ModeGain,
+    PassiveBias,
     Pointing,
     ReconstructorRecord,
     Registration,
     RtcView,
+    Standing,
     TrackerState,
+    Validity,
     Watchdog,
 )
 
@@ -293,6 +298,65 @@ async def test_the_state_of_a_service_that_knows_nothing_is_readable(client, ser
     service.now = replace(service.now, tracker=TrackerState(system="bench"))
     body = await body_of(client, "/v1/state")
     assert body["rtc"] is body["margin"] is body["dither"] is body["watchdog"] is None
+
+
+async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(client, service):
+    known = replace(
+        STATE.registration,
+        window_ns_utc=70 * SECOND,
+        standing=Standing(validity=Validity.AGEING, reason="σ grows", until_ns_utc=120 * SECOND),
+        optical_gains=(ModeGain(mode=501, gain=0.6, sigma=0.01, scatter=0.03, t_ns_utc=1),),
+        bias=PassiveBias(
+            offset=np.array([0.05, 0.0, np.deg2rad(0.01), 0.0]),
+            covariance=np.diag(SIGMA**2),
+            shared=np.zeros((4, 4)),
+            looked_ns_utc=1,
+        ),
+        pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0),
+        restored_ns_utc=60 * SECOND,
+    )
+    service.change(registration=known)
+    body = await body_of(client, "/v1/alpha")
+    assert (body["validity"], body["validity_reason"]) == ("ageing", "σ grows")
+    assert body["valid_until_ns_utc"] == 120 * SECOND
+    assert (body["age_s"], body["window_age_s"]) == (10.0, 30.0)
+    assert body["restored_ns_utc"] == 60 * SECOND
+    assert body["optical_gains"] == [
+        {"mode": 501, "gain": 0.6, "gain_sigma": 0.01, "gain_scatter": 0.03, "t_ns_utc": 1}
+    ]
+    assert body["passive_bias"]["rotation_deg"] == pytest.approx(0.01)
+    assert body["passive_bias_sigma"]["shift_x_subap"] == pytest.approx(SIGMA[0])
+    assert body["pointing"] == {"elevation_deg": 61.0, "azimuth_deg": 120.0}
+
+
+async def test_alpha_of_which_little_is_known_says_null(client):
+    body = await body_of(client, "/v1/alpha")
+    unknown = ("passive_bias", "passive_bias_sigma", "pointing", "restored_ns_utc", "suspected")
+    assert all(body[name] is None for name in (*unknown, "window_age_s"))
+
+
+async def test_a_suspected_jump_and_a_dither_that_is_due_are_seen(client, service):
+    candidate = Candidate(
+        alpha=replace(ALPHA, shift_x_subap=0.5),
+        covariance=np.diag(SIGMA**2),
+        t_ns_utc=95 * SECOND,
+        held_ns_utc=95 * SECOND,
+        innovation=400.0,
+    )
+    service.change(
+        registration=replace(STATE.registration, candidate=candidate, doubt="a jump"),
+        dither_due_since_ns_utc=95 * SECOND,
+        dither_due_reason="a jump",
+        windows_outlying=3,
+    )
+    body = await body_of(client, "/v1/state")
+    assert body["registration"]["suspected"]["shift_x_subap"] == 0.5
+    assert (body["dither_due_since_ns_utc"], body["dither_due_reason"]) == (95 * SECOND, "a jump")
+    assert body["windows_outlying"] == 3
+    metrics = (await client.get("/metrics")).text
+    assert 'pyrcal_alpha_validity{validity="fresh"} 1.0' in metrics
+    assert 'pyrcal_windows_total{verdict="outlying"} 3.0' in metrics
+    assert "pyrcal_dither_due 1.0" in metrics
 
 
 async def test_history_is_the_newest_entries_oldest_first(client):
@@ -740,12 +804,15 @@ DIMENSIONLESS = {
     "condition_number",
     "first",
     "gain",
+    "gain_scatter",
+    "gain_sigma",
     "innovation",
     "last",
     "leak",
     "magnification",
     "magnitude",
     "max_dither_modes",
+    "mode",
     "optical_gain",
     "seed",
     "status",

@@ -169,31 +169,6 @@ class TrackingTable(Table):
     stale_magnification: Positive = 0.003
     """Of the magnification."""
 
-    bias_memory_s: Positive = 3600.0
-    """How long the wind's bias of the passive estimate lasts: after it, what was learnt is worth
-    1/e."""
-
-    flexure_subap_per_degree: float = Field(default=0.02, ge=0.0)
-    """What a degree of elevation does to a shift, 1 σ, subapertures."""
-
-    flexure_deg_per_degree: float = Field(default=0.01, ge=0.0)
-    """To the rotation, degrees."""
-
-    flexure_magnification_per_degree: float = Field(default=1e-4, ge=0.0)
-    """To the magnification."""
-
-    slew_limit_deg: Positive = 5.0
-    """A telescope that has moved further since the last window makes α invalid, degrees."""
-
-    stale_shift_subap: Positive = 0.05
-    """1 σ of a shift from which on α is stale, subapertures."""
-
-    stale_rotation_deg: Positive = 0.1
-    """Of the rotation, degrees."""
-
-    stale_magnification: Positive = 0.003
-    """Of the magnification."""
-
 
 class AcquisitionTable(Table):
     """``[acquisition]``: finding α from nothing, with the loop open."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 STRENGTH = 2.0
-"""Of a window: its own σ is the one asked for over this, where the budget allows."""
+"""Of a sitting: its own σ is the one asked for over this, where the budget allows."""
 
 NEARLY_BEST = 1.1
 """Where the walk is too fast for what is asked: σ may be this much above the best there is."""
@@ -31,24 +31,27 @@ class Demand:
     """Largest RMS of all lines together on the mirror, metres OPD; never exceeded."""
 
     window_s: float
-    """Telemetry in one estimate, seconds."""
+    """Telemetry of one sitting, in one window or several, seconds."""
 
     settling_s: float = 0.0
-    """Dither before a window that comes after a pause, seconds."""
+    """Dither before a sitting that comes after a pause, seconds."""
+
+    longest_s: float = np.inf
+    """From one sitting to the next, whatever α does meanwhile, seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Schedule:
-    """A dither of one window every ``interval_s``."""
+    """A dither of one sitting every ``interval_s``."""
 
     total_m: float
     """RMS of all lines together, metres OPD."""
 
     interval_s: float
-    """From the start of a window to the start of the next; ``window_s``: no pause."""
+    """From the start of a sitting to the start of the next; ``window_s``: no pause."""
 
     sigma: Array
-    """``(4,)`` 1 σ of α just before each window, which is when it is worst."""
+    """``(4,)`` 1 σ of α just before each sitting, which is when it is worst."""
 
     sufficient: bool
     """Whether that is what was asked for; otherwise the budget is spent and it is the best."""
@@ -61,15 +64,15 @@ def schedule(precision: Array, demand: Demand) -> Schedule:
     """Return the schedule that keeps ``demand.sigma`` within the budget.
 
     ``precision`` ``(4,)`` is κ of ``σ = κ / (A sqrt(T))``, in numeric units times m sqrt(s), as
-    measured on the last windows. A window of σ² = R every Δ seconds holds a random walk of rate q
+    measured on the last windows. A sitting of σ² = R every Δ seconds holds a random walk of rate q
     at ``P² - q²Δ P - q²Δ R = 0`` before each update, so ``Δ = P² / (q² (P + R))``. Weak dither
     often costs less than strong dither seldom, but leaves no pauses and no estimate that stands
-    alone: a window is made ``STRENGTH`` times as precise as asked, which costs
+    alone: a sitting is made ``STRENGTH`` times as precise as asked, which costs
     ``sqrt(1 + STRENGTH²)`` of the least possible. Where the walk leaves no pause, the dither is no
     stronger than brings σ within ``NEARLY_BEST`` of the best the budget could buy.
     """
     total_m = min(_amplitude(precision, demand, demand.sigma / STRENGTH), demand.budget_m)
-    interval_s = _longest_interval(precision, demand, total_m)
+    interval_s = min(_longest_interval(precision, demand, total_m), demand.longest_s)
     if interval_s < demand.window_s:
         interval_s = demand.window_s
         total_m = _without_pause(precision, demand)
@@ -84,11 +87,11 @@ def schedule(precision: Array, demand: Demand) -> Schedule:
     )
 
 
-def window_length(precision: Array, demand: Demand, lengths_s: tuple[float, ...]) -> float:
-    """Return the shortest window whose estimate alone is as precise as asked, on the whole budget.
+def sitting_s(precision: Array, demand: Demand, lengths_s: tuple[float, ...]) -> float:
+    """Return the shortest sitting that alone is as precise as asked, on the whole budget.
 
-    Of ``lengths_s``, shortest first. Longer than it takes for α to walk as far as the noise of the
-    estimate a window is no use: the filter averages windows better than that.
+    Of ``lengths_s``, shortest first. One in which α walks further than the noise of its estimate is
+    no use: the filter follows α better than that.
     """
     for length_s, longer_s in pairwise(lengths_s):
         noise = precision**2 / (demand.budget_m**2 * length_s)
@@ -99,6 +102,21 @@ def window_length(precision: Array, demand: Demand, lengths_s: tuple[float, ...]
         if np.all(walk[lacking] > (noise * length_s / longer_s)[lacking]):
             return length_s
     return lengths_s[-1]
+
+
+def window_s(
+    precision: Array, demand: Demand, usable: Array, lengths_s: tuple[float, ...]
+) -> float:
+    """Return the shortest window in which the dither, on the whole budget, stands out of the noise.
+
+    Of ``lengths_s``, shortest first. Beyond a σ of ``usable`` ``(4,)`` in one window the noise in
+    the regressors biases the fit; many short windows tell as much as a long one otherwise, sooner,
+    and a lost frame or a changed matrix costs less of them.
+    """
+    noise = [precision**2 / (demand.budget_m**2 * length) for length in lengths_s]
+    return next(
+        (s for s, n in zip(lengths_s, noise, strict=True) if np.all(n <= usable**2)), lengths_s[-1]
+    )
 
 
 def _amplitude(precision: Array, demand: Demand, sigma: Array) -> float:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.dithering import Demand, Schedule, schedule, window_length
+from service.control import dithering
+from service.control.dithering import Demand, Schedule, schedule
 from service.control.precision import tabulated
 from service.reactions.dither_choice import SETTLING_S, SPARE_S, Choice, n_lines
 from service.reactions.policy import SECOND_NS, Policy
@@ -29,8 +30,14 @@ FAINT_MAGNITUDE = 11.5
 FAINT_WINDOW_S = 5.0
 """On a faint star a shorter window biases the rotation (0.08 deg at magnitude 12.5 in 1 s)."""
 
-LADDER = (1.0, 2.5, 5.0, 10.0, 30.0)
+WINDOW_LADDER = (1.0, 2.5, 5.0, 10.0)
 """Lengths of windows, in units of the shortest."""
+
+SITTING_LADDER = (1, 2, 3, 5, 8, 12)
+"""Windows in one sitting."""
+
+USABLE = np.array([0.03, 0.03, np.deg2rad(0.04), 0.003])
+"""1 σ of one window above which its fit may be biased by noise, numeric units."""
 
 CHANGE = 1.25
 """The amplitude stays while the best one is within this factor of it."""
@@ -56,28 +63,42 @@ def wanted(
     """Return the dither that is wanted in this state, and the plan behind it."""
     kappa = precision(state, rtc)
     demand = _demand(kappa, state, rtc, policy, now_ns)
+    window_s = demand.window_s
+    sittings = tuple(n * window_s for n in SITTING_LADDER)
+    sparse = replace(demand, window_s=dithering.sitting_s(kappa, demand, sittings))
+    phase, reason, next_ns = _paced(state, sparse, policy, now_ns)
+    demand = sparse if phase is DitherPhase.SPARSE else demand
     found = schedule(kappa, demand)
-    phase, reason, next_ns = _paced(state, demand, policy, now_ns)
-    strength_m = demand.budget_m
-    if phase is not DitherPhase.ACQUIRE and policy.dither_amplitude_m is None:
-        strength_m = _steady(state, found, demand)
-    lasting = max(int((LASTING_S - SETTLING_S - SPARE_S) / demand.window_s), 1)
+    plan = _plan(state, found, demand, window_s, phase)
+    fixed = policy.dither_amplitude_m is not None
     choice = Choice(
-        total_m=strength_m,
-        window_s=demand.window_s,
-        n_windows=1 if phase is DitherPhase.SPARSE else lasting,
+        total_m=demand.budget_m if fixed else plan.total_m,
+        window_s=window_s,
+        n_windows=max(int(max(demand.window_s, _lasting_s(phase)) / window_s + 1e-6), 1),
         avoid_hz=(*policy.dither_avoid_hz, *state.vibrations_hz),
         last_hz=state.dithering.lines_hz,
     )
-    plan = DitherPlan(
-        total_m=strength_m,
-        window_s=demand.window_s,
-        interval_s=found.interval_s,
+    return Wish(phase=phase, reason=reason, choice=choice, next_ns_utc=next_ns), plan
+
+
+def _plan(
+    state: TrackerState, found: Schedule, demand: Demand, window_s: float, phase: DitherPhase
+) -> DitherPlan:
+    """Return the schedule as it is carried out."""
+    total_m, interval_s = _steady(state, found, demand), found.interval_s
+    if phase is DitherPhase.ACQUIRE:
+        total_m = demand.budget_m
+    if phase is not DitherPhase.SPARSE:
+        interval_s = window_s
+    on_s = min(demand.window_s + demand.settling_s, interval_s)
+    return DitherPlan(
+        total_m=total_m,
+        window_s=window_s,
+        interval_s=interval_s,
         sigma=found.sigma,
         sufficient=found.sufficient,
-        mean_cost_m=found.mean_cost_m,
+        mean_cost_m=total_m * float(np.sqrt(on_s / interval_s)),
     )
-    return Wish(phase=phase, reason=reason, choice=choice, next_ns_utc=next_ns), plan
 
 
 def precision(state: TrackerState, rtc: RtcView) -> NDArray[np.float64]:
@@ -95,7 +116,7 @@ def budget_m(rtc: RtcView, policy: Policy) -> float:
 
 def window_lengths_s(policy: Policy) -> tuple[float, ...]:
     """Return how long a window may be, shortest first."""
-    lengths = [policy.window_s * step for step in LADDER]
+    lengths = [policy.window_s * step for step in WINDOW_LADDER]
     return tuple(s for s in lengths if s <= policy.longest_window_s) or (policy.window_s,)
 
 
@@ -108,11 +129,17 @@ def _demand(
         budget_m=budget_m(rtc, policy),
         window_s=policy.window_s,
         settling_s=SETTLING_S,
+        longest_s=policy.longest_pause_s,
     )
     lengths = window_lengths_s(policy)
     if rtc.magnitude is not None and rtc.magnitude >= FAINT_MAGNITUDE:
         lengths = tuple(s for s in lengths if s >= FAINT_WINDOW_S) or lengths[-1:]
-    return replace(demand, window_s=window_length(kappa, demand, lengths))
+    return replace(demand, window_s=dithering.window_s(kappa, demand, USABLE, lengths))
+
+
+def _lasting_s(phase: DitherPhase) -> float:
+    """Return how long a request is to be read at least, seconds."""
+    return 0.0 if phase is DitherPhase.SPARSE else LASTING_S - SETTLING_S - SPARE_S
 
 
 def _walk_rate(state: TrackerState, policy: Policy, now_ns: int) -> NDArray[np.float64]:

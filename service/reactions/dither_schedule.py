@@ -174,7 +174,7 @@ def _awaits_a_result(state: TrackerState, wish: Wish, now_ns: int) -> bool:
     if wish.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
         return False
     late = now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
-    return not late and state.windows_accepted == dithering.n_windows_asked
+    return not late and state.windows_accepted < dithering.results_due
 
 
 def _ask(state: TrackerState, rtc: RtcView, policy: Policy, wish: Wish, now_ns: int) -> Step:
@@ -186,7 +186,7 @@ def _ask(state: TrackerState, rtc: RtcView, policy: Policy, wish: Wish, now_ns: 
     dithering = replace(
         state.dithering,
         lines_hz=dither.frequency_hz,
-        n_windows_asked=state.windows_accepted,
+        results_due=state.windows_accepted + wish.choice.n_windows,
         ended_ns_utc=None,
         next_ns_utc=None,
     )

@@ -145,9 +145,10 @@ def _why_stale(state: TrackerState, now_ns: int) -> str | None:
     known, dither = state.registration, state.dither
     if dither is not None:
         since_ns = max(known.window_ns_utc if known else 0, dither.asked_ns_utc)
-        if now_ns - since_ns >= STALE_AFTER_S * SECOND_NS:
+        patience_s = max(STALE_AFTER_S, 3.0 * (dither.window_s or 0.0))
+        if now_ns - since_ns >= patience_s * SECOND_NS:
             return (
-                f"no window was accepted for {STALE_AFTER_S:.0f} s although a dither runs: α may "
+                f"no window was accepted for {patience_s:.0f} s although a dither runs: α may "
                 "have moved; see the log for the reasons"
             )
     if known is None or state.rtc is None or state.rtc.loop != "closed" or known.n_windows == 0:

@@ -621,7 +621,7 @@ def test_command_line_beats_environment_beats_file_beats_default(write):
     assert settings.api.port == 3
     assert settings.api.host == "environment"
     assert settings.dither.window_s == 4.0
-    assert settings.dither.budget_m == 10e-9
+    assert settings.dither.budget_m == 8e-9
 
 
 def test_environment_values_take_the_type_of_their_key():
@@ -670,7 +670,7 @@ def test_environment_values_take_the_type_of_their_key():
         (
             "[dither]\namplitude_m = 6e-9\n",
             "dither: found amplitude_m for 12 nm RMS of 4 modes together, expected no more than "
-            "budget_m, 10 nm",
+            "budget_m, 8 nm",
         ),
         ("[control]\npole_radius_bound = 1.0\n", "control.pole_radius_bound: found 1.0, expected"),
         ("[tracking]\nfloor_rotation_deg = nan\n", "found nan, expected a finite number"),

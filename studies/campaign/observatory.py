@@ -27,6 +27,7 @@ from service.runtime import translate
 from service.runtime.deeds import Deeds, Publishing
 from service.runtime.following import followed, news, shape_news
 from service.runtime.streams import Streams, Window, fed, with_matrix
+from service.runtime.supervisor import WATCH_INTERVAL_S
 from service.runtime.windows import fitted, lost, watched
 from service.state import Mode, TrackerState
 from service.tracker import step
@@ -61,7 +62,7 @@ class Latencies:
     tick_s: float = 1.0
     """Between two looks of the service at what it waits for."""
 
-    watch_interval_s: float = 10.0
+    watch_interval_s: float = WATCH_INTERVAL_S
     """Between two looks of the passive watchdog."""
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,8 @@ CORRECTED = np.array([0.03, 0.03, 0.03, 0.002])
 STEADY_S = 10.0
 """After the first own matrix: the loop has settled and α has been confirmed."""
 
-FLAGS = ("registration.jump", "registration.doubt", "registration.candidate")
-"""Names of log entries that say that the mirror has jumped, or may have."""
+FLAGS = ("registration.jump-suspected", "registration.jump", "registration.passive-jump")
+"""Log entries that say that the mirror has jumped, or may have."""
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -52,7 +51,10 @@ def row_of(night: Observatory, jump_times_s: tuple[float, ...]) -> Row:
         "published": [publication_row(p) for p in publications],
         "refused": sum(r.state is MatrixState.REFUSED for r in night.state.reconstructors),
         "unstable": sum(p.outcome is Outcome.DIVERGED for p in publications),
-        "log": dict(Counter(f"{e.level.value} {e.name}" for e in night.state.log)),
+        "log": [
+            (round((e.t_ns_utc - START_NS) * 1e-9, 2), e.level.value, e.name, e.text)
+            for e in night.state.log
+        ],
     }
 
 

@@ -21,7 +21,7 @@ LEARNING = 0.1
 """Weight of the newest window in the scatter: ten windows are remembered."""
 
 _FARTHEST = 3.0
-"""Windows further out than this many σ tell no more of the scatter than one at this distance."""
+"""A window further out than this many σ counts as one at this distance."""
 
 Array = NDArray[np.float64]
 
@@ -58,9 +58,9 @@ def _followed(
         return ModeGain(mode=mode, gain=measured, sigma=scatter, scatter=scatter, t_ns_utc=t_ns)
     elapsed_s = max((t_ns - known.t_ns_utc) / SECOND_NS, 0.0)
     prior = known.sigma**2 + (GAIN_RATE * known.gain) ** 2 * elapsed_s
-    innovation = measured - known.gain
-    counted = min(innovation**2, _FARTHEST**2 * (prior + known.scatter**2))
-    learnt = max(counted - prior, noise**2, 0.0)
+    farthest = _FARTHEST * float(np.sqrt(prior + known.scatter**2))
+    innovation = float(np.clip(measured - known.gain, -farthest, farthest))
+    learnt = max(innovation**2 - prior, noise**2)
     scatter = float(np.sqrt((1 - LEARNING) * known.scatter**2 + LEARNING * learnt))
     weight = prior / (prior + scatter**2)
     return ModeGain(

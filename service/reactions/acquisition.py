@@ -93,10 +93,7 @@ def acquire(
         if why is None:
             return state, ()
         return _begin(state, policy, now_ns, why, commanded=False)
-    ended = _ended_by(state, event, now_ns)
-    if ended is not None:
-        return ended
-    state, effects = _heard(state, event, policy, now_ns)
+    state, effects = _ended_by(state, event, now_ns) or _heard(state, event, policy, now_ns)
     if effects or not state.acquisition.under_way or state.rtc is None:
         return state, effects
     if state.acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:

@@ -44,7 +44,8 @@ def closed_stage(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int)
         if acquisition.command is not None:
             return state, ()
         return told(state, ev.SetLoop(closed=True), now_ns)
-    state = replace(state, acquisition=replace(acquisition, windows=state.windows_accepted))
+    acquisition = replace(acquisition, applied=record.id, windows=state.windows_accepted)
+    state = replace(state, acquisition=acquisition)
     text = f"closed on {record.n_modes} modes: sharpening the registration"
     return entered(state, AcquisitionStage.WIDENING, text, now_ns), ()
 

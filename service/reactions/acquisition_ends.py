@@ -48,7 +48,7 @@ def without_dither(state: TrackerState) -> Step:
 
 
 def again(state: TrackerState, reason: str, now_ns: int, *, slipped: bool = False) -> Step:
-    """Begin anew with the loop opened again, a few times; then give up.
+    """Begin anew with the loop opened again, at once, a few times; then give up.
 
     A loop that has slipped is closed on fewer modes next time.
     """
@@ -73,8 +73,11 @@ def again(state: TrackerState, reason: str, now_ns: int, *, slipped: bool = Fals
             n_modes=min(acquisition.n_modes, most or goal),
         ),
     )
-    text = f"opening the loop again: {reason}"
-    return entered(state, AcquisitionStage.OPENING, text, now_ns), effects
+    state = entered(state, AcquisitionStage.OPENING, f"opening the loop again: {reason}", now_ns)
+    if state.rtc is None or state.rtc.loop == "open":
+        return state, effects
+    state, more = told(state, ev.SetLoop(closed=False), now_ns)
+    return state, (*effects, *more)
 
 
 def fail(state: TrackerState, reason: str, now_ns: int) -> Step:

@@ -23,6 +23,9 @@ class Case(StrEnum):
     JUMP = "jump"
     """10 % of a subaperture, then 0.1 deg, at once."""
 
+    BUSY = "busy"
+    """Both of them together."""
+
     BUDGET = "budget"
     """Nothing: what does the dither cost? Played again without it."""
 
@@ -57,7 +60,7 @@ class Plan:
     @property
     def jump_times_s(self) -> tuple[float, ...]:
         """When the mirror jumps."""
-        if self.case is not Case.JUMP:
+        if self.case not in {Case.JUMP, Case.BUSY}:
             return ()
         return tuple(np.arange(PERIOD_S, self.seconds - PERIOD_S / 2, PERIOD_S).tolist())
 
@@ -84,14 +87,16 @@ class Plan:
     def _motion(self) -> list[str]:
         angle = np.random.default_rng((7, self.seed)).uniform(0.0, 2.0 * np.pi)
         x, y, turn = np.cos(angle), np.sin(angle), -1.0 if self.seed % 2 else 1.0
+        drift = f"--drift={0.05 * x:.4f},{0.05 * y:.4f},{0.05 * turn},0"
+        steps = (f"{0.1 * x:.4f},{0.1 * y:.4f},0,0", f"0,0,{0.1 * turn},0")
+        jumps = [f"--jump={time_s}:{steps[k % 2]}" for k, time_s in enumerate(self.jump_times_s)]
         match self.case:
             case Case.DRIFT | Case.RESTART:
-                return [f"--drift={0.05 * x:.4f},{0.05 * y:.4f},{0.05 * turn},0"]
+                return [drift]
             case Case.JUMP:
-                steps = (f"{0.1 * x:.4f},{0.1 * y:.4f},0,0", f"0,0,{0.1 * turn},0")
-                return [
-                    f"--jump={time_s}:{steps[k % 2]}" for k, time_s in enumerate(self.jump_times_s)
-                ]
+                return jumps
+            case Case.BUSY:
+                return [drift, *jumps]
             case Case.SEEING:
                 third = self.seconds / 3.0
                 return ["--seeing=0.8", f"--seeing-at={third}:1.3", f"--seeing-at={2 * third}:0.9"]

@@ -22,6 +22,9 @@ CORRECTED = np.array([0.03, 0.03, 0.03, 0.002])
 STEADY_S = 10.0
 """After the first own matrix: the loop has settled and α has been confirmed."""
 
+AFTER_JUMP_S = 15.0
+"""What has been corrected so long after a jump is tracking again; before, it is not judged so."""
+
 FLAGS = ("registration.jump-suspected", "registration.jump", "registration.passive-jump")
 """Log entries that say that the mirror has jumped, or may have."""
 
@@ -36,14 +39,17 @@ def row_of(night: Observatory, jump_times_s: tuple[float, ...]) -> Row:
     good_s = first_good_s(night)
     begin_s = STEADY_S + max(own_s or 0.0, good_s or 0.0)
     steady = [m for m in night.dome.moments if m.time_s >= begin_s]
-    errors = tracking_errors(night, begin_s)
+    errors, sigma = tracking_errors(night, begin_s, jump_times_s)
     return {
         "good_alpha_s": good_s,
         "own_matrix_s": own_s,
         "modes_reached": night.dome.moments[-1].n_controlled,
         "steady_from_s": begin_s,
         "tracking_rms": _rms(errors),
-        "tracking_within_95": _inside(night, begin_s),
+        "tracking_sigma": _rms(sigma),
+        "tracking_inside_2_sigma": np.mean(np.abs(errors) <= 2.0 * sigma, axis=0).tolist()
+        if len(errors)
+        else None,
         "jumps": [jump_row(night, publications, t) for t in jump_times_s],
         "wavefront_nm": wavefront_rms_nm(steady),
         "dither_nm": float(np.sqrt(np.mean([m.dither_nm**2 for m in steady]))) if steady else None,
@@ -68,17 +74,23 @@ def first_good_s(night: Observatory) -> float | None:
     return None
 
 
-def tracking_errors(night: Observatory, begin_s: float) -> Array:
-    """Return ``(n, 4)`` errors of what the service held to be true, block by block.
+def tracking_errors(
+    night: Observatory, begin_s: float, jump_times_s: tuple[float, ...] = ()
+) -> tuple[Array, Array]:
+    """Return ``(n, 4)`` errors of what the service held to be true, and their 1 σ, block by block.
 
-    Against where the mirror is at that moment: the age of the estimate is part of the error.
+    Against where the mirror is at that moment: the age of the estimate is part of the error. What
+    comes within ``AFTER_JUMP_S`` of a jump is left out.
     """
-    errors = [
-        (glance.alpha - moment.alpha.vector) * BOUNDARY_SCALE
+    found = [
+        (glance.alpha - moment.alpha.vector, glance.sigma)
         for moment, glance in zip(night.dome.moments, night.glances, strict=True)
-        if glance.alpha is not None and glance.time_s >= begin_s
+        if glance.alpha is not None
+        and glance.time_s >= begin_s
+        and not any(0.0 <= glance.time_s - t < AFTER_JUMP_S for t in jump_times_s)
     ]
-    return np.array(errors).reshape(-1, 4)
+    errors, sigma = (np.array([pair[k] for pair in found]).reshape(-1, 4) for k in range(2))
+    return errors * BOUNDARY_SCALE, sigma * BOUNDARY_SCALE
 
 
 def jump_row(night: Observatory, publications: list[Publication], time_s: float) -> Row:
@@ -130,16 +142,6 @@ def _corrects(publication: Publication) -> bool:
         return False
     error = (made_for.vector - publication.swap.alpha.vector) * BOUNDARY_SCALE
     return bool(np.all(np.abs(error) <= CORRECTED))
-
-
-def _inside(night: Observatory, begin_s: float) -> float | None:
-    """Return the share of blocks whose error is within 2 σ in every parameter."""
-    found = [
-        bool(np.all(np.abs(glance.alpha - moment.alpha.vector) <= 2.0 * glance.sigma))
-        for moment, glance in zip(night.dome.moments, night.glances, strict=True)
-        if glance.alpha is not None and glance.sigma is not None and glance.time_s >= begin_s
-    ]
-    return float(np.mean(found)) if found else None
 
 
 def _rms(errors: Array) -> list[float] | None:

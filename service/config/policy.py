@@ -64,24 +64,6 @@ def policy_of(settings: Settings) -> Policy:
                 tracking.stale_magnification,
             ]
         ),
-        bias_memory_s=tracking.bias_memory_s,
-        flexure_per_degree=np.array(
-            [
-                tracking.flexure_subap_per_degree,
-                tracking.flexure_subap_per_degree,
-                np.deg2rad(tracking.flexure_deg_per_degree),
-                tracking.flexure_magnification_per_degree,
-            ]
-        ),
-        slew_limit_deg=tracking.slew_limit_deg,
-        stale_sigma=np.array(
-            [
-                tracking.stale_shift_subap,
-                tracking.stale_shift_subap,
-                np.deg2rad(tracking.stale_rotation_deg),
-                tracking.stale_magnification,
-            ]
-        ),
         acquires=settings.acquisition.auto,
         acquisition_amplitude_m=settings.acquisition.amplitude_m,
         n_modes_target=control.n_modes_target,

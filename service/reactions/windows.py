@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
 from service.estimation.noisymatrix import RandomEstimate
 from service.model.misregistration import Misregistration
+from service.reactions.acquisition_plan import missed
 from service.reactions.dither import found_again
 from service.reactions.journal import OFF_LOOP, logged, with_alarm, without_alarm
 from service.reactions.modal_gain import followed_gains
@@ -35,7 +36,7 @@ mirror is seen twice."""
 GAIN_GROUPS = 16
 """A random dither on more modes than this is believed on the gains of neighbours together."""
 
-_OUT_OF_HAND = {
+OUT_OF_HAND = {
     "loop-diverging": "the loop was diverging",
     "edge-slip": "the edge had slipped",
     OFF_LOOP: "the commands were off the loop equation",
@@ -81,7 +82,7 @@ def _why_useless(state: TrackerState, estimate: WindowEstimate | RandomEstimate)
     """Return why a window's estimate must not be used, or None."""
     if state.rtc is None or estimate.session != state.rtc.session:
         return "the RTC has restarted since"
-    out_of_hand = next((_OUT_OF_HAND[a.name] for a in state.alarms if a.name in _OUT_OF_HAND), None)
+    out_of_hand = next((OUT_OF_HAND[a.name] for a in state.alarms if a.name in OUT_OF_HAND), None)
     if out_of_hand is not None:
         return f"{out_of_hand}: its telemetry is no measurement"
     lag = float(np.median(estimate.lag_frames))
@@ -106,7 +107,7 @@ def _why_useless(state: TrackerState, estimate: WindowEstimate | RandomEstimate)
 
 def refuse_window(state: TrackerState, reason: str, now_ns: int) -> TrackerState:
     """Count a window that gave nothing, and say why."""
-    state = replace(state, windows_refused=state.windows_refused + 1)
+    state = missed(replace(state, windows_refused=state.windows_refused + 1), reason)
     if reason.startswith("columns misaligned"):
         state = with_alarm(state, "columns-misaligned", reason, now_ns)
     level = Level.INFO if reason.startswith(EXPECTED) else Level.WARNING

@@ -98,6 +98,7 @@ def rtc_view(status: Status) -> RtcView:
         t_ns_utc=status.t_ns,
         seq=status.seq,
         pointing=_pointing(status.pointing),
+        flux=status.flux,
     )
 
 

@@ -45,6 +45,8 @@ async def _correlated(window: Correlated, state: TrackerState, crew: Crew) -> Ev
 async def _demodulated(spectra: Spectra, state: TrackerState, crew: Crew, deeds: Deeds) -> Event:
     """Return what a window of sines says of the registration."""
     rtc, known = state.rtc, state.registration
+    if state.acquisition.looks_afar:
+        return await _found(spectra, state, crew)
     if rtc is None or spectra.cm_id is None:
         return lost(spectra, "the RTC or its reconstructor is not known")
     try:
@@ -63,6 +65,18 @@ async def _demodulated(spectra: Spectra, state: TrackerState, crew: Crew, deeds:
     if isinstance(outcome, WindowRefused):
         return ev.WindowLost(refused=outcome)
     return ev.WindowFitted(estimate=outcome)
+
+
+async def _found(spectra: Spectra, state: TrackerState, crew: Crew) -> Event:
+    """Return where a window with the loop open puts the mirror, or why it does not."""
+    flux = None if state.rtc is None else state.rtc.flux
+    try:
+        outcome = await crew.call(Workbench.find, spectra, state.acquisition.alpha, flux)
+    except PyrcalError as error:
+        return lost(spectra, str(error))
+    if isinstance(outcome, WindowRefused):
+        return ev.WindowLost(refused=outcome)
+    return ev.FarFitted(found=outcome)
 
 
 async def watched(

@@ -22,6 +22,7 @@ from service.events import (
     StartDither,
     StopDither,
 )
+from service.reactions.dither_choice import total_m
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.service import Service, ServiceDep
 from service.routes.views import View
@@ -76,6 +77,8 @@ class StartDitherRequest(Request):
     """One for each mode."""
 
     duration_s: Positive | None = None
+    over_budget: bool = False
+    """Allow more than the budget of the settings."""
 
     @model_validator(mode="after")
     def _one_frequency_for_each_mode(self) -> StartDitherRequest:
@@ -150,8 +153,15 @@ async def dither(
         amplitude_m=body.amplitude_m,
         frequency_hz=None if body.frequency_hz is None else tuple(body.frequency_hz),
         duration_s=body.duration_s,
+        over_budget=body.over_budget,
     )
-    return await accepted(service, command)
+    answer = await accepted(service, command)
+    state = service.snapshot().tracker
+    if state.dither is None:
+        return answer
+    cost = f"{1e9 * total_m(state.dither):.3g} nm RMS in all"
+    budget = f"budget {1e9 * state.dithering.budget_m:.3g} nm"
+    return answer.model_copy(update={"text": f"{answer.text}: {cost}, {budget}"})
 
 
 @router.post("/reconstructors/{id}/approve", status_code=202, responses={**UNKNOWN})

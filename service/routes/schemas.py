@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from service.routes.dither_views import DitheringView
 from service.routes.registration_views import AlphaView, PointingView, WatchdogView
 from service.routes.rtc_views import DitherView, LoopCommandView, MeasuringView, RtcView
 from service.routes.service import Snapshot
@@ -175,6 +176,12 @@ class StateView(View):
     basis_id: str | None
     config_id: str | None
     dither: DitherView | None
+    dithering: DitheringView
+    """Why the service dithers or does not, and what that costs."""
+
+    vibrations_hz: tuple[Number, ...]
+    """Vibration lines heard in the slopes, lowest first."""
+
     measuring: MeasuringView | None
     """Null: none is."""
 

@@ -106,3 +106,13 @@ class Dithering:
 
     seen_ns_utc: int | None = None
     """Up to when that mean was taken."""
+
+    @property
+    def mean_cost_m(self) -> float:
+        """Quadratic mean of what has been on the mirror, over ten minutes, metres OPD."""
+        return float(np.sqrt(self.mean_square_m2))
+
+    @property
+    def n_windows_learnt(self) -> int:
+        """Windows that the precision was learnt from."""
+        return 0 if self.precision is None else self.precision.n_windows

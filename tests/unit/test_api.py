@@ -35,6 +35,9 @@ from service.state import (
     Alarm,
     Candidate,
     CommandState,
+    Dithering,
+    DitherPhase,
+    DitherPlan,
     DitherView,
     HistoryEntry,
     Level,
@@ -159,6 +162,21 @@ STATE = TrackerState(
     ),
     basis_id="kl",
     config_id="b1",
+    dithering=Dithering(
+        phase=DitherPhase.SPARSE,
+        reason="ordinary telemetry keeps σ between windows",
+        budget_m=8e-9,
+        plan=DitherPlan(
+            total_m=5e-9,
+            window_s=2.0,
+            interval_s=60.0,
+            sigma=SIGMA,
+            sufficient=True,
+            mean_cost_m=1e-9,
+        ),
+        mean_square_m2=9e-18,
+    ),
+    vibrations_hz=(61.0,),
     dither=DitherView(
         id="d-1",
         modes=(501, 450),
@@ -288,6 +306,10 @@ async def test_state_shows_everything_at_one_glance(client):
     assert body["margin"]["worst_pole_radius"] == 0.8
     assert (body["rtc"]["frame_rate_hz"], body["rtc"]["magnitude"]) == (1000.0, None)
     assert body["dither"]["modes"] == [501, 450]
+    assert body["dithering"]["phase"] == "sparse"
+    assert body["dithering"]["plan"]["sigma"]["rotation_deg"] == pytest.approx(0.03)
+    assert (body["dithering"]["mean_cost_m"], body["dithering"]["n_windows_learnt"]) == (3e-9, 0)
+    assert body["vibrations_hz"] == [61.0]
     assert body["watchdog"]["sigma"]["rotation_deg"] == pytest.approx(0.3)
     assert body["alarms"][0]["name"] == "rtc.silent"
     assert (body["windows_accepted"], body["windows_refused"]) == (4, 1)
@@ -357,6 +379,11 @@ async def test_a_suspected_jump_and_a_dither_that_is_due_are_seen(client, servic
     assert 'pyrcal_alpha_validity{validity="fresh"} 1.0' in metrics
     assert 'pyrcal_windows_total{verdict="outlying"} 3.0' in metrics
     assert "pyrcal_dither_due 1.0" in metrics
+
+
+async def test_who_starts_a_dither_is_told_what_it_costs(client):
+    answer = await client.post("/v1/dither", json={"action": "start", "over_budget": True})
+    assert answer.json()["text"].endswith("7.07 nm RMS in all, budget 8 nm")
 
 
 async def test_history_is_the_newest_entries_oldest_first(client):
@@ -459,12 +486,14 @@ async def test_a_damaged_matrix_is_a_problem_that_says_so(client, service):
                 "amplitude_m": 5e-9,
                 "frequency_hz": [210, 250.5],
                 "duration_s": 60,
+                "over_budget": True,
             },
             StartDither(
                 modes=(501, 450),
                 amplitude_m=5e-9,
                 frequency_hz=(210.0, 250.5),
                 duration_s=60.0,
+                over_budget=True,
             ),
         ),
         ("POST", "/v1/reconstructors/cm-1/approve", None, Approve(id="cm-1")),
@@ -493,7 +522,7 @@ async def test_a_command_is_handed_on_and_answered_202(
     assert response.status_code == 202, response.text
     assert service.commands == [command]
     answer = response.json()
-    assert answer["text"] == f"{type(command).__name__} is on its way"
+    assert answer["text"].startswith(f"{type(command).__name__} is on its way")
     for link in answer["links"].values():
         assert (await client.get(link)).status_code == 200
 

@@ -66,8 +66,10 @@ def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
     if now_ns < state.retry_ns_utc:
         return state, ()
     if rtc.dither_id is not None and rtc.dither_id.startswith(OWN_DITHER):
-        # left behind by this service: its window had another length, or it is to stop
-        return replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS), (AskNoDither(),)
+        # left behind by this service: over budget, its window of another length, or to stop
+        dithering = replace(state.dithering, stopped_id=rtc.dither_id)
+        state = replace(state, dithering=dithering, retry_ns_utc=now_ns + 2 * SECOND_NS)
+        return state, (AskNoDither(),)
     if now_ns < wish.next_ns_utc or _awaits_a_result(state, wish, now_ns):
         return state, ()
     return _ask(state, rtc, policy, wish, now_ns)
@@ -155,9 +157,12 @@ def _running(state: TrackerState, dither: DitherView, wish: Wish, now_ns: int) -
 def _adopted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState | None:
     """Take over a dither that runs, if it can be read; None: there is none."""
     running = rtc.dither
-    if running is None or running.id in {state.dither_lost, state.dithering.stopped_id}:
+    if running is None or running.id == state.dither_lost:
         return None
-    if _own(running) and total_m(running) > 1.001 * state.dithering.budget_m:
+    over = _own(running) and total_m(running) > 1.001 * state.dithering.budget_m
+    stopped = running.id == state.dithering.stopped_id
+    # a recorded night stops nothing: what it plays over budget is read all the same
+    if over is not stopped or (over and now_ns < state.retry_ns_utc):
         return None
     for window_s in window_lengths_s(policy):
         dither = replace(running, asked_ns_utc=now_ns, window_s=window_s)

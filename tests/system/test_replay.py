@@ -29,6 +29,7 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 WINDOW_S = 1.0
 POLICY = Policy(
     window_s=WINDOW_S,
+    dither_budget_m=40e-9,
     drift_rate=np.full(4, 1e-4),
     floor=np.full(4, 1e-4),
     update_threshold=np.full(4, 0.01),

@@ -15,7 +15,7 @@ from service.wire import (
     Loop,
     Status,
 )
-from tests.unit.reactions.situations import POLICY, START_NS, Story, rtc
+from tests.unit.reactions.situations import POLICY, START_NS, Story, foreign, rtc
 
 RUNNING = replace(plan_dither(rtc(), POLICY, START_NS), start_seq=4000, asked_ns_utc=0)
 
@@ -86,6 +86,22 @@ def test_lines_that_do_not_fit_a_window_are_not_adopted_and_the_services_own_is_
     story = Story().meet(**with_dither(odd))
     assert story.state.dither is None
     assert story.asked(ev.AskNoDither)
+
+
+def test_one_over_budget_from_before_a_restart_is_stopped_and_read_only_where_it_will_not_stop():
+    loud = replace(RUNNING, amplitude_m=(20e-9,) * 4)
+    story = Story()
+    story.tell(ev.SessionStarted(session="s1"))
+    assert story.tell(ev.StatusSeen(rtc=rtc(**with_dither(loud)))) == (
+        ev.FetchMatrix(id="initial"),
+    )
+    story.tell(ev.MatrixFetched(record=foreign()))
+    assert story.asked(ev.AskNoDither)
+    assert story.state.dither is None
+    story.tell(ev.StatusSeen(rtc=rtc(**with_dither(loud))), after_s=1)
+    assert story.state.dither is None
+    story.tell(ev.StatusSeen(rtc=rtc(**with_dither(loud))), after_s=3)
+    assert story.state.dither.id == loud.id
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ class TestTheFramesHoldNone:
     "changes",
     [
         {"start_seq": START + 700},
-        {"amplitude_m": (4e-9,) * 4},
+        {"amplitude_m": (3e-9,) * 4},
         {"frequency_hz": (212.0, 240.0, 284.0, 332.0)},
     ],
 )

@@ -15,6 +15,7 @@ from service import __version__
 from service.archive.records import record_from_json, record_to_json
 from service.errors import ArchiveError
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.reactions.gain_tables import table_of
 from service.state import ReconstructorRecord
 from service.wire import checksum
 
@@ -123,9 +124,25 @@ def _fill(
     file.attrs["sha256"] = checksum(matrix)
     file.attrs["software_version"] = __version__
     file.attrs["record"] = record_to_json(record)
+    if record.optical_gains:
+        _add_gains(file, record)
     if covariance is not None:
         file["covariance"] = covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)
         file["covariance"].attrs["parameters"] = PARAMETERS
+
+
+def _add_gains(file: h5py.File, record: ReconstructorRecord) -> None:
+    """Put the table of loop gains beside the matrix, which knows nothing of it."""
+    table = table_of(record.optical_gains, record.n_modes)
+    group = file.create_group("gains")
+    group.attrs["description"] = "optical gain of every mode; not part of the reconstructor"
+    group.attrs["measured_modes"] = [gain.mode for gain in record.optical_gains]
+    group.attrs["measured_gain"] = [gain.gain for gain in record.optical_gains]
+    group.attrs["measured_sigma"] = [gain.sigma for gain in record.optical_gains]
+    group["optical_gain"] = table.optical_gain
+    group["relative_sigma"] = table.relative_sigma
+    group["factor"] = table.factors
+    group["factor"].attrs["description"] = "multiplies one loop gain for all modes"
 
 
 def _attributes(record: ReconstructorRecord) -> dict[str, Provenance]:

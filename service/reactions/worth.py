@@ -83,11 +83,14 @@ def _raised(in_use: ReconstructorRecord, now_ns: int) -> float:
 
 
 def _of_step(in_use: ReconstructorRecord, known: Registration) -> NDArray[np.float64] | None:
-    """Return the covariance of what separates two registrations; both have the same model error."""
+    """Return the covariance of what separates two registrations, as both were measured.
+
+    They share the model error; what drift may have added since is no error of either.
+    """
     if in_use.sigma is None:
         return None
     then = np.maximum(in_use.sigma**2 - known.floor**2, 0.0)
-    return known.covariance + np.diag(known.grown + then)
+    return np.asarray(known.covariance + np.diag(then))
 
 
 def moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:

@@ -60,10 +60,16 @@ class LoopBody(Request):
     n_controlled: int | None = Field(default=None, ge=1)
     """Takes effect with the next reconstructor of that many modes."""
 
+    effective_gain: float | None = Field(default=None, gt=0.0, le=2.0)
+    """Gains that act as this on every mode, by the table of optical gains (``GET /v1/gains``);
+    the gate must accept the reconstructor in use with them."""
+
     @model_validator(mode="after")
     def _something(self) -> LoopBody:
         if self == LoopBody.model_construct():
-            raise ValueError("at least one of loop, gains, leak, n_controlled")
+            raise ValueError("at least one of loop, gains, leak, n_controlled, effective_gain")
+        if self.gains is not None and self.effective_gain is not None:
+            raise ValueError("gains or effective_gain, not both")
         _none_twice(self.gains or [])
         return self
 
@@ -108,6 +114,7 @@ async def loop(service: ServiceDep, body: LoopBody) -> AcceptedView:
         gains=groups,
         leak=body.leak,
         n_controlled=body.n_controlled,
+        effective_gain=body.effective_gain,
     )
     return await accepted(service, command)
 

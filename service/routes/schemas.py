@@ -141,6 +141,46 @@ class LinkView(View):
     """By kind."""
 
 
+class ExpectedGainView(View):
+    """What a new reconstructor would win over the one in use, by the linear model of the loop."""
+
+    loss_m: Number
+    """Wavefront error that a new one would save, metres RMS; null: infinite."""
+
+    wavefront_m: Number
+    """Wavefront error with a new one, metres RMS."""
+
+    pole_radius: Number
+    """Of the one in use, at the estimate itself."""
+
+    fresh_pole_radius: Number
+    """Of a new one there."""
+
+
+class AssessmentView(View):
+    """What the reconstructor in use loses, and where."""
+
+    id: str
+    alpha: FourView
+    """The registration it was computed for."""
+
+    expected: ExpectedGainView
+    t_ns_utc: int
+    """When."""
+
+
+class ModeLimitView(View):
+    """More modes than these would not pass the gate."""
+
+    n_modes: int
+    since_ns_utc: int
+    until_ns_utc: int
+    """More are not tried before."""
+
+    reason: str
+    """What the gate said of more."""
+
+
 class StateView(View):
     """What the service knows, at one glance."""
 
@@ -166,6 +206,12 @@ class StateView(View):
 
     margin: VerdictView | None
     """The gate's verdict on the reconstructor in use, at the current estimate; null: not known."""
+
+    assessment: AssessmentView | None
+    """What it loses against a new one; null: not known."""
+
+    mode_limit: ModeLimitView | None
+    """How many modes the gate lets be controlled; null: as many as are wanted."""
 
     rtc: RtcView | None
     """Null: no RTC has been heard, or it has vanished."""

@@ -778,6 +778,8 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
         "GET /v1/reconstructors",
         "GET /v1/reconstructors/{id}",
         "GET /v1/reconstructors/{id}/matrix",
+        "GET /v1/reconstructors/{id}/gains",
+        "GET /v1/gains",
         "GET /v1/events",
         "GET /v1/measurements",
         "GET /v1/measurements/{id}",
@@ -831,6 +833,7 @@ UNITS = ("_s", "_m", "_hz", "_ns", "_ns_utc", "_deg", "_subap", "_frames", "_seq
 DIMENSIONLESS = {
     "bound",
     "condition_number",
+    "effective_gain",
     "first",
     "gain",
     "gain_scatter",

@@ -1,0 +1,89 @@
+"""Whatever happens, no reconstructor is sent whose latest verdict is not yes."""
+
+from dataclasses import replace
+
+import hypothesis.strategies as st
+from hypothesis import given
+
+from service import events as ev
+from service.control.expected_gain import ExpectedGain
+from service.state import MatrixState, Mode
+from tests.properties.test_tracker_laws import LAWS, Night, commands, heard, ids
+from tests.unit.reactions.situations import ALPHA, moved, record, verdict
+
+MADE = [f"made-{k}" for k in range(1, 6)]
+any_id = st.one_of(ids, st.sampled_from(MADE))
+verdicts = st.builds(verdict, accepted=st.booleans(), radius=st.sampled_from([0.7, 0.94, 1.2]))
+judged = st.builds(
+    lambda name, said, shift, loss: ev.MarginJudged(
+        id=name,
+        verdict=said,
+        alpha=moved(ALPHA, shift_x_subap=shift),
+        expected=ExpectedGain(
+            loss_m=loss, wavefront_m=1e-7, pole_radius=0.8, fresh_pole_radius=0.6
+        ),
+    ),
+    any_id,
+    verdicts,
+    st.sampled_from([0.0, 0.05, 0.3]),
+    st.sampled_from([0.0, 1e-9, float("inf")]),
+)
+made = st.builds(
+    lambda name, state, n, asked, wanted: ev.MatrixMade(
+        record=record(name, state, n_modes=n),
+        wanted=wanted,
+        asked_modes=asked,
+        why_fewer="too little margin" if asked is not None and n < asked else "",
+    ),
+    st.sampled_from(["extra-1", "extra-2", "extra-3"]),
+    st.sampled_from([MatrixState.PROPOSED, MatrixState.REFUSED]),
+    st.sampled_from([100, 300, 400, 500]),
+    st.sampled_from([None, 400, 500]),
+    st.booleans(),
+)
+more_commands = st.one_of(
+    st.builds(ev.Approve, id=st.sampled_from([*MADE, "extra-1", "extra-2", "extra-3"])),
+    st.builds(ev.Publish, id=any_id),
+    st.builds(ev.SetLoop, effective_gain=st.sampled_from([0.3, 1.5])),
+)
+stories = st.lists(
+    st.tuples(
+        st.one_of(
+            heard,
+            commands,
+            judged,
+            judged,
+            made,
+            more_commands,
+            *[st.just("done")] * 8,
+            st.just("refused"),
+        ),
+        st.sampled_from([0.0, 0.1, 1.0, 4.0, 31.0]),
+    ),
+    min_size=30,
+    max_size=60,
+)
+
+
+@LAWS
+@given(stories, st.sampled_from(list(Mode)))
+def test_nothing_is_sent_whose_latest_verdict_is_not_yes(story, mode):
+    night = Night(mode)
+    for event, after_s in story:
+        night.tell(event, after_s)
+        for effect in night.last:
+            if isinstance(effect, ev.SendMatrix):
+                found = night.state.reconstructor(effect.id)
+                assert found.gate.accepted
+                assert found.state is MatrixState.PUBLISHED
+                assert effect.n_modes == found.n_modes
+
+
+def test_a_proposal_whose_verdict_has_changed_since_cannot_be_approved():
+    night = Night(Mode.PROPOSE)
+    proposal = replace(record("extra-1"), created_ns_utc=night.now_ns)
+    night.tell(ev.MatrixMade(record=proposal, wanted=False), 0.1)
+    night.tell(ev.MarginJudged(id="extra-1", verdict=verdict(accepted=False)), 0.1)
+    night.tell(ev.Approve(id="extra-1"), 0.1)
+    assert not night.last
+    assert night.state.reconstructor("extra-1").state is MatrixState.PROPOSED

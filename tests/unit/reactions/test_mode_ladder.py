@@ -1,0 +1,148 @@
+"""Fewer modes where the gate will not have more, and more again later."""
+
+from dataclasses import replace
+
+import pytest
+
+from service import events as ev
+from service.reactions.mode_ladder import FIRST_WAIT_S, LONGEST_WAIT_S, fewer_than
+from service.state import MatrixState, Mode
+from tests.unit.reactions.situations import POLICY, Story, of_kind, record, rtc, verdict
+
+WANTED = replace(POLICY, n_modes_target=500)
+
+
+class Night(Story):
+    """A night in which reconstructors are made as the gate allows."""
+
+    def __init__(self, mode=Mode.AUTO, policy=WANTED, n_controlled=400):
+        super().__init__(mode, policy)
+        self.meet(n_controlled=n_controlled, gains=rtc(n_controlled).gains)
+        self.made = 0
+
+    def make_for(self, effect, n_modes, *, state=MatrixState.PROPOSED, why=""):
+        """Answer a request with a reconstructor of so many modes, and let the RTC apply it."""
+        self.made += 1
+        name = f"cm-{self.made}"
+        made = record(
+            name,
+            state,
+            n_modes=n_modes,
+            created_ns_utc=self.now_ns,
+            alpha=self.state.registration.alpha,
+        )
+        effects = self.tell(
+            ev.MatrixMade(record=made, wanted=False, asked_modes=effect.n_modes, why_fewer=why)
+        )
+        if of_kind(effects, ev.SendMatrix):
+            self.acknowledge(name)
+            self.tell(ev.StatusSeen(rtc=replace(rtc(n_modes), cm_id=name)))
+        return effects
+
+    def lowered(self, n_modes=300):
+        """Be at 500 modes, find the margin short, and get fewer."""
+        (first,) = of_kind(self.see(n_windows=2), ev.MakeMatrix)
+        self.make_for(first, 400)
+        (more,) = of_kind(self.wait(6), ev.MakeMatrix)
+        self.make_for(more, 500)
+        short = verdict(accepted=False, radius=0.97)
+        self.wait(6)
+        effects = self.tell(ev.MarginJudged(id=self.state.in_use, verdict=short))
+        (fewer,) = of_kind((*effects, *self.wait(5)), ev.MakeMatrix)
+        self.make_for(fewer, n_modes, why="500 modes: too little margin")
+        return self
+
+
+def test_every_request_of_the_services_own_names_fewer_modes_to_try():
+    (effect,) = of_kind(Night().see(n_windows=2), ev.MakeMatrix)
+    assert effect.n_modes == 400
+    assert effect.fewer == fewer_than(400) == (300, 200, 150, 100, 60, 30)
+
+
+def test_raising_never_ends_below_the_present_number():
+    night = Night()
+    (first,) = of_kind(night.see(n_windows=2), ev.MakeMatrix)
+    night.make_for(first, 400)
+    night.policy = replace(WANTED, n_modes_target=594)
+    (more,) = of_kind(night.wait(6), ev.MakeMatrix)
+    assert (more.n_modes, more.fewer) == (594, (500,))
+
+
+def test_a_short_margin_lowers_the_number_of_modes_and_says_why():
+    night = Night().lowered()
+    assert night.state.rtc.n_controlled == 300
+    entry = next(e for e in night.state.log if e.name == "modes.lowered")
+    assert "500 modes lowered to 300: 500 modes: too little margin" in entry.text
+    assert night.state.mode_limit.n_modes == 300
+
+
+def test_more_are_tried_after_a_wait_while_the_margin_is_comfortable():
+    night = Night().lowered()
+    assert not of_kind(night.wait(FIRST_WAIT_S - 5), ev.MakeMatrix)
+    (more,) = of_kind(night.wait(10), ev.MakeMatrix)
+    assert (more.n_modes, more.fewer) == (500, (400,))
+
+
+@pytest.mark.parametrize("radius", [0.93, 0.949])
+def test_but_not_while_the_margin_is_only_just_enough(radius):
+    night = Night().lowered()
+    night.tell(ev.MarginJudged(id=night.state.in_use, verdict=verdict(radius=radius)))
+    assert not of_kind(night.wait(3 * FIRST_WAIT_S), ev.MakeMatrix)
+
+
+def test_a_raise_the_gate_refuses_doubles_the_wait_and_publishes_nothing():
+    night = Night().lowered()
+    (more,) = of_kind(night.wait(FIRST_WAIT_S + 5), ev.MakeMatrix)
+    sent = len(night.asked(ev.SendMatrix))
+    night.make_for(more, 500, state=MatrixState.REFUSED)
+    assert len(night.asked(ev.SendMatrix)) == sent
+    assert night.state.mode_limit.wait_s == 2 * FIRST_WAIT_S
+    assert not of_kind(night.wait(2 * FIRST_WAIT_S - 5), ev.MakeMatrix)
+    assert of_kind(night.wait(10), ev.MakeMatrix)
+
+
+def test_a_raise_that_passes_is_published_and_logged():
+    night = Night().lowered()
+    (more,) = of_kind(night.wait(FIRST_WAIT_S + 5), ev.MakeMatrix)
+    night.make_for(more, 500)
+    assert night.state.rtc.n_controlled == 500
+    assert night.state.log[-1].name != "modes.lowered"
+    assert any(e.text == "300 modes to 500" for e in night.state.log if e.name == "modes.raised")
+
+
+def test_a_number_lowered_again_soon_waits_longer_and_never_for_ever():
+    night = Night().lowered()
+    waits = []
+    for _ in range(8):
+        limit = night.state.mode_limit
+        waits.append(limit.wait_s)
+        n_windows = round(limit.wait_s / 10) + 2
+        (more,) = of_kind(night.see(n_windows=n_windows, every_s=10), ev.MakeMatrix)
+        night.make_for(more, 500, state=MatrixState.REFUSED)
+    assert waits[:4] == [60.0, 120.0, 240.0, 480.0]
+    assert max(waits) == LONGEST_WAIT_S
+
+
+def test_in_propose_fewer_modes_are_a_proposal_and_nothing_is_sent():
+    night = Night(Mode.PROPOSE)
+    (first,) = of_kind(night.see(n_windows=2), ev.MakeMatrix)
+    night.make_for(first, 200, why="400 modes: too little margin")
+    assert not night.asked(ev.SendMatrix)
+    assert night.matrix_state("cm-1") is MatrixState.PROPOSED
+
+
+def test_in_hold_nothing_is_made_however_short_the_margin():
+    night = Night(Mode.HOLD)
+    night.see(n_windows=2)
+    short = verdict(accepted=False, radius=0.99)
+    night.tell(ev.MarginJudged(id="initial", verdict=short))
+    night.wait(60)
+    assert not night.asked(ev.MakeMatrix)
+    assert "margin" in night.alarms
+
+
+def test_an_operators_own_number_is_neither_lowered_nor_raised():
+    night = Night(Mode.HOLD)
+    night.see(n_windows=2)
+    (effect,) = of_kind(night.tell(ev.Refit(n_modes=450)), ev.MakeMatrix)
+    assert effect.fewer == ()

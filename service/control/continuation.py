@@ -24,8 +24,8 @@ BAND = (0.2, 0.4)
 CLEARANCE_HZ = 21.0
 """Between two lines: the noise is measured within 20 Hz of each."""
 
-RUNGS = (20, 60, 150, 400)
-"""Modes controlled on the way up; the goal is the last."""
+FIRST_CLOSED = 150
+"""Modes a loop is first closed on: those a registration known to some per cent will carry."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,11 +87,6 @@ def lines_of(frame_rate_hz: float, window_s: float, most: int) -> tuple[float, .
     return ()
 
 
-def fewer(n_modes: int) -> int | None:
-    """Return how many modes to try to control where so many were refused; None: no fewer."""
-    return max((rung for rung in RUNGS if rung < n_modes), default=None)
-
-
-def opening_rung(goal: int) -> int:
+def first_closed(goal: int) -> int:
     """Return with how many modes a loop is first closed, on its way to ``goal``."""
-    return min(goal, RUNGS[2])
+    return min(goal, FIRST_CLOSED)

@@ -153,7 +153,7 @@ def _heard(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> St
             return on_missed(state, refused.reason, now_ns)
         case ev.DitherAnswered(accepted=False, reason=reason):
             return on_missed(state, f"the RTC refused the dither: {reason}", now_ns)
-        case ev.MatrixMade(record=record):
-            return on_made(state, record, now_ns)
+        case ev.MatrixMade():
+            return on_made(state, event, now_ns)
         case _:
             return state, ()

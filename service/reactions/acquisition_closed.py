@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service import events as ev
-from service.control.continuation import fewer
 from service.reactions.acquisition_ends import again, entered, fail, told
 from service.reactions.acquisition_plan import OUT_OF_HAND, gains_for
 from service.reactions.dither_schedule import choose_dither
 from service.reactions.journal import without_alarm
 from service.reactions.matrices import Step, send, why_unsendable
+from service.reactions.mode_ladder import fewer_than
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.worth import moved
 from service.state import (
@@ -50,9 +50,9 @@ def closed_stage(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int)
     return entered(state, AcquisitionStage.WIDENING, text, now_ns), ()
 
 
-def on_made(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> Step:
+def on_made(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
     """Send a reconstructor that has passed the gate, with the gains it was judged with."""
-    acquisition, rtc = state.acquisition, state.rtc
+    record, acquisition, rtc = made.record, state.acquisition, state.rtc
     if acquisition.stage not in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
         return state, ()
     if record.state is MatrixState.REFUSED:
@@ -63,22 +63,21 @@ def on_made(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> St
         return again(state, f"{record.id} cannot be sent: {reason}", now_ns)
     state, _ = send(state, record.id, now_ns)
     acquisition = replace(acquisition, matrix=record.id, n_modes=record.n_modes, sent=True)
+    if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
+        acquisition = replace(acquisition, most_modes=record.n_modes)
     gains = gains_for(found, record.n_modes, rtc.n_modes)
     effect = ev.SendMatrix(id=record.id, n_modes=record.n_modes, gains=gains)
     return replace(state, acquisition=acquisition), (effect,)
 
 
 def _refused(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> Step:
-    """Try fewer modes; with the loop closed, be content with those there are."""
+    """With the loop closed be content with the modes there are; else there is no more to try."""
     acquisition = state.acquisition
-    n_modes = fewer(record.n_modes)
     if acquisition.stage is AcquisitionStage.WIDENING:
-        most = max(n_modes or 0, acquisition.n_modes)
-        return replace(state, acquisition=replace(acquisition, most_modes=most)), ()
-    if n_modes is None:
-        reason = record.gate.reason if record.gate is not None else record.reason
-        return fail(state, f"not even {record.n_modes} modes pass the gate: {reason}", now_ns)
-    return replace(state, acquisition=replace(acquisition, n_modes=n_modes)), ()
+        acquisition = replace(acquisition, most_modes=acquisition.n_modes)
+        return replace(state, acquisition=acquisition), ()
+    reason = record.gate.reason if record.gate is not None else record.reason
+    return fail(state, f"no number of modes passes the gate: {reason}", now_ns)
 
 
 def _widened(
@@ -102,13 +101,16 @@ def _widened(
     seen = state.windows_accepted - acquisition.windows
     goal = _goal(acquisition)
     if seen >= 1 and (record.n_modes < goal or moved(state, record, policy)):
-        return _make(state, goal, rtc, now_ns)
+        return _make(state, goal, rtc, now_ns, at_least=record.n_modes)
     if seen >= ENOUGH_WINDOWS:
         return _done(state, record, now_ns), ()
     return choose_dither(state, rtc, policy, now_ns)
 
 
-def _make(state: TrackerState, n_modes: int, rtc: RtcView, now_ns: int) -> Step:
+def _make(
+    state: TrackerState, n_modes: int, rtc: RtcView, now_ns: int, *, at_least: int = 0
+) -> Step:
+    """Ask for a reconstructor of so many modes, or fewer but more than ``at_least``."""
     found = state.acquisition.found
     if state.making_since_ns_utc is not None or found is None or now_ns < state.retry_ns_utc:
         return state, ()
@@ -116,6 +118,7 @@ def _make(state: TrackerState, n_modes: int, rtc: RtcView, now_ns: int) -> Step:
         n_modes=n_modes,
         why=f"acquisition: {n_modes} modes",
         gains=gains_for(found, n_modes, rtc.n_modes),
+        fewer=tuple(rung for rung in fewer_than(n_modes) if rung > at_least),
     )
     return replace(state, making_since_ns_utc=now_ns), (effect,)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service import events as ev
-from service.control.continuation import fewer
 from service.reactions.acquisition_plan import OUT_OF_HAND
 from service.reactions.journal import logged, with_alarm
 from service.reactions.loop import on_loop
 from service.reactions.matrices import Step
+from service.reactions.mode_ladder import fewer_than
 from service.state import AcquisitionStage, Level, TrackerState
 
 MOST_ATTEMPTS = 3
@@ -50,14 +50,15 @@ def without_dither(state: TrackerState) -> Step:
 def again(state: TrackerState, reason: str, now_ns: int, *, slipped: bool = False) -> Step:
     """Begin anew with the loop opened again, at once, a few times; then give up.
 
-    A loop that has slipped is closed on fewer modes next time.
+    A loop that has slipped is closed on half as many modes next time.
     """
     acquisition = state.acquisition
     if acquisition.attempt >= MOST_ATTEMPTS:
         return fail(state, f"{reason}, after {acquisition.attempt} attempts", now_ns)
     most = acquisition.most_modes
     if slipped:
-        most = fewer(acquisition.n_modes) or acquisition.n_modes
+        half = [rung for rung in fewer_than(acquisition.n_modes) if 2 * rung <= acquisition.n_modes]
+        most = max(half, default=acquisition.n_modes)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
     state, effects = without_dither(state)
     state = replace(

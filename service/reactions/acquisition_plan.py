@@ -11,9 +11,9 @@ from service.control.continuation import (
     FINER,
     SMOOTH,
     Reach,
+    first_closed,
     lines_of,
     modes_of,
-    opening_rung,
 )
 from service.reactions.journal import WRONG_RTC
 from service.reactions.policy import SECOND_NS, Policy
@@ -109,7 +109,7 @@ def begun(
         commanded=commanded,
         attempt=1,
         found=found,
-        n_modes=opening_rung(found.n_controlled),
+        n_modes=first_closed(found.n_controlled),
     )
     return replace(state, acquisition=acquisition, registration=None, margin=None)
 

@@ -12,10 +12,9 @@ from service.control.continuation import (
     FINER,
     MOST_LINES,
     SMOOTH,
-    fewer,
+    first_closed,
     lines_of,
     modes_of,
-    opening_rung,
 )
 
 
@@ -62,17 +61,9 @@ def test_an_rtc_that_plays_few_modes_gets_few():
     assert lines_of(1000.0, 2.0, 2) == ()
 
 
-def test_rungs_go_down_one_by_one_to_an_end():
-    seen, n_modes = [], fewer(594)
-    while n_modes is not None:
-        seen.append(n_modes)
-        n_modes = fewer(n_modes)
-    assert seen == [400, 150, 60, 20]
-
-
 def test_a_loop_is_first_closed_on_no_more_modes_than_its_goal():
-    assert opening_rung(594) == 150
-    assert opening_rung(30) == 30
+    assert first_closed(594) == 150
+    assert first_closed(30) == 30
 
 
 def test_finer_modes_are_the_more_precise_ones():

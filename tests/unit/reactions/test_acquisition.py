@@ -265,18 +265,17 @@ class TestNothingWrong:
         story.tell(ev.Acquire())
         assert story.state.registration is None
 
-    def test_what_the_gate_refuses_is_not_sent_and_fewer_modes_are_tried(self):
+    def test_fewer_modes_are_made_where_the_gate_refuses_many(self):
         story = Acquiring().to_partial()
-        for n_modes in (150, 60):
-            assert story.asked(ev.MakeMatrix)[-1].n_modes == n_modes
-            story.make(f"cm-{n_modes}", MatrixState.REFUSED, n_modes=n_modes)
-        assert story.asked(ev.MakeMatrix)[-1].n_modes == 20
-        assert not story.asked(ev.SendMatrix)
+        (made,) = story.asked(ev.MakeMatrix)
+        assert (made.n_modes, made.fewer) == (150, (100, 60, 30))
+        story.close(60)
+        (sent,) = story.asked(ev.SendMatrix)
+        assert sent.gains == (0.4,) * 60 + (0.0,) * 534
 
-    def test_when_not_even_a_few_modes_pass_the_gate_it_ends_with_the_loop_open(self):
+    def test_when_no_number_of_modes_passes_the_gate_it_ends_with_the_loop_open(self):
         story = Acquiring().to_partial()
-        for n_modes in (150, 60, 20):
-            story.make(f"cm-{n_modes}", MatrixState.REFUSED, n_modes=n_modes)
+        story.make("cm-150", MatrixState.REFUSED, n_modes=150)
         assert story.stage is AcquisitionStage.FAILED
         assert not story.asked(ev.SendMatrix)
         assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
@@ -293,6 +292,8 @@ class TestNothingWrong:
     def test_more_modes_that_the_gate_refuses_are_done_without(self):
         story = Acquiring().to_widening()
         story.see(FAR)
+        asked = story.asked(ev.MakeMatrix)[-1]
+        assert (asked.n_modes, asked.fewer) == (400, (300, 200))
         story.make("cm-400", MatrixState.REFUSED, n_modes=400)
         story.see(FAR)
         story.widen(150)

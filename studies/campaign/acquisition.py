@@ -1,0 +1,194 @@
+"""Acquisitions of the whole service from registrations it knows nothing of, in simulated time.
+
+Run: ``python -m studies.campaign.acquisition --plant linear --starts 0:100 --output
+var/acquisition.jsonl --table table.md``; starts that are there already are not run again. Each
+start draws its registration uniformly from ±1.5 subapertures, ±6 deg and ±5 %; the loop is closed
+on the matrix of a perfect registration, and nobody tells the service anything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from service.config import load_instrument, load_settings
+from service.config.policy import policy_of
+from service.model.misregistration import BOUNDARY_SCALE
+from service.state import AcquisitionStage, Mode
+from service.worker import Compute, Workbench
+from studies.campaign.acquisition_table import table
+from studies.campaign.observatory import Observatory
+from studies.campaign.system_nights import GAINS
+
+RANGE = np.array([1.5, 1.5, 6.0, 0.05])
+"""Of the registrations that are drawn, boundary units."""
+
+_SEED = 1905
+_LOOK_S = 0.5
+_OVER = (AcquisitionStage.TRACKING, AcquisitionStage.FAILED, AcquisitionStage.ABORTED)
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """What is run; two starts that are equal give the same row."""
+
+    plant: str = "linear"
+    truth: str = "ideal"
+    """The simulator's set of imperfections."""
+
+    seed: int = 0
+    magnitude: float = 10.0
+    gain: float = 0.4
+    n_controlled: int = 400
+    """Modes in the loop as it is found, and to come back to."""
+
+    within_s: float = 90.0
+    sampling: int = 3
+    """Of the service's model: pupil points per subaperture, and nodes."""
+
+    @property
+    def alpha(self) -> NDArray[np.float64]:
+        """``(4,)`` where the mirror truly lies, boundary units."""
+        rng = np.random.default_rng([_SEED, self.seed])
+        return np.asarray(rng.uniform(-1.0, 1.0, 4) * RANGE + [0.0, 0.0, 0.0, 1.0])
+
+    @property
+    def words(self) -> list[str]:
+        """The simulator's command line."""
+        alpha = ",".join(f"{value:.5f}" for value in self.alpha)
+        return [
+            f"--plant={self.plant}",
+            f"--imperfections={self.truth}",
+            f"--mag={self.magnitude}",
+            f"--seed={self.seed}",
+            f"--gain={self.gain}",
+            f"--n-controlled={self.n_controlled}",
+            f"--alpha={alpha}",
+        ]
+
+
+def play(start: Start) -> Row:
+    """Run one start until it tracks, fails, or its time is over."""
+    begun = time.monotonic()
+    with threadpool_limits(1):
+        settings = load_settings(None, {}, {"control.n_modes_target": start.n_controlled})
+        bench = _bench(start.sampling)
+        linear = start.plant == "linear"
+        night = Observatory(start.words, policy_of(settings), Mode.AUTO, bench, with_poles=linear)
+        while night.time_s < start.within_s and night.state.acquisition.stage not in _OVER:
+            night.advance(_LOOK_S)
+    acquisition, known = night.state.acquisition, night.state.registration
+    row: Row = {
+        "stage": str(acquisition.stage),
+        "text": acquisition.text,
+        "time_s": night.time_s,
+        "attempts": acquisition.attempt,
+        "n_modes": night.dome.moments[-1].n_controlled,
+        "closed": night.dome.moments[-1].closed,
+        "wavefront_nm": night.dome.moments[-1].wavefront_nm,
+        "true": (night.dome.alpha.vector * BOUNDARY_SCALE).tolist(),
+        "error": None,
+        "sigma": None,
+        "log": [entry.text for entry in night.state.log if entry.name.startswith("acquisition")],
+    }
+    if known is not None:
+        error = known.alpha.vector - night.dome.alpha.vector
+        row["error"] = (error * BOUNDARY_SCALE).tolist()
+        row["sigma"] = (known.sigma * BOUNDARY_SCALE).tolist()
+    row["radii"] = [swap.radius for swap in night.swaps]
+    return asdict(start) | row | {"took_s": time.monotonic() - begun}
+
+
+@cache
+def _bench(sampling: int) -> Workbench:
+    compute = Compute(threads=1, pupil_sampling=sampling, detector_nodes=sampling)
+    return Workbench(load_instrument("flao-lbt"), compute)
+
+
+def main() -> int:
+    """Run what is missing, then print the table."""
+    given = _parser().parse_args()
+    rows = _read(given.output)
+    done = {_key(row) for row in rows}
+    with given.output.open("a") as file:
+        for start in _starts(given):
+            if _key(asdict(start)) in done:
+                continue
+            rows.append(play(start))
+            file.write(json.dumps(rows[-1]) + "\n")
+            file.flush()
+            sys.stderr.write(f"{start.seed}: {rows[-1]['text']}\n")
+    text = table(rows)
+    sys.stdout.write(text)
+    if given.table is not None:
+        command = "python -m studies.campaign.acquisition " + " ".join(sys.argv[1:])
+        given.table.write_text(f"Made by `{command}`.\n\n{text}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.campaign.acquisition",
+        description="Lets the service find registrations from nothing, and counts how it ended.",
+    )
+    parser.add_argument(
+        "--output", type=Path, default=Path("acquisition.jsonl"), help="rows, resumed"
+    )
+    parser.add_argument("--table", type=Path, metavar="FILE.md")
+    parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
+    parser.add_argument("--truth", default="ideal", metavar="NAME")
+    parser.add_argument("--starts", type=_range, default=range(2), metavar="FIRST:END")
+    parser.add_argument("--mag", type=float, default=10.0)
+    parser.add_argument("--gain", type=float, help="default: 0.4 linear, 0.6 diffractive")
+    parser.add_argument("--n-controlled", type=int, default=400)
+    parser.add_argument("--within", type=float, default=90.0, metavar="S")
+    parser.add_argument(
+        "--sampling", type=int, default=3, help="of the service's model (default: %(default)s)"
+    )
+    return parser
+
+
+def _starts(given: argparse.Namespace) -> Iterator[Start]:
+    for seed in given.starts:
+        yield Start(
+            plant=given.plant,
+            truth=given.truth,
+            seed=seed,
+            magnitude=given.mag,
+            gain=GAINS[given.plant] if given.gain is None else given.gain,
+            n_controlled=given.n_controlled,
+            within_s=given.within,
+            sampling=given.sampling,
+        )
+
+
+def _read(path: Path) -> list[Row]:
+    if not path.exists():
+        return []
+    return [json.loads(text) for text in path.read_text().splitlines()]
+
+
+def _key(row: Row) -> tuple[Any, ...]:
+    return tuple(row[name] for name in asdict(Start()))
+
+
+def _range(text: str) -> range:
+    first, end = text.split(":")
+    return range(int(first), int(end))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

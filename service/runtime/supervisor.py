@@ -313,10 +313,11 @@ class Supervisor:
         """Keep what the service after this one needs; never more often than the disk likes."""
         saved = self._state
         while True:
-            await asyncio.sleep(SAVE_INTERVAL_S)
+            await asyncio.sleep(SAVE_INTERVAL_S / 10)
             if has_news(saved, self._state):
                 saved = self._state
                 await asyncio.to_thread(self._leave, saved)
+                await asyncio.sleep(SAVE_INTERVAL_S)
 
     def _leave(self, state: TrackerState) -> None:
         try:

@@ -144,7 +144,9 @@ def test_a_service_that_is_killed_and_restarted_picks_up_where_it_was(night):
     wait_for(lambda: night.state["in_use"] == in_use, 20.0, "the matrix in use is known")
     kept = [record["id"] for record in night.shelf if record["parent"]]
     assert kept[: len(ids)] == ids
-    wait_for(lambda: night.state["registration"], 30.0, "a window")
+    assert night.state["registration"]["restored_ns_utc"] is not None
+    check_registration(night.state["registration"])
+    wait_for(lambda: night.state["registration"]["n_windows"] >= 2, 30.0, "two windows")
     check_registration(night.state["registration"])
     matrix = night.client.get(f"/v1/reconstructors/{in_use}/matrix")
     assert matrix.status_code == 200

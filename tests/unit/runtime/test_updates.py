@@ -1,0 +1,195 @@
+"""Updates on a real worker and archive: fewer modes, what is won, gains beside the matrix."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.archive import Archive
+from service.errors import CommandError
+from service.runtime.crew import Crew
+from service.runtime.deeds import Deeds, Publishing
+from service.runtime.loops import GAIN_SAFETY, loop_settings, timing
+from service.state import MatrixState, ModeGain
+from service.worker import start_worker
+from tests.unit.reactions.situations import START_NS, rtc
+from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, small_instrument
+from tests.unit.runtime.test_deeds import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
+
+pytestmark = pytest.mark.timeout(60)
+
+MEASURED = tuple(
+    ModeGain(mode=mode, gain=gain, sigma=0.01, scatter=0.02, t_ns_utc=START_NS)
+    for mode, gain in ((60, 0.55), (70, 0.56), (80, 0.57))
+)
+
+
+@pytest.fixture(scope="module")
+def crew():
+    executor = start_worker(small_instrument(), COMPUTE)
+    crew = Crew(lambda: executor)
+    yield crew
+    crew.dismiss()
+    executor.shutdown(wait=True)
+
+
+@pytest.fixture
+def archive(tmp_path):
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        yield archive
+
+
+@pytest.fixture
+def bridge():
+    return HandmadeBridge()
+
+
+@pytest.fixture
+def deeds(bridge, crew, archive):
+    return deeds_with(bridge, crew, archive, 0.95)
+
+
+def deeds_with(bridge, crew, archive, bound):
+    return Deeds(
+        bridge=bridge,
+        crew=crew,
+        archive=archive,
+        instrument=small_instrument(),
+        publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=bound),
+        clock_ns=Clock(),
+    )
+
+
+def loop_of(gain):
+    return rtc(
+        N_CONTROLLED,
+        n_modes=N_MODES,
+        gains=(gain,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED),
+    )
+
+
+def unsure(by):
+    """A registration so uncertain that many modes have no margin."""
+    return replace(REGISTRATION, covariance=np.diag(np.array([by, by, by / 10, by / 10]) ** 2))
+
+
+async def make(deeds, state, n_modes=N_CONTROLLED, fewer=()):
+    return await deeds.carry_out(ev.MakeMatrix(n_modes=n_modes, why="a test", fewer=fewer), state)
+
+
+class TestFewer:
+    """What is made where the gate refuses as many modes as were asked for."""
+
+    async def test_as_many_as_asked_for_where_they_pass(self, deeds):
+        made = await make(deeds, STATE, fewer=(30, 20, 10))
+        assert (made.record.n_modes, made.asked_modes, made.why_fewer) == (45, 45, "")
+
+    async def test_the_most_that_pass_where_they_do_not(self, deeds):
+        state = replace(STATE, registration=unsure(0.3))
+        alone = {n: (await make(deeds, state, n)).record.gate.accepted for n in (45, 30, 20, 10, 5)}
+        assert not alone[45]
+        assert any(alone.values())
+        most = max(n for n, accepted in alone.items() if accepted)
+        made = await make(deeds, state, fewer=(30, 20, 10, 5))
+        assert made.record.state is MatrixState.PROPOSED
+        assert made.record.n_modes == most
+        assert made.record.gate.accepted
+        assert made.record.id.endswith(f"-{most}")
+        assert "pole radius" in made.why_fewer
+
+    async def test_what_was_asked_for_is_refused_where_none_pass(self, deeds):
+        state = replace(STATE, rtc=loop_of(1.9))
+        made = await make(deeds, state, fewer=(30, 10))
+        assert made.record.state is MatrixState.REFUSED
+        assert (made.record.n_modes, made.why_fewer) == (45, "")
+
+
+class TestLoss:
+    """What the one in use loses against a new one."""
+
+    async def test_the_one_just_made_loses_nothing(self, deeds):
+        made = await make(deeds, STATE)
+        state = replace(STATE, reconstructors=(made.record,))
+        judged = await deeds.carry_out(ev.JudgeMatrix(id=made.record.id), state)
+        assert judged.alpha == REGISTRATION.alpha
+        assert judged.expected.loss_m == pytest.approx(0.0, abs=1e-12)
+
+    async def test_one_for_another_registration_loses_wavefront_and_margin(self, deeds):
+        made = await make(deeds, STATE)
+        moved = replace(REGISTRATION.alpha, shift_y_subap=0.25)
+        state = replace(STATE, registration=replace(REGISTRATION, alpha=moved))
+        judged = await deeds.carry_out(ev.JudgeMatrix(id=made.record.id), state)
+        assert judged.expected.loss_m > 1e-11
+        assert judged.expected.pole_radius > judged.expected.fresh_pole_radius + 0.02
+
+
+class TestGains:
+    """Optical gains stand beside a matrix and are never part of it."""
+
+    async def test_the_same_bytes_whatever_gains_were_measured_or_are_in_force(self, deeds):
+        found = set()
+        for gains in ((), MEASURED, tuple(replace(one, gain=0.3) for one in MEASURED)):
+            for gain in (0.1, 0.4):
+                state = replace(
+                    STATE,
+                    rtc=loop_of(gain),
+                    registration=replace(REGISTRATION, optical_gains=gains),
+                )
+                found.add((await make(deeds, state)).record.sha256)
+        assert len(found) == 1
+
+    async def test_the_table_is_in_the_file_beside_the_matrix(self, deeds, archive, tmp_path):
+        state = replace(STATE, registration=replace(REGISTRATION, optical_gains=MEASURED))
+        made = (await make(deeds, state)).record
+        assert made.optical_gains == MEASURED
+        assert archive.records()[-1].optical_gains == MEASURED
+        with h5py.File(tmp_path / "reconstructors" / f"{made.id}.h5") as file:
+            assert file["gains"].attrs["measured_modes"].tolist() == [60, 70, 80]
+            assert file["gains/factor"].shape == (N_CONTROLLED,)
+            assert file["gains/factor"][()].mean() == pytest.approx(1.0)
+
+    async def test_gains_by_the_table_are_asked_for_when_the_gate_agrees(self, deeds, bridge):
+        made = await make(deeds, STATE)
+        state = replace(STATE, reconstructors=(made.record,), in_use=made.record.id)
+        gains = tuple(np.linspace(0.5, 0.4, N_CONTROLLED)) + (0.0,) * (N_MODES - N_CONTROLLED)
+        asked = ev.AskLoop(id="loop-1", gains=gains, judged=True)
+        answer = await deeds.carry_out(asked, state)
+        assert answer.accepted
+        assert bridge.commands[-1].gains == gains
+
+    async def test_and_never_reach_the_rtc_when_it_does_not(self, deeds, bridge):
+        made = await make(deeds, STATE)
+        state = replace(STATE, reconstructors=(made.record,), in_use=made.record.id)
+        gains = (2.5,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED)
+        answer = await deeds.carry_out(ev.AskLoop(id="loop-1", gains=gains, judged=True), state)
+        assert not answer.accepted
+        assert "unstable" in answer.reason
+        assert not bridge.commands
+
+    async def test_nothing_is_judged_for_a_matrix_nobody_knows(self, deeds):
+        asked = ev.AskLoop(id="loop-1", gains=(0.1,) * N_MODES, judged=True)
+        with pytest.raises(CommandError, match="cannot be judged"):
+            await deeds.carry_out(asked, replace(STATE, in_use=None))
+
+
+class TestLoopOfTheGate:
+    """The optical gains the gate and the expected loss are told."""
+
+    def test_the_gate_gets_more_than_the_expected_gain_of_every_mode(self):
+        known = replace(REGISTRATION, optical_gains=MEASURED)
+        loop = loop_settings(loop_of(0.4), (0.4,) * N_CONTROLLED, known)
+        expected = timing(loop_of(0.4), N_CONTROLLED, known).optical_gain
+        assert expected.shape == (N_MODES,)
+        assert np.all(loop.optical_gain > 1.05 * expected[:N_CONTROLLED])
+
+    def test_a_mean_of_unknown_modes_is_taken_for_all_with_some_safety(self):
+        loop = loop_settings(loop_of(0.4), (0.4,) * N_CONTROLLED, REGISTRATION)
+        assert loop.optical_gain == pytest.approx(GAIN_SAFETY * REGISTRATION.optical_gain)
+
+    def test_with_nothing_measured_the_model_is_believed(self):
+        blind = replace(REGISTRATION, optical_gain=None)
+        assert loop_settings(loop_of(0.4), (0.4,) * N_CONTROLLED, blind).optical_gain == 1.0

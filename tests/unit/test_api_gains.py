@@ -1,0 +1,92 @@
+"""The table of loop gains over real HTTP messages, with a hand-written service behind it."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import httpx
+import pytest
+
+from service.api import create_app
+from service.events import SetLoop
+from service.state import ModeGain, TrackerState
+from tests.unit.reactions.situations import START_NS, record, rtc
+from tests.unit.runtime.test_deeds import REGISTRATION
+
+MEASURED = (
+    ModeGain(mode=20, gain=0.5, sigma=0.01, scatter=0.02, t_ns_utc=START_NS),
+    ModeGain(mode=509, gain=0.7, sigma=0.02, scatter=0.02, t_ns_utc=START_NS),
+)
+
+
+class FakeService:
+    """Shows a state, remembers what it was asked."""
+
+    def __init__(self):
+        self.commands = []
+        self.state = TrackerState(
+            system="flao",
+            rtc=rtc(),
+            registration=replace(REGISTRATION, optical_gains=MEASURED),
+            reconstructors=(record("cm-1", optical_gains=MEASURED[:1]), record("cm-2")),
+        )
+
+    def snapshot(self):
+        return SimpleNamespace(tracker=self.state)
+
+    async def submit(self, command):
+        self.commands.append(command)
+        return "1 action(s) under way"
+
+
+@pytest.fixture
+def service():
+    return FakeService()
+
+
+@pytest.fixture
+async def client(service):
+    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
+        yield client
+
+
+async def test_the_present_table_is_of_every_mode_of_the_basis(client):
+    table = (await client.get("/v1/gains")).json()
+    assert table["reconstructor"] is None
+    assert [one["mode"] for one in table["measured"]] == [20, 509]
+    assert len(table["optical_gain"]) == len(table["factor"]) == 594
+    assert table["optical_gain"][20] == pytest.approx(0.5, rel=0.05)
+    assert table["factor"][20] > table["factor"][509]
+
+
+async def test_a_reconstructors_table_is_of_its_own_modes_and_time(client):
+    table = (await client.get("/v1/reconstructors/cm-1/gains")).json()
+    assert table["reconstructor"] == "cm-1"
+    assert [one["mode"] for one in table["measured"]] == [20]
+    assert len(table["factor"]) == 400
+
+
+async def test_where_nothing_was_measured_the_table_says_so(client):
+    table = (await client.get("/v1/reconstructors/cm-2/gains")).json()
+    assert table["measured"] == []
+    assert min(table["relative_sigma"]) > 0.1
+
+
+async def test_a_table_of_nothing_is_a_problem(client, service):
+    assert (await client.get("/v1/reconstructors/cm-9/gains")).status_code == 404
+    service.state = replace(service.state, rtc=None)
+    answer = await client.get("/v1/gains")
+    assert (answer.status_code, "no RTC is there" in answer.text) == (409, True)
+
+
+async def test_gains_by_the_table_are_asked_for_by_their_effect(client, service):
+    answer = await client.post("/v1/loop", json={"effective_gain": 0.3})
+    assert answer.status_code == 202
+    assert service.commands == [SetLoop(effective_gain=0.3)]
+
+
+async def test_gains_of_both_kinds_at_once_are_refused(client):
+    body = {"effective_gain": 0.3, "gains": [{"first": 0, "last": 1, "gain": 0.2}]}
+    answer = await client.post("/v1/loop", json=body)
+    assert answer.status_code == 422
+    assert "not both" in answer.text

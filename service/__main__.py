@@ -31,6 +31,7 @@ from service.errors import ConfigurationError, PyrcalError
 from service.fits.upload import UploadFitter
 from service.model.instrument import Instrument
 from service.reactions.measurements import MEASUREMENTS_KEPT
+from service.reactions.noisy import NOISY_KEPT
 from service.reactions.shelf import restored
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.crew import Crew
@@ -253,6 +254,7 @@ def _supervisor(
         mode=settings.service.mode,
         reconstructors=restored(archive.records()),
         measurements=archive.measured.records()[-MEASUREMENTS_KEPT:],
+        noisy=archive.noisy.records()[-NOISY_KEPT:],
         basis_id=instrument.basis_id,
         config_id=instrument.config_id,
     )

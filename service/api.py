@@ -7,7 +7,17 @@ from fastapi.routing import APIRoute
 
 from service import __version__
 from service.routes import fits as fits_of_uploads
-from service.routes import gains, health, loop, measurements, operating, pointing, problems, reading
+from service.routes import (
+    gains,
+    health,
+    loop,
+    measurements,
+    noisy,
+    operating,
+    pointing,
+    problems,
+    reading,
+)
 from service.routes.fits import Fits
 from service.routes.service import Link, Service, Snapshot
 
@@ -38,7 +48,7 @@ def create_app(service: Service, fits: Fits | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app)
-    for routes in (reading, gains, operating, pointing, loop, measurements, health):
+    for routes in (reading, gains, operating, pointing, loop, measurements, noisy, health):
         app.include_router(routes.router)
     if fits is not None:
         app.state.fits = fits

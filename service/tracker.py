@@ -23,6 +23,7 @@ from service.reactions.matrices import (
     shelved,
 )
 from service.reactions.measurements import MEASURING, meanwhile, on_measurement
+from service.reactions.noisy import awaits_its_dither, gather, on_noisy
 from service.reactions.operator import on_command
 from service.reactions.policy import Policy
 from service.reactions.rtc import (
@@ -59,6 +60,10 @@ def step(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step
     effects = (*effects, *more)
     if state.acquisition.under_way:
         return state, effects
+    state, more = gather(state, event, policy, now_ns)
+    effects = (*effects, *more)
+    if awaits_its_dither(state):
+        return state, effects
     state, more = decide(state, policy, now_ns)
     return state, (*effects, *more)
 
@@ -85,6 +90,10 @@ def _react(  # noqa: C901 - one line for each event
             return on_measurement(state, event, policy, now_ns)
         case ev.JobFailed(effect=ev.AskMeasurement()):
             return on_measurement(state, event, policy, now_ns)
+        case ev.MeasureNoisy() | ev.GiveUpNoisy() | ev.NoisyMade():
+            return on_noisy(state, event, policy, now_ns)
+        case ev.JobFailed(effect=ev.FinishNoisy()):
+            return on_noisy(state, event, policy, now_ns)
         case ev.SetLoop() | ev.Ramp() | ev.LoopAnswered():
             return on_loop(state, event, now_ns)
         case ev.JobFailed(effect=ev.AskLoop() | ev.AskRamp()):

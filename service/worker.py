@@ -233,9 +233,12 @@ class Workbench:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=window.t_end_ns_utc)
         return _unsettled(window)
 
-    def response(self, alpha: Misregistration) -> NDArray[np.float32]:
-        """Return D(α) of the sensor as it works, ``(n_slopes, n_modes)``, slope per metre OPD."""
-        return self._sensor.interaction_matrix(alpha)
+    def response(self, alpha: Misregistration | None) -> NDArray[np.float32]:
+        """Return D(α) of the sensor as it works, ``(n_slopes, n_modes)``, slope per metre OPD.
+
+        None: at the nominal registration.
+        """
+        return self._sensor.interaction_matrix(alpha or self._start)
 
     def _approach(
         self,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from service.archive.index import AuditEntry, Index
 from service.archive.measured import MeasuredArchive
+from service.archive.noisy import NoisyArchive
 from service.archive.product import Provenance, read_matrix, read_product, write_product
 from service.archive.tracking import TrackingFile
 from service.errors import ArchiveError, UnknownIdError
@@ -39,6 +40,8 @@ class Archive:
         self._index = Index(directory / "index.sqlite")
         self.measured = MeasuredArchive(directory / "interaction_matrices", self._index)
         """Interaction matrices the RTC has measured."""
+        self.noisy = NoisyArchive(directory / "noisy_matrices")
+        """Noisy interaction matrices of random dithers."""
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
         self._lock: IO[str] | None = None
@@ -73,12 +76,13 @@ class Archive:
             for leftover in self._products.glob("*.part"):
                 leftover.unlink()
             self.measured.prepare()
+            self.noisy.prepare()
         except OSError as error:
             self.close()
             raise ArchiveError(f"{self._directory}: cannot be used: {error}") from error
         try:
             self._index.open()
-            return (*self._adopt(), *self.measured.adopt())
+            return (*self._adopt(), *self.measured.adopt(), *self.noisy.adopt())
         except ArchiveError:
             self.close()
             raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.state import MeasurePattern, Mode, Pointing
+from service.state import MeasurePattern, Mode, ModeSet, Pointing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,6 +112,33 @@ class SetPointing:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MeasureNoisy:
+    """Measure a noisy interaction matrix, loop closed; None: the service's own choice."""
+
+    id: str
+    """Of the matrix to come, and of its dither; never used before."""
+
+    modes: tuple[int, ...] | ModeSet = ModeSet.CONTROLLED
+    """0-based basis indices, or which they are."""
+
+    total_m: float | None = None
+    """RMS of all modes together, metres OPD."""
+
+    duration_s: float | None = None
+    """Of telemetry."""
+
+    over_budget: bool = False
+    """Whether it may be more than the budget of the dither."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GiveUpNoisy:
+    """End a noisy interaction matrix under way, and its dither; nothing of it is kept."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GainGroup:
     """One gain for a range of modes."""
 
@@ -183,6 +210,8 @@ Command = (
     | Rollback
     | Measure
     | GiveUp
+    | MeasureNoisy
+    | GiveUpNoisy
     | SetLoop
     | SetPointing
     | Ramp

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.state import DitherView, MeasurementRecord
+from service.state import DitherView, MeasurementRecord, NoisyRecord
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,6 +98,13 @@ class AskRamp:
     frames_per_gain: int
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FinishNoisy:
+    """Fit and archive what has been summed of a noisy interaction matrix."""
+
+    record: NoisyRecord
+
+
 Effect = (
     MakeMatrix
     | CopyMatrix
@@ -109,4 +116,5 @@ Effect = (
     | AskMeasurement
     | AskLoop
     | AskRamp
+    | FinishNoisy
 )

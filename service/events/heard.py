@@ -14,7 +14,14 @@ from service.estimation.passive import PassiveEstimate
 from service.events.commands import Command
 from service.events.effects import Effect
 from service.model.misregistration import Misregistration
-from service.state import Level, MatrixState, MeasurementRecord, ReconstructorRecord, RtcView
+from service.state import (
+    Level,
+    MatrixState,
+    MeasurementRecord,
+    NoisyRecord,
+    ReconstructorRecord,
+    RtcView,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,6 +187,13 @@ class MatrixMeasured:
     record: MeasurementRecord
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NoisyMade:
+    """A noisy interaction matrix has been archived."""
+
+    record: NoisyRecord
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobFailed:
     """Something that was to be done could not be."""
@@ -209,5 +223,6 @@ Event = (
     | Vibrations
     | LoopAnswered
     | MatrixMeasured
+    | NoisyMade
     | JobFailed
 )

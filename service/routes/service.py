@@ -176,6 +176,28 @@ class Service(Protocol):
             If it is missing.
         """
 
+    def noisy_file(self, noisy_id: str) -> bytes:
+        """Return the HDF5 file of a noisy interaction matrix; called from a worker thread.
+
+        Raises
+        ------
+        UnknownIdError
+            If there is none of this id.
+        ArchiveError
+            If it is missing or damaged.
+        """
+
+    async def noisy_picture(self, noisy_id: str) -> bytes:
+        """Return a PNG of a noisy interaction matrix beside the synthetic one.
+
+        Raises
+        ------
+        UnknownIdError, ArchiveError
+            As :meth:`noisy_file`.
+        ConfigurationError
+            If matplotlib is not installed.
+        """
+
 
 def _service_of(request: Request) -> Service:
     service: Service = request.app.state.service

@@ -25,6 +25,7 @@ from service.runtime import translate
 from service.runtime.asking import Question, ask
 from service.runtime.crew import Crew
 from service.runtime.loops import loop_settings, timing
+from service.runtime.noisy import NoisyDesk
 from service.state import (
     MatrixState,
     ReconstructorRecord,
@@ -73,6 +74,8 @@ class Deeds:
         self._clock_ns = clock_ns
         self._matrices: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
         self._commanded_modes: int | None = None
+        self.noisy = NoisyDesk(crew=crew, archive=archive, instrument=instrument)
+        """Sums of the noisy interaction matrix under way."""
 
     async def carry_out(self, effect: Effect, state: TrackerState) -> Event | None:
         """Do it and return what came of it; None when the answer comes over the link.
@@ -93,6 +96,8 @@ class Deeds:
                 return await self._fetch(matrix_id)
             case ev.SendMatrix():
                 return await self._send(effect, state)
+            case ev.FinishNoisy(record=record):
+                return await self.noisy.finish(record, state)
             case ev.AskLoop(judged=True):
                 return await self._ask_judged(effect, state)
             case _:

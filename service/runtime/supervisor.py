@@ -118,6 +118,14 @@ class Supervisor:
         """Return the HDF5 file of a measured interaction matrix."""
         return self._archive.measured.file(measurement_id)
 
+    def noisy_file(self, noisy_id: str) -> bytes:
+        """Return the HDF5 file of a noisy interaction matrix."""
+        return self._archive.noisy.file(noisy_id)
+
+    async def noisy_picture(self, noisy_id: str) -> bytes:
+        """Return a PNG of a noisy interaction matrix beside the synthetic one."""
+        return await self._deeds.noisy.picture(noisy_id)
+
     async def run(self) -> None:
         """Work until cancelled: prepare the model, then listen, tick, fit, watch and record."""
         self._tell(replace(self._state, log=()))
@@ -181,6 +189,8 @@ class Supervisor:
         if isinstance(window, WindowRefused):
             self._post(ev.WindowLost(refused=window))
             return
+        if isinstance(window, Correlated):
+            self._deeds.noisy.take(window, self._state)
         if self._windows.full():
             late = self._windows.get_nowait()
             reason = "the worker is too slow for the telemetry: a window was given up"

@@ -10,6 +10,7 @@ from service.state.acquisition import Acquisition
 from service.state.dithering import Dithering
 from service.state.journal import Alarm, LogEntry
 from service.state.measurements import MeasurementRecord
+from service.state.noisy import NoisyRecord
 from service.state.pointing import Pointing
 from service.state.reconstructors import ReconstructorRecord
 from service.state.registration import HistoryEntry, Registration, Watchdog
@@ -49,6 +50,9 @@ class TrackerState:
 
     measurements: tuple[MeasurementRecord, ...] = ()
     """Of interaction matrices, oldest first, bounded."""
+
+    noisy: tuple[NoisyRecord, ...] = ()
+    """Noisy interaction matrices, oldest first, bounded."""
 
     in_use: str | None = None
     """Id of the matrix the RTC multiplies with; None: unknown."""
@@ -133,6 +137,15 @@ class TrackerState:
     def measurement(self, measurement_id: str) -> MeasurementRecord | None:
         """Return the record of this measured matrix, or None."""
         return next((r for r in reversed(self.measurements) if r.id == measurement_id), None)
+
+    def noisy_matrix(self, noisy_id: str) -> NoisyRecord | None:
+        """Return the record of this noisy interaction matrix, or None."""
+        return next((r for r in reversed(self.noisy) if r.id == noisy_id), None)
+
+    @property
+    def gathering(self) -> NoisyRecord | None:
+        """The noisy interaction matrix under way, or None."""
+        return next((r for r in reversed(self.noisy) if r.under_way), None)
 
     @property
     def measuring(self) -> MeasurementRecord | None:

@@ -770,6 +770,7 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
     }
     assert set(operations) == {
         "GET /v1/state",
+        "POST /v1/acquisition",
         "POST /v1/loop",
         "POST /v1/loop/ramp",
         "DELETE /v1/measurements/{id}",
@@ -781,6 +782,12 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
         "GET /v1/reconstructors/{id}/gains",
         "GET /v1/gains",
         "GET /v1/events",
+        "POST /v1/noisy-matrix",
+        "GET /v1/noisy-matrix",
+        "GET /v1/noisy-matrix/{id}",
+        "DELETE /v1/noisy-matrix/{id}",
+        "GET /v1/noisy-matrix/{id}/file",
+        "GET /v1/noisy-matrix/{id}/comparison.png",
         "GET /v1/measurements",
         "GET /v1/measurements/{id}",
         "GET /v1/measurements/{id}/matrix",
@@ -844,9 +851,11 @@ DIMENSIONLESS = {
     "magnification",
     "magnitude",
     "max_dither_modes",
+    "misfit",
     "mode",
     "optical_gain",
     "seed",
+    "snr",
     "status",
 }
 COUNTS = ("n_", "frames_", "windows_")

@@ -17,8 +17,8 @@ _SCAN_ROW = 2.6
 """Inches."""
 
 
-def check_plots() -> None:
-    """Refuse to begin where figures cannot be drawn.
+def check_plots(what: str = "--plot") -> None:
+    """Refuse to begin where figures cannot be drawn; ``what`` is what asks for one.
 
     Raises
     ------
@@ -29,7 +29,7 @@ def check_plots() -> None:
         import matplotlib.figure  # noqa: F401 - an extra, and slow to import
     except ImportError as error:
         raise ConfigurationError(
-            "--plot: needs matplotlib; expected pyrcal installed with its extra 'plots'"
+            f"{what}: needs matplotlib; expected pyrcal installed with its extra 'plots'"
         ) from error
 
 

@@ -1,0 +1,207 @@
+"""Noisy interaction matrices over real HTTP messages, with a hand-written service behind."""
+
+from dataclasses import replace
+
+import httpx
+import numpy as np
+import pytest
+
+from service.api import Snapshot, create_app
+from service.errors import CommandError, ConfigurationError, UnknownIdError
+from service.events import GiveUpNoisy, MeasureNoisy
+from service.model.misregistration import Misregistration
+from service.state import ModeSet, NoisyFinding, NoisyRecord, NoisyState, TrackerState
+
+FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"
+STORED = NoisyRecord(
+    id="noisy-1",
+    state=NoisyState.STORED,
+    modes=(0, 7, 3),
+    total_m=5e-9,
+    duration_s=30.0,
+    window_s=5.0,
+    seed=77,
+    asked_ns_utc=900,
+    basis_id="kl",
+    config_id="b1",
+    finding=NoisyFinding(
+        n_slopes=4,
+        n_frames=29_994,
+        n_missing=6,
+        snr=1.4,
+        alpha=Misregistration(shift_x_subap=0.1, rotation_rad=np.deg2rad(0.2)),
+        covariance=np.diag([0.01, 0.01, np.deg2rad(0.02), 0.001]) ** 2,
+        optical_gain=0.6,
+        misfit=1.01,
+        cm_id="cm-1",
+        session="s-1",
+        created_ns_utc=1_000,
+        sha256="0" * 64,
+    ),
+)
+RUNNING = replace(STORED, id="noisy-2", state=NoisyState.RUNNING, finding=None)
+
+
+class FakeService:
+    """Holds a real state and remembers what it was asked."""
+
+    def __init__(self):
+        self.commands = []
+        self.refusal = None
+        self.without_plots = False
+
+    def snapshot(self):
+        return Snapshot(
+            tracker=TrackerState(system="flao-lbt", noisy=(STORED, RUNNING)),
+            link=None,
+            now_ns=1_763_696_400_250_000_000,
+            started_ns=0,
+            ready=True,
+            ready_reason="ready",
+        )
+
+    async def submit(self, command):
+        if self.refusal is not None:
+            raise self.refusal
+        self.commands.append(command)
+        return "MeasureNoisy: 1 action(s) under way"
+
+    def noisy_file(self, noisy_id):
+        if noisy_id != "noisy-1":
+            raise UnknownIdError(f"noisy matrix {noisy_id}: no such matrix in the archive")
+        return FILE
+
+    async def noisy_picture(self, noisy_id):
+        if self.without_plots:
+            raise ConfigurationError(
+                "the picture of a noisy matrix: needs matplotlib; expected pyrcal installed with "
+                "its extra 'plots'"
+            )
+        self.noisy_file(noisy_id)
+        return IMAGE
+
+
+@pytest.fixture
+def service():
+    return FakeService()
+
+
+@pytest.fixture
+async def client(service):
+    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
+        yield client
+
+
+async def test_a_bare_request_takes_the_controlled_modes(client, service):
+    response = await client.post("/v1/noisy-matrix")
+    assert response.status_code == 202, response.text
+    body = response.json()
+    assert body["id"] == "noisy-20251121T034000.250000"
+    assert body["links"]["matrix"] == f"/v1/noisy-matrix/{body['id']}"
+    assert service.commands == [MeasureNoisy(id=body["id"])]
+
+
+@pytest.mark.parametrize(("modes", "expected"), [("all", ModeSet.ALL), ([3, 9], (3, 9))])
+async def test_every_choice_reaches_the_command(client, service, modes, expected):
+    body = {
+        "modes": modes,
+        "total_amplitude_m": 2e-9,
+        "duration_s": 60,
+        "over_budget": True,
+    }
+    response = await client.post("/v1/noisy-matrix", json=body)
+    assert response.status_code == 202, response.text
+    (command,) = service.commands
+    assert command == MeasureNoisy(
+        id=response.json()["id"],
+        modes=expected,
+        total_m=2e-9,
+        duration_s=60.0,
+        over_budget=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"modes": "every"}, "modes"),
+        ({"modes": []}, "at least one mode, none of them twice"),
+        ({"modes": [1, 1]}, "at least one mode, none of them twice"),
+        ({"modes": [-1]}, "modes"),
+        ({"total_amplitude_m": 0.0}, "total_amplitude_m"),
+        ({"duration_s": 4000.0}, "duration_s"),
+        ({"amplitude_m": 1e-9}, "amplitude_m: unknown"),
+    ],
+)
+async def test_a_request_that_cannot_be_meant_is_refused(client, service, body, words):
+    response = await client.post("/v1/noisy-matrix", json=body)
+    assert response.status_code == 422, response.text
+    assert words in response.json()["detail"]
+    assert service.commands == []
+
+
+async def test_a_refusal_arrives_in_its_own_words(client, service):
+    service.refusal = CommandError("noisy matrix: 11 nm RMS in all, budget 8 nm")
+    response = await client.post("/v1/noisy-matrix", json={})
+    assert (response.status_code, response.json()["detail"]) == (409, str(service.refusal))
+
+
+async def test_one_can_be_given_up(client, service):
+    response = await client.delete("/v1/noisy-matrix/noisy-2")
+    assert response.status_code == 202, response.text
+    assert service.commands == [GiveUpNoisy(id="noisy-2")]
+
+
+async def test_they_are_listed_oldest_first(client):
+    body = (await client.get("/v1/noisy-matrix")).json()
+    assert [m["id"] for m in body["noisy_matrices"]] == ["noisy-1", "noisy-2"]
+    assert [m["state"] for m in body["noisy_matrices"]] == ["stored", "running"]
+
+
+async def test_one_tells_how_it_was_made_and_what_it_says(client):
+    body = (await client.get("/v1/noisy-matrix/noisy-1")).json()
+    assert (body["n_modes"], body["modes"], body["seed"]) == (3, [0, 7, 3], 77)
+    assert body["amplitude_m"] == pytest.approx(5e-9 / np.sqrt(3))
+    found = body["finding"]
+    assert found["alpha"]["rotation_deg"] == pytest.approx(0.2)
+    assert found["sigma"]["rotation_deg"] == pytest.approx(0.02)
+    assert (found["snr"], found["misfit"]) == (1.4, 1.01)
+    assert (found["n_frames"], found["n_missing"]) == (29_994, 6)
+
+
+async def test_one_under_way_has_found_nothing_yet(client):
+    body = (await client.get("/v1/noisy-matrix/noisy-2")).json()
+    assert (body["state"], body["finding"]) == ("running", None)
+
+
+@pytest.mark.parametrize("path", ["noisy-9", "noisy-9/file", "noisy-9/comparison.png"])
+async def test_an_unknown_one_is_not_found(client, path):
+    response = await client.get(f"/v1/noisy-matrix/{path}")
+    assert response.status_code == 404
+    assert "noisy-9" in response.json()["detail"]
+
+
+async def test_the_product_leaves_as_it_lies_in_the_archive(client):
+    response = await client.get("/v1/noisy-matrix/noisy-1/file")
+    assert response.content == FILE
+    assert response.headers["content-disposition"] == 'attachment; filename="noisy-1.h5"'
+
+
+async def test_the_picture_is_a_png(client):
+    response = await client.get("/v1/noisy-matrix/noisy-1/comparison.png")
+    assert (response.content, response.headers["content-type"]) == (IMAGE, "image/png")
+
+
+async def test_without_matplotlib_the_picture_says_what_to_install(client, service):
+    service.without_plots = True
+    response = await client.get("/v1/noisy-matrix/noisy-1/comparison.png")
+    assert response.status_code == 501
+    assert "extra 'plots'" in response.json()["detail"]
+
+
+@pytest.mark.parametrize("action", ["approve", "publish", "reject"])
+async def test_no_route_publishes_one(client, service, action):
+    response = await client.post(f"/v1/noisy-matrix/noisy-1/{action}")
+    assert response.status_code in {404, 405}
+    assert service.commands == []

@@ -289,8 +289,8 @@ class Workbench:
         alpha: Misregistration,
         timing: Timing,
         magnitude: float | None,
-    ) -> ExpectedGain:
-        """Return what a new reconstructor would win over the one in use.
+    ) -> ExpectedGain | None:
+        """Return what a new reconstructor would win over the one in use; None: nobody can say.
 
         ``magnitude`` is the star's; None: the noise of the settings.
         """
@@ -313,7 +313,10 @@ class Workbench:
             crossing_hz=self._compute.wind_m_s / model.instrument.diameter_m,
             slope_noise=noise,
         )
-        return expected_gain(in_use, fresh, seen, timing, sky)
+        try:
+            return expected_gain(in_use, fresh, seen, timing, sky)
+        except np.linalg.LinAlgError:
+            return None
 
     def _recipe(self, n_modes: int) -> Recipe:
         prior = None

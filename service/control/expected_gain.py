@@ -121,7 +121,10 @@ def expected_gain(
     then_m2, fresh_radius = _left(fresh, seen, timing, sky, spectra)
     rest_m2 = float(sky.variance_m2[len(in_use) :].sum()) + sky.beyond_m2
     wavefront = float(np.sqrt(then_m2 + rest_m2))
-    loss = float(np.sqrt(now_m2 + rest_m2)) - wavefront if radius < 1.0 else float("inf")
+    loss = float(np.sqrt(now_m2 + rest_m2)) - wavefront
+    if max(radius, fresh_radius) >= 1.0:
+        # a mode without gain and leak never moves: a new reconstructor would not change that
+        loss = float("inf") if fresh_radius < 1.0 else 0.0
     return ExpectedGain(
         loss_m=loss, wavefront_m=wavefront, pole_radius=radius, fresh_pole_radius=fresh_radius
     )

@@ -65,10 +65,11 @@ def with_limit(
     if record.n_modes < asked:
         state = _limited(state, record.n_modes, why_fewer, now_ns)
     if record.n_modes < n_now:
-        text = f"{n_now} modes lowered to {record.n_modes}: {why_fewer}"
+        text = f"{record.id} has {record.n_modes} modes, {n_now} are controlled: {why_fewer}"
         return logged(state, "modes.lowered", text, now_ns, Level.WARNING)
     if record.n_modes > n_now:
-        state = logged(state, "modes.raised", f"{n_now} modes to {record.n_modes}", now_ns)
+        text = f"{record.id} has {record.n_modes} modes, {n_now} are controlled"
+        state = logged(state, "modes.raised", text, now_ns)
     limit = state.mode_limit
     if limit is not None and record.n_modes > limit.n_modes:
         # kept: a limit found again soon must be waited out longer

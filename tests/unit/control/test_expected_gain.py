@@ -67,8 +67,15 @@ def test_the_margin_shrinks_with_a_shift_and_a_new_matrix_has_all_of_it():
 
 
 def test_what_is_unstable_loses_everything():
-    fast = replace(TIMING, gains=np.full(N_CONTROLLED, 1.2))
+    fast = replace(TIMING, gains=np.full(N_CONTROLLED, 0.9))
     assert judged(shifted(0.3), timing=fast).loss_m == float("inf")
+
+
+def test_a_mode_that_never_moves_is_no_reason_for_another_matrix():
+    gains = np.full(N_CONTROLLED, 0.4)
+    gains[3] = 0.0
+    found = judged(shifted(0.1), timing=replace(TIMING, gains=gains))
+    assert (found.loss_m, found.fresh_pole_radius) == (0.0, pytest.approx(1.0))
 
 
 def test_noise_alone_leaves_what_the_closed_form_says():

@@ -6,8 +6,8 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 
 from service import __version__
-from service.routes import fits as fits_of_uploads
 from service.routes import (
+    acquisition,
     gains,
     health,
     loop,
@@ -18,6 +18,7 @@ from service.routes import (
     problems,
     reading,
 )
+from service.routes import fits as fits_of_uploads
 from service.routes.fits import Fits
 from service.routes.service import Link, Service, Snapshot
 
@@ -48,7 +49,17 @@ def create_app(service: Service, fits: Fits | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app)
-    for routes in (reading, gains, operating, pointing, loop, measurements, noisy, health):
+    for routes in (
+        reading,
+        gains,
+        operating,
+        acquisition,
+        pointing,
+        loop,
+        measurements,
+        noisy,
+        health,
+    ):
         app.include_router(routes.router)
     if fits is not None:
         app.state.fits = fits

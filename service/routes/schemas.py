@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from service.routes.acquisition_views import AcquisitionView
 from service.routes.dither_views import DitheringView
 from service.routes.registration_views import AlphaView, PointingView, WatchdogView
 from service.routes.rtc_views import DitherView, LoopCommandView, MeasuringView, RtcView
@@ -231,6 +232,7 @@ class StateView(View):
     measuring: MeasuringView | None
     """Null: none is."""
 
+    acquisition: AcquisitionView
     loop_command: LoopCommandView | None
     """Null: none was asked for."""
 

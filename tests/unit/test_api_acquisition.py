@@ -1,0 +1,70 @@
+"""Acquisitions over real HTTP messages, with a hand-written service behind it."""
+
+from dataclasses import replace
+
+import httpx
+import pytest
+
+from service.api import create_app
+from service.errors import CommandError
+from service.events import AbortAcquisition, Acquire
+from service.routes.acquisition_views import AcquisitionView
+from service.state import Acquisition, AcquisitionStage
+from tests.unit.reactions.situations import ALPHA
+
+
+class FakeService:
+    """Remembers what it was asked."""
+
+    def __init__(self):
+        self.commands = []
+        self.refusal = None
+
+    async def submit(self, command):
+        if self.refusal is not None:
+            raise self.refusal
+        self.commands.append(command)
+        return "1 action(s) under way"
+
+
+@pytest.fixture
+def service():
+    return FakeService()
+
+
+@pytest.fixture
+async def client(service):
+    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
+        yield client
+
+
+@pytest.mark.parametrize(
+    ("action", "command"), [("start", Acquire()), ("abort", AbortAcquisition())]
+)
+async def test_what_is_asked_reaches_the_command(client, service, action, command):
+    response = await client.post("/v1/acquisition", json={"action": action})
+    assert response.status_code == 202, response.text
+    assert service.commands == [command]
+
+
+@pytest.mark.parametrize("body", [{}, {"action": "go"}, {"action": "start", "modes": [1]}])
+async def test_what_makes_no_sense_is_refused(client, service, body):
+    response = await client.post("/v1/acquisition", json=body)
+    assert response.status_code == 422
+    assert not service.commands
+
+
+async def test_one_that_cannot_begin_says_why(client, service):
+    service.refusal = CommandError("acquisition: no RTC is there")
+    response = await client.post("/v1/acquisition", json={"action": "start"})
+    assert response.status_code == 409
+    assert "no RTC is there" in response.json()["detail"]
+
+
+def test_the_view_tells_stage_and_what_was_found_in_degrees():
+    under_way = Acquisition(stage=AcquisitionStage.CONFIRMING, text="looking", attempt=1)
+    view = AcquisitionView.model_validate(replace(under_way, alpha=ALPHA))
+    assert (view.stage, view.under_way, view.n_attempts) == ("confirming", True, 1)
+    assert view.alpha.rotation_deg == pytest.approx(0.2)
+    assert AcquisitionView.model_validate(Acquisition()).alpha is None

@@ -18,9 +18,9 @@ from service.estimation.wind import (
     with_passive,
 )
 from service.model.misregistration import Misregistration
+from service.reactions.estimate import DISAGREES, bias_of, brought_forward, remembered
 from service.reactions.journal import logged, with_alarm
 from service.reactions.policy import SECOND_NS, Policy
-from service.reactions.tracking import bias_of, brought_forward, remembered
 from service.reactions.validity import aged, with_dither_due
 from service.state import (
     HistoryEntry,
@@ -93,7 +93,7 @@ def _barking(
         state = replace(state, registration=replace(state.registration, doubt=text))
     detail = f"{text} (innovation {innovation:.0f}, expected 4)"
     state = logged(state, "registration.passive-jump", detail, now_ns, Level.WARNING)
-    state = with_dither_due(with_alarm(state, "watchdog", text, now_ns), text, now_ns)
+    state = with_dither_due(with_alarm(state, DISAGREES, text, now_ns), text, now_ns)
     state = aged(state, policy, now_ns)
     return _shown(state, event, BIAS_FLOOR, np.zeros(4), text, consistent=False)
 

@@ -12,7 +12,7 @@ from service.estimation.lockin import WindowRefused
 from service.reactions.journal import LOG_LENGTH
 from service.reactions.measurements import MEASUREMENTS_KEPT
 from service.reactions.shelf import RECONSTRUCTORS_KEPT
-from service.reactions.tracking import HISTORY_LENGTH
+from service.reactions.estimate import HISTORY_LENGTH
 from service.state import (
     MatrixState,
     MeasurementRecord,

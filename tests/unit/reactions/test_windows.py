@@ -6,7 +6,7 @@ import pytest
 
 from service import events as ev
 from service.estimation.lockin import WindowRefused
-from service.reactions.tracking import HISTORY_LENGTH
+from service.reactions.estimate import HISTORY_LENGTH
 from service.state import Level, Mode
 from tests.unit.reactions.situations import ALPHA, PRECISE, START_NS, Story, estimate, moved
 
@@ -68,7 +68,7 @@ def test_a_window_from_before_the_estimate_does_not_shrink_its_uncertainty_below
         ({"optical_gain": np.array([0.6, 0.6, 0.05, 0.6])}, "optical gains of 0.05 to 0.60"),
         ({"optical_gain": np.array([0.6, 0.6, 3.5, 0.6])}, "optical gains of 0.60 to 3.50"),
         ({"covariance": PRECISE * 1e4}, "too uncertain"),
-        ({"alpha": moved(shift_y_subap=-0.8)}, "outside the capture range"),
+        ({"alpha": moved(shift_y_subap=-0.9)}, "outside the capture range"),
         ({"alpha": moved(magnification=0.02)}, "outside the capture range"),
     ],
 )

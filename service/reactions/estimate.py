@@ -1,0 +1,158 @@
+"""The registration as a filter: brought forward, corrected by a window, remembered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.wind import Drift, Joint, begin_joint, predicted
+from service.model.misregistration import Misregistration
+from service.reactions.journal import without_alarm
+from service.reactions.policy import SECOND_NS, Policy
+from service.reactions.validity import aged, flexure, slewed_deg, without_dither_due
+from service.state import (
+    HistoryEntry,
+    ModeGain,
+    PassiveBias,
+    Registration,
+    Source,
+    TrackerState,
+)
+
+HISTORY_LENGTH = 5000
+
+SUSPECTED = "jump-suspected"
+"""Alarm while a window far out waits for the one that decides about it."""
+
+DISAGREES = "watchdog"
+"""Alarm while ordinary telemetry contradicts α."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measured:
+    """What one dithered window says of α."""
+
+    alpha: Misregistration
+    covariance: Array
+    """``(4, 4)`` numeric units, from its own data."""
+
+    t_ns_utc: int
+    """End of the window, the RTC's clock."""
+
+    source: Source
+    optical_gain: float
+    """Mean modulus of the gains of the dithered modes."""
+
+    optical_gains: tuple[ModeGain, ...]
+    """Those of every mode known, this window's included."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Folded:
+    """What the filter makes of a window."""
+
+    joint: Joint
+    n_windows: int
+    """Windows that agree with it, it included."""
+
+    innovation: float
+    """Normalised innovation squared (4 degrees of freedom)."""
+
+
+def brought_forward(
+    state: TrackerState, known: Registration, t_ns_utc: int, policy: Policy, now_ns: int
+) -> Joint:
+    """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
+    elapsed_ns = t_ns_utc - known.t_ns_utc
+    if elapsed_ns < -int(policy.window_s * SECOND_NS):
+        # a clock that was set back, or another night played again: the service's own must do
+        elapsed_ns = now_ns - known.arrived_ns_utc
+    drift = Drift(alpha_rate=policy.drift_rate, bias_memory_s=policy.bias_memory_s)
+    bent = flexure(known.pointing, state.pointing, policy)
+    return predicted(joint_of(known), drift, elapsed_ns / SECOND_NS, bent)
+
+
+def joint_of(known: Registration) -> Joint:
+    """Return the filter's state that a registration holds."""
+    fresh = begin_joint(known.alpha.vector, known.covariance)
+    bias = known.bias
+    if bias is None:
+        return fresh
+    covariance = fresh.covariance.copy()
+    covariance[4:, 4:] = bias.covariance
+    covariance[4:, :4], covariance[:4, 4:] = bias.shared, bias.shared.T
+    return Joint(mean=np.concatenate([known.alpha.vector, bias.offset]), covariance=covariance)
+
+
+def bias_of(joint: Joint, looked_ns_utc: int) -> PassiveBias:
+    """Return what the filter knows of the passive estimate's bias."""
+    return PassiveBias(
+        offset=joint.bias,
+        covariance=joint.covariance[4:, 4:],
+        shared=joint.covariance[4:, :4],
+        looked_ns_utc=looked_ns_utc,
+    )
+
+
+def remembered(state: TrackerState, entry: HistoryEntry) -> TrackerState:
+    """Return the state with one more line in its history."""
+    return replace(state, history=(*state.history, entry)[-HISTORY_LENGTH:])
+
+
+def counted(state: TrackerState, known: Registration, prior: Joint, policy: Policy) -> int:
+    """Return how many windows agree after this one: it stands alone where α had gone stale."""
+    sigma = np.sqrt(np.diag(prior.alpha_covariance) + known.floor**2)
+    alone = slewed_deg(state, known) > policy.slew_limit_deg or np.any(sigma > policy.stale_sigma)
+    return 1 if alone else known.n_windows + 1
+
+
+def accepted(
+    state: TrackerState, folded: Folded, measured: Measured, policy: Policy, now_ns: int
+) -> TrackerState:
+    """Return the state whose registration is what the filter says after a window."""
+    joint = folded.joint
+    known = state.registration
+    bias = None if known is None else known.bias
+    registration = Registration(
+        alpha=Misregistration.from_vector(joint.alpha),
+        covariance=joint.alpha_covariance,
+        floor=policy.floor,
+        t_ns_utc=measured.t_ns_utc,
+        arrived_ns_utc=now_ns,
+        n_windows=folded.n_windows,
+        window_ns_utc=now_ns,
+        optical_gain=measured.optical_gain,
+        optical_gains=measured.optical_gains,
+        bias=bias_of(joint, 0 if bias is None else bias.looked_ns_utc),
+        passive_after_ns_utc=known.passive_after_ns_utc if known is not None else 0,
+        pointing=state.pointing,
+        window_pointing=state.pointing,
+        restored_ns_utc=known.restored_ns_utc if known is not None else None,
+        basis_id=state.basis_id,
+        config_id=state.config_id,
+    )
+    state = replace(state, registration=registration, windows_accepted=state.windows_accepted + 1)
+    state = without_alarm(without_dither_due(state), SUSPECTED, now_ns)
+    state = without_alarm(state, DISAGREES, now_ns)
+    state = remembered(state, entry_of(measured, registration, folded.innovation))
+    return aged(state, policy, now_ns)
+
+
+def entry_of(
+    measured: Measured, registration: Registration, innovation: float, *, entered: bool = True
+) -> HistoryEntry:
+    """Return the line of the history that a window leaves."""
+    return HistoryEntry(
+        t_ns_utc=measured.t_ns_utc,
+        measured=measured.alpha,
+        measured_sigma=np.sqrt(np.diag(measured.covariance)),
+        filtered=registration.alpha,
+        filtered_sigma=registration.sigma,
+        innovation=innovation,
+        source=measured.source,
+        entered=entered,
+    )

@@ -10,6 +10,9 @@ import numpy as np
 PERIOD_S = 30.0
 """Between two things that happen in a night; the first comes after it, when all has settled."""
 
+LATER_S = 10.0
+"""A jump comes up to so much later, at random: in a window, or in the pause between two."""
+
 SWING_S = 2.0
 """Of seeing that takes the optical gain with it: from one extreme to the other."""
 
@@ -62,7 +65,9 @@ class Plan:
         """When the mirror jumps."""
         if self.case not in {Case.JUMP, Case.BUSY}:
             return ()
-        return tuple(np.arange(PERIOD_S, self.seconds - PERIOD_S / 2, PERIOD_S).tolist())
+        due_s = np.arange(PERIOD_S, self.seconds - LATER_S - PERIOD_S / 2, PERIOD_S)
+        later_s = np.random.default_rng((11, self.seed)).uniform(0.0, LATER_S, len(due_s))
+        return tuple(np.round(due_s + later_s, 2).tolist())
 
     @property
     def restart_s(self) -> float | None:

@@ -18,7 +18,7 @@ from service.state import ModeGain, PassiveBias, Pointing, Registration, Saved
 
 VERSION = 1
 
-_NOT_KEPT = ("grown", "standing", "candidate", "restored_ns_utc")
+_NOT_KEPT = ("grown", "standing", "candidate", "earlier", "restored_ns_utc")
 """What the next service works out anew."""
 
 _READ_FAILURES = (OSError, ValueError, KeyError, TypeError, AttributeError)

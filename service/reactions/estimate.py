@@ -13,6 +13,7 @@ from service.reactions.journal import without_alarm
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.validity import aged, flexure, slewed_deg, without_dither_due
 from service.state import (
+    Earlier,
     HistoryEntry,
     ModeGain,
     PassiveBias,
@@ -76,6 +77,20 @@ def brought_forward(
     return predicted(joint_of(known), drift, elapsed_ns / SECOND_NS, bent)
 
 
+def seen_from(earlier: Earlier, measured: Measured, state: TrackerState, policy: Policy) -> float:
+    """Return how far a window lies from what was known before the last one.
+
+    Squared, normalised, expected 4. A jump in the middle of a window moves that one by half of it
+    and the next by the other half, and neither half need be far out.
+    """
+    elapsed_s = max(measured.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
+    walked = policy.drift_rate**2 * elapsed_s
+    walked = walked + flexure(earlier.pointing, state.pointing, policy) ** 2
+    total = earlier.covariance + np.diag(walked) + measured.covariance
+    difference = measured.alpha.vector - earlier.alpha.vector
+    return float(difference @ np.linalg.solve(total, difference))
+
+
 def joint_of(known: Registration) -> Joint:
     """Return the filter's state that a registration holds."""
     fresh = begin_joint(known.alpha.vector, known.covariance)
@@ -129,6 +144,7 @@ def accepted(
         optical_gains=measured.optical_gains,
         bias=bias_of(joint, 0 if bias is None else bias.looked_ns_utc),
         passive_after_ns_utc=known.passive_after_ns_utc if known is not None else 0,
+        earlier=_earlier(known, folded),
         pointing=state.pointing,
         window_pointing=state.pointing,
         restored_ns_utc=known.restored_ns_utc if known is not None else None,
@@ -140,6 +156,17 @@ def accepted(
     state = without_alarm(state, DISAGREES, now_ns)
     state = remembered(state, entry_of(measured, registration, folded.innovation))
     return aged(state, policy, now_ns)
+
+
+def _earlier(known: Registration | None, folded: Folded) -> Earlier | None:
+    if known is None or folded.n_windows == 1 or known.candidate is not None:
+        return None
+    return Earlier(
+        alpha=known.alpha,
+        covariance=known.covariance,
+        t_ns_utc=known.t_ns_utc,
+        pointing=known.pointing,
+    )
 
 
 def entry_of(

@@ -23,7 +23,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
         session=state.rtc.session if state.rtc is not None else None,
         in_use=state.in_use,
         pointing=state.pointing,
-        registration=replace(state.registration, candidate=None),
+        registration=replace(state.registration, candidate=None, earlier=None),
     )
 
 

@@ -30,6 +30,7 @@ from service.reactions.estimate import (
     counted,
     entry_of,
     remembered,
+    seen_from,
 )
 from service.reactions.journal import logged, with_alarm
 from service.reactions.policy import SECOND_NS, Policy
@@ -57,8 +58,11 @@ def with_window(
         if aside <= JUMP_THRESHOLD and aside < _innovation(prior, measured):
             return _jumped(state, prior, measured, policy, now_ns)
         state = _outlier(state, known.candidate, measured, now_ns)
-    if _innovation(prior, measured) > JUMP_THRESHOLD:
-        return _held(state, prior, measured, policy, now_ns)
+    innovation = _innovation(prior, measured)
+    if known.candidate is None and known.earlier is not None:
+        innovation = max(innovation, seen_from(known.earlier, measured, state, policy))
+    if innovation > JUMP_THRESHOLD:
+        return _held(state, measured, innovation, policy, now_ns)
     folded = Folded(
         joint=with_dithered(prior, measured.alpha.vector, measured.covariance),
         n_windows=counted(state, known, prior, policy),
@@ -68,10 +72,10 @@ def with_window(
 
 
 def _held(
-    state: TrackerState, prior: Joint, measured: Measured, policy: Policy, now_ns: int
+    state: TrackerState, measured: Measured, innovation: float, policy: Policy, now_ns: int
 ) -> TrackerState:
     """Put a window that is far out aside, and doubt α until another one has come."""
-    known, innovation = _known(state), _innovation(prior, measured)
+    known = _known(state)
     text = (
         f"a window lies {_step(measured, known)} from α (innovation {innovation:.0f}, expected 4): "
         "the next one decides; nothing is made or sent meanwhile"

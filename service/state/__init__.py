@@ -9,6 +9,7 @@ from service.state.pointing import Pointing
 from service.state.reconstructors import MatrixState, ReconstructorRecord
 from service.state.registration import (
     Candidate,
+    Earlier,
     HistoryEntry,
     ModeGain,
     PassiveBias,
@@ -35,6 +36,7 @@ __all__ = [
     "DitherPlan",
     "DitherView",
     "Dithering",
+    "Earlier",
     "HistoryEntry",
     "Level",
     "LogEntry",

@@ -112,6 +112,21 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Earlier:
+    """What was known before the last window: a jump inside that one is seen from here."""
+
+    alpha: Misregistration
+    covariance: Array
+    """``(4, 4)`` at ``t_ns_utc``, numeric units."""
+
+    t_ns_utc: int
+    """End of the telemetry that had entered, the RTC's clock."""
+
+    pointing: Pointing | None
+    """Of the telescope then; None: not known."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:
     """The current estimate of α and how sure the service is of it."""
 
@@ -158,6 +173,9 @@ class Registration:
 
     window_pointing: Pointing | None = None
     """Of the telescope at the last dithered window; None: not known."""
+
+    earlier: Earlier | None = None
+    """Before the last window; None: that was the first, or it was the first after a jump."""
 
     candidate: Candidate | None = None
     """A jump that the next window confirms or denies; None: there is none."""

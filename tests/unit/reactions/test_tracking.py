@@ -138,6 +138,25 @@ class TestDecision:
         assert known.alpha.shift_x_subap == pytest.approx(THERE.shift_x_subap, abs=0.002)
         assert known.n_windows == 2
 
+    def test_a_jump_in_the_middle_of_a_window_is_seen_by_the_one_after_it(self, story):
+        """Half of 0.07 deg is 3.8 σ of a window and its walk, all of it over two windows 5.8 σ."""
+        half, there = moved(rotation_rad=np.deg2rad(0.035)), moved(rotation_rad=np.deg2rad(0.07))
+        story.see(half)
+        assert "jump-suspected" not in story.alarms
+        story.see(there)
+        assert "jump-suspected" in story.alarms
+        story.see(there)
+        known = story.state.registration
+        assert known.alpha.rotation_rad == pytest.approx(there.rotation_rad, abs=5e-5)
+        assert "registration.jump" in story.logged
+
+    def test_a_drift_ten_times_faster_than_expected_is_no_jump_after_another(self, story):
+        for k in range(1, 20):
+            story.see(moved(shift_x_subap=0.01 * k))
+        assert "registration.jump" not in story.logged
+        shift = story.state.registration.alpha.shift_x_subap
+        assert shift == pytest.approx(ALPHA.shift_x_subap + 0.19, abs=0.005)
+
     def test_outliers_in_a_row_never_move_it_while_no_two_agree(self, story):
         rng = np.random.default_rng(2)
         for _ in range(20):

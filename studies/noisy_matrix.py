@@ -2,8 +2,8 @@
 
 Random signs on all controlled modes, 5 nm RMS on the mirror altogether: what one element of the
 matrix is worth after half a minute, and what the registration fitted to it is worth. Run:
-``python -m studies.noisy_matrix --magnitude 7 --out noisy-7.json``. Beside the table of windows it
-writes what the picture needs (``--product FILE``), as the service archives it.
+``python -m studies.noisy_matrix --magnitude 7 --out noisy-7.json --archive noisy``. Beside what the
+windows say it archives the matrix as the service does, and draws it.
 """
 
 from __future__ import annotations
@@ -18,12 +18,16 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from service.archive.noisy import NoisyArchive
 from service.config import load_instrument
 from service.estimation import randomdither
 from service.estimation.noisymatrix import RandomEstimate, noisy_matrix
 from service.estimation.randomdither import Correlated, RandomDither, RandomPlan, joined
 from service.estimation.span import WindowRefused
+from service.fits.figures.noisy import draw
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.runtime.noisy import finished, work_out
+from service.state import NoisyRecord, NoisyState
 from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, Workbench
 from sim_rtc.assembly import Telescope, build_telescope
@@ -65,14 +69,14 @@ def main() -> None:
         if total is None:
             raise SystemExit("no window was finished")
         whole = bench.fit_random(total, start)
+        if given.archive is not None:
+            _archive(given, total, bench, start)
     found = {
         "arguments": {k: str(v) for k, v in vars(given).items()},
         "windows": rows,
         "whole": _row(whole, true) | _signal(total),
     }
     given.out.write_text(json.dumps(found, indent=1) + "\n")
-    if given.sums is not None:
-        _keep(given.sums, total)
 
 
 def _arguments() -> argparse.Namespace:
@@ -89,7 +93,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--window-s", type=float, default=5.0)
     parser.add_argument("--windows", type=int, default=6)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--sums", type=Path, help="keep the correlations here, NumPy")
+    parser.add_argument("--archive", type=Path, help="folder for the matrix and its picture")
     return parser.parse_args()
 
 
@@ -177,9 +181,28 @@ def _signal(total: Correlated) -> dict[str, Any]:
     }
 
 
-def _keep(path: Path, total: Correlated) -> None:
-    sums = {name: getattr(total.sums, name) for name in total.sums.__slots__}
-    np.savez(path, modes=total.plan.modes, amplitude_m=total.plan.amplitude_m, **sums)
+def _archive(
+    given: argparse.Namespace, total: Correlated, bench: Workbench, start: Misregistration
+) -> None:
+    """Archive the matrix as the service does, and draw it."""
+    found, instrument = work_out(bench, total, start), load_instrument("flao-lbt")
+    record = NoisyRecord(
+        id=f"noisy-mag{given.magnitude:g}",
+        state=NoisyState.FINISHING,
+        modes=total.plan.modes,
+        total_m=1e-9 * given.total_nm,
+        duration_s=given.window_s * given.windows,
+        window_s=given.window_s,
+        seed=given.seed,
+        asked_ns_utc=0,
+        basis_id="simulated",
+        config_id="simulated",
+    )
+    archive = NoisyArchive(given.archive)
+    archive.prepare()
+    archive.store(finished(record, total, found), found.numbers, instrument.name)
+    picture = draw(archive.path(record.id), instrument)
+    (given.archive / f"{record.id}.png").write_bytes(picture)
 
 
 if __name__ == "__main__":

@@ -223,7 +223,7 @@ def _made(state: TrackerState, record: NoisyRecord, now_ns: int) -> TrackerState
     known, found = state.noisy_matrix(record.id), record.finding
     if found is None or (known is not None and known.state is NoisyState.GIVEN_UP):
         return state
-    text = f"{record.id}: {found.n_frames} frames, an element is worth {found.snr:.2f} of its noise"
+    text = f"{record.id}: {found.n_frames} frames, signal / noise of an element {found.snr:.2f}"
     return logged(_with(state, record), "noisy-matrix.stored", text, now_ns)
 
 

@@ -87,7 +87,7 @@ class NoisyDesk:
         self._id = self._total = None
         start = None if known is None else known.alpha
         found = await self._crew.call(work_out, total, start)
-        record = _finished(record, total, found)
+        record = finished(record, total, found)
         store = self._archive.noisy.store
         await asyncio.to_thread(store, record, found.numbers, self._instrument.name)
         return ev.NoisyMade(record=record)
@@ -137,7 +137,8 @@ def _single(values: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.ascontiguousarray(values, np.float32)
 
 
-def _finished(record: NoisyRecord, total: Correlated, found: Found) -> NoisyRecord:
+def finished(record: NoisyRecord, total: Correlated, found: Found) -> NoisyRecord:
+    """Return the record of a matrix that is ready for the archive."""
     estimate = found.estimate
     finding = NoisyFinding(
         n_slopes=len(found.numbers.matrix),

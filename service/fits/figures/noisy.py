@@ -141,8 +141,8 @@ def shown_columns(modes: NDArray[np.intp]) -> list[int]:
 def _heading(facts: dict[str, Any]) -> str:
     lines = [
         f"{facts['instrument']}, {facts['id']}: {len(facts['modes'])} modes, "
-        f"{1e9 * facts['total_m']:.3g} nm RMS in all, {facts['n_frames']} frames; an element is "
-        f"worth {facts['element_snr']:.2f} of its noise"
+        f"{1e9 * facts['total_m']:.3g} nm RMS in all, {facts['n_frames']} frames; signal / noise "
+        f"of an element {facts['element_snr']:.2f}"
     ]
     if "rotation_deg" in facts:
         lines.append(

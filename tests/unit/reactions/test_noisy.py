@@ -120,7 +120,7 @@ def test_what_is_archived_is_stored_and_the_service_dithers_on(story):
     finished(story)
     assert state_of(story) is NoisyState.STORED
     assert story.state.gathering is None
-    assert "worth 1.40 of its noise" in story.state.log[-1].text
+    assert "signal / noise of an element 1.40" in story.state.log[-1].text
 
 
 def test_a_session_that_ends_in_the_middle_is_finished_with_what_there_is(story):

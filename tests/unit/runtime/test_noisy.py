@@ -1,0 +1,182 @@
+"""The noisy interaction matrix from windows to archive and picture, on a small instrument."""
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.archive import Archive
+from service.errors import CommandError, UnknownIdError
+from service.estimation.frames import FrameBlock
+from service.estimation.randomdither import RandomDither, RandomPlan, accumulate
+from service.fits.figures.noisy import Pair
+from service.model.misregistration import Misregistration
+from service.reactions.journal import with_alarm
+from service.runtime.deeds import Deeds, Publishing
+from service.runtime.noisy import NoisyDesk
+from service.state import NoisyRecord, NoisyState, TrackerState
+from service.worker import Workbench
+from tests.unit.reactions.situations import rtc
+from tests.unit.runtime.small import COMPUTE, small_instrument
+
+ALPHA = Misregistration(
+    shift_x_subap=0.12, shift_y_subap=-0.08, rotation_rad=0.004, magnification=1.003
+)
+MODES = tuple(range(0, 60, 2))
+TOTAL_M = 5e-9
+N_FRAMES = 1000
+RUNNING = NoisyRecord(
+    id="noisy-1",
+    state=NoisyState.RUNNING,
+    modes=MODES,
+    total_m=TOTAL_M,
+    duration_s=2.0,
+    window_s=1.0,
+    seed=3,
+    asked_ns_utc=0,
+    basis_id="kl",
+    config_id="b1",
+)
+STATE = TrackerState(system="small", noisy=(RUNNING,))
+
+
+class NearCrew:
+    """Runs jobs here and now, on the real workbench."""
+
+    def __init__(self):
+        self.bench = Workbench(small_instrument(), COMPUTE)
+
+    async def call(self, job, *args):
+        return job(self.bench, *args)
+
+
+@pytest.fixture(scope="module")
+def crew():
+    return NearCrew()
+
+
+@pytest.fixture
+def archive(tmp_path):
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        yield archive
+
+
+@pytest.fixture
+def desk(crew, archive):
+    return NoisyDesk(crew=crew, archive=archive, instrument=small_instrument())
+
+
+def windows(crew, n=2, *, gain=0.6, noise=3e-3, modes=MODES, session="s1"):
+    """Windows of a sensor that sees random signs on these modes, and noise."""
+    rng = np.random.default_rng(7)
+    matrix = crew.bench.response(ALPHA)
+    amplitude_m = TOTAL_M / np.sqrt(len(modes))
+    dither = np.zeros((n * N_FRAMES, matrix.shape[1]), np.float32)
+    dither[:, modes] = amplitude_m * rng.choice([-1.0, 1.0], (len(dither), len(modes)))
+    slopes = gain * dither @ matrix.T + noise * rng.standard_normal((len(dither), len(matrix)))
+    block = FrameBlock(
+        session=session,
+        first_seq=0,
+        t0_ns_utc=0,
+        dt_ns=1_000_000,
+        slopes=slopes.astype(np.float32),
+        commands_m=dither,
+        dither_m=dither,
+        cm_id="cm-1",
+    )
+    plan = RandomPlan(
+        modes=modes, amplitude_m=(amplitude_m,) * len(modes), n_frames=N_FRAMES, first_seq=0
+    )
+    _, found = accumulate(RandomDither(plan=plan), block)
+    return found
+
+
+async def finish(desk, crew, **changes):
+    for window in windows(crew, **changes):
+        desk.take(window, STATE)
+    return await desk.finish(RUNNING, STATE)
+
+
+async def test_windows_become_an_archived_matrix_and_the_registration_in_it(desk, crew, archive):
+    made = await finish(desk, crew)
+    assert isinstance(made, ev.NoisyMade)
+    record = made.record
+    assert (record.state, record.reason) == (NoisyState.STORED, "")
+    found = record.finding
+    assert (found.n_frames, found.session, found.cm_id) == (1998, "s1", "cm-1")
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(found.alpha.vector - ALPHA.vector) < 4.0 * sigma)
+    assert found.optical_gain == pytest.approx(0.6, abs=0.03)
+    assert [r.id for r in archive.noisy.records()] == ["noisy-1"]
+
+
+async def test_what_is_archived_is_the_matrix_within_its_stated_noise(desk, crew, archive):
+    await finish(desk, crew)
+    with h5py.File(archive.noisy.path("noisy-1")) as file:
+        matrix, noise = file["interaction_matrix"][()], file["element_noise"][()]
+        synthetic, gain = file["synthetic"][()], file["optical_gain"][()]
+    true = 0.6 * crew.bench.response(ALPHA)[:, list(MODES)]
+    assert np.sqrt(np.mean(((matrix - true) / noise) ** 2)) == pytest.approx(1.0, abs=0.03)
+    # the model at the α found lies within that noise, too
+    assert np.linalg.norm(synthetic * gain - true) < 0.1 * np.linalg.norm(matrix - true)
+
+
+async def test_windows_of_another_dither_or_of_a_loop_out_of_hand_do_not_count(desk, crew):
+    (other,) = windows(crew, n=1, modes=MODES[:5])
+    desk.take(other, STATE)
+    (window,) = windows(crew, n=1)
+    desk.take(window, replace(STATE, noisy=()))
+    desk.take(window, with_alarm(STATE, "loop-diverging", "it does", 0))
+    with pytest.raises(CommandError, match="no window of its dither was whole"):
+        await desk.finish(RUNNING, STATE)
+
+
+async def test_what_came_before_the_rtc_restarted_does_not_count(desk, crew):
+    (before,) = windows(crew, n=1)
+    desk.take(before, STATE)
+    made = await finish(desk, crew, n=1, session="s2")
+    assert (made.record.finding.session, made.record.finding.n_frames) == ("s2", 999)
+
+
+async def test_a_matrix_nobody_can_fit_is_kept_and_says_so(desk, crew):
+    made = await finish(desk, crew, gain=0.0)
+    assert made.record.finding.alpha is None
+    assert "the dither is not seen" in made.record.reason
+
+
+async def test_nothing_that_publishes_finds_one(crew, archive):
+    deeds = Deeds(
+        bridge=None,
+        crew=crew,
+        archive=archive,
+        instrument=small_instrument(),
+        publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
+        clock_ns=lambda: 0,
+    )
+    await finish(deeds.noisy, crew)
+    with pytest.raises(UnknownIdError):
+        deeds.matrix("noisy-1")
+    state = replace(STATE, rtc=rtc())
+    for effect in (
+        ev.SendMatrix(id="noisy-1", n_modes=30, gains=None),
+        ev.CopyMatrix(source="noisy-1", why="a mistake"),
+    ):
+        with pytest.raises(UnknownIdError, match="noisy-1"):
+            await deeds.carry_out(effect, state)
+    assert archive.records() == ()
+
+
+async def test_the_picture_shows_measured_beside_synthetic(desk, crew, archive):
+    pytest.importorskip("matplotlib")
+    await finish(desk, crew)
+    image = await desk.picture("noisy-1")
+    assert image.startswith(b"\x89PNG")
+    pair = Pair.read(archive.noisy.path("noisy-1"), small_instrument())
+    left = (pair.measured - pair.synthetic) / pair.noise
+    assert np.sqrt(np.mean(left**2)) == pytest.approx(1.0, abs=0.03)
+    with pytest.raises(UnknownIdError):
+        await desk.picture("noisy-9")

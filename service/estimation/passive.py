@@ -1,57 +1,37 @@
-"""The watchdog: registration from ordinary telemetry, without a dither.
+"""The watchdog: what ordinary telemetry, without a dither, says of the registration.
 
-First differences of slopes and commands of the same frame give a noisy interaction matrix. It is
-a measurement to fit a model to, never a matrix to control with. Differencing once is the most a
-two-frame delay allows: more lets slope noise re-enter through the loop. Frozen flow biases the
-shifts by 1.6 % of a subaperture at 8 m/s and 16 % at 25 m/s, and no integration removes it.
+The turbulence that is left in the filtered commands biases the shifts by the wind, steadily, and no
+integration removes it: docs/results/passive.md has by how much.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from service.estimation.frames import FrameBlock
+from service.estimation.estimator import PASSIVE, Determines
+from service.estimation.highpass import high_pass
+from service.estimation.passivesums import Passive as Passive
+from service.estimation.passivesums import accumulate as accumulate
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
 Array = NDArray[Any]
 
 BIAS_FLOOR = np.array([0.10, 0.10, np.deg2rad(0.05), 0.001])
-"""1 σ nobody may go below without a dither: the wind's bias of the shifts, measured otherwise."""
+"""1 σ nobody may go below without a dither: the wind's bias, and the model's own error."""
 
 MIN_FRAMES_PER_MODE = 5
 """Fewer effective frames leave the command covariance too noisy to invert."""
 
+MIN_SAMPLES = 8
+"""Fewer filtered frames do not tell how noisy the slopes are."""
+
 _RIDGE = 1e-6
 _STILL_RIDGE = 1e-9
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Passive:
-    """Forgetting sums over first differences: feed it blocks with ``accumulate``."""
-
-    n_modes: int
-    """Controlled modes: the only ones that move by themselves."""
-
-    memory_frames: float
-    """Frames after which a sample's weight has fallen to 1/e."""
-
-    command_power: NDArray[np.float32] | None = None
-    """``(n_modes, n_modes)`` sum of dc dc^T, metres²."""
-
-    cross: NDArray[np.float32] | None = None
-    """``(n_slopes, n_modes)`` sum of ds dc^T, metres."""
-
-    slope_power: float = 0.0
-    """Sum of |ds|²."""
-
-    n_effective: float = 0.0
-    """Frames in the sums, forgetting included."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,104 +39,111 @@ class PassiveEstimate:
     """What ordinary telemetry says of the registration."""
 
     alpha: Misregistration
-    sigma: NDArray[np.float64]
-    """``(4,)`` numeric units, never below ``BIAS_FLOOR``."""
+    covariance: NDArray[np.float64]
+    """``(4, 4)`` numeric units, of the scatter alone: the bias is not in it."""
 
-    gains: NDArray[np.float64]
+    optical_gain: NDArray[np.float64]
     """``(n_modes,)`` free gain of each mode against the model."""
 
+    misfit: float
+    """Residual power over what the slopes' noise explains; 1: the model explains the data. NaN: too
+    young to tell."""
+
     step: NDArray[np.float64]
-    """``(4,)`` distance from the linearisation."""
+    """``(4,)`` distance from the linearisation, numeric units."""
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """``(4,)`` 1 σ in numeric units where nothing is known of the bias."""
+        return np.asarray(np.sqrt(np.diag(self.covariance) + BIAS_FLOOR**2))
+
+    @property
+    def determines(self) -> Determines:
+        """Which of the four parameters it can tell."""
+        return PASSIVE
 
 
-def accumulate(state: Passive, block: FrameBlock) -> Passive:
-    """Add a block of frames; no difference spans two blocks."""
-    if block.n_frames < 2:
-        return state
-    commands = np.diff(block.commands_m[:, : state.n_modes], axis=0)
-    slopes = np.diff(block.slopes, axis=0)
-    n = len(commands)
-    fade = float(np.exp(-n / state.memory_frames))
-    power, cross = commands.T @ commands, slopes.T @ commands
-    if state.command_power is not None and state.cross is not None:
-        power += np.float32(fade) * state.command_power
-        cross += np.float32(fade) * state.cross
-    return replace(
-        state,
-        command_power=power,
-        cross=cross,
-        slope_power=fade * state.slope_power + float(np.vdot(slopes, slopes)),
-        n_effective=fade * state.n_effective + n,
-    )
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NoisyMatrix:
+    """What the telemetry makes of the interaction matrix."""
+
+    matrix: NDArray[np.float64]
+    """``(n_slopes, n_modes)`` of the controlled modes, slope per metre OPD."""
+
+    shape: NDArray[np.float64]
+    """``(n_modes, n_modes)`` covariance of the columns' errors, for slopes with noise of 1."""
 
 
-def interaction_matrix(state: Passive) -> Array | None:
-    """Return the noisy interaction matrix ``(n_slopes, n_modes)``, or None when too young."""
-    found = _noisy_matrix(state)
-    return None if found is None else found[0]
+def noisy_matrix(state: Passive) -> NoisyMatrix | None:
+    """Return the noisy interaction matrix, or None when the telemetry is too young.
 
-
-def _noisy_matrix(state: Passive) -> tuple[Array, Array] | None:
-    """Return the noisy matrix and the relative noise variance ``(n_modes,)`` of its columns.
-
-    The residual slopes are as noisy for every column, so a column's noise is what the inverse of
-    the command covariance makes of it: the diagonal of that inverse.
+    ``D = (sum s z^T) (sum c z^T)^-1``, as z is independent of the noise of its frame. The errors of
+    its columns go as ``X^-T (sum z z^T) X^-1`` with ``X = sum c z^T``.
     """
-    if state.command_power is None or state.cross is None:
+    if state.cross is None or state.moved is None or state.power is None:
         return None
     if state.n_effective < MIN_FRAMES_PER_MODE * state.n_modes:
         return None
-    power = _invertible_power(state.command_power)
-    if power is None:
-        return None
-    lower, _ = factor = cho_factor(power, lower=True)
-    half = solve_triangular(lower, np.eye(len(power)), lower=True)
-    matrix = cho_solve(factor, state.cross.T.astype(np.float64)).T
-    return np.asarray(matrix), np.einsum("km,km->m", half, half)
-
-
-def _invertible_power(command_power: Array) -> Array | None:
-    """Return the command covariance with a ridge; None when no mode has moved at all.
-
-    The ridge is relative to each mode's own power, or the strongest would drown the weakest, with
-    just enough of the mean for a mode that never moves.
-    """
-    power = command_power.astype(np.float64)
-    own = np.diag(power)
+    own = np.diag(state.power).astype(np.float64)
     if not own.any():
         return None
-    return np.asarray(power + np.diag(_RIDGE * own + _STILL_RIDGE * own.mean()))
+    # relative to each mode's own power, or the strongest would drown the weakest, with just
+    # enough of the mean for a mode that never moves
+    ridge = np.diag(_RIDGE * own + _STILL_RIDGE * own.mean())
+    inverse = np.linalg.inv(state.moved.astype(np.float64) + ridge)
+    return NoisyMatrix(
+        matrix=state.cross.astype(np.float64) @ inverse,
+        shape=inverse.T @ state.power.astype(np.float64) @ inverse,
+    )
 
 
 def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     """Fit α and a free gain per mode to the noisy matrix; None when too few frames came.
 
     Variable projection (Kaufman 1975): ``g_j = D_j.Y_j / D_j.D_j``,
-    ``J_jk = g_j (I - P_j) dD_j/dα_k``, each mode weighted by its noise.
+    ``J_jk = g_j (I - P_j) dD_j/dα_k``, each mode weighted by its noise. The residual gives the
+    noise of the slopes; with it, ``Cov = A^-1 (J w) Q (J w)^T A^-1``, as the errors Q of the
+    columns are not independent.
     """
-    found = _noisy_matrix(state)
+    found = noisy_matrix(state)
     if found is None:
         return None
-    measured, noise = found
-    weight = 1.0 / (np.mean(np.einsum("sm,sm->m", measured, measured)) * noise)
     modes = slice(0, state.n_modes)
     matrix = linearisation.matrix[:, modes].astype(np.float64)
+    noise = np.diag(found.shape)
+    # a mode that never moves has no noise, and no weight
+    least = noise[noise > 0.0].min()
+    weight = np.where(noise > 0.0, least / np.maximum(noise, least), 0.0)
     norm = np.einsum("sm,sm->m", matrix, matrix)
-    gains = np.einsum("sm,sm->m", matrix, measured) / norm
-    residual = measured - gains * matrix
+    gains = np.einsum("sm,sm->m", matrix, found.matrix) / norm
     jacobian = []
     for derivative in linearisation.derivatives[:, :, modes].astype(np.float64):
         along = np.einsum("sm,sm->m", matrix, derivative) / norm
-        jacobian.append(gains * (derivative - along * matrix))
-    flat = np.array([(j * np.sqrt(weight)).ravel() for j in jacobian])
-    target = (residual * np.sqrt(weight)).ravel()
-    normal = flat @ flat.T
-    step = np.linalg.solve(normal, flat @ target)
-    left = target - step @ flat
-    scatter = np.linalg.inv(normal) * (left @ left) / (left.size - state.n_modes - 4)
+        jacobian.append((gains * (derivative - along * matrix)).ravel())
+    flat = np.array(jacobian)
+    heavy = (flat.reshape(4, *matrix.shape) * weight).reshape(4, -1)
+    residual = (found.matrix - gains * matrix).ravel()
+    normal = np.linalg.inv(flat @ heavy.T)
+    step = normal @ (heavy @ residual)
+    left = (residual - step @ flat).reshape(matrix.shape)
+    freedom = (len(matrix) - 1) * (weight @ noise) - 4 * least
+    variance = float(np.einsum("sm,sm,m->", left, left, weight) / freedom)
+    scores = heavy.reshape(-1, state.n_modes)
+    spread = (scores @ found.shape).reshape(4, -1) @ heavy.T
     return PassiveEstimate(
         alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
-        sigma=np.sqrt(np.diag(scatter) + BIAS_FLOOR**2),
-        gains=gains,
+        covariance=variance * normal @ spread @ normal,
+        optical_gain=gains,
+        misfit=variance / _slope_variance(state, found.matrix),
         step=step,
     )
+
+
+def _slope_variance(state: Passive, matrix: Array) -> float:
+    """Return the variance of a slope's noise at the frequencies of the filter."""
+    if len(state.samples) < MIN_SAMPLES:
+        return float("nan")
+    slopes = np.array([slopes for slopes, _ in state.samples])
+    commands = np.array([commands for _, commands in state.samples])
+    passed = float(np.sum(high_pass(state.delay_frames).taps ** 2))
+    return float(np.mean((slopes - commands @ matrix.T) ** 2)) / passed

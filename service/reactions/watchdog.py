@@ -124,7 +124,7 @@ def _noise(estimate: PassiveEstimate, known: Registration, t_ns_utc: int) -> Arr
 
 
 def _scatter(estimate: PassiveEstimate) -> Array:
-    return np.diag(np.maximum(estimate.sigma**2 - BIAS_FLOOR**2, 0.0))
+    return estimate.covariance
 
 
 def _reading_sigma(estimate: PassiveEstimate, prior: Joint) -> Array:

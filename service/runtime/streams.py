@@ -98,7 +98,11 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     streams = _watching_the_edge(streams, rtc)
     # frames that are on their way may have been made by the loop as it was
     streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None)
-    memory = Passive(n_modes=rtc.n_controlled, memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz)
+    memory = Passive(
+        n_modes=rtc.n_controlled,
+        memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz,
+        delay_frames=rtc.delay_frames,
+    )
     if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
         ears = hearing(rtc.n_slopes)
         streams = replace(streams, lock_in=None, random=None, dither=None)

@@ -19,7 +19,7 @@ from service.estimation.frames import FrameBlock
 from service.estimation.instrumental import Loop, WindowEstimate
 from service.estimation.lockin import LockIn, LockInPlan, Spectra, WindowRefused
 from service.estimation.noisymatrix import RandomEstimate
-from service.estimation.passive import Passive, PassiveEstimate
+from service.estimation.passive import BIAS_FLOOR, Passive, PassiveEstimate
 from service.estimation.randomdither import Correlated, RandomDither, RandomPlan
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.wire import DitherAction, DitherKind, DitherRequest
@@ -183,6 +183,7 @@ def _windows(
     watched = Passive(
         n_modes=night.n_controlled,
         memory_frames=2.0 * plan.n_frames,
+        delay_frames=telescope.settings.delay_frames,
     )
     rng, n_frames = np.random.default_rng(night.seed), 0
     while True:
@@ -268,18 +269,16 @@ def _row(outcome: Outcome, true: Misregistration, errors_nm: list[float]) -> dic
     if isinstance(outcome, WindowRefused):
         return row | {"refused": outcome.reason}
     difference = outcome.alpha.vector - true.vector
-    misfit: float | None = None
+    covariance, gains = outcome.covariance, np.abs(outcome.optical_gain)
     if isinstance(outcome, PassiveEstimate):
-        covariance, gains = np.diag(outcome.sigma**2), outcome.gains
-    else:
-        covariance, gains = outcome.covariance, np.abs(outcome.optical_gain)
-        misfit = outcome.misfit
+        # nothing is known of the wind's bias in a night without a dither
+        covariance = covariance + np.diag(BIAS_FLOOR**2)
     return row | {
         "refused": None,
         "error": (difference * BOUNDARY_SCALE).tolist(),
         "covariance": (covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)).tolist(),
         "optical_gain": float(gains.mean()),
-        "misfit": misfit,
+        "misfit": outcome.misfit,
     }
 
 

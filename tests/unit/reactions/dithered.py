@@ -6,7 +6,7 @@ import numpy as np
 
 from service import events as ev
 from service.control.precision import tabulated
-from service.estimation.passive import BIAS_FLOOR, PassiveEstimate
+from service.estimation.passive import PassiveEstimate
 from service.reactions.dither_choice import SETTLING_S, total_m
 from service.state import Mode
 from tests.unit.reactions.situations import ALPHA, Story, estimate, moved, rtc
@@ -24,6 +24,7 @@ class DitheredNight(Story):
     ):
         super().__init__(Mode.HOLD, policy)
         self.looks = looks
+        self.deaf = False
         self.view = rtc(magnitude=magnitude, **changes)
         self.kappa = tabulated(magnitude) if kappa is None else kappa
         self.alpha = alpha
@@ -51,7 +52,7 @@ class DitheredNight(Story):
                         id=dither.id, accepted=True, reason="", start_seq=self.seq
                     )
                     self.pass_on(self.tell(answer))
-                case ev.AskNoDither():
+                case ev.AskNoDither() if not self.deaf:
                     self.playing = None
                 case _:
                     pass
@@ -103,8 +104,13 @@ class DitheredNight(Story):
     def look(self):
         """The passive watchdog, off by a steady wind."""
         off = moved(self.alpha(self.t_s), shift_x_subap=0.04)
-        sigma = np.hypot([0.003, 0.003, 1e-4, 1e-4], BIAS_FLOOR)
-        found = PassiveEstimate(alpha=off, sigma=sigma, gains=np.full(400, 0.6), step=np.zeros(4))
+        found = PassiveEstimate(
+            alpha=off,
+            covariance=np.diag([0.003, 0.003, 1e-4, 1e-4]) ** 2,
+            optical_gain=np.full(400, 0.6),
+            misfit=1.0,
+            step=np.zeros(4),
+        )
         return ev.Watched(estimate=found, t_ns_utc=self.now_ns)
 
     @property

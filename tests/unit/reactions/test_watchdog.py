@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service import events as ev
-from service.estimation.passive import BIAS_FLOOR, PassiveEstimate
+from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.reactions.tracking import PASSIVE_BLIND_S
 from service.state import Mode, Source, Validity
@@ -27,8 +27,9 @@ SCATTER = np.array([0.003, 0.003, 1e-4, 1e-4])
 def watched(alpha, scatter=SCATTER):
     return PassiveEstimate(
         alpha=alpha,
-        sigma=np.hypot(scatter, BIAS_FLOOR),
-        gains=np.full(400, 0.6),
+        covariance=np.diag(scatter**2),
+        optical_gain=np.full(400, 0.6),
+        misfit=1.0,
         step=np.zeros(4),
     )
 

@@ -36,6 +36,9 @@ RESULT_WITHIN_S = 10.0
 SOON_OVER_S = 2.0
 """A dither that ends by itself so soon is not worth a command."""
 
+STOPPED_WITHIN_S = 5.0
+"""An RTC still playing a dither so long after it was asked to stop does not stop dithers."""
+
 MEMORY_S = 600.0
 """Of the mean cost that is shown."""
 
@@ -67,9 +70,8 @@ def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
         return state, ()
     if rtc.dither_id is not None and rtc.dither_id.startswith(OWN_DITHER):
         # left behind by this service: over budget, its window of another length, or to stop
-        dithering = replace(state.dithering, stopped_id=rtc.dither_id)
-        state = replace(state, dithering=dithering, retry_ns_utc=now_ns + 2 * SECOND_NS)
-        return state, (AskNoDither(),)
+        state = replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS)
+        return _stopped(state, rtc.dither_id, now_ns), (AskNoDither(),)
     if now_ns < wish.next_ns_utc or _awaits_a_result(state, wish, now_ns):
         return state, ()
     return _ask(state, rtc, policy, wish, now_ns)
@@ -138,7 +140,8 @@ def _why_none(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
 def _running(state: TrackerState, dither: DitherView, wish: Wish, now_ns: int) -> Step:
     """Stop a dither that has done its work, or is too weak for what has come up meanwhile."""
     left_s = dither.duration_s - (now_ns - dither.asked_ns_utc) / SECOND_NS
-    if dither.start_seq is None or left_s < SOON_OVER_S:
+    deaf = dither.id == state.dithering.stopped_id
+    if dither.start_seq is None or left_s < SOON_OVER_S or deaf:
         return state, ()
     known = state.registration
     seen = known is not None and known.window_ns_utc > dither.asked_ns_utc
@@ -148,10 +151,18 @@ def _running(state: TrackerState, dither: DitherView, wish: Wish, now_ns: int) -
     if not (done or weak):
         return state, ()
     text = f"{dither.id}: {wish.reason}" if done else f"{dither.id} is too weak: {wish.reason}"
-    dithering = replace(state.dithering, stopped_id=dither.id, ended_ns_utc=None)
-    state = replace(state, dither=None, dithering=dithering)
+    state = replace(_stopped(state, dither.id, now_ns), dither=None)
+    # the next one must not overtake the command to stop
     state = replace(state, retry_ns_utc=max(state.retry_ns_utc, now_ns + SECOND_NS))
     return logged(state, "dither.stopped", text, now_ns), (AskNoDither(),)
+
+
+def _stopped(state: TrackerState, dither_id: str, now_ns: int) -> TrackerState:
+    """Note that the RTC is asked to stop a dither, and since when."""
+    if state.dithering.stopped_id == dither_id:
+        return state
+    dithering = replace(state.dithering, stopped_id=dither_id, ended_ns_utc=None)
+    return replace(state, dithering=replace(dithering, stopped_ns_utc=now_ns))
 
 
 def _adopted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState | None:
@@ -161,8 +172,9 @@ def _adopted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> 
         return None
     over = _own(running) and total_m(running) > 1.001 * state.dithering.budget_m
     stopped = running.id == state.dithering.stopped_id
-    # a recorded night stops nothing: what it plays over budget is read all the same
-    if over is not stopped or (over and now_ns < state.retry_ns_utc):
+    # a recorded night stops nothing: what it goes on playing is read all the same
+    heard_ns = state.dithering.stopped_ns_utc + round(STOPPED_WITHIN_S * SECOND_NS)
+    if now_ns < heard_ns if stopped else over:
         return None
     for window_s in window_lengths_s(policy):
         dither = replace(running, asked_ns_utc=now_ns, window_s=window_s)

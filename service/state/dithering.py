@@ -99,7 +99,10 @@ class Dithering:
     stopped."""
 
     stopped_id: str | None = None
-    """The dither that was stopped because it had done its work: not to be adopted again."""
+    """The last dither that the service asked the RTC to stop by itself."""
+
+    stopped_ns_utc: int = 0
+    """When it did."""
 
     mean_square_m2: float = 0.0
     """Mean square of what has been on the mirror, over ten minutes, metres OPD squared."""

@@ -30,6 +30,7 @@ WINDOW_S = 1.0
 POLICY = Policy(
     window_s=WINDOW_S,
     dither_budget_m=40e-9,
+    longest_pause_s=0.0,
     drift_rate=np.full(4, 1e-4),
     floor=np.full(4, 1e-4),
     update_threshold=np.full(4, 0.01),

@@ -100,7 +100,7 @@ def test_one_over_budget_from_before_a_restart_is_stopped_and_read_only_where_it
     assert story.state.dither is None
     story.tell(ev.StatusSeen(rtc=rtc(**with_dither(loud))), after_s=1)
     assert story.state.dither is None
-    story.tell(ev.StatusSeen(rtc=rtc(**with_dither(loud))), after_s=3)
+    story.tell(ev.StatusSeen(rtc=rtc(**with_dither(loud))), after_s=5)
     assert story.state.dither.id == loud.id
 
 

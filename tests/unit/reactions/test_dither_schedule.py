@@ -142,6 +142,14 @@ class TestWhen:
         night.tell(ev.StatusSeen(rtc=shown), 0.5)
         assert night.state.dither is None
 
+    def test_an_rtc_that_does_not_stop_it_is_not_asked_for_ever_and_read_all_the_same(self):
+        night = DitheredNight(CALM)
+        night.deaf = True
+        night.live(25)
+        assert 1 <= len(night.asked(ev.AskNoDither)) <= 3
+        assert night.state.dither.id == night.requests[0].id
+        assert night.state.windows_accepted > MIN_WINDOWS + 2
+
     def test_no_request_outlives_a_dead_service_for_long(self):
         night = DitheredNight(BRISK).live(120)
         assert max(dither.duration_s for dither in night.requests) <= LASTING_S + 5.0

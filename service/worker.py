@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from service.control.dither_modes import information
 from service.control.edge import Outer
 from service.control.expected_gain import ExpectedGain, Sky, Timing, beyond_m2, expected_gain
 from service.control.gate import GateVerdict, LoopSettings, judge
@@ -106,6 +107,9 @@ class Description:
     actuators: Actuators | None = None
     """None: the modes are measured surfaces, and nobody knows the actuators behind them."""
 
+    mode_information: NDArray[np.float64] | None = None
+    """``(n_modes, 4, 4)`` what a dither of each mode tells of α; None: not worked out."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Made:
@@ -157,12 +161,13 @@ class Workbench:
 
     def describe(self) -> Description:
         """Return what telemetry must look like, and prepare for the first fit."""
-        self._near(self._start)
+        linearisation = self._near(self._start)
         return Description(
             n_slopes=self._model.n_slopes,
             n_modes=self._model.basis.n_modes,
             mode_variance_m2=self._model.basis.variance_m2,
             actuators=_actuators(self._model),
+            mode_information=information(linearisation),
         )
 
     def fit(

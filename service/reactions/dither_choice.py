@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.control.dither_modes import SPAN, most_telling
 from service.control.dithering import clear_of
 from service.errors import ModelError
 from service.estimation.lockin import SIDE_OFFSETS_HZ, LockInPlan
@@ -170,10 +171,16 @@ def _step_hz(rtc: RtcView, window_s: float) -> float:
 
 
 def _uncontrolled_modes(rtc: RtcView, policy: Policy) -> tuple[int, ...]:
-    """Return four modes spread just above the controlled ones, or the highest four there are."""
+    """Return the four most telling modes above the controlled ones, or the highest four there are.
+
+    Until the model is known they are spread evenly.
+    """
     first = max(rtc.n_controlled, min(policy.n_modes_target, rtc.n_modes))
     spare = rtc.n_modes - first
     if spare < _N_LINES:
         return tuple(range(max(rtc.n_modes - _N_LINES, 0), rtc.n_modes))
+    if policy.mode_information is not None:
+        above = range(first, min(first + SPAN, rtc.n_modes))
+        return most_telling(policy.mode_information, above, _N_LINES, policy.dither_sigma)
     step = max(1, min(20, spare // (_N_LINES + 1)))
     return tuple(first + step // 2 + step * line for line in range(_N_LINES))

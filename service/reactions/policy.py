@@ -33,7 +33,10 @@ class Policy:
     """Between two windows; 0: no pause at all."""
 
     dither_modes: tuple[int, ...] | None = None
-    """None: four modes the loop will not control."""
+    """None: the four that tell most among those the loop will not control."""
+
+    mode_information: NDArray[np.float64] | None = None
+    """``(n_modes, 4, 4)`` what each mode tells of α; None: the model is not known yet."""
 
     dither_frequencies_hz: tuple[float, ...] | None = None
     """None: spread over 0.2-0.35 of the frame rate."""

@@ -29,7 +29,7 @@ from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.runtime.following import followed, news, shape_news
 from service.runtime.resuming import SAVE_INTERVAL_S, has_news, leave
-from service.runtime.streams import Streams, Window, fed, with_matrix
+from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.windows import fitted, watched
 from service.state import Level, LogEntry, MeasureState, TrackerState
 from service.tracker import step
@@ -39,8 +39,8 @@ from service.worker import Description, Workbench
 POLL_S = 0.05
 """Longest time telemetry waits to be taken in: frames held for a hole ring no bell."""
 
-WATCH_INTERVAL_S = 10.0
-"""Between two looks of the passive watchdog."""
+WATCH_INTERVAL_S = 4.0
+"""Between two looks of the passive watchdog: a jump is to be seen within 5 s."""
 
 WINDOWS_WAITING = 1
 """Windows that may wait for the worker; a newer one says more, so the older is given up."""
@@ -140,6 +140,8 @@ class Supervisor:
             group.create_task(self._save())
             description = await self._described()
             self._streams = Streams(description=description)
+            known = description.mode_information
+            self._policy = replace(self._policy, mode_information=known)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"
             self._post(ev.Noted(name="service.ready", text=text))
             for work in (self._listen, self._tick, self._fit, self._watch):
@@ -228,7 +230,8 @@ class Supervisor:
             await asyncio.sleep(WATCH_INTERVAL_S)
             if self._streams is None:
                 continue
-            event = await watched(self._streams, self._state, self._crew, time.time_ns())
+            self._streams, sums = taken(self._streams)
+            event = await watched(sums, self._state, self._crew)
             if event is not None:
                 self._post(event)
 

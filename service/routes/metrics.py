@@ -15,7 +15,7 @@ from service import __version__
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.routes.registration_views import age_s
 from service.routes.service import Link, Snapshot
-from service.state import MatrixState, MeasurePattern, Mode, TrackerState, Validity
+from service.state import DitherPhase, MatrixState, MeasurePattern, Mode, TrackerState, Validity
 
 _LINK_COUNTERS = {
     "batches_received": "Telemetry batches taken in",
@@ -55,6 +55,7 @@ class SnapshotCollector(Collector):
         yield _gauge("uptime_seconds", "Since the service started", uptime_s)
         yield from _of_link(snapshot.link)
         yield from _of_registration(snapshot)
+        yield from _of_the_dither(snapshot.tracker)
         yield from _of_reconstructors(snapshot.tracker)
         yield from _of_measurement(snapshot)
         alarms = {alarm.name: 1 for alarm in snapshot.tracker.alarms}
@@ -101,6 +102,15 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     yield _gauge("dither_due", "1 while a dithered window is wanted before all else", due)
     gain = "Mean optical gain of the dithered modes"
     yield _gauge("optical_gain_ratio", gain, registration.optical_gain)
+
+
+def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:
+    dithering = tracker.dithering
+    mean = "Quadratic mean of the dither over ten minutes, metres OPD"
+    yield _gauge("dither_mean_metres", mean, dithering.mean_cost_m)
+    yield _gauge("dither_budget_metres", "Largest RMS of all modes together", dithering.budget_m)
+    phases = {str(phase): phase is dithering.phase for phase in DitherPhase}
+    yield _labelled_gauge("dither_phase", "1 for how the service dithers", "phase", phases)
 
 
 def _of_reconstructors(tracker: TrackerState) -> Iterator[Metric]:

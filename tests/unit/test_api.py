@@ -379,6 +379,8 @@ async def test_a_suspected_jump_and_a_dither_that_is_due_are_seen(client, servic
     assert 'pyrcal_alpha_validity{validity="fresh"} 1.0' in metrics
     assert 'pyrcal_windows_total{verdict="outlying"} 3.0' in metrics
     assert "pyrcal_dither_due 1.0" in metrics
+    assert "pyrcal_dither_mean_metres 3e-09" in metrics
+    assert 'pyrcal_dither_phase{phase="sparse"} 1.0' in metrics
 
 
 async def test_who_starts_a_dither_is_told_what_it_costs(client):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.state import MeasurePattern, Mode, ModeSet, Pointing
+from service.state import DitherKind, MeasurePattern, Mode, ModeSet, Pointing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,13 +24,17 @@ class Refit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartDither:
-    """Start a sinusoidal dither; None: the service's own choice."""
+    """Start a dither; None: the service's own choice."""
 
-    modes: tuple[int, ...] | None = None
-    """0-based basis indices."""
+    kind: DitherKind = DitherKind.SINE
+    modes: tuple[int, ...] | ModeSet | None = None
+    """0-based basis indices, or which they are: as many as that only with random signs."""
 
     amplitude_m: float | None = None
-    """RMS of each mode, metres OPD."""
+    """RMS of each mode of a sine, metres OPD."""
+
+    total_m: float | None = None
+    """RMS of all modes of random signs together, metres OPD."""
 
     frequency_hz: tuple[float, ...] | None = None
     """One for each mode."""

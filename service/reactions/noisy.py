@@ -14,7 +14,7 @@ from service.reactions.dither_choice import OWN_DITHER, total_m
 from service.reactions.journal import logged
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
-from service.reactions.random_dither import Asked, plan_random
+from service.reactions.random_dither import RANDOM_TOTAL_M, Asked, plan_random
 from service.state import (
     DitherView,
     Level,
@@ -28,9 +28,6 @@ NOISY_KEPT = 100
 
 DURATION_S = 30.0
 """Where none is asked for: an element is worth its noise by then, on a bright star."""
-
-TOTAL_M = 5e-9
-"""Where none is asked for, within the budget."""
 
 FREE_WITHIN_S = 15.0
 """For the service's own dither to be gone from the RTC's status."""
@@ -85,7 +82,7 @@ def awaits_its_dither(state: TrackerState) -> bool:
 def _ask(state: TrackerState, command: ev.MeasureNoisy, policy: Policy, now_ns: int) -> Step:
     rtc = _ready(state, command)
     duration_s, budget_m = command.duration_s or DURATION_S, policy.dither_budget_m
-    total = command.total_m or min(TOTAL_M, budget_m)
+    total = command.total_m or min(RANDOM_TOTAL_M, budget_m)
     if total > budget_m * (1.0 + 1e-9) and not command.over_budget:
         raise CommandError(
             f"noisy matrix: {1e9 * total:.3g} nm RMS in all, budget {1e9 * budget_m:.3g} nm; say "

@@ -8,13 +8,22 @@ from service import events as ev
 from service.errors import CommandError
 from service.events import Event
 from service.reactions.dither import found_again
-from service.reactions.dither_choice import plan_dither, total_m, why_unusable
+from service.reactions.dither_choice import ASKED_DITHER, plan_dither, total_m, why_unusable
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send
 from service.reactions.policy import Policy
+from service.reactions.random_dither import RANDOM_TOTAL_M, Asked, plan_random
 from service.reactions.shelf import known_record, with_state
 from service.reactions.worth import outdated
-from service.state import MatrixState, Mode, TrackerState
+from service.state import (
+    DitherKind,
+    DitherView,
+    MatrixState,
+    Mode,
+    ModeSet,
+    RtcView,
+    TrackerState,
+)
 
 
 def on_command(  # noqa: C901 - one line for each command
@@ -68,6 +77,34 @@ def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, no
         raise CommandError("a dither needs an RTC with its loop closed")
     if state.dither is not None:
         raise CommandError(f"{state.dither.id} is running: stop it first")
+    dither = _planned_dither(event, rtc, policy, now_ns)
+    found_nm, budget_nm = 1e9 * total_m(dither), 1e9 * policy.dither_budget_m
+    cost = f"{found_nm:.3g} nm RMS in all, budget {budget_nm:.3g} nm"
+    over = found_nm > budget_nm * (1.0 + 1e-9)
+    if over and not event.over_budget:
+        raise CommandError(f"dither: {cost}; say over_budget if that is meant")
+    state = replace(state, dither=dither, dither_stopped=False)
+    modes = f"modes {dither.modes}" if len(dither.modes) < 10 else f"{len(dither.modes)} modes"
+    text = f"{dither.kind}, {modes}, {cost}" + (": over budget, as asked" if over else "")
+    return logged(state, "dither.asked", text, now_ns), (ev.AskDither(dither=dither),)
+
+
+def _planned_dither(event: ev.StartDither, rtc: RtcView, policy: Policy, now_ns: int) -> DitherView:
+    """Return the dither to ask for.
+
+    Raises
+    ------
+    CommandError
+        If it could not be played, or not be read.
+    """
+    if event.kind is DitherKind.BINARY or isinstance(event.modes, ModeSet):
+        asked = Asked(
+            id=f"{ASKED_DITHER}{now_ns}",
+            modes=event.modes or ModeSet.CONTROLLED,
+            total_m=event.total_m or min(RANDOM_TOTAL_M, policy.dither_budget_m),
+            duration_s=event.duration_s or policy.dither_duration_s,
+        )
+        return plan_random(asked, rtc, policy, now_ns)
     dither = plan_dither(
         rtc,
         policy,
@@ -84,14 +121,7 @@ def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, no
     reason = why_unusable(dither, rtc, policy)
     if reason is not None:
         raise CommandError(f"dither: {reason}")
-    found_nm, budget_nm = 1e9 * total_m(dither), 1e9 * policy.dither_budget_m
-    cost = f"{found_nm:.3g} nm RMS in all, budget {budget_nm:.3g} nm"
-    over = found_nm > budget_nm * (1.0 + 1e-9)
-    if over and not event.over_budget:
-        raise CommandError(f"dither: {cost}; say over_budget if that is meant")
-    state = replace(state, dither=dither, dither_stopped=False)
-    text = f"modes {dither.modes}, {cost}" + (": over budget, as asked" if over else "")
-    return logged(state, "dither.asked", text, now_ns), (ev.AskDither(dither=dither),)
+    return dither
 
 
 def _refit(state: TrackerState, n_modes: int | None, now_ns: int) -> Step:

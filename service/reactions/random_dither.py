@@ -12,6 +12,9 @@ from service.reactions.dither_choice import SETTLING_S, SPARE_S
 from service.reactions.policy import Policy
 from service.state import DitherKind, DitherView, ModeSet, RtcView
 
+RANDOM_TOTAL_M = 5e-9
+"""RMS of all modes together where none is asked for, within the budget."""
+
 COMFORTABLE = 2.0
 """Windows are longer by this than they have to be for so many modes."""
 

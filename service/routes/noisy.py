@@ -14,10 +14,11 @@ from fastapi import APIRouter, Path, Response
 from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from service.errors import ConfigurationError, UnknownIdError
 from service.events import GiveUpNoisy, MeasureNoisy
+from service.routes.modes import Modes
 from service.routes.operating import AcceptedView, Positive, Request, accepted
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.routes.service import ServiceDep
@@ -27,7 +28,6 @@ from service.state import ModeSet, NoisyFinding, NoisyRecord, NoisyState
 router = APIRouter(prefix="/v1", tags=["noisy interaction matrices"], responses={**INVALID})
 
 LONGEST_S = 3600.0
-MOST_MODES = 100_000
 _ALL = "/v1/noisy-matrix"
 
 NoisyId = Annotated[str, Path(alias="id", description="Id of a noisy interaction matrix")]
@@ -39,9 +39,7 @@ class NoisyBody(Request):
     The loop stays closed: random signs on all its modes at once, a few nanometres altogether.
     """
 
-    modes: list[Annotated[int, Field(ge=0)]] | Annotated[ModeSet, Field(strict=False)] = (
-        ModeSet.CONTROLLED
-    )
+    modes: Modes = ModeSet.CONTROLLED
     """0-based basis indices, none twice, or "controlled" or "all"."""
 
     total_amplitude_m: Positive | None = None
@@ -52,13 +50,6 @@ class NoisyBody(Request):
 
     over_budget: bool = False
     """Whether it may be more than the dither's budget."""
-
-    @model_validator(mode="after")
-    def _none_twice(self) -> NoisyBody:
-        modes = self.modes
-        if not isinstance(modes, ModeSet) and not 0 < len(set(modes)) == len(modes) <= MOST_MODES:
-            raise ValueError("at least one mode, none of them twice")
-        return self
 
 
 class NoisyFindingView(View):

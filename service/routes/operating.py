@@ -23,10 +23,11 @@ from service.events import (
     StopDither,
 )
 from service.reactions.dither_choice import total_m
+from service.routes.modes import Modes
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.service import Service, ServiceDep
 from service.routes.views import View
-from service.state import Mode
+from service.state import DitherKind, Mode, ModeSet
 
 router = APIRouter(
     prefix="/v1",
@@ -36,6 +37,8 @@ router = APIRouter(
 
 MatrixId = Annotated[str, Path(alias="id", description="Id of a reconstructor")]
 Positive = Annotated[float, Field(gt=0.0)]
+
+MOST_SINES = 64
 
 
 class Request(BaseModel):
@@ -62,30 +65,45 @@ class RefitRequest(Request):
 
 
 class StartDitherRequest(Request):
-    """Start a sinusoidal dither; what is left out, the service chooses."""
+    """Start a dither; what is left out, the service chooses."""
 
     action: Literal["start"]
-    modes: list[Annotated[int, Field(ge=0)]] | None = Field(
-        default=None, min_length=1, max_length=64
-    )
-    """0-based basis indices."""
+    kind: DitherKind = Field(default=DitherKind.SINE, strict=False)
+    """"sine", or "binary": random signs, on hundreds of modes if need be."""
+
+    modes: Modes | None = None
+    """0-based basis indices, none twice; of a binary dither also "controlled" or "all"."""
 
     amplitude_m: Positive | None = None
-    """RMS of each mode, metres OPD."""
+    """RMS of each mode of a sine, metres OPD."""
+
+    total_amplitude_m: Positive | None = None
+    """RMS of all modes of a binary dither together, metres OPD."""
 
     frequency_hz: list[Positive] | None = Field(default=None, min_length=1, max_length=64)
-    """One for each mode."""
+    """One for each mode of a sine."""
 
     duration_s: Positive | None = None
     over_budget: bool = False
     """Allow more than the budget of the settings."""
 
     @model_validator(mode="after")
-    def _one_frequency_for_each_mode(self) -> StartDitherRequest:
-        if self.frequency_hz is not None and len(self.frequency_hz) != len(self.modes or ()):
+    def _consistent(self) -> StartDitherRequest:
+        listed = [] if self.modes is None or isinstance(self.modes, ModeSet) else self.modes
+        if self.kind is DitherKind.BINARY:
+            if self.amplitude_m is not None or self.frequency_hz is not None:
+                raise ValueError(
+                    "no amplitude_m and no frequency_hz with binary: total_amplitude_m"
+                )
+            return self
+        if isinstance(self.modes, ModeSet) or len(listed) > MOST_SINES:
+            raise ValueError(f"at most {MOST_SINES} modes with sine")
+        if self.total_amplitude_m is not None:
+            raise ValueError("no total_amplitude_m with sine: amplitude_m of each mode")
+        if self.frequency_hz is not None and len(self.frequency_hz) != len(listed):
             raise ValueError(
                 f"one frequency_hz for each of modes: {len(self.frequency_hz)} given for "
-                f"{len(self.modes or ())}"
+                f"{len(listed)}"
             )
         return self
 
@@ -148,9 +166,12 @@ async def dither(
     """Start or stop the dither."""
     if isinstance(body, StopDitherRequest):
         return await accepted(service, StopDither())
+    modes = body.modes
     command = StartDither(
-        modes=None if body.modes is None else tuple(body.modes),
+        kind=body.kind,
+        modes=tuple(modes) if isinstance(modes, list) else modes,
         amplitude_m=body.amplitude_m,
+        total_m=body.total_amplitude_m,
         frequency_hz=None if body.frequency_hz is None else tuple(body.frequency_hz),
         duration_s=body.duration_s,
         over_budget=body.over_budget,

@@ -125,10 +125,10 @@ async def test_every_choice_reaches_the_command(client, service, modes, expected
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ({"modes": "every"}, "modes"),
-        ({"modes": []}, "at least one mode, none of them twice"),
-        ({"modes": [1, 1]}, "at least one mode, none of them twice"),
-        ({"modes": [-1]}, "modes"),
+        ({"modes": "every"}, "modes: found 'every', expected 'controlled', 'all' or a list"),
+        ({"modes": []}, "modes: found []"),
+        ({"modes": [1, 1]}, "modes: found [1, 1], expected modes without any of them twice"),
+        ({"modes": [-1]}, "modes.0: found -1"),
         ({"total_amplitude_m": 0.0}, "total_amplitude_m"),
         ({"duration_s": 4000.0}, "duration_s"),
         ({"amplitude_m": 1e-9}, "amplitude_m: unknown"),

@@ -1,12 +1,16 @@
 """What a window of random dither does to the registration."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from service import events as ev
+from service.errors import CommandError
 from service.estimation.noisymatrix import RandomEstimate
-from service.state import Source
-from tests.unit.reactions.situations import ALPHA, PRECISE, Story, moved
+from service.reactions.dither_choice import total_m
+from service.state import DitherKind, ModeSet, Source
+from tests.unit.reactions.situations import ALPHA, POLICY, PRECISE, Story, moved, of_kind
 
 
 def random_estimate(alpha=ALPHA, *, t_ns=0, n_modes=400, **changes):
@@ -80,3 +84,22 @@ def test_a_jump_seen_by_random_signs_needs_a_second_window():
         see(story)
     see(story, alpha=moved(shift_x_subap=0.1))
     assert story.state.registration.candidate is not None
+
+
+def test_an_operator_may_dither_every_mode_of_the_basis():
+    story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
+    command = ev.StartDither(
+        kind=DitherKind.BINARY, modes=ModeSet.ALL, total_m=5e-9, duration_s=60.0
+    )
+    (asked,) = of_kind(story.tell(command), ev.AskDither)
+    assert asked.dither.modes == tuple(range(594))
+    assert total_m(asked.dither) == pytest.approx(5e-9)
+    assert "binary, 594 modes, 5 nm RMS in all" in story.state.log[-1].text
+
+
+def test_random_signs_over_the_budget_must_be_meant():
+    story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
+    command = ev.StartDither(kind=DitherKind.BINARY, total_m=20e-9, duration_s=60.0)
+    with pytest.raises(CommandError, match="20 nm RMS in all, budget 8 nm"):
+        story.tell(command)
+    assert of_kind(story.tell(replace(command, over_budget=True)), ev.AskDither)

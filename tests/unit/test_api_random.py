@@ -1,0 +1,68 @@
+"""Random dithers asked for over real HTTP messages, with a hand-written service behind."""
+
+import httpx
+import pytest
+
+from service.api import Snapshot, create_app
+from service.events import StartDither
+from service.state import DitherKind, ModeSet, TrackerState
+
+
+class FakeService:
+    def __init__(self):
+        self.commands = []
+
+    def snapshot(self):
+        return Snapshot(
+            tracker=TrackerState(system="flao-lbt"),
+            link=None,
+            now_ns=0,
+            started_ns=0,
+            ready=True,
+            ready_reason="ready",
+        )
+
+    async def submit(self, command):
+        self.commands.append(command)
+        return "StartDither: 1 action(s) under way"
+
+
+@pytest.fixture
+def service():
+    return FakeService()
+
+
+@pytest.fixture
+async def client(service):
+    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
+        yield client
+
+
+@pytest.mark.parametrize(
+    ("modes", "expected"), [("all", ModeSet.ALL), (list(range(400)), tuple(range(400)))]
+)
+async def test_random_signs_on_hundreds_of_modes(client, service, modes, expected):
+    body = {"action": "start", "kind": "binary", "modes": modes, "total_amplitude_m": 5e-9}
+    response = await client.post("/v1/dither", json=body)
+    assert response.status_code == 202, response.text
+    assert service.commands == [StartDither(kind=DitherKind.BINARY, modes=expected, total_m=5e-9)]
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"kind": "noise"}, "kind: found 'noise'"),
+        ({"kind": "binary", "amplitude_m": 1e-9}, "no amplitude_m and no frequency_hz"),
+        ({"kind": "binary", "frequency_hz": [250.0]}, "no amplitude_m and no frequency_hz"),
+        ({"modes": "all"}, "at most 64 modes with sine"),
+        ({"modes": list(range(65))}, "at most 64 modes with sine"),
+        ({"modes": [3, 3]}, "modes without any of them twice"),
+        ({"total_amplitude_m": 1e-9}, "no total_amplitude_m with sine"),
+    ],
+)
+async def test_what_does_not_belong_together_is_refused(client, service, body, words):
+    response = await client.post("/v1/dither", json={"action": "start", **body})
+    assert response.status_code == 422, response.text
+    assert words in response.json()["detail"]
+    assert service.commands == []

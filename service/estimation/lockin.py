@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,9 @@ Array = NDArray[Any]
 
 SIDE_OFFSETS_HZ = np.concatenate([np.arange(-20.0, -2.0), np.arange(3.0, 21.0)])
 """Where the noise is measured, relative to each dither line: 36 bins; 6 were too few."""
+
+CHUNK_FRAMES = 512
+"""Frames multiplied at once: the sums, 2 MB, are read from memory once for all of them."""
 
 MIN_AMPLITUDE_RATIO = 0.5
 """A dither weaker than this share of its request was not applied as asked."""
@@ -110,7 +114,31 @@ class LockIn:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Sums:
-    """As in :class:`Spectra`."""
+    """Sums so far, and the rows that wait to be added to them."""
+
+    slopes: Array
+    """``(2 * n_bins, n_slopes)``: real parts of every bin, then imaginary ones; so the others."""
+
+    commands: Array
+    """``(2 * n_bins, n_modes)``."""
+
+    dither: Array
+    """``(2 * n_lines, n_modes)``."""
+
+    waiting: tuple[_Rows, ...] = ()
+
+    @property
+    def n_waiting(self) -> int:
+        """Frames that wait."""
+        return sum(len(rows.slopes) for rows in self.waiting)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Rows:
+    """Contiguous frames of a window."""
+
+    first: int
+    """Their place in the window."""
 
     slopes: Array
     commands: Array
@@ -124,45 +152,82 @@ def accumulate(lock_in: LockIn, block: FrameBlock) -> tuple[LockIn, list[Spectra
 
 
 def _begin(plan: LockInPlan, block: FrameBlock) -> _Sums:
-    shape = plan.bins_hz.shape
+    n_bins, n_modes = plan.bins_hz.size, block.commands_m.shape[1]
     return _Sums(
-        slopes=np.zeros((*shape, block.slopes.shape[1]), np.complex64),
-        commands=np.zeros((*shape, block.commands_m.shape[1]), np.complex64),
-        dither=np.zeros((shape[0], block.commands_m.shape[1]), np.complex64),
+        slopes=np.zeros((2 * n_bins, block.slopes.shape[1]), np.float32),
+        commands=np.zeros((2 * n_bins, n_modes), np.float32),
+        dither=np.zeros((2 * len(plan.modes), n_modes), np.float32),
     )
 
 
 def _add(plan: LockInPlan, window: Window[_Sums], block: FrameBlock, rows: slice) -> Window[_Sums]:
-    n_rows = rows.stop - rows.start
-    index = np.arange(n_rows) + (block.first_seq + rows.start - window.span.first_seq)
-    hann = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / plan.n_frames)
-    turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, index)
-    phasors = (hann * np.exp(-2j * np.pi * turns)).astype(np.complex64)
-    lines = phasors.reshape(*plan.bins_hz.shape, n_rows)[:, 0]
     # no block without dither columns comes this far
     dither = block.commands_m[:0] if block.dither_m is None else block.dither_m
-    shape, sums = plan.bins_hz.shape, window.sums
-    return replace(
-        window,
-        span=advanced(window.span, block, rows),
-        sums=_Sums(
-            slopes=sums.slopes + _project(phasors, block.slopes[rows]).reshape(*shape, -1),
-            commands=sums.commands + _project(phasors, block.commands_m[rows]).reshape(*shape, -1),
-            dither=sums.dither + _project(lines, dither[rows]),
-        ),
+    sums = window.sums
+    while rows.start < rows.stop:
+        part = slice(rows.start, min(rows.stop, rows.start + CHUNK_FRAMES))
+        new = _Rows(
+            first=block.first_seq + part.start - window.span.first_seq,
+            slopes=block.slopes[part],
+            commands=block.commands_m[part],
+            dither=dither[part],
+        )
+        window = replace(window, span=advanced(window.span, block, part))
+        sums = replace(sums, waiting=(*sums.waiting, new))
+        if sums.n_waiting >= CHUNK_FRAMES:
+            sums = _projected(plan, sums)
+        rows = slice(part.stop, rows.stop)
+    return replace(window, sums=sums)
+
+
+def _projected(plan: LockInPlan, sums: _Sums) -> _Sums:
+    """Return the sums with the rows that waited in them."""
+    if not sums.waiting:
+        return sums
+    turning = _turning(plan)
+    phasors = np.concatenate([_phasors(plan, turning, rows) for rows in sums.waiting], axis=1)
+    lines = phasors[:: plan.bins_hz.shape[1]]
+    slopes, commands, dither = (
+        np.concatenate([getattr(rows, name) for rows in sums.waiting])
+        for name in ("slopes", "commands", "dither")
+    )
+    # real products: the columns are real
+    parts = np.concatenate([phasors.real, phasors.imag])
+    return _Sums(
+        slopes=sums.slopes + parts @ slopes,
+        commands=sums.commands + parts @ commands,
+        dither=sums.dither + np.concatenate([lines.real, lines.imag]) @ dither,
     )
 
 
-def _project(phasors: Array, columns: Array) -> Array:
-    """Return ``phasors @ columns`` for real columns, as two real products."""
-    return np.asarray(phasors.real @ columns + 1j * (phasors.imag @ columns))
+@lru_cache(maxsize=4)
+def _turning(plan: LockInPlan) -> Array:
+    """Return ``exp(-i w k)`` of every bin, ``(n_bins, CHUNK_FRAMES)``, from k = 0."""
+    turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, np.arange(CHUNK_FRAMES))
+    return np.exp(-2j * np.pi * turns).astype(np.complex64)
+
+
+def _phasors(plan: LockInPlan, turning: Array, rows: _Rows) -> Array:
+    """Return ``h_k exp(-i w k)`` of these rows, ``(n_bins, n_rows)``."""
+    index = rows.first + np.arange(len(rows.slopes))
+    hann = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / plan.n_frames)
+    start = np.exp(-2j * np.pi * rows.first * plan.bins_hz.ravel() / plan.frame_rate_hz)
+    phasors = turning[:, : len(index)] * start.astype(np.complex64)[:, None]
+    return np.asarray(phasors * hann.astype(np.float32))
+
+
+def _complex(parts: Array, *shape: int) -> Array:
+    """Return real and imaginary parts, one above the other, as complex numbers."""
+    real, imaginary = np.split(parts, 2)
+    return np.asarray((real + 1j * imaginary).reshape(*shape, -1))
 
 
 def _close(plan: LockInPlan, window: Window[_Sums]) -> Spectra | WindowRefused:
     """Return the finished window, or why its dither is not the one asked for."""
-    sums = window.sums
+    sums = _projected(plan, window.sums)
+    dither = _complex(sums.dither, len(plan.modes))
     weight = 0.5 * plan.n_frames / np.sqrt(2.0)
-    applied = np.abs(sums.dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
+    applied = np.abs(dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
     ratio = applied / np.array(plan.amplitude_m)
     if ratio.min() < MIN_AMPLITUDE_RATIO:
         weakest = int(ratio.argmin())
@@ -179,9 +244,9 @@ def _close(plan: LockInPlan, window: Window[_Sums]) -> Spectra | WindowRefused:
         first_seq=window.span.first_seq,
         t_end_ns_utc=window.span.next_t_ns - window.dt_ns,
         n_missing=window.span.n_missing,
-        slopes=sums.slopes,
-        commands=sums.commands,
-        dither=sums.dither,
+        slopes=_complex(sums.slopes, *plan.bins_hz.shape),
+        commands=_complex(sums.commands, *plan.bins_hz.shape),
+        dither=dither,
     )
 
 

@@ -128,17 +128,6 @@ def widened(prior: Joint, noise: Array) -> Joint:
     return replace(prior, covariance=prior.covariance + JUMP_INFLATION**2 * np.diag(moved))
 
 
-def correlation_factor(since_last_s: float, memory_s: float) -> float:
-    """Return the factor on the variance of a passive look whose telemetry was partly seen before.
-
-    Sums that forget with ``memory_s`` make the errors of looks Δt apart correlate by
-    ``ρ = exp(-Δt / memory_s)``. With variances ``(1 + ρ) / (1 - ρ)`` times as large a chain of
-    looks, treated as independent, weighs what it is worth.
-    """
-    rho = float(np.exp(-max(since_last_s, 0.0) / memory_s))
-    return np.inf if rho >= 1.0 else (1.0 + rho) / (1.0 - rho)
-
-
 def _innovation(prior: Joint, measured: Array, noise: Array, sees: Array) -> float:
     difference = measured - sees @ prior.mean
     total = sees @ prior.covariance @ sees.T + noise

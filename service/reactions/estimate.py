@@ -30,6 +30,9 @@ SUSPECTED = "jump-suspected"
 DISAGREES = "watchdog"
 """Alarm while ordinary telemetry contradicts α."""
 
+CLOCK_SET_BACK_NS = 60 * SECOND_NS
+"""Telemetry never waits so long for the worker: the RTC's clock has gone back."""
+
 Array = NDArray[np.float64]
 
 
@@ -69,7 +72,7 @@ def brought_forward(
 ) -> Joint:
     """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
     elapsed_ns = t_ns_utc - known.t_ns_utc
-    if elapsed_ns < -int(policy.window_s * SECOND_NS):
+    if elapsed_ns < -CLOCK_SET_BACK_NS:
         # a clock that was set back, or another night played again: the service's own must do
         elapsed_ns = now_ns - known.arrived_ns_utc
     drift = Drift(alpha_rate=policy.drift_rate, bias_memory_s=policy.bias_memory_s)

@@ -37,9 +37,6 @@ from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.validity import aged, with_dither_due
 from service.state import Candidate, Level, Registration, TrackerState
 
-PASSIVE_BLIND_S = 30.0
-"""After a jump: three times what the passive sums remember, so that 5 % of it are left in them."""
-
 Array = NDArray[np.float64]
 
 
@@ -120,11 +117,10 @@ def _jumped(
     noise = candidate.covariance + _walked(candidate, measured, policy)
     joint = with_dithered(widened(prior, noise), candidate.alpha.vector, noise)
     joint = with_dithered(joint, measured.alpha.vector, measured.covariance)
-    blind_ns = candidate.t_ns_utc + round(PASSIVE_BLIND_S * SECOND_NS)
     state = replace(
         state,
         windows_accepted=state.windows_accepted + 1,
-        registration=replace(known, passive_after_ns_utc=blind_ns),
+        registration=replace(known, passive_after_ns_utc=candidate.t_ns_utc),
     )
     folded = Folded(joint=joint, n_windows=2, innovation=_innovation(prior, measured))
     state = accepted(state, folded, measured, policy, now_ns)

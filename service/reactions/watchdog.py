@@ -1,4 +1,7 @@
-"""The passive estimate between dithers: α and its bias from ordinary telemetry."""
+"""The passive estimate between dithers: α and its bias from ordinary telemetry.
+
+Each look is at telemetry that no other has seen, so their errors are independent.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,14 @@ from service.estimation.passive import BIAS_FLOOR, PassiveEstimate
 from service.estimation.wind import (
     JUMP_THRESHOLD,
     Joint,
-    correlation_factor,
     forgotten,
     passive_innovation,
     with_passive,
 )
 from service.model.misregistration import Misregistration
-from service.reactions.estimate import DISAGREES, bias_of, brought_forward, remembered
+from service.reactions.estimate import DISAGREES, bias_of, brought_forward, joint_of, remembered
 from service.reactions.journal import logged, with_alarm
-from service.reactions.policy import SECOND_NS, Policy
+from service.reactions.policy import Policy
 from service.reactions.validity import aged, with_dither_due
 from service.state import (
     HistoryEntry,
@@ -30,9 +32,6 @@ from service.state import (
     TrackerState,
     Watchdog,
 )
-
-PASSIVE_MEMORY_S = 10.0
-"""Time after which telemetry counts 1/e in the passive sums."""
 
 Array = NDArray[np.float64]
 
@@ -44,31 +43,44 @@ def on_watchdog(
     known = state.registration
     if known is None:
         return _shown(state, event, BIAS_FLOOR, np.zeros(4), "no dithered estimate to compare with")
-    t_ns_utc = event.t_ns_utc if state.rtc is None else state.rtc.t_ns_utc
-    prior = brought_forward(state, known, t_ns_utc, policy, now_ns)
-    if known.candidate is not None or t_ns_utc <= known.passive_after_ns_utc:
+    prior = brought_forward(state, known, event.t_ns_utc, policy, now_ns)
+    if _mixed(known):
         text = "not used: its telemetry may be from both sides of a jump"
+        state = replace(state, registration=_looked(known, event))
         return _shown(state, event, _reading_sigma(event.estimate, prior), prior.bias, text)
-    measured, noise = event.estimate.alpha.vector, _noise(event.estimate, known, t_ns_utc)
-    innovation = passive_innovation(prior, measured, noise)
+    measured = event.estimate.alpha.vector
+    innovation = passive_innovation(prior, measured, event.estimate.covariance)
     if innovation > JUMP_THRESHOLD:
-        return _barking(state, event, prior, innovation, t_ns_utc, policy, now_ns)
-    joint = with_passive(prior, measured, noise)
-    state = _entered(state, known, joint, t_ns_utc, now_ns)
-    state = aged(state, policy, now_ns)
-    if state.registration is not None:
-        entry = HistoryEntry(
-            t_ns_utc=t_ns_utc,
-            measured=Misregistration.from_vector(measured - joint.bias),
-            measured_sigma=_reading_sigma(event.estimate, prior),
-            filtered=state.registration.alpha,
-            filtered_sigma=state.registration.sigma,
-            innovation=innovation,
-            source=Source.PASSIVE,
-        )
-        state = remembered(state, entry)
+        return _barking(state, event, prior, innovation, policy, now_ns)
+    joint = with_passive(prior, measured, event.estimate.covariance)
+    registration = _after(state, known, joint, event, now_ns)
+    state = aged(replace(state, registration=registration), policy, now_ns)
+    sigma = _reading_sigma(event.estimate, prior)
+    entry = HistoryEntry(
+        t_ns_utc=event.t_ns_utc,
+        measured=Misregistration.from_vector(measured - joint.bias),
+        measured_sigma=sigma,
+        filtered=registration.alpha,
+        filtered_sigma=registration.sigma,
+        innovation=innovation,
+        source=Source.PASSIVE,
+    )
     text = "agrees with α and with what is known of its own bias"
-    return _shown(state, event, _reading_sigma(event.estimate, prior), joint.bias, text)
+    return _shown(remembered(state, entry), event, sigma, joint.bias, text)
+
+
+def _looked(known: Registration, event: ev.Watched) -> Registration:
+    return replace(known, bias=bias_of(joint_of(known), event.t_ns_utc))
+
+
+def _mixed(known: Registration) -> bool:
+    """Return whether a look may be at telemetry from before a jump and from after it.
+
+    It began no earlier than the one before it ended.
+    """
+    began_ns_utc = known.bias.looked_ns_utc if known.bias is not None else 0
+    jumped_ns_utc = known.passive_after_ns_utc
+    return known.candidate is not None or (jumped_ns_utc > 0 and began_ns_utc < jumped_ns_utc)
 
 
 def _barking(
@@ -76,7 +88,6 @@ def _barking(
     event: ev.Watched,
     prior: Joint,
     innovation: float,
-    t_ns_utc: int,
     policy: Policy,
     now_ns: int,
 ) -> TrackerState:
@@ -88,9 +99,8 @@ def _barking(
         "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
         "dithered window must tell which"
     )
-    state = _entered(state, known, forgotten(prior), t_ns_utc, now_ns)
-    if state.registration is not None:
-        state = replace(state, registration=replace(state.registration, doubt=text))
+    registration = replace(_after(state, known, forgotten(prior), event, now_ns), doubt=text)
+    state = replace(state, registration=registration)
     detail = f"{text} (innovation {innovation:.0f}, expected 4)"
     state = logged(state, "registration.passive-jump", detail, now_ns, Level.WARNING)
     state = with_dither_due(with_alarm(state, DISAGREES, text, now_ns), text, now_ns)
@@ -98,38 +108,24 @@ def _barking(
     return _shown(state, event, BIAS_FLOOR, np.zeros(4), text, consistent=False)
 
 
-def _entered(
-    state: TrackerState, known: Registration, joint: Joint, t_ns_utc: int, now_ns: int
-) -> TrackerState:
-    registration = replace(
+def _after(
+    state: TrackerState, known: Registration, joint: Joint, event: ev.Watched, now_ns: int
+) -> Registration:
+    """Return the registration as the filter has it after a look."""
+    return replace(
         known,
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
-        t_ns_utc=max(t_ns_utc, known.t_ns_utc),
+        t_ns_utc=max(event.t_ns_utc, known.t_ns_utc),
         arrived_ns_utc=now_ns,
-        bias=bias_of(joint, t_ns_utc),
+        bias=bias_of(joint, event.t_ns_utc),
         pointing=state.pointing,
     )
-    return replace(state, registration=registration)
-
-
-def _noise(estimate: PassiveEstimate, known: Registration, t_ns_utc: int) -> Array:
-    """Return the covariance of its scatter, larger for telemetry that was looked at before."""
-    scatter = _scatter(estimate)
-    if known.bias is None or known.bias.looked_ns_utc == 0:
-        return scatter
-    since_s = (t_ns_utc - known.bias.looked_ns_utc) / SECOND_NS
-    # two looks at the very same telemetry: the second adds nothing
-    return scatter * min(correlation_factor(since_s, PASSIVE_MEMORY_S), 1e12)
-
-
-def _scatter(estimate: PassiveEstimate) -> Array:
-    return estimate.covariance
 
 
 def _reading_sigma(estimate: PassiveEstimate, prior: Joint) -> Array:
     """Return ``(4,)`` 1 σ of the estimate as a reading of α: its scatter, and that of its bias."""
-    return np.sqrt(np.diag(_scatter(estimate)) + np.diag(prior.covariance)[4:])
+    return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[4:])
 
 
 def _shown(

@@ -250,6 +250,19 @@ def _dithered(
     return streams, ()
 
 
+def taken(streams: Streams) -> tuple[Streams, Passive | None]:
+    """Return streams that begin new passive sums, and the old ones if they hold enough for a look.
+
+    No two looks then share telemetry: their errors are independent, and one that lies wholly after
+    a jump says so.
+    """
+    sums = streams.passive
+    if sums is None or sums.n_effective < passive.MIN_FRAMES_PER_MODE * sums.n_modes:
+        return streams, None
+    begun = replace(sums, cross=None, moved=None, power=None, n_effective=0.0)
+    return replace(streams, passive=begun), sums
+
+
 def _beyond_the_dither(streams: Streams, rtc: RtcView, reading: LockIn | RandomDither) -> bool:
     """Return whether the end of the dither would cut the window that has begun."""
     dither, window = streams.dither, reading.window

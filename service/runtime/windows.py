@@ -11,11 +11,11 @@ from service.errors import PyrcalError
 from service.estimation.estimator import Window
 from service.estimation.instrumental import Loop
 from service.estimation.lockin import Spectra, WindowRefused
+from service.estimation.passive import Passive
 from service.estimation.randomdither import Correlated
 from service.events import Event
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
-from service.runtime.streams import Streams
 from service.state import Level, TrackerState
 from service.worker import Workbench
 
@@ -80,16 +80,18 @@ async def _found(spectra: Spectra, state: TrackerState, crew: Crew) -> Event:
 
 
 async def watched(
-    streams: Streams, state: TrackerState, crew: Crew, now_ns: int
+    sums: Passive | None, state: TrackerState, crew: Crew
 ) -> ev.Watched | ev.Noted | None:
     """Return what the watchdog makes of ordinary telemetry; None: there is too little of it."""
-    if state.registration is None or streams.passive is None:
+    if state.registration is None or sums is None or sums.tail is None:
         return None
+    last = sums.tail
+    end_ns = last.t0_ns_utc + (last.n_frames - 1) * last.dt_ns
     try:
-        estimate = await crew.call(Workbench.watch, streams.passive, state.registration.alpha)
+        estimate = await crew.call(Workbench.watch, sums, state.registration.alpha)
     except PyrcalError as error:
         return ev.Noted(name="watchdog.failed", text=str(error), level=Level.WARNING)
-    return None if estimate is None else ev.Watched(estimate=estimate, t_ns_utc=now_ns)
+    return None if estimate is None else ev.Watched(estimate=estimate, t_ns_utc=end_ns)
 
 
 def lost(window: Window, reason: str) -> Event:

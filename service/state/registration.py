@@ -166,7 +166,8 @@ class Registration:
     """Of the passive estimate; None: nothing is known of it."""
 
     passive_after_ns_utc: int = 0
-    """Passive estimates up to here hold telemetry from before a jump, the RTC's clock."""
+    """End of the window in which α jumped, the RTC's clock: only a passive estimate that began
+    after it is of the new place."""
 
     pointing: Pointing | None = None
     """Of the telescope at ``t_ns_utc``; None: not known."""

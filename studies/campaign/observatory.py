@@ -26,7 +26,7 @@ from service.reactions.policy import SECOND_NS, Policy
 from service.runtime import translate
 from service.runtime.deeds import Deeds, Publishing
 from service.runtime.following import followed, news, shape_news
-from service.runtime.streams import Streams, Window, fed, with_matrix
+from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.supervisor import WATCH_INTERVAL_S
 from service.runtime.windows import fitted, lost, watched
 from service.state import Mode, TrackerState
@@ -295,7 +295,8 @@ class Observatory:
         self._at(self._worked(self.latencies.fit_s), done)
 
     def _watch(self) -> None:
-        found = asyncio.run(watched(self.streams, self.state, self._crew, self.dome.now_ns))
+        self.streams, sums = taken(self.streams)
+        found = asyncio.run(watched(sums, self.state, self._crew))
         if found is not None:
             event = found
             self._at(self._worked(self.latencies.watch_s), lambda: self._post(event))

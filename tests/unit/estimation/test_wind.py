@@ -13,7 +13,6 @@ from service.estimation.wind import (
     Drift,
     Joint,
     begin_joint,
-    correlation_factor,
     dithered_innovation,
     forgotten,
     passive_innovation,
@@ -162,46 +161,24 @@ class TestBias:
         np.testing.assert_allclose(np.sqrt(np.diag(later.covariance)[4:]), BIAS_FLOOR)
 
 
-class TestCorrelation:
-    """Looks at telemetry that was looked at before."""
-
-    def test_a_chain_of_looks_is_worth_what_its_mean_scatters_by(self):
-        """Mean of n values correlated by exp(-1): its variance, from 4000 such chains."""
-        rng, n, rho = np.random.default_rng(3), 200, np.exp(-1.0)
-        fresh = np.sqrt(1 - rho**2) * rng.normal(size=(4000, n))
-        looks = np.empty_like(fresh)
-        looks[:, 0] = rng.normal(size=4000)
-        for k in range(1, n):
-            looks[:, k] = rho * looks[:, k - 1] + fresh[:, k]
-        counted = correlation_factor(10.0, 10.0) / n
-        assert np.var(looks.mean(axis=1)) == pytest.approx(counted, rel=0.06)
-
-    def test_far_apart_they_are_independent_and_together_they_are_one(self):
-        assert correlation_factor(1e3, 10.0) == pytest.approx(1.0)
-        assert correlation_factor(0.0, 10.0) == np.inf
-
-
 def night(seed: int, dither_every_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Errors ``(n, 4)`` and normalised squares ``(n,)`` of an hour: passive every 10 s."""
     rng = np.random.default_rng(seed)
     joint: Joint | None = None
     size = np.array([0.06, 0.06, np.deg2rad(0.03), 0.0006])
     true, bias, errors, squares = NOWHERE.copy(), rng.normal(size=4) * size, [], []
-    rho = np.exp(-1.0)
-    scatter = rng.normal(size=4)
     for t in np.arange(0.0, 3600.0, 10.0):
         true = true + DRIFT.alpha_rate * np.sqrt(10.0) * rng.normal(size=4)
         keep = np.exp(-10.0 / DRIFT.bias_memory_s)
         bias = keep * bias + size * np.sqrt(1 - keep**2) * rng.normal(size=4)
-        scatter = rho * scatter + np.sqrt(1 - rho**2) * rng.normal(size=4)
         joint = None if joint is None else predicted(joint, DRIFT, 10.0)
         if t % dither_every_s == 0.0:
             read = true + np.sqrt(np.diag(DITHERED)) * rng.normal(size=4)
             begun = begin_joint(read, DITHERED)
             joint = begun if joint is None else with_dithered(joint, read, DITHERED)
         assert joint is not None
-        read = true + bias + np.sqrt(np.diag(SCATTER)) * scatter
-        joint = with_passive(joint, read, SCATTER * correlation_factor(10.0, 10.0))
+        read = true + bias + np.sqrt(np.diag(SCATTER)) * rng.normal(size=4)
+        joint = with_passive(joint, read, SCATTER)
         if t > 600.0:
             error = joint.alpha - true
             errors.append(error)
@@ -210,7 +187,7 @@ def night(seed: int, dither_every_s: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_one_dither_a_minute_holds_the_shifts_to_a_percent_whatever_the_wind():
-    """The bias is 6 % RMS, the dither alone scatters by 0.8 %, looks share telemetry.
+    """The bias is 6 % RMS, the dither alone scatters by 0.8 %.
 
     The bias is smaller than the filter allows for, so its σ is on the safe side.
     """

@@ -8,13 +8,10 @@ import pytest
 from service import events as ev
 from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
-from service.reactions.tracking import PASSIVE_BLIND_S
 from service.state import Mode, Source, Validity
 from tests.unit.reactions.situations import (
     ALPHA,
-    POLICY,
     SECOND,
-    START_NS,
     Story,
     moved,
     of_kind,
@@ -94,26 +91,6 @@ def test_once_learnt_it_follows_a_drift_without_any_window(story):
     assert story.state.history[-1].source is Source.PASSIVE
 
 
-def test_looks_close_together_tell_no_more_than_their_telemetry_holds():
-    """Of α + b, at rest: after a first look 100 in 10 s say what one says after 10 s.
-
-    With ρ the correlation of two looks their variance counts (1 + ρ) / (1 - ρ) times: 2.16 for one
-    e-folding, 200 for a hundredth of it. So R (1 + 1/2.16)^-1 = 0.68 R, and 0.67 R.
-    """
-    still = replace(POLICY, drift_rate=np.zeros(4), bias_memory_s=1e12)
-    found = []
-    for n_looks in (1, 100):
-        story = Story(Mode.HOLD, still).meet()
-        story.see()
-        watch(story, ALPHA)
-        for _ in range(n_looks):
-            watch(story, ALPHA, 10.0 / n_looks)
-        known = story.state.registration
-        both = known.covariance + known.bias.covariance + known.bias.shared + known.bias.shared.T
-        found.append(both[0, 0] / SCATTER[0] ** 2)
-    np.testing.assert_allclose(found, [0.684, 0.667], rtol=0.01)
-
-
 class TestBark:
     """An estimate that fits neither α nor what is known of its bias."""
 
@@ -170,13 +147,14 @@ class TestJump:
         assert story.state.registration.alpha == before.alpha
         assert "both sides of a jump" in story.state.watchdog.text
 
-    def test_later_they_are(self, story):
+    def test_one_that_began_after_it_is(self, story):
         learnt(story)
         there = moved(shift_x_subap=0.15)
         story.see(there, n_windows=2)
-        story.see(there, every_s=PASSIVE_BLIND_S)
-        watch(story, moved(there, shift_x_subap=0.06))
-        assert story.state.history[-1].source is Source.PASSIVE
+        for used in (False, True):
+            story.see(there, every_s=1.0)
+            watch(story, moved(there, shift_x_subap=0.06), after_s=3.0)
+            assert (story.state.history[-1].source is Source.PASSIVE) is used
 
     def test_nor_while_one_is_suspected(self, story):
         story.see(moved(shift_x_subap=0.15))
@@ -185,11 +163,11 @@ class TestJump:
         assert story.state.registration.covariance is before.covariance
 
 
-def test_without_an_rtc_its_own_time_counts(story):
-    story.tell(ev.RtcVanished())
-    event = ev.Watched(estimate=watched(ALPHA), t_ns_utc=START_NS + 60 * SECOND)
-    story.tell(event, after_s=1.0)
-    assert story.state.registration.t_ns_utc == START_NS + 60 * SECOND
+def test_it_is_of_the_time_of_its_telemetry_not_of_when_the_worker_was_done(story):
+    end_ns = story.state.registration.t_ns_utc + 4 * SECOND
+    story.tell(ev.Watched(estimate=watched(ALPHA), t_ns_utc=end_ns), after_s=60.0)
+    assert story.state.registration.t_ns_utc == end_ns
+    assert story.state.registration.bias.looked_ns_utc == end_ns
 
 
 def test_a_registration_without_a_bias_knows_nothing_of_it(story):

@@ -13,6 +13,7 @@ from service.runtime.streams import (
     Streams,
     fed,
     shape_mismatch,
+    taken,
     troubles,
     with_dither,
     with_matrix,
@@ -382,3 +383,31 @@ class TestVibrations:
         for number in range(130):
             streams, _ = fed(streams, self.shaken(100 * number))
         assert streams.hearing.lines_hz == ()
+
+
+class TestLooks:
+    """What the watchdog takes from the streams."""
+
+    def test_too_little_stays_where_it_is(self, streams):
+        young, _ = play(streams, 0, 1, n=15)
+        kept, sums = taken(young)
+        assert sums is None
+        assert kept is young
+
+    def test_no_two_looks_share_telemetry(self, streams):
+        """Nothing is forgotten here: two looks hold together what one of all telemetry would."""
+        sums = replace(streams.passive, memory_frames=1e12)
+        one, _ = play(replace(streams, passive=sums), 0, 20)
+        all_of_it, _ = play(one, 2000, 20)
+        rest, first = taken(one)
+        rest, _ = play(rest, 2000, 20)
+        _, second = taken(rest)
+        _, both = taken(all_of_it)
+        assert both.n_effective == pytest.approx(first.n_effective + second.n_effective)
+        np.testing.assert_allclose(both.power, first.power + second.power, rtol=1e-5, atol=1e-20)
+
+    def test_what_is_taken_is_gone_at_once(self, streams):
+        one, _ = play(streams, 0, 20)
+        rest, sums = taken(one)
+        assert sums is not None
+        assert taken(rest)[1] is None

@@ -178,6 +178,13 @@ def test_an_estimate_says_which_window_it_is_of():
     assert estimate.t_ns_utc == spectra.t_end_ns_utc > T0_NS + 998 * DT_NS
 
 
+def test_an_estimate_says_how_much_dither_it_is_of():
+    found = fit_window(bright_windows()[0], small_linearisation(), BRIGHT.loop)
+    total_m = np.sqrt(np.sum(np.square(BRIGHT.plan.amplitude_m)))
+    assert found.dither_m == pytest.approx(total_m, rel=1e-3)
+    assert found.window_s == 1.0
+
+
 def test_the_step_leads_from_the_linearisation_to_the_estimate():
     estimate = fit_window(bright_windows()[0], small_linearisation(), BRIGHT.loop)
     np.testing.assert_allclose(

@@ -13,10 +13,11 @@ from service.estimation.noisymatrix import RandomEstimate
 from service.model.misregistration import Misregistration
 from service.reactions.acquisition_plan import missed
 from service.reactions.dither import found_again
+from service.reactions.estimate import Measured
 from service.reactions.journal import OFF_LOOP, logged, with_alarm, without_alarm
 from service.reactions.modal_gain import followed_gains
 from service.reactions.policy import Policy
-from service.reactions.tracking import Measured, with_window
+from service.reactions.tracking import with_window
 from service.reactions.validity import USELESS_SIGMA
 from service.state import Level, Source, TrackerState
 

@@ -21,15 +21,15 @@ from sim_rtc.plant import Optics, TelescopeOptics
 from sim_rtc.telemetry import Snapshot
 from studies.campaign.observatory_dome import Moment
 
-WATCHED_S = 5.0
-"""After a swap: an unstable loop leaves every doubt behind in a fraction of it."""
+WATCHED_S = 20.0
+"""After a swap: an unstable loop needs a fraction of it, an edge may slip after seconds."""
 
 LEAST_S = 0.5
 """Less than this of a matrix in use tells nothing."""
 
-GROWTH = 1.5
+GROWTH = 2.0
 """A wavefront error that ends so much above the one before, and above the night's best, has grown:
-seeing that changes by a third in this time makes 1.3."""
+seeing that gets worse by a half in this time makes 1.4."""
 
 STROKE_M = 1e-8
 """Of the push and pull that find a telescope's response, metres RMS: a pyramid is linear there."""

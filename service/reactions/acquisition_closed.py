@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service import events as ev
+from service.control.edge import FORGIVING_LEAK
 from service.reactions.acquisition_ends import again, entered, fail, told
 from service.reactions.acquisition_plan import OUT_OF_HAND, gains_for
 from service.reactions.dither_schedule import choose_dither
-from service.reactions.journal import without_alarm
+from service.reactions.journal import logged, without_alarm
 from service.reactions.matrices import Step, send, why_unsendable
 from service.reactions.mode_ladder import fewer_than
 from service.reactions.policy import SECOND_NS, Policy
@@ -37,6 +38,8 @@ def closed_stage(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int)
     if acquisition.stage is AcquisitionStage.WIDENING:
         return _widened(state, rtc, record, policy, now_ns)
     if record is None:
+        if acquisition.command is not None and rtc.leak > FORGIVING_LEAK:
+            return state, ()
         return _make(state, acquisition.n_modes, rtc, now_ns)
     if rtc.cm_id != record.id:
         return state, ()
@@ -62,7 +65,9 @@ def on_made(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
     if rtc is None or found is None or reason is not None:
         return again(state, f"{record.id} cannot be sent: {reason}", now_ns)
     state, _ = send(state, record.id, now_ns)
-    acquisition = replace(acquisition, matrix=record.id, n_modes=record.n_modes, sent=True)
+    acquisition = replace(
+        acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None
+    )
     if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
         acquisition = replace(acquisition, most_modes=record.n_modes)
     gains = gains_for(found, record.n_modes, rtc.n_modes)
@@ -71,12 +76,17 @@ def on_made(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
 
 
 def _refused(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> Step:
-    """With the loop closed be content with the modes there are; else there is no more to try."""
-    acquisition = state.acquisition
+    """With the loop closed be content with the modes there are; else try a leak for the edge."""
+    acquisition, gate, rtc = state.acquisition, record.gate, state.rtc
     if acquisition.stage is AcquisitionStage.WIDENING:
         acquisition = replace(acquisition, most_modes=acquisition.n_modes)
         return replace(state, acquisition=acquisition), ()
-    reason = record.gate.reason if record.gate is not None else record.reason
+    slippery = gate is not None and gate.edge_motion_m is not None
+    if slippery and rtc is not None and rtc.leak > FORGIVING_LEAK:
+        text = f"a leak of {FORGIVING_LEAK} is to keep the outer ring in place"
+        state = logged(state, "acquisition.leak", text, now_ns)
+        return told(state, ev.SetLoop(leak=FORGIVING_LEAK), now_ns)
+    reason = gate.reason if gate is not None else record.reason
     return fail(state, f"no number of modes passes the gate: {reason}", now_ns)
 
 

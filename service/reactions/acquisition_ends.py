@@ -109,8 +109,8 @@ def abort(state: TrackerState, why: str, now_ns: int) -> Step:
     if acquisition.stage not in _CLOSED:
         state = replace(state, registration=None)
     restored = found is not None and found.closed and found.held and not acquisition.sent
-    if restored and state.rtc is not None:
-        state, more = told(state, ev.SetLoop(closed=True), now_ns)
+    if found is not None and restored and state.rtc is not None:
+        state, more = told(state, ev.SetLoop(closed=True, leak=found.leak), now_ns)
         effects = (*effects, *more)
     left = "closed as it was found" if restored else "left as it is"
     text = f"ended {why}; the loop is {left}"

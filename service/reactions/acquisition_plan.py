@@ -88,7 +88,13 @@ def loop_found(state: TrackerState, rtc: RtcView, policy: Policy) -> LoopFound:
     out_of_hand = any(alarm.name in OUT_OF_HAND for alarm in state.alarms)
     goal = rtc.n_controlled or min(policy.n_modes_target, rtc.n_modes)
     gains = rtc.gains if closed else (CLOSING_GAIN,) * goal
-    return LoopFound(closed=closed, gains=gains, n_controlled=goal, held=closed and not out_of_hand)
+    return LoopFound(
+        closed=closed,
+        gains=gains,
+        n_controlled=goal,
+        leak=rtc.leak,
+        held=closed and not out_of_hand,
+    )
 
 
 def gains_for(found: LoopFound, n_modes: int, of_basis: int) -> tuple[float, ...]:

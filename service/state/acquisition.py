@@ -65,6 +65,9 @@ class LoopFound:
     n_controlled: int
     """Modes to come back to."""
 
+    leak: float
+    """Per frame."""
+
     held: bool
     """Whether it was closed and no alarm said that it did not hold."""
 

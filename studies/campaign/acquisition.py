@@ -45,6 +45,7 @@ Row = dict[str, Any]
 class Start:
     """What is run; two starts that are equal give the same row."""
 
+    instrument: str = "flao-lbt"
     plant: str = "linear"
     truth: str = "ideal"
     """The simulator's set of imperfections."""
@@ -70,6 +71,7 @@ class Start:
         """The simulator's command line."""
         alpha = ",".join(f"{value:.5f}" for value in self.alpha)
         return [
+            f"--instrument={self.instrument}",
             f"--plant={self.plant}",
             f"--imperfections={self.truth}",
             f"--mag={self.magnitude}",
@@ -85,7 +87,7 @@ def play(start: Start) -> Row:
     begun = time.monotonic()
     with threadpool_limits(1):
         settings = load_settings(None, {}, {"control.n_modes_target": start.n_controlled})
-        bench = _bench(start.sampling)
+        bench = _bench(start.instrument, start.sampling)
         linear = start.plant == "linear"
         night = Observatory(start.words, policy_of(settings), Mode.AUTO, bench, with_poles=linear)
         while night.time_s < start.within_s and night.state.acquisition.stage not in _OVER:
@@ -113,9 +115,9 @@ def play(start: Start) -> Row:
 
 
 @cache
-def _bench(sampling: int) -> Workbench:
+def _bench(instrument: str, sampling: int) -> Workbench:
     compute = Compute(threads=1, pupil_sampling=sampling, detector_nodes=sampling)
-    return Workbench(load_instrument("flao-lbt"), compute)
+    return Workbench(load_instrument(instrument), compute)
 
 
 def main() -> int:
@@ -148,6 +150,7 @@ def _parser() -> argparse.ArgumentParser:
         "--output", type=Path, default=Path("acquisition.jsonl"), help="rows, resumed"
     )
     parser.add_argument("--table", type=Path, metavar="FILE.md")
+    parser.add_argument("--instrument", default="flao-lbt", metavar="NAME|FILE")
     parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
     parser.add_argument("--truth", default="ideal", metavar="NAME")
     parser.add_argument("--starts", type=_range, default=range(2), metavar="FIRST:END")
@@ -164,6 +167,7 @@ def _parser() -> argparse.ArgumentParser:
 def _starts(given: argparse.Namespace) -> Iterator[Start]:
     for seed in given.starts:
         yield Start(
+            instrument=given.instrument,
             plant=given.plant,
             truth=given.truth,
             seed=seed,

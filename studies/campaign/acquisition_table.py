@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,8 @@ accuracy asked for; or further than 5 of its own σ."""
 WRONG_SIGMA = 5.0
 
 _HEADER = (
-    "| plant, truth | starts | tracking (share) | time s: median, longest | opened again | "
-    "failed, clear state | unclear | wrong α | unstable matrix applied | error RMS x, y % / mdeg / "
+    "| telescope, plant, truth | starts | tracking (share) | time s: median, longest | "
+    "opened again | failed, clear state | unclear | wrong α | unstable matrix applied | error RMS x, y % / mdeg / "
     "% |\n|---|---|---|---|---|---|---|---|---|---|\n"
 )
 
@@ -26,7 +27,8 @@ def table(rows: list[Row]) -> str:
     """Return the table, one line for each kind of start."""
     groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
     for row in rows:
-        key = (row["plant"], row["truth"], row["magnitude"], row["gain"], row["n_controlled"])
+        name = Path(row["instrument"]).stem
+        key = (name, row["plant"], row["truth"], row["magnitude"], row["gain"], row["n_controlled"])
         groups[key].append(row)
     return _HEADER + "".join(_line(key, group) for key, group in sorted(groups.items()))
 
@@ -40,7 +42,7 @@ def wrong(row: Row) -> bool:
 
 
 def _line(key: tuple[Any, ...], rows: list[Row]) -> str:
-    plant, truth, magnitude, gain, n_controlled = key
+    name, plant, truth, magnitude, gain, n_controlled = key
     tracking = [row for row in rows if row["stage"] == "tracking"]
     failed = [row for row in rows if row["stage"] == "failed"]
     times = [row["time_s"] for row in tracking]
@@ -53,7 +55,8 @@ def _line(key: tuple[Any, ...], rows: list[Row]) -> str:
         x, y, rotation, magnification = np.sqrt(np.mean(errors**2, axis=0)) * [100, 100, 1e3, 100]
         rms = f"{x:.2f} {y:.2f} {rotation:.1f} {magnification:.3f}"
     return (
-        f"| {plant}, {truth}, mag {magnitude:g}, {n_controlled} modes g {gain:g} | {len(rows)} | "
+        f"| {name}, {plant}, {truth}, mag {magnitude:g}, {n_controlled} modes g {gain:g} | "
+        f"{len(rows)} | "
         f"{len(tracking)} ({len(tracking) / len(rows):.0%}) | {spent} | {again} | {len(failed)} | "
         f"{len(rows) - len(tracking) - len(failed)} | {sum(map(wrong, rows))} | {unstable} | "
         f"{rms} |\n"

@@ -15,7 +15,7 @@ from service.reactions.acquisition_ends import MOST_ATTEMPTS
 from service.reactions.acquisition_far import MOST_MISSES
 from service.reactions.acquisition_plan import MISSES_BEFORE, OUT_OF_HAND_S, far_dither
 from service.state import AcquisitionStage, MatrixState, Mode
-from tests.unit.reactions.situations import POLICY, Story, estimate, moved, rtc
+from tests.unit.reactions.situations import POLICY, Story, estimate, moved, rtc, verdict
 
 ACQUIRES = replace(POLICY, acquires=True)
 FAR = Misregistration(
@@ -281,6 +281,28 @@ class TestNothingWrong:
         assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
         assert story.state.registration is None
 
+    def test_where_the_edge_would_slip_with_any_modes_a_leak_is_asked_for_first(self):
+        story = Acquiring().to_partial()
+        slips = replace(verdict(accepted=False), edge_motion_m=5e-7)
+        story.make("cm-150", MatrixState.REFUSED, n_modes=150, gate=slips)
+        asked = story.asked(ev.AskLoop)[-1]
+        assert (asked.closed, asked.leak) == (None, 0.99)
+        story.tell(ev.LoopAnswered(id=asked.id, accepted=True, reason=""))
+        story.still_open()
+        assert len(story.asked(ev.MakeMatrix)) == 1
+        story.still_open(leak=0.99)
+        assert len(story.asked(ev.MakeMatrix)) == 2
+        story.close(150)
+        assert story.stage is AcquisitionStage.WIDENING
+
+    def test_a_leak_that_does_not_help_ends_it(self):
+        story = Acquiring().to_partial()
+        slips = replace(verdict(accepted=False), edge_motion_m=5e-7)
+        story.make("cm-150", MatrixState.REFUSED, n_modes=150, gate=slips)
+        story.still_open(leak=0.99)
+        story.make("cm-151", MatrixState.REFUSED, n_modes=150, gate=slips)
+        assert story.stage is AcquisitionStage.FAILED
+
     def test_a_matrix_asked_for_before_it_began_is_not_sent(self):
         story = Acquiring()
         story.see(n_windows=3)
@@ -415,7 +437,7 @@ class TestOperator:
         story.tell(ev.AbortAcquisition())
         assert story.stage is AcquisitionStage.ABORTED
         last = story.asked(ev.AskLoop)[-1]
-        assert (last.closed, last.gains) == (True, None)
+        assert (last.closed, last.gains, last.leak) == (True, None, 0.999)
         assert story.asked(ev.AskNoDither)
 
     def test_who_aborts_gets_a_diverging_loop_open(self):

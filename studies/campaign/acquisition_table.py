@@ -18,8 +18,8 @@ WRONG_SIGMA = 5.0
 
 _HEADER = (
     "| telescope, plant, truth | starts | tracking (share) | time s: median, longest | "
-    "opened again | failed, clear state | unclear | wrong α | unstable matrix applied | error RMS x, y % / mdeg / "
-    "% |\n|---|---|---|---|---|---|---|---|---|---|\n"
+    "opened again | failed, clear state | unclear | wrong α | unstable matrix applied | "
+    "error RMS x, y % / mdeg / % |\n|---|---|---|---|---|---|---|---|---|---|\n"
 )
 
 

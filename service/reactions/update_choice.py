@@ -62,7 +62,7 @@ def choose_update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
         return state, ()
     if rtc.loop != "closed" or state.making_since_ns_utc is not None:
         return state, ()
-    if _busy(state) or now_ns < max(_next_attempt_ns(state, policy), state.retry_ns_utc):
+    if _busy(state) or now_ns < max(_next_attempt_ns(state, rtc, policy), state.retry_ns_utc):
         return state, ()
     in_use = state.reconstructor(state.in_use) if state.in_use else None
     if in_use is None:
@@ -95,12 +95,16 @@ def _busy(state: TrackerState) -> bool:
     )
 
 
-def _next_attempt_ns(state: TrackerState, policy: Policy) -> int:
-    """Return before when no reconstructor is computed by itself."""
+def _next_attempt_ns(state: TrackerState, rtc: RtcView, policy: Policy) -> int:
+    """Return before when no reconstructor is computed by itself.
+
+    One refused for another α, or for more modes than are controlled, holds back no other.
+    """
     own = [r for r in state.reconstructors if r.parent is not None]
     if not own:
         return 0
     last = own[-1]
     failed = (MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED, MatrixState.DISCARDED)
-    wait_s = policy.refused_interval_s if last.state in failed else policy.minimum_interval_s
+    again = last.state in failed and not outdated(state, last) and last.n_modes <= rtc.n_controlled
+    wait_s = policy.refused_interval_s if again else policy.minimum_interval_s
     return last.created_ns_utc + int(wait_s * SECOND_NS)

@@ -7,7 +7,15 @@ import pytest
 from service import events as ev
 from service.reactions.mode_ladder import FIRST_WAIT_S, LONGEST_WAIT_S, fewer_than
 from service.state import MatrixState, Mode
-from tests.unit.reactions.situations import POLICY, Story, of_kind, record, rtc, verdict
+from tests.unit.reactions.situations import (
+    POLICY,
+    Story,
+    moved,
+    of_kind,
+    record,
+    rtc,
+    verdict,
+)
 
 WANTED = replace(POLICY, n_modes_target=500)
 
@@ -99,6 +107,15 @@ def test_a_raise_the_gate_refuses_doubles_the_wait_and_publishes_nothing():
     assert night.state.mode_limit.wait_s == 2 * FIRST_WAIT_S
     assert not of_kind(night.wait(2 * FIRST_WAIT_S - 5), ev.MakeMatrix)
     assert of_kind(night.wait(10), ev.MakeMatrix)
+
+
+def test_a_refused_raise_does_not_hold_back_an_update():
+    night = Night().lowered()
+    (more,) = of_kind(night.wait(FIRST_WAIT_S + 5), ev.MakeMatrix)
+    night.make_for(more, 500, state=MatrixState.REFUSED)
+    (update,) = of_kind(night.see(moved(shift_x_subap=0.05), n_windows=4), ev.MakeMatrix)
+    assert update.n_modes == 300
+    assert update.why.startswith("moved by")
 
 
 def test_a_raise_that_passes_is_published_and_logged():

@@ -51,6 +51,8 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
 def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     """Take over what the RTC says of itself."""
     state = without_alarm(state, "rtc-vanished", now_ns)
+    if state.rtc is not None and _loop(state.rtc) != _loop(rtc):
+        state = _without_bias(state)
     state = replace(
         state,
         rtc=rtc,
@@ -68,6 +70,16 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     else:
         state = without_alarm(state, "loop-open", now_ns)
     return follow_status(state, rtc, now_ns)
+
+
+def _loop(rtc: RtcView) -> tuple[object, ...]:
+    return rtc.n_controlled, rtc.gains, rtc.leak, rtc.delay_frames, rtc.frame_rate_hz
+
+
+def _without_bias(state: TrackerState) -> TrackerState:
+    """Forget the passive estimate's bias: it was that of another loop."""
+    known = state.registration
+    return state if known is None else replace(state, registration=replace(known, bias=None))
 
 
 def _of_this_basis(state: TrackerState, now_ns: int) -> TrackerState:

@@ -174,3 +174,15 @@ def test_a_registration_without_a_bias_knows_nothing_of_it(story):
     story.state = replace(story.state, registration=replace(story.state.registration, bias=None))
     watch(story, moved(shift_x_subap=0.08))
     assert story.state.registration.bias.offset[0] > 0.05
+
+
+@pytest.mark.parametrize(
+    "changes", [{"n_controlled": 500}, {"leak": 0.99}, {"gains": (0.3,) * 400 + (0.0,) * 194}]
+)
+def test_another_loop_has_another_bias(story, changes):
+    learnt(story)
+    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns)))
+    assert story.state.registration.bias is not None
+    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns, **changes)))
+    assert story.state.registration.bias is None
+    assert story.state.registration.usable

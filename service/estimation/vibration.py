@@ -130,7 +130,8 @@ def lines_hz(state: Vibrations, known_hz: tuple[float, ...] = ()) -> tuple[float
     """Return the vibration lines, lowest first, without those known: the dither's own.
 
     A bin is a line when in any view it stands ``LINE_RATIO`` above the median of its
-    neighbourhood and is the highest within two bins.
+    neighbourhood and is the highest within two bins. Below 2 % of the frame rate turbulence falls
+    too steeply for a neighbourhood to tell, and no dither goes there.
     """
     if state.power is None or state.n_segments < MIN_SEGMENTS:
         return ()
@@ -141,5 +142,5 @@ def lines_hz(state: Vibrations, known_hz: tuple[float, ...] = ()) -> tuple[float
         around = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURHOOD + 1)
         highest = np.lib.stride_tricks.sliding_window_view(np.pad(power, 2), 5).max(axis=1)
         peaks = (power > LINE_RATIO * np.median(around, axis=1)) & (power == highest)
-        found |= {float(step * k) for k in np.flatnonzero(peaks) if k > 2}
+        found |= {float(step * k) for k in np.flatnonzero(peaks) if k > _NEIGHBOURHOOD}
     return tuple(sorted(f for f in found if all(abs(f - k) > 3.0 * step for k in known_hz)))

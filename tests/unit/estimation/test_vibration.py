@@ -54,6 +54,13 @@ def test_lines_are_found_to_a_bin():
     np.testing.assert_allclose(found, [61.0, 240.0], atol=1.0)
 
 
+def test_the_steep_end_of_turbulence_is_no_line():
+    rng = np.random.default_rng(3)
+    # a loop's own overshoot at 5 Hz, where turbulence bends
+    steep = lfilter([1.0], [1.0, -1.993, 0.994], rng.normal(size=(12 * 1024, N_SLOPES)), axis=0)
+    assert lines_hz(listened(steep)) == ()
+
+
 def test_the_dithers_own_lines_are_not_vibrations():
     found = lines_hz(listened(slopes(1, {61.0: 0.5, 240.0: 0.3})), known_hz=(240.0,))
     np.testing.assert_allclose(found, [61.0], atol=1.0)

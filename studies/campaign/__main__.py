@@ -37,7 +37,7 @@ def main() -> int:
     nights = [night for night in _nights(given) if _key(asdict(night)) not in done]
     started = time.monotonic()
     with _executor(given.workers) as executor, given.output.open("a") as file:
-        for k, new in enumerate(_played(executor, nights), start=1):
+        for k, new in enumerate(_played(executor, nights, given.keep), start=1):
             rows += new
             file.writelines(json.dumps(row) + "\n" for row in new)
             file.flush()
@@ -53,7 +53,7 @@ def main() -> int:
             tracking.floor_magnification,
         ]
     )
-    text = table(rows, floor)
+    text = table(rows, floor, pooled=given.winds_in_turn is not None)
     sys.stdout.write(text)
     if given.table is not None:
         command = "pyrcal campaign " + " ".join(sys.argv[1:])
@@ -74,6 +74,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", type=_range, default=range(2), metavar="FIRST:END")
     parser.add_argument("--magnitudes", type=_floats, default=(10.0,), metavar="R,R...")
     parser.add_argument("--winds", type=_floats, default=(12.0,), metavar="M_S,M_S...")
+    parser.add_argument(
+        "--winds-in-turn",
+        type=_floats,
+        metavar="M_S,M_S...",
+        help="one for each seed, over and over, and one line of the table for all",
+    )
     parser.add_argument("--profile", help="named layers instead of winds")
     parser.add_argument("--truths", type=_words, default=("ideal",), metavar="NAME,NAME...")
     parser.add_argument("--estimators", type=_words, default=("lock-in",), metavar="NAME,NAME...")
@@ -91,6 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--window-s", type=float, default=5.0)
     parser.add_argument("--windows", type=int, default=4, help="of each night")
     parser.add_argument("--working-point-modes", type=int)
+    parser.add_argument("--modes", type=_ints, metavar="MODE,MODE...", help="that are dithered")
+    parser.add_argument("--camera", choices=("ccd", "emccd"), default="ccd")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="of sums to look at again")
     parser.add_argument("--twins", action="store_true", help="also without dither: what it costs")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     return parser
@@ -101,7 +110,9 @@ def _nights(given: argparse.Namespace) -> Iterator[Night]:
     grid = itertools.product(
         given.seeds, given.truths, given.estimators, given.troubles, given.magnitudes, given.winds
     )
-    for seed, truth, estimator, trouble, magnitude, wind_m_s in grid:
+    turns = given.winds_in_turn
+    for seed, truth, estimator, trouble, magnitude, wind in grid:
+        wind_m_s = wind if turns is None else turns[seed % len(turns)]
         night = Night(
             plant=given.plant,
             truth=truth,
@@ -117,6 +128,8 @@ def _nights(given: argparse.Namespace) -> Iterator[Night]:
             window_s=given.window_s,
             n_windows=given.windows,
             working_point_modes=given.working_point_modes,
+            modes=given.modes,
+            camera=given.camera,
         )
         yield night
         if given.twins:
@@ -128,8 +141,8 @@ def _executor(workers: int) -> Executor:
     return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
 
 
-def _played(executor: Executor, nights: Iterable[Night]) -> Iterator[list[Row]]:
-    for finished in as_completed([executor.submit(play, night) for night in nights]):
+def _played(executor: Executor, nights: Iterable[Night], keep: Path | None) -> Iterator[list[Row]]:
+    for finished in as_completed([executor.submit(play, night, keep) for night in nights]):
         yield finished.result()
 
 
@@ -140,7 +153,8 @@ def _read(path: Path) -> list[Row]:
 
 
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in asdict(Night()))
+    values = (row[name] for name in asdict(Night()))
+    return tuple(tuple(value) if isinstance(value, list) else value for value in values)
 
 
 def _range(text: str) -> range:
@@ -150,6 +164,10 @@ def _range(text: str) -> range:
 
 def _floats(text: str) -> tuple[float, ...]:
     return tuple(float(word) for word in text.split(","))
+
+
+def _ints(text: str) -> tuple[int, ...]:
+    return tuple(int(word) for word in text.split(","))
 
 
 def _words(text: str) -> tuple[str, ...]:

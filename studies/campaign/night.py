@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import os
+import pickle
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -75,41 +79,84 @@ class Night:
     window_s: float = 5.0
     n_windows: int = 4
     working_point_modes: int | None = None
+    modes: tuple[int, ...] | None = None
+    """0-based indices of the dithered ones; None: four above the controlled ones."""
+
+    camera: str = "ccd"
+    """The simulator's usual one, with 4 electrons of read noise, or "emccd": 0.4, and twice the
+    photon noise."""
 
     @property
-    def modes(self) -> tuple[int, ...]:
-        """Four modes above the controlled ones."""
-        return tuple(self.n_controlled + step for step in (9, 27, 45, 63))
+    def dithered(self) -> tuple[int, ...]:
+        """The modes a dither moves."""
+        return self.modes or tuple(self.n_controlled + step for step in (9, 27, 45, 63))
 
 
-def play(night: Night) -> list[dict[str, Any]]:
-    """Run one night and return a row per window; the first row is of the night as a whole."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Seen:
+    """One window of a night's telemetry, and the truth behind it."""
+
+    window: Window
+    loop: Loop
+    true: Misregistration
+    errors_nm: tuple[float, ...]
+    """Wavefront error of its batches, RMS."""
+
+
+def play(night: Night, keep: Path | None = None) -> list[dict[str, Any]]:
+    """Run one night and return a row for each of its windows.
+
+    With ``keep`` the sums of its telemetry are put there, and a night that is there already is
+    not simulated again: only looked at, perhaps with another model.
+    """
     with threadpool_limits(1):
-        instrument = load_instrument("flao-lbt")
-        options = parse_options(_simulated(night))
-        telescope = build_telescope(options, instrument)
-        true = telescope.optics.start().alpha
-        error = WavefrontError(telescope.weights)
-        rows: list[dict[str, Any]] = []
-        with Ahead(telescope.feed.blocks()) as ahead:
-            computer = telescope.computer(iter(ahead))
-            computer.prepare()
-            plan = _start(night, computer, options.frame_rate_hz)
-            known = Misregistration()
-            errors_nm: list[float] = []
-            for window in _windows(night, computer, plan, telescope, error, errors_nm):
-                outcome = _estimated(night, window, _loop(telescope), known)
-                if not isinstance(outcome, WindowRefused):
-                    known = outcome.alpha
-                rows.append(_row(outcome, true, errors_nm))
-                errors_nm.clear()
-                if len(rows) == night.n_windows:
-                    break
-    start = {"alpha": (true.vector * BOUNDARY_SCALE).tolist()}
-    return [asdict(night) | row | {"window": k} | start for k, row in enumerate(rows)]
+        rows, known = [], Misregistration()
+        for k, seen in enumerate(_kept(night, keep)):
+            outcome = _estimated(night, seen, known)
+            if not isinstance(outcome, WindowRefused):
+                known = outcome.alpha
+            alpha = (seen.true.vector * BOUNDARY_SCALE).tolist()
+            rows.append(asdict(night) | _row(outcome, seen) | {"window": k, "alpha": alpha})
+        return rows
 
 
-def _simulated(night: Night) -> list[str]:
+def kept_in(night: Night, folder: Path) -> Path:
+    """Return the file of a night's sums: the model it is looked at with plays no part."""
+    words = repr(replace(night, working_point_modes=None))
+    return folder / f"{hashlib.sha256(words.encode()).hexdigest()[:16]}.pickle"
+
+
+def _kept(night: Night, keep: Path | None) -> Iterator[Seen]:
+    if keep is None:
+        yield from _simulated_windows(night)
+        return
+    path = kept_in(night, keep)
+    if not path.exists():
+        keep.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_suffix(f".{os.getpid()}")
+        unfinished.write_bytes(pickle.dumps(list(_simulated_windows(night)), protocol=5))
+        unfinished.rename(path)
+    yield from pickle.loads(path.read_bytes())
+
+
+def _simulated_windows(night: Night) -> Iterator[Seen]:
+    options = parse_options(simulated(night))
+    telescope = build_telescope(options, load_instrument("flao-lbt"))
+    true, error = telescope.optics.start().alpha, WavefrontError(telescope.weights)
+    with Ahead(telescope.feed.blocks()) as ahead:
+        computer = telescope.computer(iter(ahead))
+        computer.prepare()
+        plan = start_dither(night, computer, options.frame_rate_hz)
+        errors_nm: list[float] = []
+        windows = _windows(night, computer, plan, telescope, error, errors_nm)
+        for window in itertools.islice(windows, night.n_windows):
+            seen = tuple(errors_nm)
+            yield Seen(window=window, loop=loop_of(telescope), true=true, errors_nm=seen)
+            errors_nm.clear()
+
+
+def simulated(night: Night) -> list[str]:
+    """Return the simulator's options of a night."""
     options = {
         "plant": night.plant,
         "imperfections": night.truth,
@@ -123,14 +170,18 @@ def _simulated(night: Night) -> list[str]:
     else:
         options["profile"] = night.profile
     words = [f"--{name}={value}" for name, value in options.items()]
+    if night.camera == "emccd":
+        words += ["--read-noise=0.4", "--excess-noise=2"]
     return words + options_for(night.trouble, LINE_FRACTIONS[1])
 
 
-def _start(night: Night, computer: RealTimeComputer, rate_hz: float) -> LockInPlan | RandomPlan:
+def start_dither(
+    night: Night, computer: RealTimeComputer, rate_hz: float
+) -> LockInPlan | RandomPlan:
     """Close the loop for a moment, ask for the dither, and return how it is to be read."""
     computer.next_batch()
     n_frames = round(night.window_s * rate_hz)
-    amplitude_m = (night.amplitude_nm * 1e-9,) * len(night.modes)
+    amplitude_m = (night.amplitude_nm * 1e-9,) * len(night.dithered)
     lines = tuple(round(f * rate_hz * night.window_s) / night.window_s for f in LINE_FRACTIONS)
     first_seq = round(SETTLING_S * rate_hz)
     silent = night.estimator is Estimator.PASSIVE or night.amplitude_nm == 0.0
@@ -141,7 +192,7 @@ def _start(night: Night, computer: RealTimeComputer, rate_hz: float) -> LockInPl
                 id="campaign",
                 action=DitherAction.START,
                 kind=DitherKind.SINE if sine else DitherKind.BINARY,
-                modes=night.modes,
+                modes=night.dithered,
                 amplitude_m=amplitude_m,
                 frequency_hz=lines if sine else None,
                 duration_s=2.0 + 1.5 * night.window_s * (night.n_windows + 2),
@@ -153,13 +204,13 @@ def _start(night: Night, computer: RealTimeComputer, rate_hz: float) -> LockInPl
         first_seq += reply.start_seq
     if night.estimator is Estimator.RANDOM:
         return RandomPlan(
-            modes=night.modes,
+            modes=night.dithered,
             amplitude_m=amplitude_m,
             n_frames=n_frames,
             first_seq=first_seq,
         )
     return LockInPlan(
-        modes=night.modes,
+        modes=night.dithered,
         frequencies_hz=lines,
         amplitude_m=tuple(max(a, 1e-12) for a in amplitude_m),
         frame_rate_hz=rate_hz,
@@ -226,7 +277,8 @@ def blocks_of(batches: list[Batch], telescope: Telescope) -> list[FrameBlock]:
     return blocks
 
 
-def _loop(telescope: Telescope) -> Loop:
+def loop_of(telescope: Telescope) -> Loop:
+    """Return the loop as it starts."""
     settings = telescope.settings
     gains = np.array(settings.gains)
     gains[len(telescope.reconstructor.matrix) :] = 0.0
@@ -246,15 +298,15 @@ def _bench(working_point_modes: int | None) -> Workbench:
     return Workbench(load_instrument("flao-lbt"), compute)
 
 
-def _estimated(night: Night, window: Window, loop: Loop, start: Misregistration) -> Outcome:
-    bench = _bench(night.working_point_modes)
+def _estimated(night: Night, seen: Seen, start: Misregistration) -> Outcome:
+    bench, window = _bench(night.working_point_modes), seen.window
     if isinstance(window, WindowRefused):
         return window
     if night.amplitude_nm == 0.0 and night.estimator is not Estimator.PASSIVE:
         return WindowRefused(reason="no dither was asked for", t_ns_utc=0)
     match window:
         case Spectra():
-            return bench.fit(window, loop, start)
+            return bench.fit(window, seen.loop, start)
         case Correlated():
             return bench.fit_random(window, start)
         case Passive():
@@ -262,13 +314,15 @@ def _estimated(night: Night, window: Window, loop: Loop, start: Misregistration)
             return found or WindowRefused(reason="too few frames", t_ns_utc=0)
 
 
-def _row(outcome: Outcome, true: Misregistration, errors_nm: list[float]) -> dict[str, Any]:
+def _row(outcome: Outcome, seen: Seen) -> dict[str, Any]:
     row: dict[str, Any] = {
-        "wavefront_nm": float(np.sqrt(np.mean(np.square(errors_nm)))) if errors_nm else None
+        "wavefront_nm": float(np.sqrt(np.mean(np.square(seen.errors_nm))))
+        if seen.errors_nm
+        else None
     }
     if isinstance(outcome, WindowRefused):
         return row | {"refused": outcome.reason}
-    difference = outcome.alpha.vector - true.vector
+    difference = outcome.alpha.vector - seen.true.vector
     covariance, gains = outcome.covariance, np.abs(outcome.optical_gain)
     if isinstance(outcome, PassiveEstimate):
         # nothing is known of the wind's bias in a night without a dither

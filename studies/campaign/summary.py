@@ -14,7 +14,7 @@ Row = dict[str, Any]
 
 GROUPED_BY = (
     "plant", "truth", "estimator", "trouble", "magnitude", "profile", "wind_m_s", "gain",
-    "n_controlled", "amplitude_nm", "window_s", "working_point_modes",
+    "n_controlled", "amplitude_nm", "window_s", "working_point_modes", "modes", "camera",
 )  # fmt: skip
 """Nights that differ in nothing but the seed make one line of the table."""
 
@@ -27,11 +27,16 @@ HEADER = (
 )
 
 
-def table(rows: list[Row], floor: Array) -> str:
-    """Return the campaign as a Markdown table; ``floor`` ``(4,)`` in boundary units."""
+def table(rows: list[Row], floor: Array, *, pooled: bool = False) -> str:
+    """Return the campaign as a Markdown table; ``floor`` ``(4,)`` in boundary units.
+
+    ``pooled``: one line for all winds.
+    """
     groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
     for row in rows:
-        groups[tuple(row[name] for name in GROUPED_BY)].append(row)
+        common = row | {"wind_m_s": None} if pooled else row
+        values = (common[name] for name in GROUPED_BY)
+        groups[tuple(tuple(v) if isinstance(v, list) else v for v in values)].append(row)
     return HEADER + "".join(line(key, group, floor) for key, group in groups.items())
 
 
@@ -84,7 +89,8 @@ def _four(values: Array) -> str:
 
 
 def _name(key: dict[str, Any]) -> str:
-    sky = key["profile"] or f"{key['wind_m_s']:g} m/s"
+    wind = "many winds" if key["wind_m_s"] is None else f"{key['wind_m_s']:g} m/s"
+    sky = key["profile"] or wind
     words = [
         f"{key['estimator']}, {key['plant']} {key['truth']}, mag {key['magnitude']:g}, {sky}",
         f"{key['n_controlled']} modes g {key['gain']:g}",
@@ -92,6 +98,10 @@ def _name(key: dict[str, Any]) -> str:
     ]
     if key["working_point_modes"]:
         words.append("working point")
+    if key["modes"]:
+        words.append("modes " + " ".join(str(mode) for mode in key["modes"]))
+    if key["camera"] != "ccd":
+        words.append(key["camera"])
     if key["trouble"] != "none":
         words.append(f"**{key['trouble']}**")
     return ", ".join(words)

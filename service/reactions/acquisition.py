@@ -121,7 +121,7 @@ def _ended_by(state: TrackerState, event: Event, now_ns: int) -> Step | None:
         case ev.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
             return abort(state, f"because the mode is {mode}", now_ns)
         case ev.RtcVanished():
-            return fail(state, "the RTC vanished: restart it", now_ns)
+            return abort(state, "because the RTC vanished", now_ns)
         case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
             return again(state, "the RTC began a new session", now_ns)
         case ev.Tick() if _late(acquisition, now_ns):

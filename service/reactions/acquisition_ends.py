@@ -108,10 +108,11 @@ def abort(state: TrackerState, why: str, now_ns: int) -> Step:
     state, effects = without_dither(state)
     if acquisition.stage not in _CLOSED:
         state = replace(state, registration=None)
-    restored = found is not None and found.closed and found.held and not acquisition.sent
-    if found is not None and restored and state.rtc is not None:
+    untouched = found is not None and found.closed and found.held and not acquisition.sent
+    left = "left as it is"
+    if found is not None and untouched and state.rtc is not None:
+        left = "closed as it was found"
         state, more = told(state, ev.SetLoop(closed=True, leak=found.leak), now_ns)
         effects = (*effects, *more)
-    left = "closed as it was found" if restored else "left as it is"
     text = f"ended {why}; the loop is {left}"
     return entered(state, AcquisitionStage.ABORTED, text, now_ns), effects

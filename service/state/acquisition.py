@@ -39,7 +39,7 @@ class AcquisitionStage(StrEnum):
     """Given up; the text says why, and what to do."""
 
     ABORTED = "aborted"
-    """An operator ended it."""
+    """An operator ended it, or the RTC vanished."""
 
 
 UNDER_WAY = frozenset(

@@ -223,13 +223,23 @@ class TestByItself:
     def test_it_does_not_begin_again_after_it_has_failed(self):
         story = Acquiring()
         story.tell(ev.Acquire())
-        story.tell(ev.RtcVanished())
-        story.meet(session="s9")
+        command = story.asked(ev.AskLoop)[-1]
+        story.tell(ev.LoopAnswered(id=command.id, accepted=False, reason="busy"))
         story.tell(DIVERGING)
         n_before = len(story.asked(ev.AskLoop))
         story.wait(60)
         assert len(story.asked(ev.AskLoop)) == n_before
         assert "acquisition" in story.alarms
+
+    def test_it_begins_again_when_an_rtc_that_vanished_is_back_and_diverges(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.tell(ev.RtcVanished())
+        assert story.stage is AcquisitionStage.ABORTED
+        story.meet(session="s9")
+        story.tell(DIVERGING)
+        story.wait(4)
+        assert story.stage is AcquisitionStage.OPENING
 
 
 class TestNothingWrong:
@@ -367,8 +377,9 @@ class TestTrouble:
     def test_an_rtc_that_vanishes_ends_it(self):
         story = Acquiring().to_partial()
         story.tell(ev.RtcVanished())
-        assert story.stage is AcquisitionStage.FAILED
+        assert story.stage is AcquisitionStage.ABORTED
         assert "vanished" in story.text
+        assert "left as it is" in story.text
 
     def test_an_rtc_that_begins_anew_is_looked_at_anew(self):
         story = Acquiring().to_widening()

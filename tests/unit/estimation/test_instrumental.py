@@ -128,6 +128,16 @@ def test_the_predicted_covariance_is_the_scatter_that_is_seen(case, spectra):
     assert 0.6 < np.mean(chi2) / 4 < 1.6
 
 
+@CASES
+def test_the_sigma_of_the_gains_is_the_scatter_that_is_seen(case, spectra):
+    """48 windows tell a standard deviation to 10 %."""
+    estimates = settled(case, spectra())
+    seen = np.std([np.abs(e.optical_gain) for e in estimates], axis=0, ddof=1)
+    said = np.sqrt(np.mean([e.gain_sigma**2 for e in estimates], axis=0))
+    np.testing.assert_allclose(seen / said, 1.0, atol=0.3)
+    assert estimates[0].modes == case.plan.modes
+
+
 def test_the_command_as_its_own_instrument_is_biased(monkeypatch):
     """What the instrument is for: the command carries turbulence and noise of its own."""
     right = errors(FAINT, settled(FAINT, faint_windows()))

@@ -100,8 +100,9 @@ def _tell(night: Observatory) -> None:
         for _, event in night.events
         if isinstance(event, ev.MatrixMade)
     }
-    for swap in night.swaps:
-        lines.append((swap.time_s, f"swap: {swap.n_modes} modes; {why.get(swap.id, '')}"))
+    lines.extend(
+        (swap.time_s, f"swap: {swap.n_modes} modes; {why.get(swap.id, '')}") for swap in night.swaps
+    )
     for time_s, text in sorted(lines):
         sys.stdout.write(f"{time_s:6.1f} s: {text}\n")
 

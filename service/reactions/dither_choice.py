@@ -160,6 +160,12 @@ def clear_lines(rtc: RtcView, n_lines: int, choice: Choice) -> tuple[float, ...]
     return wanted
 
 
+def on_vibrations(dither: DitherView, avoid_hz: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the lines of a dither that are not clear of vibrations."""
+    near = CLEARANCES_HZ[-1] - 1e-6
+    return tuple(f for f in dither.frequency_hz if any(abs(f - v) < near for v in avoid_hz))
+
+
 def n_lines(rtc: RtcView, policy: Policy) -> int:
     """Return how many modes the service dithers by itself."""
     return min(len(policy.dither_modes or range(_N_LINES)), rtc.max_dither_modes)

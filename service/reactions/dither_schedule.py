@@ -10,7 +10,13 @@ from service.control.precision import forgetting_mean, measured_ratio
 from service.estimation.instrumental import WindowEstimate
 from service.estimation.noisymatrix import RandomEstimate
 from service.events import AskDither, AskNoDither
-from service.reactions.dither_choice import OWN_DITHER, plan_dither, total_m, why_unusable
+from service.reactions.dither_choice import (
+    OWN_DITHER,
+    on_vibrations,
+    plan_dither,
+    total_m,
+    why_unusable,
+)
 from service.reactions.dither_pace import (
     SHORTEST_PAUSE_S,
     Wish,
@@ -25,6 +31,7 @@ from service.state import (
     DitherKind,
     DitherPhase,
     DitherView,
+    Level,
     Precision,
     RtcView,
     TrackerState,
@@ -200,6 +207,10 @@ def _ask(state: TrackerState, rtc: RtcView, policy: Policy, wish: Wish, now_ns: 
     if reason is not None:
         state = replace(state, retry_ns_utc=now_ns + 60 * SECOND_NS)
         return with_alarm(state, "dither", f"no usable dither: {reason}", now_ns), ()
+    shaken = on_vibrations(dither, wish.choice.avoid_hz)
+    if shaken and dither.frequency_hz != state.dithering.lines_hz:
+        text = f"lines at {shaken} Hz are on vibrations: there is no room, or the settings fix them"
+        state = logged(state, "dither.on-vibrations", text, now_ns, Level.WARNING)
     dithering = replace(
         state.dithering,
         lines_hz=dither.frequency_hz,

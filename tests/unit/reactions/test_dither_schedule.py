@@ -216,6 +216,17 @@ class TestLines:
         night.live(60)
         assert night.requests[-1].frequency_hz == last
 
+    def test_lines_the_settings_fix_stay_and_are_named(self):
+        fixed = replace(
+            BRISK,
+            dither_modes=(501, 502),
+            dither_frequencies_hz=(210.0, 260.0),
+            dither_avoid_hz=(212.0,),
+        )
+        night = DitheredNight(fixed)
+        assert night.requests[0].frequency_hz == (210.0, 260.0)
+        assert "lines at (210.0,) Hz are on vibrations" in night.state.log[-2].text
+
     def test_a_vibration_the_settings_know_is_avoided_from_the_start(self):
         night = DitheredNight(replace(BRISK, dither_avoid_hz=(211.0,)))
         assert self.clear(night.requests[0], 211.0) >= 8.0
@@ -225,6 +236,7 @@ class TestLines:
         everywhere = tuple(np.arange(190.0, 370.0, 5.0))
         night = DitheredNight(replace(BRISK, dither_avoid_hz=everywhere)).live(20)
         assert night.requests
+        assert "dither.on-vibrations" in night.logged
         assert night.state.windows_accepted > 0
 
 

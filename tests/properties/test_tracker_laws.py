@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from service import events as ev
 from service.errors import CommandError
 from service.estimation.lockin import WindowRefused
+from service.reactions.dither_choice import total_m
 from service.reactions.journal import LOG_LENGTH
 from service.reactions.measurements import MEASUREMENTS_KEPT
 from service.reactions.shelf import RECONSTRUCTORS_KEPT
@@ -91,6 +92,8 @@ commands = st.one_of(
         ev.StartDither,
         modes=st.sampled_from([None, (501,), (501, 502), (700,)]),
         frequency_hz=st.sampled_from([None, (250.0,), (1.0,)]),
+        amplitude_m=st.sampled_from([None, 1e-9, 2e-8]),
+        over_budget=st.booleans(),
     ),
     st.just(ev.StopDither()),
     st.builds(ev.Approve, id=ids),
@@ -394,6 +397,18 @@ def test_a_measurement_that_is_over_stays_over_and_given_up_stays_given_up(story
             assert state not in over or after[name] in over
             if state is MeasureState.GIVEN_UP:
                 assert after[name] is MeasureState.GIVEN_UP
+
+
+@LAWS
+@given(stories)
+def test_no_dither_is_over_budget_unless_an_operator_means_it(story):
+    night = Night()
+    for event, after_s in story:
+        night.tell(event, after_s)
+        meant = getattr(event, "over_budget", False)
+        for effect in night.last:
+            if isinstance(effect, ev.AskDither) and not meant:
+                assert total_m(effect.dither) <= POLICY.dither_budget_m * (1.0 + 1e-9)
 
 
 @LAWS

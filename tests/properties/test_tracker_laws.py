@@ -10,10 +10,10 @@ from service import events as ev
 from service.errors import CommandError
 from service.estimation.lockin import WindowRefused
 from service.reactions.dither_choice import total_m
+from service.reactions.estimate import HISTORY_LENGTH
 from service.reactions.journal import LOG_LENGTH
 from service.reactions.measurements import MEASUREMENTS_KEPT
 from service.reactions.shelf import RECONSTRUCTORS_KEPT
-from service.reactions.estimate import HISTORY_LENGTH
 from service.state import (
     MatrixState,
     MeasurementRecord,

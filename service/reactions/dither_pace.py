@@ -81,6 +81,20 @@ def wanted(
     return Wish(phase=phase, reason=reason, choice=choice, next_ns_utc=next_ns), plan
 
 
+def by_hand(state: TrackerState, rtc: RtcView, policy: Policy) -> Choice:
+    """Return what an operator's dither is like where the operator does not say."""
+    plan = state.dithering.plan
+    window_s = policy.window_s if plan is None else plan.window_s
+    lasting_s = policy.dither_duration_s - SETTLING_S - SPARE_S
+    return Choice(
+        total_m=budget_m(rtc, policy),
+        window_s=window_s,
+        n_windows=max(int(lasting_s / window_s + 1e-6), 1),
+        avoid_hz=(*policy.dither_avoid_hz, *state.vibrations_hz),
+        last_hz=state.dithering.lines_hz,
+    )
+
+
 def _plan(
     state: TrackerState, found: Schedule, demand: Demand, window_s: float, phase: DitherPhase
 ) -> DitherPlan:

@@ -8,7 +8,14 @@ from service import events as ev
 from service.errors import CommandError
 from service.events import Event
 from service.reactions.dither import found_again
-from service.reactions.dither_choice import ASKED_DITHER, plan_dither, total_m, why_unusable
+from service.reactions.dither_choice import (
+    ASKED_DITHER,
+    Choice,
+    plan_dither,
+    total_m,
+    why_unusable,
+)
+from service.reactions.dither_pace import by_hand
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send
 from service.reactions.policy import Policy
@@ -77,7 +84,7 @@ def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, no
         raise CommandError("a dither needs an RTC with its loop closed")
     if state.dither is not None:
         raise CommandError(f"{state.dither.id} is running: stop it first")
-    dither = _planned_dither(event, rtc, policy, now_ns)
+    dither = _planned_dither(event, by_hand(state, rtc, policy), rtc, policy, now_ns)
     found_nm, budget_nm = 1e9 * total_m(dither), 1e9 * policy.dither_budget_m
     cost = f"{found_nm:.3g} nm RMS in all, budget {budget_nm:.3g} nm"
     over = found_nm > budget_nm * (1.0 + 1e-9)
@@ -89,7 +96,9 @@ def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, no
     return logged(state, "dither.asked", text, now_ns), (ev.AskDither(dither=dither),)
 
 
-def _planned_dither(event: ev.StartDither, rtc: RtcView, policy: Policy, now_ns: int) -> DitherView:
+def _planned_dither(
+    event: ev.StartDither, choice: Choice, rtc: RtcView, policy: Policy, now_ns: int
+) -> DitherView:
     """Return the dither to ask for.
 
     Raises
@@ -109,6 +118,7 @@ def _planned_dither(event: ev.StartDither, rtc: RtcView, policy: Policy, now_ns:
         rtc,
         policy,
         now_ns,
+        choice=choice,
         modes=event.modes,
         amplitude_m=event.amplitude_m,
         frequency_hz=event.frequency_hz,

@@ -191,6 +191,15 @@ class TestWhen:
         night.live(10)
         assert night.playing is None
 
+    def test_an_operators_own_has_the_stars_windows_and_keeps_clear_of_vibrations(self):
+        night = DitheredNight(CALM, magnitude=12.5).live(60)
+        night.tell(ev.Vibrations(lines_hz=(239.0,)))
+        night.pass_on(night.tell(ev.StopDither()))
+        night.pass_on(night.tell(ev.StartDither(amplitude_m=1e-9)))
+        asked = night.requests[-1]
+        assert asked.window_s >= FAINT_WINDOW_S
+        assert min(abs(line - 239.0) for line in asked.frequency_hz) >= 8.0
+
     def test_small_changes_of_the_optimum_change_nothing(self):
         night = DitheredNight(BRISK).live(60)
         before = night.requests[-1]

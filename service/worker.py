@@ -32,7 +32,7 @@ from service.control.regularised import Prior
 from service.errors import ModelError
 from service.estimation import passive
 from service.estimation.edge import Actuators
-from service.estimation.faraway import FarEstimate, Search, find
+from service.estimation.faraway import NOT_FOUND, FarEstimate, Search, find
 from service.estimation.instrumental import Loop, WindowEstimate, fit_window
 from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.noisymatrix import RandomEstimate, fit_random
@@ -217,9 +217,7 @@ class Workbench:
         try:
             return find(spectra, Search(far=far, near=near, nominal=self._start, starts=starts))
         except np.linalg.LinAlgError as error:
-            return WindowRefused(
-                reason=f"registration not found: {error}", t_ns_utc=spectra.t_end_ns_utc
-            )
+            return WindowRefused(reason=f"{NOT_FOUND}: {error}", t_ns_utc=spectra.t_end_ns_utc)
 
     def fit_random(
         self, window: Correlated, start: Misregistration | None

@@ -43,6 +43,9 @@ FAINTEST = 5.0
 
 LARGEST_GAIN = 3.0
 
+NOT_FOUND = "registration not found"
+"""How the reason begins of a window that was good and led nowhere."""
+
 
 class Model(Protocol):
     """An optical model of the dithered modes alone, columns in the order of the lines."""
@@ -151,7 +154,7 @@ def find(spectra: Spectra, search: Search) -> FarEstimate | WindowRefused:
         if why_not is None:
             return found
         reason = why_not
-    return WindowRefused(reason=f"registration not found: {reason}", t_ns_utc=spectra.t_end_ns_utc)
+    return WindowRefused(reason=f"{NOT_FOUND}: {reason}", t_ns_utc=spectra.t_end_ns_utc)
 
 
 def _landed(columns: _Columns, search: Search, start: Misregistration) -> Misregistration | None:

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from service import events as ev
 from service.errors import CommandError
+from service.estimation.faraway import NOT_FOUND
 from service.events import Event
 from service.reactions.acquisition_closed import closed_stage, on_made
 from service.reactions.acquisition_ends import abort, again, fail, without_dither
@@ -25,7 +26,6 @@ from service.reactions.acquisition_plan import (
 from service.reactions.journal import logged, without_alarm
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
-from service.reactions.windows import EXPECTED
 from service.state import Acquisition, AcquisitionStage, Mode, TrackerState
 
 PATIENCE_S = 180.0
@@ -149,7 +149,7 @@ def _heard(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> St
     match event:
         case ev.FarFitted(found=found):
             return on_far(state, found, policy, now_ns)
-        case ev.WindowLost(refused=refused) if not refused.reason.startswith(EXPECTED):
+        case ev.WindowLost(refused=refused) if refused.reason.startswith(NOT_FOUND):
             return on_missed(state, refused.reason, now_ns)
         case ev.DitherAnswered(accepted=False, reason=reason):
             return on_missed(state, f"the RTC refused the dither: {reason}", now_ns)

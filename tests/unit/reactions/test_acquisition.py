@@ -359,6 +359,14 @@ class TestTrouble:
         assert "nothing fits" in story.text
         assert "acquisition" in story.alarms
 
+    def test_windows_that_were_never_looked_at_do_not_count(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        for _ in range(2 * MOST_MISSES):
+            story.miss_afar("the worker is too slow for the telemetry: a window was given up")
+        assert story.state.acquisition.attempt == 1
+
     def test_a_stage_that_takes_too_long_begins_it_anew(self):
         story = Acquiring()
         story.tell(ev.Acquire())

@@ -7,9 +7,6 @@ from enum import StrEnum
 
 import numpy as np
 
-PERIOD_S = 30.0
-"""Between two things that happen in a night; the first comes after it, when all has settled."""
-
 LATER_S = 10.0
 """A jump comes up to so much later, at random: in a window, or in the pause between two."""
 
@@ -56,6 +53,9 @@ class Plan:
     gain: float = 0.6
     n_controlled: int = 400
     seconds: float = 90.0
+    period_s: float = 30.0
+    """Between two things that happen; the first comes after it, when all should have settled."""
+
     instrument: str = "flao-lbt"
     settings: tuple[str, ...] = ()
     """Of the service, ``dither.window_s=5``, where they are not the defaults."""
@@ -65,14 +65,14 @@ class Plan:
         """When the mirror jumps."""
         if self.case not in {Case.JUMP, Case.BUSY}:
             return ()
-        due_s = np.arange(PERIOD_S, self.seconds - LATER_S - PERIOD_S / 2, PERIOD_S)
+        due_s = np.arange(self.period_s, self.seconds - LATER_S - self.period_s / 2, self.period_s)
         later_s = np.random.default_rng((11, self.seed)).uniform(0.0, LATER_S, len(due_s))
         return tuple(np.round(due_s + later_s, 2).tolist())
 
     @property
     def restart_s(self) -> float | None:
         """When the RTC begins again."""
-        return PERIOD_S if self.case is Case.RESTART else None
+        return self.period_s if self.case is Case.RESTART else None
 
     @property
     def words(self) -> list[str]:

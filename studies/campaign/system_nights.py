@@ -116,6 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--gain", type=float, help="default: 0.4 linear, 0.6 diffractive")
     parser.add_argument("--n-controlled", type=int, default=400)
     parser.add_argument("--seconds", type=float, default=90.0, help="of each night")
+    parser.add_argument("--period", type=float, default=30.0, help="between jumps, s")
     parser.add_argument(
         "--set",
         dest="settings",
@@ -141,6 +142,7 @@ def _plans(given: argparse.Namespace) -> Iterator[Plan]:
             gain=GAINS[given.plant] if given.gain is None else given.gain,
             n_controlled=given.n_controlled,
             seconds=given.seconds,
+            period_s=given.period,
             instrument=given.instrument,
             settings=tuple(given.settings),
         )

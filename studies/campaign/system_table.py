@@ -13,8 +13,8 @@ UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
 """Printed in % of a subaperture, thousandths of a degree, %."""
 
 GROUPED_BY = (
-    "case", "plant", "truth", "magnitude", "gain", "n_controlled", "seconds", "instrument",
-    "settings",
+    "case", "plant", "truth", "magnitude", "gain", "n_controlled", "seconds", "period_s",
+    "instrument", "settings",
 )  # fmt: skip
 """Nights that differ in nothing but the seed make one line."""
 
@@ -29,8 +29,8 @@ def table(rows: list[Row]) -> str:
     """Return the nights as a Markdown table, the worst of each group in brackets."""
     groups: dict[str, list[Row]] = defaultdict(list)
     for row in rows:
-        groups[_name(row)].append(row)
-    return HEADER + "".join(line(name, group) for name, group in groups.items())
+        groups[str([row[name] for name in GROUPED_BY])].append(row)
+    return HEADER + "".join(line(_name(group[0]), group) for group in groups.values())
 
 
 def line(name: str, rows: list[Row]) -> str:

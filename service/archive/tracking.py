@@ -91,7 +91,8 @@ def _plain(value: object) -> object:
         case Misregistration():
             return value.vector.tolist()
         case PassiveBias():
-            return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+            kept = (f.name for f in fields(value) if f.name not in _NOT_KEPT)
+            return {name: _plain(getattr(value, name)) for name in kept}
         case Pointing() | ModeGain():
             return asdict(value)
         case tuple():

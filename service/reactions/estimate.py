@@ -11,6 +11,7 @@ from service.estimation.wind import Drift, Joint, begin_joint, predicted
 from service.model.misregistration import Misregistration
 from service.reactions.journal import without_alarm
 from service.reactions.policy import SECOND_NS, Policy
+from service.reactions.surprise import CLOCK_SET_BACK_S
 from service.reactions.validity import aged, flexure, slewed_deg, without_dither_due
 from service.state import (
     Earlier,
@@ -29,9 +30,6 @@ SUSPECTED = "jump-suspected"
 
 DISAGREES = "watchdog"
 """Alarm while ordinary telemetry contradicts α."""
-
-CLOCK_SET_BACK_NS = 60 * SECOND_NS
-"""Telemetry never waits so long for the worker: the RTC's clock has gone back."""
 
 Array = NDArray[np.float64]
 
@@ -72,26 +70,12 @@ def brought_forward(
 ) -> Joint:
     """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
     elapsed_ns = t_ns_utc - known.t_ns_utc
-    if elapsed_ns < -CLOCK_SET_BACK_NS:
+    if elapsed_ns < -CLOCK_SET_BACK_S * SECOND_NS:
         # a clock that was set back, or another night played again: the service's own must do
         elapsed_ns = now_ns - known.arrived_ns_utc
     drift = Drift(alpha_rate=policy.drift_rate, bias_memory_s=policy.bias_memory_s)
     bent = flexure(known.pointing, state.pointing, policy)
     return predicted(joint_of(known), drift, elapsed_ns / SECOND_NS, bent)
-
-
-def seen_from(earlier: Earlier, measured: Measured, state: TrackerState, policy: Policy) -> float:
-    """Return how far a window lies from what was known before the last one.
-
-    Squared, normalised, expected 4. A jump in the middle of a window moves that one by half of it
-    and the next by the other half, and neither half need be far out.
-    """
-    elapsed_s = max(measured.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
-    walked = policy.drift_rate**2 * elapsed_s
-    walked = walked + flexure(earlier.pointing, state.pointing, policy) ** 2
-    total = earlier.covariance + np.diag(walked) + measured.covariance
-    difference = measured.alpha.vector - earlier.alpha.vector
-    return float(difference @ np.linalg.solve(total, difference))
 
 
 def joint_of(known: Registration) -> Joint:
@@ -106,9 +90,10 @@ def joint_of(known: Registration) -> Joint:
     return Joint(mean=np.concatenate([known.alpha.vector, bias.offset]), covariance=covariance)
 
 
-def bias_of(joint: Joint, looked_ns_utc: int) -> PassiveBias:
+def bias_of(joint: Joint, looked_ns_utc: int, earlier: Earlier | None = None) -> PassiveBias:
     """Return what the filter knows of the passive estimate's bias."""
     return PassiveBias(
+        earlier=earlier,
         offset=joint.bias,
         covariance=joint.covariance[4:, 4:],
         shared=joint.covariance[4:, :4],
@@ -135,6 +120,7 @@ def accepted(
     joint = folded.joint
     known = state.registration
     bias = None if known is None else known.bias
+    jumped = known is not None and known.candidate is not None
     registration = Registration(
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
@@ -145,7 +131,11 @@ def accepted(
         window_ns_utc=now_ns,
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
-        bias=bias_of(joint, 0 if bias is None else bias.looked_ns_utc),
+        bias=bias_of(
+            joint,
+            0 if bias is None else bias.looked_ns_utc,
+            None if bias is None or jumped else bias.earlier,
+        ),
         passive_after_ns_utc=known.passive_after_ns_utc if known is not None else 0,
         earlier=_earlier(known, folded),
         pointing=state.pointing,

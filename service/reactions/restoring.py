@@ -15,15 +15,17 @@ CLOCKS_AGREE_S = 60.0
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     """Return what is worth keeping of a state; None: nothing is known yet."""
-    if state.registration is None:
+    known = state.registration
+    if known is None:
         return None
+    bias = known.bias and replace(known.bias, earlier=None)
     return Saved(
         system=state.system,
         saved_ns_utc=now_ns,
         session=state.rtc.session if state.rtc is not None else None,
         in_use=state.in_use,
         pointing=state.pointing,
-        registration=replace(state.registration, candidate=None, earlier=None),
+        registration=replace(known, bias=bias, candidate=None, earlier=None),
     )
 
 

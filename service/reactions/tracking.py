@@ -30,10 +30,10 @@ from service.reactions.estimate import (
     counted,
     entry_of,
     remembered,
-    seen_from,
 )
 from service.reactions.journal import logged, with_alarm
 from service.reactions.policy import SECOND_NS, Policy
+from service.reactions.surprise import VARYING, Reading, window_surprise
 from service.reactions.validity import aged, with_dither_due
 from service.state import Candidate, Level, Registration, TrackerState
 
@@ -50,16 +50,14 @@ def with_window(
         folded = Folded(joint=joint, n_windows=1, innovation=0.0)
         return accepted(state, folded, measured, policy, now_ns)
     prior = brought_forward(state, known, measured.t_ns_utc, policy, now_ns)
+    far = window_surprise(known, _reading(measured, state), policy)
     if known.candidate is not None:
         aside = _distance(known.candidate, measured, policy)
-        if aside <= JUMP_THRESHOLD and aside < _innovation(prior, measured):
+        if aside <= JUMP_THRESHOLD and aside < far:
             return _jumped(state, prior, measured, policy, now_ns)
         state = _outlier(state, known.candidate, measured, now_ns)
-    innovation = _innovation(prior, measured)
-    if known.candidate is None and known.earlier is not None:
-        innovation = max(innovation, seen_from(known.earlier, measured, state, policy))
-    if innovation > JUMP_THRESHOLD:
-        return _held(state, measured, innovation, policy, now_ns)
+    if far > JUMP_THRESHOLD:
+        return _held(state, measured, far, policy, now_ns)
     folded = Folded(
         joint=with_dithered(prior, measured.alpha.vector, measured.covariance),
         n_windows=counted(state, known, prior, policy),
@@ -128,6 +126,15 @@ def _jumped(
     return logged(state, "registration.jump", text, now_ns, Level.WARNING)
 
 
+def _reading(measured: Measured, state: TrackerState) -> Reading:
+    return Reading(
+        value=measured.alpha.vector,
+        noise=measured.covariance,
+        t_ns_utc=measured.t_ns_utc,
+        pointing=state.pointing,
+    )
+
+
 def _known(state: TrackerState) -> Registration:
     if state.registration is None:
         raise ValueError("no α is known: there is nothing to doubt")
@@ -142,7 +149,8 @@ def _distance(candidate: Candidate, measured: Measured, policy: Policy) -> float
     """Return how far two windows lie apart: squared, normalised, expected 4."""
     difference = measured.alpha.vector - candidate.alpha.vector
     walked = _walked(candidate, measured, policy)
-    total = candidate.covariance + measured.covariance + walked
+    varied = np.diag(2.0 * (VARYING * policy.floor) ** 2)
+    total = candidate.covariance + measured.covariance + walked + varied
     return float(difference @ np.linalg.solve(total, difference))
 
 

@@ -23,6 +23,7 @@ from service.model.misregistration import Misregistration
 from service.reactions.estimate import DISAGREES, bias_of, brought_forward, joint_of, remembered
 from service.reactions.journal import logged, with_alarm
 from service.reactions.policy import Policy
+from service.reactions.surprise import Reading, look_surprise, sum_of
 from service.reactions.validity import aged, with_dither_due
 from service.state import (
     HistoryEntry,
@@ -49,9 +50,16 @@ def on_watchdog(
         state = replace(state, registration=_looked(known, event))
         return _shown(state, event, _reading_sigma(event.estimate, prior), prior.bias, text)
     measured = event.estimate.alpha.vector
+    reading = Reading(
+        value=measured,
+        noise=event.estimate.covariance,
+        t_ns_utc=event.t_ns_utc,
+        pointing=state.pointing,
+    )
+    far = look_surprise(known, joint_of(known), reading, policy)
+    if far > JUMP_THRESHOLD:
+        return _barking(state, event, prior, far, policy, now_ns)
     innovation = passive_innovation(prior, measured, event.estimate.covariance)
-    if innovation > JUMP_THRESHOLD:
-        return _barking(state, event, prior, innovation, policy, now_ns)
     joint = with_passive(prior, measured, event.estimate.covariance)
     registration = _after(state, known, joint, event, now_ns)
     state = aged(replace(state, registration=registration), policy, now_ns)
@@ -87,7 +95,7 @@ def _barking(
     state: TrackerState,
     event: ev.Watched,
     prior: Joint,
-    innovation: float,
+    far: float,
     policy: Policy,
     now_ns: int,
 ) -> TrackerState:
@@ -99,9 +107,11 @@ def _barking(
         "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
         "dithered window must tell which"
     )
-    registration = replace(_after(state, known, forgotten(prior), event, now_ns), doubt=text)
+    gone = forgotten(prior)
+    registration = _after(state, known, gone, event, now_ns)
+    registration = replace(registration, doubt=text, bias=bias_of(gone, event.t_ns_utc))
     state = replace(state, registration=registration)
-    detail = f"{text} (innovation {innovation:.0f}, expected 4)"
+    detail = f"{text} (innovation {far:.0f}, expected 4)"
     state = logged(state, "registration.passive-jump", detail, now_ns, Level.WARNING)
     state = with_dither_due(with_alarm(state, DISAGREES, text, now_ns), text, now_ns)
     state = aged(state, policy, now_ns)
@@ -118,7 +128,7 @@ def _after(
         covariance=joint.alpha_covariance,
         t_ns_utc=max(event.t_ns_utc, known.t_ns_utc),
         arrived_ns_utc=now_ns,
-        bias=bias_of(joint, event.t_ns_utc),
+        bias=bias_of(joint, event.t_ns_utc, sum_of(known, joint_of(known))),
         pointing=state.pointing,
     )
 

@@ -77,6 +77,21 @@ class ModeGain:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Earlier:
+    """What was known before the last measurement: a jump inside that one is seen from here."""
+
+    alpha: Misregistration
+    covariance: Array
+    """``(4, 4)`` at ``t_ns_utc``, numeric units."""
+
+    t_ns_utc: int
+    """End of the telemetry that had entered, the RTC's clock."""
+
+    pointing: Pointing | None
+    """Of the telescope then; None: not known."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PassiveBias:
     """What has been learnt of how far the passive estimate is off, and how sure that is."""
 
@@ -91,6 +106,9 @@ class PassiveBias:
 
     looked_ns_utc: int
     """End of the telemetry of the last passive estimate, the RTC's clock; 0: there was none."""
+
+    earlier: Earlier | None = None
+    """α and bias together before that one; None: it was the first, or has been doubted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -109,21 +127,6 @@ class Candidate:
 
     innovation: float
     """Normalised innovation squared (4 degrees of freedom)."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Earlier:
-    """What was known before the last window: a jump inside that one is seen from here."""
-
-    alpha: Misregistration
-    covariance: Array
-    """``(4, 4)`` at ``t_ns_utc``, numeric units."""
-
-    t_ns_utc: int
-    """End of the telemetry that had entered, the RTC's clock."""
-
-    pointing: Pointing | None
-    """Of the telescope then; None: not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

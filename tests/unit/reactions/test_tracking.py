@@ -139,8 +139,8 @@ class TestDecision:
         assert known.n_windows == 2
 
     def test_a_jump_in_the_middle_of_a_window_is_seen_by_the_one_after_it(self, story):
-        """Half of 0.07 deg is 3.8 σ of a window and its walk, all of it over two windows 5.8 σ."""
-        half, there = moved(rotation_rad=np.deg2rad(0.035)), moved(rotation_rad=np.deg2rad(0.07))
+        """Half of 0.026 deg is 3 σ of what is expected, all of it seen from before 5.6 σ."""
+        half, there = moved(rotation_rad=np.deg2rad(0.013)), moved(rotation_rad=np.deg2rad(0.026))
         story.see(half)
         assert "jump-suspected" not in story.alarms
         story.see(there)

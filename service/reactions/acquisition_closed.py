@@ -142,7 +142,7 @@ def _done(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> Trac
     acquisition = state.acquisition
     goal = acquisition.found.n_controlled if acquisition.found is not None else record.n_modes
     took_s = (now_ns - acquisition.started_ns_utc) / SECOND_NS
-    modes = f"{record.n_modes} modes" if record.n_modes >= goal else f"{record.n_modes} of {goal}"
-    text = f"tracking after {took_s:.0f} s, {modes} controlled"
+    of_goal = "" if record.n_modes >= goal else f" of {goal}"
+    text = f"tracking after {took_s:.0f} s, {record.n_modes}{of_goal} modes controlled"
     state = entered(state, AcquisitionStage.TRACKING, text, now_ns)
     return without_alarm(state, "acquisition", now_ns)

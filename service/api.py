@@ -8,6 +8,7 @@ from fastapi.routing import APIRoute
 from service import __version__
 from service.routes import (
     acquisition,
+    estimators,
     gains,
     health,
     loop,
@@ -51,6 +52,7 @@ def create_app(service: Service, fits: Fits | None = None) -> FastAPI:
     problems.install(app)
     for routes in (
         reading,
+        estimators,
         gains,
         operating,
         acquisition,

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.estimation.estimator import LOCK_IN, Determines
 from service.estimation.lockin import Spectra
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
@@ -77,6 +78,11 @@ class WindowEstimate:
 
     window_s: float = 0.0
     """Length of the window, seconds; 0: not known."""
+
+    @property
+    def determines(self) -> Determines:
+        """Which of the four parameters it can tell."""
+        return LOCK_IN
 
 
 def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> WindowEstimate:

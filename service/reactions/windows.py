@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.estimation.estimator import DitheredEstimate
 from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
 from service.estimation.noisymatrix import RandomEstimate
 from service.model.misregistration import Misregistration
@@ -72,14 +73,14 @@ def on_window(
     return with_window(state, measured, policy, now_ns)
 
 
-def _gains_of(estimate: WindowEstimate | RandomEstimate) -> tuple[tuple[int, ...], Array, Any]:
+def _gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
     """Return modes, moduli of their gains, and 1 σ of them where it is known."""
     if isinstance(estimate, RandomEstimate):
         return estimate.gains_by_group(GAIN_GROUPS)
     return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
 
 
-def _why_useless(state: TrackerState, estimate: WindowEstimate | RandomEstimate) -> str | None:
+def _why_useless(state: TrackerState, estimate: DitheredEstimate) -> str | None:
     """Return why a window's estimate must not be used, or None."""
     if state.rtc is None or estimate.session != state.rtc.session:
         return "the RTC has restarted since"

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import BeforeValidator
 
 from service.routes.views import Number, View
-from service.state import CommandState, DitherKind, MeasurePattern, MeasureState
+from service.state import CommandState, DitherKind, MeasurePattern, MeasureState, NoisyState
 
 
 class GainGroupView(View):
@@ -108,6 +108,25 @@ class MeasuringView(View):
 
     opens_loop: bool
     """Whether the loop is open meanwhile."""
+
+
+class GatheringView(View):
+    """The noisy interaction matrix under way."""
+
+    id: str
+    """Of the matrix to come, and of its dither: ``/v1/noisy-matrix/{id}`` says more."""
+
+    state: NoisyState
+    """"waiting", "asked", "running" or "finishing"."""
+
+    total_m: float
+    """RMS of all its modes together, metres OPD."""
+
+    duration_s: float
+    """Of telemetry."""
+
+    asked_ns_utc: int
+    """Since when."""
 
 
 class LoopCommandView(View):

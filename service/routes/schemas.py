@@ -5,7 +5,13 @@ from __future__ import annotations
 from service.routes.acquisition_views import AcquisitionView
 from service.routes.dither_views import DitheringView
 from service.routes.registration_views import AlphaView, PointingView, WatchdogView
-from service.routes.rtc_views import DitherView, LoopCommandView, MeasuringView, RtcView
+from service.routes.rtc_views import (
+    DitherView,
+    GatheringView,
+    LoopCommandView,
+    MeasuringView,
+    RtcView,
+)
 from service.routes.service import Snapshot
 from service.routes.views import FourView, Number, View
 from service.state import Level, MatrixState, Mode
@@ -231,6 +237,9 @@ class StateView(View):
 
     measuring: MeasuringView | None
     """Null: none is."""
+
+    gathering: GatheringView | None
+    """The noisy interaction matrix under way; null: none is."""
 
     acquisition: AcquisitionView
     loop_command: LoopCommandView | None

@@ -28,7 +28,7 @@ from service.state import NoisyFinding, NoisyRecord, NoisyState, TrackerState
 from service.wire import checksum
 from service.worker import Workbench
 
-DRAW_WITHIN_S = 60.0
+DRAW_WITHIN_S = 120.0
 DRAW_NICE = 10
 
 

@@ -10,6 +10,7 @@ from service.api import Snapshot, create_app
 from service.errors import CommandError, ConfigurationError, UnknownIdError
 from service.events import GiveUpNoisy, MeasureNoisy
 from service.model.misregistration import Misregistration
+from service.routes.rtc_views import GatheringView
 from service.state import ModeSet, NoisyFinding, NoisyRecord, NoisyState, TrackerState
 
 FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"
@@ -205,3 +206,20 @@ async def test_no_route_publishes_one(client, service, action):
     response = await client.post(f"/v1/noisy-matrix/noisy-1/{action}")
     assert response.status_code in {404, 405}
     assert service.commands == []
+
+
+async def test_the_state_shows_the_one_under_way(client):
+    shown = (await client.get("/v1/noisy-matrix/noisy-2")).json()
+    assert shown["state"] == "running"
+    view = GatheringView.model_validate(TrackerState(system="x", noisy=(RUNNING,)).gathering)
+    assert (view.id, view.state, view.duration_s) == ("noisy-2", NoisyState.RUNNING, 30.0)
+
+
+async def test_every_estimator_says_what_it_cannot_tell(client):
+    found = (await client.get("/v1/estimators")).json()["estimators"]
+    missing = {entry["source"]: entry["missing"] for entry in found}
+    assert missing == {
+        "lock-in": [],
+        "random": [],
+        "passive": ["shift_x_subap", "shift_y_subap"],
+    }

@@ -31,7 +31,9 @@ SPARE_S = 0.3
 
 OWN_DITHER = "dither-"
 ASKED_DITHER = "operator-"
-"""How the id of a dither begins that the service has chosen, and an operator."""
+NOISY_DITHER = "noisy-"
+"""How the id of a dither begins that the service has chosen, an operator, and one that measures a
+noisy interaction matrix."""
 
 _N_LINES = 4
 

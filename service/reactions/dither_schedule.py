@@ -11,6 +11,7 @@ from service.estimation.instrumental import WindowEstimate
 from service.estimation.noisymatrix import RandomEstimate
 from service.events import AskDither, AskNoDither
 from service.reactions.dither_choice import (
+    NOISY_DITHER,
     OWN_DITHER,
     on_vibrations,
     plan_dither,
@@ -75,7 +76,7 @@ def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
         return adopted, ()
     if now_ns < state.retry_ns_utc:
         return state, ()
-    if rtc.dither_id is not None and rtc.dither_id.startswith(OWN_DITHER):
+    if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
         # left behind by this service: over budget, its window of another length, or to stop
         state = replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS)
         return _stopped(state, rtc.dither_id, now_ns), (AskNoDither(),)

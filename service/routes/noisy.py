@@ -18,6 +18,7 @@ from pydantic import Field
 
 from service.errors import ConfigurationError, UnknownIdError
 from service.events import GiveUpNoisy, MeasureNoisy
+from service.reactions.dither_choice import NOISY_DITHER
 from service.routes.modes import Modes
 from service.routes.operating import AcceptedView, Positive, Request, accepted
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
@@ -149,7 +150,7 @@ async def measure_noisy(service: ServiceDep, body: NoisyBody | None = None) -> N
     body = body or NoisyBody()
     now = datetime.fromtimestamp(service.snapshot().now_ns / 1e9, UTC)
     command = MeasureNoisy(
-        id=f"noisy-{now:%Y%m%dT%H%M%S.%f}",
+        id=f"{NOISY_DITHER}{now:%Y%m%dT%H%M%S.%f}",
         modes=body.modes if isinstance(body.modes, ModeSet) else tuple(body.modes),
         total_m=body.total_amplitude_m,
         duration_s=body.duration_s,

@@ -213,6 +213,16 @@ def test_an_open_loop_has_no_noisy_matrix():
         story.tell(ASK)
 
 
+def test_a_dither_left_by_the_service_before_this_one_is_stopped():
+    """Nobody sums it any more, and the service's own cannot begin beside it."""
+    story = Story().meet(dither_id="noisy-0")
+    assert story.asked(ev.AskNoDither)
+    story.effects.clear()
+    status(story, dither_id=None)
+    story.wait(5.0)
+    assert story.asked(ev.AskDither)
+
+
 @pytest.mark.parametrize(
     "command",
     [ev.Approve(id="noisy-1"), ev.Publish(id="noisy-1"), ev.Reject(id="noisy-1")],

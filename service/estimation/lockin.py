@@ -204,7 +204,7 @@ def _projected(plan: LockInPlan, sums: _Sums) -> _Sums:
 def _turning(plan: LockInPlan) -> Array:
     """Return ``exp(-i w k)`` of every bin, ``(n_bins, CHUNK_FRAMES)``, from k = 0."""
     turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, np.arange(CHUNK_FRAMES))
-    return np.exp(-2j * np.pi * turns).astype(np.complex64)
+    return np.asarray(np.exp(-2j * np.pi * turns), np.complex64)
 
 
 def _phasors(plan: LockInPlan, turning: Array, rows: _Rows) -> Array:

@@ -24,6 +24,10 @@ Array = NDArray[Any]
 BIAS_FLOOR = np.array([0.10, 0.10, np.deg2rad(0.05), 0.001])
 """1 σ nobody may go below without a dither: the wind's bias, and the model's own error."""
 
+BIAS_OVER_SCATTER = np.array([10.0, 10.0, 0.0, 0.0])
+"""Where the loop's own noise hardly shows (a bright star in 25 m/s) the scatter grows, and the bias
+with it: a quarter of a subaperture was seen at a scatter of 0.014."""
+
 MIN_FRAMES_PER_MODE = 5
 """Fewer effective frames leave the command covariance too noisy to invert."""
 
@@ -55,7 +59,8 @@ class PassiveEstimate:
     @property
     def sigma(self) -> NDArray[np.float64]:
         """``(4,)`` 1 σ in numeric units where nothing is known of the bias."""
-        return np.asarray(np.sqrt(np.diag(self.covariance) + BIAS_FLOOR**2))
+        scatter = np.diag(self.covariance)
+        return np.asarray(np.sqrt(scatter * (1.0 + BIAS_OVER_SCATTER**2) + BIAS_FLOOR**2))
 
     @property
     def determines(self) -> Determines:

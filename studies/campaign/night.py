@@ -23,7 +23,7 @@ from service.estimation.frames import FrameBlock
 from service.estimation.instrumental import Loop, WindowEstimate
 from service.estimation.lockin import LockIn, LockInPlan, Spectra, WindowRefused
 from service.estimation.noisymatrix import RandomEstimate
-from service.estimation.passive import BIAS_FLOOR, Passive, PassiveEstimate
+from service.estimation.passive import Passive, PassiveEstimate
 from service.estimation.randomdither import Correlated, RandomDither, RandomPlan
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.wire import DitherAction, DitherKind, DitherRequest
@@ -326,7 +326,7 @@ def _row(outcome: Outcome, seen: Seen) -> dict[str, Any]:
     covariance, gains = outcome.covariance, np.abs(outcome.optical_gain)
     if isinstance(outcome, PassiveEstimate):
         # nothing is known of the wind's bias in a night without a dither
-        covariance = covariance + np.diag(BIAS_FLOOR**2)
+        covariance = covariance + np.diag(outcome.sigma**2 - np.diag(covariance))
     return row | {
         "refused": None,
         "error": (difference * BOUNDARY_SCALE).tolist(),

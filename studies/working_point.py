@@ -1,9 +1,10 @@
-"""How far the flat-reference model leads astray at the pyramid's working point.
+"""How far models of the pyramid lead astray at its working point.
 
-The response of the diffractive telescope to the modes the service dithers is averaged, free of
-noise, over the residual wavefronts of its own closed loop, and the service's model is fitted to
-it: what remains is the floor that no integration removes. Beside it, the same around a flat
-wavefront: what the drawing alone gets wrong. Run: ``python -m studies.working_point``.
+The response of the diffractive telescope to a few modes is averaged, free of noise, over the
+residual wavefronts of its own closed loop, and two models are fitted to it: the response to a flat
+wavefront, and the one at the working point that the service may be told to use. What remains is
+the floor that no integration removes. Beside it, the flat model at a flat wavefront: what the
+drawing alone gets wrong. Run: ``python -m studies.working_point``.
 """
 
 from __future__ import annotations
@@ -16,18 +17,24 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.model.interaction import InteractionModel
+from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.model.modes import karhunen_loeve_basis
+from service.model.workingpoint import working_point
 from sim_rtc.diffractive_plant import DiffractiveOptics
 from sim_rtc.options import parse_options
-from studies.model_floor import MODES, fitted
 from studies.optical_gain import PROBE_M, closed_loop, telescope_of
 
 Array32 = NDArray[np.float32]
 
 GAIN = 0.6
-SNAPSHOT_FRAMES = 25
+SNAPSHOT_FRAMES = 20
+SETTLED_FRAMES = 500
+
+SETS = ((409, 427, 445, 463), (405, 428, 451, 471), (409, 428, 451, 471), (451, 471, 485, 499))
+"""Dithered together: evenly spread, then those that tell more and more of the rotation."""
+
+MODES = tuple(sorted({mode for modes in SETS for mode in modes}))
 
 
 def mean_columns(optics: DiffractiveOptics, residuals_m: Array32, n_modes: int) -> Array32:
@@ -42,34 +49,62 @@ def mean_columns(optics: DiffractiveOptics, residuals_m: Array32, n_modes: int) 
     return columns
 
 
+def error_of(
+    linearisation: Linearisation, columns: Array32, modes: tuple[int, ...]
+) -> tuple[NDArray[np.float64], float]:
+    """Return the error of α ``(4,)``, boundary units, about the truth, and the mean gain."""
+    normal, score, gains = np.zeros((4, 4)), np.zeros(4), []
+    for mode in modes:
+        column = linearisation.matrix[:, mode].astype(np.float64)
+        target = columns[:, mode].astype(np.float64)
+        gain = column @ target / (column @ column)
+        jacobian = gain * linearisation.derivatives[:, :, mode].astype(np.float64)
+        jacobian -= np.outer(jacobian @ column / (column @ column), column)
+        normal += jacobian @ jacobian.T / (target @ target)
+        score += jacobian @ (target - gain * column) / (target @ target)
+        gains.append(gain)
+    return np.linalg.solve(normal, score) * BOUNDARY_SCALE, float(np.mean(gains))
+
+
 def main() -> None:
-    """Print the error of each telescope, flat and at work."""
+    """Print the error of each telescope by each model, for each set of modes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--telescopes", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=1.8, help="of each closed loop")
+    parser.add_argument("--telescopes", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=1.5, help="of each closed loop")
     parser.add_argument("--seeing", default="1.0")
+    parser.add_argument("--truth", default="ideal", help="the simulator's set of imperfections")
     given = parser.parse_args()
     instrument = load_instrument("flao-lbt")
     basis = karhunen_loeve_basis(instrument)
-    model = InteractionModel(instrument, basis)
-    sys.stdout.write("seed  residuals  " + "  ".join(PARAMETERS) + "\n")
+    halo = working_point(instrument, n_controlled=400, sampling=3)
+    flat, at_work = (InteractionModel(instrument, basis, halo=h) for h in (None, halo))
+    sys.stdout.write("seed  light  model  modes            gain  " + "  ".join(PARAMETERS) + "\n")
     with threadpool_limits(1):
         for seed in range(given.telescopes):
             options = parse_options(
-                f"--plant diffractive --seed {seed} --seeing {given.seeing}".split()
+                f"--plant diffractive --imperfections {given.truth} --seed {seed} "
+                f"--seeing {given.seeing}".split()
             )
             gains = np.full(options.n_controlled, GAIN, dtype=np.float32)
             n_frames = round(given.seconds * options.frame_rate_hz)
             run = closed_loop(telescope_of(options), gains, n_frames)
-            true = run.optics.alpha
-            at_work = run.residual_m[::SNAPSHOT_FRAMES]
-            for name, residuals in (("flat", np.zeros_like(at_work[:1])), ("loop", at_work)):
-                columns = mean_columns(run.optics, residuals, instrument.modes.n_modes)
-                error = (fitted(model, columns, true) - true.vector) * BOUNDARY_SCALE
-                sys.stdout.write(
-                    f"{seed:4d}  {name:9s}  " + "  ".join(f"{e:+.5f}" for e in error) + "\n"
-                )
-                sys.stdout.flush()
+            residuals = run.residual_m[SETTLED_FRAMES::SNAPSHOT_FRAMES]
+            still = np.zeros_like(residuals[:1])
+            for light, wavefronts, name, model in (
+                ("still", still, "flat", flat),
+                ("loop ", residuals, "flat", flat),
+                ("loop ", residuals, "work", at_work),
+            ):
+                columns = mean_columns(run.optics, wavefronts, instrument.modes.n_modes)
+                linearisation = model.linearise(run.optics.alpha)
+                for modes in SETS:
+                    error, gain = error_of(linearisation, columns, modes)
+                    numbers = "  ".join(f"{e:+.5f}" for e in error)
+                    name_of = " ".join(str(mode) for mode in modes)
+                    sys.stdout.write(
+                        f"{seed:4d}  {light}  {name}   {name_of}  {gain:.3f}  {numbers}\n"
+                    )
+                    sys.stdout.flush()
 
 
 if __name__ == "__main__":

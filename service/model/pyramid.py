@@ -183,9 +183,10 @@ class PyramidOptics:
         circle = 2 * np.pi * self.wfs.modulation_lambda_over_d / self.wfs.pupil_diameter
         rings = [(circle, 1.0 if self.halo is None else self.halo.core_weight, self.n_modulation)]
         if self.halo is not None:
+            halo = self.halo
             rings += [
-                (float(radius), float(weight), self.halo.n_points)
-                for radius, weight in zip(self.halo.radii, self.halo.weights, strict=True)
+                (float(radius), float(weight), n)
+                for radius, weight, n in zip(halo.radii, halo.weights, halo.n_points, strict=True)
             ]
         radii = np.concatenate([np.full(n // 2, radius) for radius, _, n in rings])
         angles = np.concatenate([2 * np.pi * (np.arange(n // 2) + 0.5) / n for _, _, n in rings])

@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 SERVO_RESIDUAL = 0.12
 """Share of the turbulence left at the cut-off by noise and delay; it falls with (k / k_c)²."""
 
-N_RINGS = 15
-POINTS_PER_RING = 20
-"""With the core's 28 points 328 in all, which suffices."""
+POINTS = tuple(range(12, 42, 2))
+"""On each of 15 rings, inner ones first: 390 with an error of 0.01 % in magnification. As many on
+every ring, all at the same angles, would need 600: the outer ones are the longer."""
 
 _N_SAMPLES = 4000
 
@@ -44,8 +44,8 @@ class Halo:
     weights: Array
     """``(n_rings,)`` share of the light on each ring; what diffracts further out is lost."""
 
-    n_points: int = POINTS_PER_RING
-    """Points on each ring, even."""
+    n_points: tuple[int, ...]
+    """Points on each ring, all even."""
 
 
 def working_point(
@@ -106,9 +106,11 @@ def _rings(tilt: Array, brightness: Array, core: float) -> Halo:
     """Return rings of equal light: each stands for a quantile of the halo."""
     light = np.concatenate([[0.0], np.cumsum((brightness[1:] + brightness[:-1]) / 2)])
     light *= tilt[1] - tilt[0]
-    middle = (np.arange(N_RINGS) + 0.5) / N_RINGS * light[-1]
+    n_rings = len(POINTS)
+    middle = (np.arange(n_rings) + 0.5) / n_rings * light[-1]
     return Halo(
         core_weight=core,
         radii=np.interp(middle, light, tilt),
-        weights=np.full(N_RINGS, light[-1] / N_RINGS),
+        weights=np.full(n_rings, light[-1] / n_rings),
+        n_points=POINTS,
     )

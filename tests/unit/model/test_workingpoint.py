@@ -46,7 +46,7 @@ def test_without_residual_the_source_is_the_modulation_circle():
 
 
 def test_a_halo_of_no_light_changes_nothing():
-    dark = Halo(core_weight=1.0, radii=np.array([2.0]), weights=np.array([0.0]))
+    dark = Halo(core_weight=1.0, radii=np.array([2.0]), weights=np.array([0.0]), n_points=(20,))
     flat = small_model().interaction_matrix(ALIGNED)
     np.testing.assert_allclose(small_matrix(dark), flat, atol=1e-5 * np.abs(flat).max())
 
@@ -86,3 +86,12 @@ def test_the_derivatives_follow_the_matrix_at_the_working_point_too():
     coarse, fine = (shift_derivative_error(n_nodes) for n_nodes in (3, 6))
     assert coarse < 0.04
     assert fine < coarse / 4
+
+
+def test_long_rings_need_their_points_more_than_short_ones():
+    halo = working_point(small_instrument(), n_controlled=30, r0_m=0.2, sampling=3)
+    n_rings = len(halo.n_points)
+    even = dataclasses.replace(halo, n_points=(sum(halo.n_points) // n_rings,) * n_rings)
+    finer = dataclasses.replace(halo, n_points=tuple(4 * n for n in halo.n_points))
+    graded, equal, fine = (small_matrix(h) for h in (halo, even, finer))
+    assert np.linalg.norm(graded - fine) < np.linalg.norm(equal - fine)

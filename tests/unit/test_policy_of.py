@@ -1,0 +1,41 @@
+"""From the user's settings to the tracker's policy."""
+
+import numpy as np
+import pytest
+
+from service.config import load_settings
+from service.config.policy import policy_of
+from service.errors import ConfigurationError
+
+
+def policy(**tracking):
+    return policy_of(load_settings(None, {}, {f"tracking.{k}": v for k, v in tracking.items()}))
+
+
+def test_rates_per_minute_become_a_walk_after_a_second_in_numeric_units():
+    found = policy(drift_subap_per_minute=0.06, drift_deg_per_minute=0.12)
+    np.testing.assert_allclose(found.drift_rate[:3] * np.sqrt(60.0), [0.06, 0.06, np.deg2rad(0.12)])
+
+
+def test_flexure_slew_and_the_limits_of_a_stale_alpha_are_the_users():
+    found = policy(
+        flexure_subap_per_degree=0.03,
+        flexure_deg_per_degree=0.02,
+        flexure_magnification_per_degree=3e-4,
+        slew_limit_deg=7.0,
+        stale_shift_subap=0.04,
+        stale_rotation_deg=0.2,
+        stale_magnification=0.004,
+        bias_memory_s=600.0,
+    )
+    np.testing.assert_allclose(found.flexure_per_degree, [0.03, 0.03, np.deg2rad(0.02), 3e-4])
+    np.testing.assert_allclose(found.stale_sigma, [0.04, 0.04, np.deg2rad(0.2), 0.004])
+    assert (found.slew_limit_deg, found.bias_memory_s) == (7.0, 600.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("flexure_subap_per_degree", -0.1), ("slew_limit_deg", 0.0)]
+)
+def test_what_cannot_be_is_refused_by_its_key(key, value):
+    with pytest.raises(ConfigurationError, match=key):
+        policy(**{key: value})

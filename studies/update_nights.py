@@ -1,9 +1,9 @@
 """Nights of the whole service that show when it makes a reconstructor, and of how many modes.
 
 Simulated time, on the linear or the diffractive telescope. ``drift``: the mirror drifts all night,
-with the service's thresholds and with thresholds of the plain distance alone. ``gain``: the
-operator raises the loop's gain until the gate will not have so many modes, and lowers it again.
-Run: ``python -m studies.update_nights drift gain --seconds 180``.
+with the service's thresholds and with thresholds of the plain distance alone. ``leak``: the leak is
+too weak for so many modes, the edge would slip; then the operator sets a stronger one.
+Run: ``python -m studies.update_nights drift leak --seconds 180``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from service import events as ev
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
+from service.control.edge import FORGIVING_LEAK
 from service.state import Mode
 from service.worker import Compute, Workbench
 from studies.campaign.observatory import Observatory
@@ -73,15 +74,13 @@ def drift(given: argparse.Namespace, bench: Workbench) -> None:
         _tell(night)
 
 
-def gain(given: argparse.Namespace, bench: Workbench) -> None:
-    """Print what becomes of the modes while the loop's gain is too high for so many."""
+def leak(given: argparse.Namespace, bench: Workbench) -> None:
+    """Print what becomes of the modes while the leak is too weak for so many, and after."""
     night = night_of(given, [], {}, bench)
-    night.advance(60.0)
-    for value in (given.too_much, given.gain):
-        groups = (ev.GainGroup(first=0, last=night.dome.status().n_controlled - 1, gain=value),)
-        night.command(ev.SetLoop(gains=groups))
-        sys.stdout.write(f"{night.time_s:6.1f} s: the operator sets the gain to {value:g}\n")
-        night.advance((given.seconds - 60.0) / 2)
+    night.advance(given.seconds / 4)
+    night.command(ev.SetLoop(leak=FORGIVING_LEAK))
+    sys.stdout.write(f"{night.time_s:6.1f} s: the operator sets a leak of {FORGIVING_LEAK}\n")
+    night.advance(3 * given.seconds / 4)
     _tell(night)
     radii = np.array([swap.radius for swap in night.swaps if swap.radius is not None])
     sys.stdout.write(f"true pole radius at the swaps: {np.round(radii, 3).tolist()}\n")
@@ -107,7 +106,7 @@ def _tell(night: Observatory) -> None:
         sys.stdout.write(f"{time_s:6.1f} s: {text}\n")
 
 
-NIGHTS = {"drift": drift, "gain": gain}
+NIGHTS = {"drift": drift, "leak": leak}
 
 
 def main() -> None:
@@ -120,7 +119,6 @@ def main() -> None:
     parser.add_argument("--target", type=int, default=500, help="modes wanted")
     parser.add_argument("--seconds", type=float, default=180.0)
     parser.add_argument("--gain", type=float, default=0.4)
-    parser.add_argument("--too-much", type=float, default=0.8)
     parser.add_argument("--leak", type=float, default=0.999)
     parser.add_argument("--mag", default="10")
     parser.add_argument("--seed", type=int, default=1)

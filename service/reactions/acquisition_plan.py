@@ -45,6 +45,9 @@ OUT_OF_HAND_S = 2.0
 MISSES_BEFORE = 3
 """Windows in a row that found no registration, before the service acquires by itself."""
 
+MISSES_DESPITE = 10
+"""The same while α is known: what comes may only be bad telemetry, which opens no loop."""
+
 NOT_CAPTURED = ("the fit did not settle", "outside the capture range")
 """How the reasons of such windows begin."""
 
@@ -133,7 +136,8 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
         lasted_ns = now_ns - alarm.since_ns_utc
         if alarm.name in OUT_OF_HAND and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
-    if acquisition.misses >= MISSES_BEFORE:
+    known = state.registration is not None and state.registration.usable
+    if acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE):
         return f"{acquisition.misses} windows in a row found no registration"
     return None
 

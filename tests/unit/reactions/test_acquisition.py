@@ -13,7 +13,12 @@ from service.model.misregistration import Misregistration
 from service.reactions.acquisition import PATIENCE_S
 from service.reactions.acquisition_ends import MOST_ATTEMPTS
 from service.reactions.acquisition_far import MOST_MISSES
-from service.reactions.acquisition_plan import MISSES_BEFORE, OUT_OF_HAND_S, far_dither
+from service.reactions.acquisition_plan import (
+    MISSES_BEFORE,
+    MISSES_DESPITE,
+    OUT_OF_HAND_S,
+    far_dither,
+)
 from service.state import AcquisitionStage, MatrixState, Mode
 from tests.unit.reactions.situations import POLICY, Story, estimate, moved, rtc, verdict
 
@@ -202,6 +207,15 @@ class TestByItself:
     def test_it_begins_when_windows_find_no_registration(self):
         story = Acquiring()
         for _ in range(MISSES_BEFORE - 1):
+            story.miss_afar("the fit did not settle: it is far away")
+        assert story.stage is AcquisitionStage.IDLE
+        story.miss_afar("the fit did not settle: it is far away")
+        assert story.stage is AcquisitionStage.OPENING
+
+    def test_with_alpha_known_bad_windows_must_go_on_for_longer(self):
+        story = Acquiring()
+        story.see(n_windows=3)
+        for _ in range(MISSES_DESPITE - 1):
             story.miss_afar("the fit did not settle: it is far away")
         assert story.stage is AcquisitionStage.IDLE
         story.miss_afar("the fit did not settle: it is far away")

@@ -80,8 +80,8 @@ class DitherTable(Table):
     sigma_magnification: Positive = 0.001
     """Of the magnification."""
 
-    longest_pause_s: float = Field(default=60.0, ge=0.0, le=3600.0)
-    """Longest time between two windows, seconds; 0: no pause at all."""
+    longest_pause_s: float = Field(default=0.0, ge=0.0, le=3600.0)
+    """Longest time between two windows, seconds: so long may a jump go unseen. 0: no pause."""
 
     amplitude_m: float | None = Field(default=None, gt=0.0, le=1e-7)
     """RMS of each mode, metres OPD; None: the service chooses, within the budget."""

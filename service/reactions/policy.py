@@ -29,8 +29,8 @@ class Policy:
     dither_avoid_hz: tuple[float, ...] = ()
     """Vibrations the dither keeps clear of, besides those that are heard."""
 
-    longest_pause_s: float = 60.0
-    """Between two windows; 0: no pause at all."""
+    longest_pause_s: float = 0.0
+    """Between two windows, for so long a jump may go unseen; 0: no pause at all."""
 
     dither_modes: tuple[int, ...] | None = None
     """None: the four that tell most among those the loop will not control."""

@@ -19,8 +19,8 @@ from tests.unit.reactions.situations import ALPHA, POLICY, Story, moved, of_kind
 FAST = np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005]) / np.sqrt(60.0)
 """The default flexure: 5 % of a subaperture in a minute."""
 
-BRISK = replace(POLICY, drift_rate=FAST)
-CALM = replace(POLICY, drift_rate=FAST / 10.0)
+BRISK = replace(POLICY, drift_rate=FAST, longest_pause_s=60.0)
+CALM = replace(BRISK, drift_rate=FAST / 10.0)
 
 
 def sigma_of(story):

@@ -40,6 +40,7 @@ _LATER = (
     ev.SetLoop,
     ev.Ramp,
     ev.Measure,
+    ev.MeasureNoisy,
 )
 """What an operator cannot have while the loop is the acquisition's."""
 

@@ -446,7 +446,10 @@ class TestTrouble:
 
 
 class TestOperator:
-    @pytest.mark.parametrize("command", [ev.Refit(), ev.SetLoop(closed=True), ev.StartDither()])
+    @pytest.mark.parametrize(
+        "command",
+        [ev.Refit(), ev.SetLoop(closed=True), ev.StartDither(), ev.MeasureNoisy(id="noisy-1")],
+    )
     def test_cannot_disturb_it(self, command):
         story = Acquiring()
         story.tell(ev.Acquire())

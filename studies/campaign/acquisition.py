@@ -24,6 +24,8 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
+from service.estimation.faraway import FarEstimate
+from service.events import FarFitted
 from service.model.misregistration import BOUNDARY_SCALE
 from service.state import AcquisitionStage, Mode
 from service.worker import Compute, Workbench
@@ -106,12 +108,28 @@ def play(start: Start) -> Row:
         "sigma": None,
         "log": [entry.text for entry in night.state.log if entry.name.startswith("acquisition")],
     }
+    row["far"] = [
+        _far(event.found, night) for _, event in night.events if isinstance(event, FarFitted)
+    ]
     if known is not None:
         error = known.alpha.vector - night.dome.alpha.vector
         row["error"] = (error * BOUNDARY_SCALE).tolist()
         row["sigma"] = (known.sigma * BOUNDARY_SCALE).tolist()
     row["radii"] = [swap.radius for swap in night.swaps]
     return asdict(start) | row | {"took_s": time.monotonic() - begun}
+
+
+def _far(found: FarEstimate, night: Observatory) -> Row:
+    """Return how far off a window with the loop open was, and what it saw."""
+    error = found.estimate.alpha.vector - night.dome.alpha.vector
+    gains = np.abs(found.estimate.optical_gain)
+    return {
+        "modes": [min(found.estimate.modes), max(found.estimate.modes)],
+        "error": (error * BOUNDARY_SCALE).tolist(),
+        "unexplained": found.unexplained,
+        "gains": [float(gains.min()), float(gains.max())],
+        "n_starts": found.n_starts,
+    }
 
 
 @cache

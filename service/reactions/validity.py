@@ -155,7 +155,9 @@ def _why_stale(state: TrackerState, now_ns: int) -> str | None:
         return None
     if known.standing.validity in _WORTHLESS and not known.doubt:
         return f"{known.standing.reason}: have it dithered"
-    if state.margin is not None and not state.margin.accepted and np.any(known.grown > 0.0):
+    margin = state.margin
+    # an edge that would slip is refused whatever σ is
+    if margin is not None and margin.worst_pole_radius > margin.bound:
         own = np.sqrt(np.diag(known.covariance) + known.floor**2)
         if np.any(known.sigma > 2.0 * own):
             return "σ has grown beyond what the stability gate accepts: have it dithered"

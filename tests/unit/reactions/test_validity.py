@@ -110,7 +110,13 @@ class TestTime:
         assert "estimate-stale" not in story.alarms
 
     def test_a_margin_that_only_a_grown_sigma_takes_away_is_an_alarm_of_its_age(self, story):
-        story.tell(ev.MarginJudged(id="initial", verdict=verdict(accepted=False)))
+        edge = verdict(accepted=False, radius=0.7)
+        story.tell(ev.MarginJudged(id="initial", verdict=edge))
+        story.wait(10)
+        assert "estimate-stale" not in story.alarms
+        story.see()
+        short = verdict(accepted=False, radius=0.97)
+        story.tell(ev.MarginJudged(id="initial", verdict=short))
         story.wait(0.2, every_s=0.2)
         assert "estimate-stale" not in story.alarms
         story.wait(5)

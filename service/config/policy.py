@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from service.config.floor import floor_of
 from service.config.settings import Settings
+from service.model.misregistration import BOUNDARY_SCALE
 from service.reactions.policy import Policy
 
 
@@ -38,14 +40,7 @@ def policy_of(settings: Settings) -> Policy:
         window_s=dither.window_s,
         longest_window_s=dither.longest_window_s,
         drift_rate=per_minute / np.sqrt(60.0),
-        floor=np.array(
-            [
-                tracking.floor_shift_subap,
-                tracking.floor_shift_subap,
-                np.deg2rad(tracking.floor_rotation_deg),
-                tracking.floor_magnification,
-            ]
-        ),
+        floor=floor_of(settings) / BOUNDARY_SCALE,
         bias_memory_s=tracking.bias_memory_s,
         flexure_per_degree=np.array(
             [

@@ -135,13 +135,14 @@ class TrackingTable(Table):
     drift_magnification_per_minute: Positive = 0.0005
     """Of the magnification."""
 
-    floor_shift_subap: float = Field(default=0.005, ge=0.0)
-    """1 σ model error of each shift, subapertures; no integration removes it."""
+    floor_shift_subap: float | None = Field(default=None, ge=0.0)
+    """1 σ model error of each shift, subapertures; no integration removes it. None: as measured for
+    the model in use, see ``service.config.floor``."""
 
-    floor_rotation_deg: float = Field(default=0.02, ge=0.0)
+    floor_rotation_deg: float | None = Field(default=None, ge=0.0)
     """Of the rotation, degrees."""
 
-    floor_magnification: float = Field(default=0.001, ge=0.0)
+    floor_magnification: float | None = Field(default=None, ge=0.0)
     """Of the magnification."""
 
     bias_memory_s: Positive = 3600.0

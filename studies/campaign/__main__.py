@@ -20,9 +20,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from service.config import load_settings
+from service.config.floor import floor_of
 from studies.campaign.night import Estimator, Night, play, without_dither
 from studies.campaign.plots import plot
 from studies.campaign.summary import Row, table
@@ -44,15 +43,10 @@ def main() -> int:
             left_s = (time.monotonic() - started) / k * (len(nights) - k)
             sys.stderr.write(f"\r{k} of {len(nights)} nights, {left_s / 60:.0f} min left   ")
     sys.stderr.write("\n")
-    tracking = load_settings(None, {}).tracking
-    floor = np.array(
-        [
-            tracking.floor_shift_subap,
-            tracking.floor_shift_subap,
-            tracking.floor_rotation_deg,
-            tracking.floor_magnification,
-        ]
-    )
+    environment = {}
+    if given.working_point_modes is not None:
+        environment["PYRCAL_COMPUTE__WORKING_POINT_MODES"] = str(given.working_point_modes)
+    floor = floor_of(load_settings(None, environment))
     text = table(rows, floor, pooled=given.winds_in_turn is not None)
     sys.stdout.write(text)
     if given.table is not None:

@@ -1,49 +1,35 @@
-"""The heavy work, in a process of its own: fitting, computing reconstructors, judging them.
-
-A compute thread beside the ingest raises its latency thirty-fold; a nice'd process leaves it
-alone. The executor is the seam: anything with ``submit`` may take its place.
-"""
+"""The optical model at work: fitting windows, computing reconstructors, judging them."""
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import Concatenate, ParamSpec, TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from service.control.dither_modes import information
-from service.control.edge import Outer
 from service.control.expected_gain import ExpectedGain, Sky, Timing, beyond_m2, expected_gain
 from service.control.gate import GateVerdict, LoopSettings, judge
 from service.control.noise import noise_of_star
 from service.control.recipe import Method, Recipe, reconstruct
-from service.control.reconstructor import MAX_CONDITION
 from service.control.regularised import Prior
-from service.errors import ModelError
 from service.estimation import passive
-from service.estimation.edge import Actuators
 from service.estimation.faraway import NOT_FOUND, FarEstimate, Search, find
 from service.estimation.instrumental import Loop, WindowEstimate, fit_window
 from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.noisymatrix import RandomEstimate, fit_random
 from service.estimation.randomdither import Correlated
-from service.model.instrument import Influence, Instrument, Mirror
+from service.model.instrument import Instrument
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from service.model.modes import ModalBasis, modal_basis
+from service.model.modes import modal_basis
 from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo, working_point
 from service.registration.start import far_starts
+from service.worker.instruments import actuators_of, check_controllable, outer_of
+from service.worker.records import Compute, Description, Made
 
 SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
 """A step shorter than this (numeric units) leaves a linearisation error below 1e-4 of its unit."""
@@ -68,62 +54,6 @@ FIT_RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
 """An estimate further than this from its start has diverged (numeric units)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Compute:
-    """What the worker may use and how finely it samples the optics."""
-
-    threads: int = 2
-    """Threads that share the rows of a product; BLAS itself keeps to one."""
-
-    nice: int = 10
-    pupil_sampling: int = 3
-    detector_nodes: int = 3
-    working_point_modes: int | None = None
-    """Telemetry is compared with the response of a loop that controls this many modes at the
-    instrument's r0; None: with that of a flat wavefront."""
-
-    method: Method = Method.SVD
-    """How interaction matrices are inverted."""
-
-    max_condition: float = MAX_CONDITION
-    """Of a truncated SVD."""
-
-    slope_noise: float = 0.05
-    """1 σ of one slope in one frame: of a MAP inversion, and of a star of unknown magnitude."""
-
-    wind_m_s: float = 15.0
-    """At which the expected loss of a reconstructor is computed."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Description:
-    """What the service must know of the model to check telemetry against it."""
-
-    n_slopes: int
-    n_modes: int
-    mode_variance_m2: NDArray[np.float64]
-    """``(n_modes,)`` expected variance of each mode under the instrument's turbulence."""
-
-    actuators: Actuators | None = None
-    """None: the modes are measured surfaces, and nobody knows the actuators behind them."""
-
-    mode_information: NDArray[np.float64] | None = None
-    """``(n_modes, 4, 4)`` what a dither of each mode tells of α; None: not worked out."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Made:
-    """A reconstructor and the gate's verdict on it."""
-
-    matrix: NDArray[np.float32]
-    """``(n_modes, n_slopes)`` metres per slope."""
-
-    condition_number: float
-    gate: GateVerdict
-    why_fewer: str = ""
-    """What the gate said of more modes, where it has fewer than were asked for."""
-
-
 class Workbench:
     """The optical model and the last linearisation, kept between jobs.
 
@@ -132,7 +62,7 @@ class Workbench:
     """
 
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
-        _check(instrument)
+        check_controllable(instrument)
         basis = modal_basis(instrument)
         self._threads = ThreadPoolExecutor(compute.threads)
 
@@ -166,7 +96,7 @@ class Workbench:
             n_slopes=self._model.n_slopes,
             n_modes=self._model.basis.n_modes,
             mode_variance_m2=self._model.basis.variance_m2,
-            actuators=_actuators(self._model),
+            actuators=actuators_of(self._model),
             mode_information=information(linearisation),
         )
 
@@ -344,7 +274,7 @@ class Workbench:
         bound: float,
     ) -> GateVerdict:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
-        loop = replace(loop, outer=_outer(self._model))
+        loop = replace(loop, outer=outer_of(self._model))
         return judge(reconstructor, self._near(alpha), alpha, covariance, loop, bound=bound)
 
     def watch(
@@ -383,23 +313,6 @@ def _most(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -
     return replace(found, why_fewer=f"{len(refused.matrix)} modes: {refused.gate.reason}")
 
 
-def _actuators(model: RtcInteractionModel) -> Actuators | None:
-    basis, mirror = model.basis, model.instrument.mirror
-    if not isinstance(basis, ModalBasis) or not isinstance(mirror, Mirror):
-        return None
-    return Actuators(positions=mirror.positions_m, strokes=basis.mode_to_actuator)
-
-
-def _outer(model: RtcInteractionModel) -> Outer | None:
-    """Return the outermost ring where a stroke is the height of the surface in metres."""
-    actuators, mirror = _actuators(model), model.instrument.mirror
-    if actuators is None or not isinstance(mirror, Mirror):
-        return None
-    if mirror.influence is not Influence.THIN_PLATE or not mirror.stroke_known:
-        return None
-    return Outer(actuators=actuators.strokes[actuators.outer])
-
-
 def _length(estimate: WindowEstimate | RandomEstimate) -> float:
     """Return the length of a step, in units of what counts as settled."""
     return float(np.abs(estimate.step / SETTLED).max())
@@ -415,72 +328,3 @@ def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:
         "outside the capture range, or the instrument file is another's",
         t_ns_utc=spectra.t_end_ns_utc,
     )
-
-
-def _check(instrument: Instrument) -> None:
-    """Refuse what can be fitted offline, but not controlled with.
-
-    Raises
-    ------
-    ModelError
-        If the stroke is unknown, or the RTC delivers frames.
-    """
-    if not instrument.mirror.stroke_known:
-        raise ModelError(
-            f"{instrument.name}: found mirror.stroke = unknown; expected a known one: a "
-            "reconstructor gives metres (pyrcal fit needs none)"
-        )
-    if instrument.frames is not None:
-        raise ModelError(
-            f"{instrument.name}: found wfs.input = frames; expected slopes, which is what an RTC "
-            "sends (pyrcal fit takes frames)"
-        )
-
-
-_open_workbench: Callable[[], Workbench] | None = None
-"""Of the worker process; an executor has no other place for what outlives a job."""
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def start_worker(instrument: Instrument, compute: Compute) -> ProcessPoolExecutor:
-    """Return an executor of one nice'd worker process; nothing runs before the first job."""
-    return ProcessPoolExecutor(
-        max_workers=1,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_enter,
-        initargs=(instrument, compute),
-    )
-
-
-def run_job(job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs) -> R:
-    """Run a method of the workbench in the worker process."""
-    if _open_workbench is None:
-        raise RuntimeError("not in a worker process")
-    return job(_open_workbench(), *args, **kwargs)
-
-
-def _enter(instrument: Instrument, compute: Compute) -> None:
-    """Prepare the worker process."""
-    global _open_workbench
-    be_polite(compute.nice)
-    # made by the first job, so that an impossible instrument fails that job and says why
-    _open_workbench = functools.cache(lambda: Workbench(instrument, compute))
-
-
-def be_polite(nice: int) -> None:
-    """Make this process nice, one BLAS thread wide, and gone when its parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(nice)
-    threading.Thread(target=_follow_parent, daemon=True).start()
-    threadpool_limits(1)
-
-
-def _follow_parent() -> None:
-    """End with the service, even when it was killed."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        with contextlib.suppress(OSError):
-            parent.join()
-        os._exit(1)

@@ -59,10 +59,11 @@ def test_in_auto_the_registration_is_found_and_the_loop_served_first_its_modes_t
     service = night.service("auto")
     night.rtc()
     night.wait_for_modes(N_TARGET)
+    # the acknowledgement comes first, the next status says the same
+    wait_for(lambda: (now := night.state)["rtc"]["cm_id"] == now["in_use"], 5.0, "one story")
     state = night.state
     check_registration(state["registration"])
     assert state["margin"]["accepted"]
-    assert state["rtc"]["cm_id"] == state["in_use"]
     assert state["rtc"]["n_controlled"] == N_TARGET
     own = [record for record in night.shelf if record["parent"] is not None]
     assert [record["n_modes"] for record in own[:2]] == [N_START, N_TARGET]

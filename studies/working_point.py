@@ -1,10 +1,11 @@
 """How far models of the pyramid lead astray at its working point.
 
 The response of the diffractive telescope to a few modes is averaged, free of noise, over the
-residual wavefronts of its own closed loop, and two models are fitted to it: the response to a flat
-wavefront, and the one at the working point that the service may be told to use. What remains is
-the floor that no integration removes. Beside it, the flat model at a flat wavefront: what the
-drawing alone gets wrong. Run: ``python -m studies.working_point``.
+residual wavefronts of its own closed loop, and three models are fitted to it: the response to a
+flat wavefront, the one at the working point that the instrument's r0 leads to expect, and the one
+that follows the optical gains, as the service does. What remains is the floor that no integration
+removes. Beside it, the flat model at a flat wavefront: what the drawing alone gets wrong. Run:
+``python -m studies.working_point``.
 """
 
 from __future__ import annotations
@@ -76,9 +77,16 @@ def main() -> None:
     given = parser.parse_args()
     instrument = load_instrument("flao-lbt")
     basis = karhunen_loeve_basis(instrument)
-    halo = working_point(instrument, n_controlled=400, sampling=3)
-    flat, at_work = (InteractionModel(instrument, basis, halo=h) for h in (None, halo))
-    sys.stdout.write("seed  light  model  modes            gain  " + "  ".join(PARAMETERS) + "\n")
+
+    def at_work(strength: float) -> InteractionModel:
+        r0_m = instrument.modes.r0_m * strength ** (-3 / 5)
+        halo = working_point(instrument, n_controlled=400, r0_m=r0_m, sampling=3)
+        return InteractionModel(instrument, basis, halo=halo)
+
+    flat, expected = InteractionModel(instrument, basis), at_work(1.0)
+    sys.stdout.write(
+        "seed  light  model      modes            gain  " + "  ".join(PARAMETERS) + "\n"
+    )
     with threadpool_limits(1):
         for seed in range(given.telescopes):
             options = parse_options(
@@ -90,13 +98,17 @@ def main() -> None:
             run = closed_loop(telescope_of(options), gains, n_frames)
             residuals = run.residual_m[SETTLED_FRAMES::SNAPSHOT_FRAMES]
             still = np.zeros_like(residuals[:1])
-            for light, wavefronts, name, model in (
-                ("still", still, "flat", flat),
-                ("loop ", residuals, "flat", flat),
-                ("loop ", residuals, "work", at_work),
+            alpha, n_modes = run.optics.alpha, instrument.modes.n_modes
+            by_day, at_night = (mean_columns(run.optics, w, n_modes) for w in (still, residuals))
+            near = flat.linearise(alpha), expected.linearise(alpha)
+            seen, left = (error_of(n, at_night, SETS[1])[1] for n in near)
+            strength = np.log(seen) / np.log(seen / left)
+            for light, columns, name, linearisation in (
+                ("still", by_day, "flat    ", near[0]),
+                ("loop ", at_night, "flat    ", near[0]),
+                ("loop ", at_night, "expected", near[1]),
+                ("loop ", at_night, "followed", at_work(strength).linearise(alpha)),
             ):
-                columns = mean_columns(run.optics, wavefronts, instrument.modes.n_modes)
-                linearisation = model.linearise(run.optics.alpha)
                 for modes in SETS:
                     error, gain = error_of(linearisation, columns, modes)
                     numbers = "  ".join(f"{e:+.5f}" for e in error)

@@ -22,23 +22,20 @@ from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.noisymatrix import RandomEstimate, fit_random
 from service.estimation.randomdither import Correlated
 from service.model.instrument import Instrument
-from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.rtc import RtcInteractionModel
-from service.model.workingpoint import Halo, working_point
+from service.model.workingpoint import Halo
 from service.registration.start import far_starts
 from service.worker.instruments import actuators_of, check_controllable, outer_of
 from service.worker.records import Compute, Description, Made
-
-SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
-"""A step shorter than this (numeric units) leaves a linearisation error below 1e-4 of its unit."""
+from service.worker.sensor import SETTLED, Sensor
 
 MAX_APPROACHES = 5
 """Steps of the coarse model; from the edge of the capture range three are enough."""
 
 REACH = 4.0
-"""A coarse step this long, in units of ``SETTLED``, ends well within one of them."""
+"""A step this long, in units of ``SETTLED``, ends well within one of them."""
 
 CONTRACTION = 0.5
 """A step longer than this share of the last one is not Newton's any more: the fit has failed."""
@@ -58,7 +55,8 @@ class Workbench:
     """The optical model and the last linearisation, kept between jobs.
 
     Telemetry, and the stability of a loop, are of the sensor as it works; what is published is the
-    inverse of its response to a flat wavefront: the optical gain is never folded in.
+    inverse of its response to a flat wavefront: the optical gain is never folded in. Every optical
+    gain that comes or goes is relative to that flat response.
     """
 
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
@@ -77,21 +75,21 @@ class Workbench:
             )
 
         sampling, nodes = compute.pupil_sampling, compute.detector_nodes
-        self._model = self._sensor = model(sampling, nodes, None)
+        self._sensor = Sensor(
+            lambda halo: model(sampling, nodes, halo),
+            instrument,
+            compute.working_point_modes,
+            sampling,
+        )
+        self._model = self._sensor.flat
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
-        if compute.working_point_modes is not None:
-            halo = working_point(
-                instrument, n_controlled=compute.working_point_modes, sampling=sampling
-            )
-            self._sensor = model(sampling, nodes, halo)
         self._start = instrument.start
-        self._linearisation: Linearisation | None = None
         self._compute = compute
         self._far: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
 
     def describe(self) -> Description:
         """Return what telemetry must look like, and prepare for the first fit."""
-        linearisation = self._near(self._start)
+        linearisation = self._sensor.near(self._start)
         return Description(
             n_slopes=self._model.n_slopes,
             n_modes=self._model.basis.n_modes,
@@ -106,21 +104,34 @@ class Workbench:
         """Estimate α from one window, from ``start`` or, without one, from the nominal rotation.
 
         Where the linearisation at hand is too far away, the coarse model leads to within reach of
-        one new, fine linearisation.
+        one new, fine linearisation. A working point that does not give the optical gains that were
+        measured is followed first.
         """
         try:
-            estimate = fit_window(spectra, self._near(start or self._start), loop)
-            if not _settled(estimate):
-                near = self._approach(spectra, loop, estimate, start or self._start)
-                if near is None:
-                    return _unsettled(spectra)
-                estimate = fit_window(spectra, self._linearise(near), loop)
-            if not _settled(estimate):
-                # the coarse model's own bias may be more than what counts as settled
-                estimate = fit_window(spectra, self._linearise(estimate.alpha), loop)
+            estimate = self._settled_fit(spectra, loop, start or self._start)
+            if estimate is None:
+                return _unsettled(spectra)
+            found = self._against_flat(estimate)
+            if self._sensor.follow(found.modes, found.optical_gain):
+                estimate = self._settled_fit(spectra, loop, found.alpha)
         except np.linalg.LinAlgError as error:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
-        return estimate if _settled(estimate) else _unsettled(spectra)
+        return _unsettled(spectra) if estimate is None else self._against_flat(estimate)
+
+    def _settled_fit(
+        self, spectra: Spectra, loop: Loop, start: Misregistration
+    ) -> WindowEstimate | None:
+        """Return the fit about a linearisation that is near enough to it; None: there is none."""
+        estimate = fit_window(spectra, self._sensor.near(start), loop)
+        if _length(estimate) > REACH:
+            near = self._approach(spectra, loop, estimate, start)
+            if near is None:
+                return None
+            estimate = fit_window(spectra, self._sensor.linearise(near), loop)
+        if not _settled(estimate):
+            # near enough; or the coarse model's bias, flat as it is, was more than what settles
+            estimate = fit_window(spectra, self._sensor.linearise(estimate.alpha), loop)
+        return estimate if _settled(estimate) else None
 
     def find(
         self, spectra: Spectra, start: Misregistration | None, flux: bytes | None
@@ -154,24 +165,41 @@ class Workbench:
     ) -> RandomEstimate | WindowRefused:
         """Estimate α from one window of random dither, from ``start`` as in :meth:`fit`."""
         try:
-            estimate = fit_random(window, self._near(start or self._start))
+            estimate = fit_random(window, self._sensor.near(start or self._start))
             for _ in range(MAX_APPROACHES):
-                if isinstance(estimate, WindowRefused) or _settled(estimate):
+                if isinstance(estimate, WindowRefused):
                     return estimate
+                if _settled(estimate):
+                    ratio = self._sensor.ratio()[list(estimate.modes)]
+                    return replace(
+                        estimate,
+                        optical_gain=estimate.optical_gain * ratio,
+                        gain_sigma=estimate.gain_sigma * ratio,
+                    )
                 begun = start or self._start
                 if np.any(np.abs(estimate.alpha.vector - begun.vector) > FIT_RANGE):
                     break
-                estimate = fit_random(window, self._linearise(estimate.alpha))
+                estimate = fit_random(window, self._sensor.linearise(estimate.alpha))
         except np.linalg.LinAlgError as error:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=window.t_end_ns_utc)
         return _unsettled(window)
 
     def response(self, alpha: Misregistration | None) -> NDArray[np.float32]:
-        """Return D(α) of the sensor as it works, ``(n_slopes, n_modes)``, slope per metre OPD.
+        """Return D(α) to a flat wavefront, ``(n_slopes, n_modes)``, slope per metre OPD.
 
         None: at the nominal registration.
         """
-        return self._sensor.interaction_matrix(alpha or self._start)
+        return self._model.interaction_matrix(alpha or self._start)
+
+    def _against_flat(self, estimate: WindowEstimate) -> WindowEstimate:
+        """Return the estimate with its gains relative to the flat response, not that at work."""
+        ratio = self._sensor.ratio()[list(estimate.modes)]
+        sigma = estimate.gain_sigma
+        return replace(
+            estimate,
+            optical_gain=estimate.optical_gain * ratio,
+            gain_sigma=None if sigma is None else sigma * ratio,
+        )
 
     def _approach(
         self,
@@ -228,8 +256,9 @@ class Workbench:
         ``magnitude`` is the star's; None: the noise of the settings.
         """
         model, n_modes = self._model, len(in_use)
-        seen = self._near(alpha).matrix_at(alpha)
-        flat = seen if self._sensor is model else model.interaction_matrix(alpha)
+        seen = self._sensor.near(alpha).matrix_at(alpha)
+        timing = replace(timing, optical_gain=timing.optical_gain / self._sensor.ratio())
+        flat = seen if self._sensor.is_flat else model.interaction_matrix(alpha)
         fresh = reconstruct(flat, self._recipe(n_modes)).matrix
         noise = self._compute.slope_noise
         if magnitude is not None:
@@ -274,25 +303,24 @@ class Workbench:
         bound: float,
     ) -> GateVerdict:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
-        loop = replace(loop, outer=outer_of(self._model))
-        return judge(reconstructor, self._near(alpha), alpha, covariance, loop, bound=bound)
+        near = self._sensor.near(alpha)
+        loop = replace(
+            loop,
+            outer=outer_of(self._model),
+            optical_gain=loop.optical_gain / self._sensor.ratio()[: len(reconstructor)],
+        )
+        return judge(reconstructor, near, alpha, covariance, loop, bound=bound)
 
     def watch(
         self, state: passive.Passive, start: Misregistration
     ) -> passive.PassiveEstimate | None:
         """Estimate α from ordinary telemetry; None when there is too little of it."""
-        return passive.fit(state, self._near(start))
-
-    def _near(self, alpha: Misregistration) -> Linearisation:
-        """Return the linearisation at hand if it is close enough, else a new one."""
-        kept = self._linearisation
-        if kept is None or np.any(np.abs(alpha.vector - kept.alpha.vector) > SETTLED):
-            return self._linearise(alpha)
-        return kept
-
-    def _linearise(self, alpha: Misregistration) -> Linearisation:
-        self._linearisation = self._sensor.linearise(alpha)
-        return self._linearisation
+        found = passive.fit(state, self._sensor.near(start))
+        if found is None:
+            return None
+        return replace(
+            found, optical_gain=found.optical_gain * self._sensor.ratio()[: state.n_modes]
+        )
 
 
 def _most(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -> Made:

@@ -9,7 +9,6 @@ import pickle
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -111,8 +110,13 @@ def play(night: Night, keep: Path | None = None) -> list[dict[str, Any]]:
     """
     with threadpool_limits(1):
         rows, known = [], Misregistration()
+        # of this night alone: it follows the seeing, and rows must not depend on other nights
+        bench = Workbench(
+            load_instrument("flao-lbt"),
+            Compute(threads=1, working_point_modes=night.working_point_modes),
+        )
         for k, seen in enumerate(_kept(night, keep)):
-            outcome = _estimated(night, seen, known)
+            outcome = _estimated(night, seen, known, bench)
             if not isinstance(outcome, WindowRefused):
                 known = outcome.alpha
             alpha = (seen.true.vector * BOUNDARY_SCALE).tolist()
@@ -291,15 +295,8 @@ def loop_of(telescope: Telescope) -> Loop:
     )
 
 
-@cache
-def _bench(working_point_modes: int | None) -> Workbench:
-    """One model per process: it takes longer to make than a window to fit."""
-    compute = Compute(threads=1, working_point_modes=working_point_modes)
-    return Workbench(load_instrument("flao-lbt"), compute)
-
-
-def _estimated(night: Night, seen: Seen, start: Misregistration) -> Outcome:
-    bench, window = _bench(night.working_point_modes), seen.window
+def _estimated(night: Night, seen: Seen, start: Misregistration, bench: Workbench) -> Outcome:
+    window = seen.window
     if isinstance(window, WindowRefused):
         return window
     if night.amplitude_nm == 0.0 and night.estimator is not Estimator.PASSIVE:

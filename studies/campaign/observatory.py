@@ -11,7 +11,7 @@ import asyncio
 import heapq
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -110,11 +110,12 @@ class Observatory:
         ``with_poles`` finds the true poles of every swap, seconds on a diffractive telescope.
         """
         self.dome = Dome(options)
-        self.policy = policy
+        description = workbench.describe()
+        self.policy = replace(policy, mode_information=description.mode_information)
         self.latencies = latencies or Latencies()
         system = self.dome.computer.identity.system
         self.state = TrackerState(system=system, mode=mode)
-        self.streams = Streams(description=workbench.describe())
+        self.streams = Streams(description=description)
         self.glances: list[Glance] = []
         self.swaps: list[Swap] = []
         self.events: list[tuple[float, Event]] = []

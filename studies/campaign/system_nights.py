@@ -15,7 +15,6 @@ import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +62,11 @@ def play(plan: Plan) -> Row:
     """Run one night, and again without its dithers where that is the question."""
     with threadpool_limits(1):
         settings = load_settings(None, {}, _settings(plan))
-        bench = _bench(plan.instrument)
+        # of this night alone: at the working point it follows the seeing
+        bench = Workbench(
+            load_instrument(plan.instrument),
+            Compute(threads=1, working_point_modes=settings.compute.working_point_modes),
+        )
         begun = time.monotonic()
         night = Observatory(plan.words, policy_of(settings), Mode.AUTO, bench)
         if plan.restart_s is not None:
@@ -90,12 +93,6 @@ def _without_dither_nm(night: Observatory, plan: Plan, begin_s: float) -> float 
     orders = [o for o in night.dome.orders if not isinstance(o.what, DitherRequest)]
     twin = replayed(plan.words, orders, plan.seconds)
     return wavefront_rms_nm([m for m in twin.moments if m.time_s >= begin_s])
-
-
-@cache
-def _bench(instrument: str) -> Workbench:
-    """One model per process: it takes longer to make than most of what it does."""
-    return Workbench(load_instrument(instrument), Compute(threads=1))
 
 
 def _parser() -> argparse.ArgumentParser:

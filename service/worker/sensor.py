@@ -1,0 +1,129 @@
+"""The sensor as telemetry shows it: at a flat wavefront, or at its working point.
+
+The working point is one of a loop whose residual is not known beforehand: the seeing, the star and
+the loop's gains all play a part. How strong it is can be read off the dithered modes, whose
+optical gain is what that residual makes of them, so the model follows them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.instrument import Instrument
+from service.model.interaction import Linearisation
+from service.model.misregistration import Misregistration
+from service.model.rtc import RtcInteractionModel
+from service.model.workingpoint import Halo, working_point
+
+Array = NDArray[np.float64]
+
+SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
+"""A step shorter than this (numeric units) leaves a linearisation error below 1e-4 of its unit."""
+
+FOLLOWED = 0.04
+"""Gains that differ from the model's by more than this, as a logarithm, move the working point:
+0.02 % in magnification. Less is not worth another linearisation."""
+
+STRENGTHS = (0.05, 4.0)
+"""Variance of the residual over that at the instrument's r0. Below the first a wavefront is flat:
+0.1 nm of error of the linear simulator; the second is 2.3" of seeing."""
+
+ModelOf = Callable[[Halo | None], RtcInteractionModel]
+
+
+class Sensor:
+    """The response at work, its last linearisation, and what it is of that to a flat wavefront.
+
+    ``model_of`` makes the model of a halo. Without ``n_controlled`` modes, or with None, the
+    response is that to a flat wavefront for good.
+    """
+
+    def __init__(
+        self, model_of: ModelOf, instrument: Instrument, n_controlled: int | None, sampling: int
+    ) -> None:
+        self.flat = model_of(None)
+        self._model_of = model_of
+        self._instrument = instrument
+        self._n_controlled = n_controlled
+        self._sampling = sampling
+        self._strength = 1.0
+        self._model = self._at_work()
+        self._linearisation: Linearisation | None = None
+        self._ratio: Array | None = None
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether it is the response to a flat wavefront."""
+        return self._n_controlled is None
+
+    @property
+    def strength(self) -> float:
+        """Variance of the residual over that expected at the instrument's r0."""
+        return 0.0 if self.is_flat else self._strength
+
+    def near(self, alpha: Misregistration) -> Linearisation:
+        """Return the linearisation at hand if it is close enough, else a new one."""
+        kept = self._linearisation
+        if kept is None or np.any(np.abs(alpha.vector - kept.alpha.vector) > SETTLED):
+            return self.linearise(alpha)
+        return kept
+
+    def linearise(self, alpha: Misregistration) -> Linearisation:
+        """Return a new linearisation about ``alpha``, and keep it."""
+        self._linearisation = self._model.linearise(alpha)
+        self._ratio = None
+        return self._linearisation
+
+    def interaction_matrix(self, alpha: Misregistration) -> NDArray[np.float32]:
+        """Return D(α), ``(n_slopes, n_modes)``, slope per metre OPD."""
+        return self._model.interaction_matrix(alpha)
+
+    def ratio(self) -> Array:
+        """Return ``(n_modes,)`` how much of the flat response is left of each mode at work.
+
+        Of the linearisation at hand, projected on the flat response: the optical gain the model
+        expects. Ones where there is none.
+        """
+        kept = self._linearisation
+        if self.is_flat or kept is None:
+            return np.ones(self.flat.basis.n_modes)
+        if self._ratio is None:
+            flat = self.flat.interaction_matrix(kept.alpha)
+            power = np.einsum("ij,ij->j", flat, flat)
+            self._ratio = np.einsum("ij,ij->j", kept.matrix, flat) / power
+        return np.asarray(self._ratio, dtype=np.float64)
+
+    def follow(self, modes: tuple[int, ...], optical_gain: NDArray[np.complex128]) -> bool:
+        """Take the working point from the optical gains of dithered modes; whether it moved.
+
+        ``optical_gain`` ``(n,)`` is relative to the flat response. Its logarithm is the residual's
+        variance times what the model of the same modes says for the present one.
+        """
+        if self.is_flat or not modes:
+            return False
+        seen = float(np.log(np.abs(optical_gain)).mean())
+        expected = float(np.log(self.ratio()[list(modes)]).mean())
+        if abs(seen - expected) <= FOLLOWED:
+            return False
+        before = self._strength
+        self._strength = float(np.clip(before * seen / expected, *STRENGTHS))
+        if self._strength == before:
+            return False
+        self._model = self._at_work()
+        self._linearisation = None
+        return True
+
+    def _at_work(self) -> RtcInteractionModel:
+        if self._n_controlled is None:
+            return self.flat
+        halo = working_point(
+            self._instrument,
+            n_controlled=self._n_controlled,
+            # a residual's variance goes with r0^(-5/3)
+            r0_m=self._instrument.modes.r0_m * self._strength ** (-3 / 5),
+            sampling=self._sampling,
+        )
+        return self._model_of(halo)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,38 @@ from numpy.typing import NDArray
 
 from service.errors import ArchiveError
 from service.model.misregistration import Misregistration
-from service.state import ModeGain, PassiveBias, Pointing, Registration, Saved
+from service.state import (
+    Acquisition,
+    AcquisitionStage,
+    Interruption,
+    LoopFound,
+    ModeGain,
+    PassiveBias,
+    Pointing,
+    Registration,
+    Saved,
+)
 
 VERSION = 1
 
 _NOT_KEPT = ("grown", "standing", "candidate", "earlier", "restored_ns_utc")
 """What the next service works out anew."""
+
+_ACQUISITION_KEPT = (
+    "stage",
+    "text",
+    "started_ns_utc",
+    "since_ns_utc",
+    "commanded",
+    "attempt",
+    "found",
+    "n_modes",
+    "most_modes",
+    "matrix",
+    "sent",
+    "interruption",
+)
+"""The rest is of telemetry that the next one will not have."""
 
 _READ_FAILURES = (OSError, ValueError, KeyError, TypeError, AttributeError)
 
@@ -74,13 +100,9 @@ class TrackingFile:
 
 
 def _to_json(saved: Saved) -> dict[str, Any]:
-    known = saved.registration
-    kept = {f.name: getattr(known, f.name) for f in fields(known) if f.name not in _NOT_KEPT}
     return {
         "version": VERSION,
-        **{f.name: getattr(saved, f.name) for f in fields(saved)},
-        "pointing": _plain(saved.pointing),
-        "registration": {name: _plain(value) for name, value in kept.items()},
+        **{f.name: _plain(getattr(saved, f.name)) for f in fields(saved)},
     }
 
 
@@ -90,10 +112,12 @@ def _plain(value: object) -> object:
             return value.tolist()
         case Misregistration():
             return value.vector.tolist()
-        case PassiveBias():
+        case Registration() | PassiveBias():
             kept = (f.name for f in fields(value) if f.name not in _NOT_KEPT)
             return {name: _plain(getattr(value, name)) for name in kept}
-        case Pointing() | ModeGain():
+        case Acquisition():
+            return {name: _plain(getattr(value, name)) for name in _ACQUISITION_KEPT}
+        case Pointing() | ModeGain() | LoopFound() | Interruption():
             return asdict(value)
         case tuple():
             return [_plain(entry) for entry in value]
@@ -104,7 +128,20 @@ def _plain(value: object) -> object:
 def _from_json(values: dict[str, Any]) -> Saved:
     if values.pop("version") != VERSION:
         raise ValueError(f"expected version {VERSION}")
-    known = values["registration"]
+    known, acquisition = values["registration"], values.get("acquisition")
+    if known is None and acquisition is None:
+        raise ValueError("neither an α nor an acquisition")
+    return Saved(
+        **{
+            **values,
+            "pointing": _pointing(values["pointing"]),
+            "registration": None if known is None else _registration(known),
+            "acquisition": None if acquisition is None else _acquisition(acquisition),
+        }
+    )
+
+
+def _registration(known: dict[str, Any]) -> Registration:
     floor = _numbers(known["floor"], (4,))
     registration = Registration(
         **{
@@ -119,8 +156,28 @@ def _from_json(values: dict[str, Any]) -> Saved:
         }
     )
     _check(registration)
-    saved = Saved(**{**values, "registration": registration, "pointing": None})
-    return replace(saved, pointing=_pointing(values["pointing"]))
+    return registration
+
+
+def _acquisition(values: dict[str, Any]) -> Acquisition:
+    stage = AcquisitionStage(values["stage"])
+    found, interruption = values["found"], values["interruption"]
+    for name in ("started_ns_utc", "since_ns_utc", "attempt", "n_modes"):
+        if type(values[name]) is not int:
+            raise TypeError(f"{name} is {values[name]!r}, expected an integer")
+    return Acquisition(
+        **{
+            **values,
+            "stage": stage,
+            "found": None if found is None else _loop_found(found),
+            "interruption": None if interruption is None else Interruption(**interruption),
+        }
+    )
+
+
+def _loop_found(values: dict[str, Any]) -> LoopFound:
+    gains = _numbers(values["gains"], (len(values["gains"]),))
+    return LoopFound(**{**values, "gains": tuple(gains.tolist())})
 
 
 def _check(known: Registration) -> None:

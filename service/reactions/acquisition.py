@@ -23,6 +23,7 @@ from service.reactions.acquisition_plan import (
     why_needed,
     why_not_now,
 )
+from service.reactions.acquisition_restart import after_restart
 from service.reactions.journal import logged, without_alarm
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
@@ -69,9 +70,10 @@ def on_acquire(state: TrackerState, event: Event, policy: Policy, now_ns: int) -
         If there is none to abort, or none can begin now.
     """
     if isinstance(event, ev.AbortAcquisition):
-        if not state.acquisition.under_way:
+        interrupted = state.acquisition.stage is AcquisitionStage.INTERRUPTED
+        if not state.acquisition.under_way and not interrupted:
             raise CommandError("acquisition: none is under way")
-        return abort(state, "by the operator", now_ns)
+        return abort(without_alarm(state, "acquisition", now_ns), "by the operator", now_ns)
     reason = why_not_now(state, policy)
     if state.rtc is None or reason is not None:
         raise CommandError(f"acquisition: {reason}")
@@ -87,6 +89,8 @@ def acquire(
     ``before`` is the state before anybody else had seen the event.
     """
     acquisition = state.acquisition
+    if acquisition.stage is AcquisitionStage.INTERRUPTED:
+        return after_restart(state, policy, now_ns)
     if not acquisition.under_way:
         if state.windows_accepted > before.windows_accepted:
             state = replace(state, acquisition=replace(acquisition, misses=0))

@@ -5,17 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service import events as ev
-from service.reactions.acquisition_plan import OUT_OF_HAND
+from service.reactions.acquisition_plan import OUT_OF_HAND, left_open
 from service.reactions.journal import logged, with_alarm
 from service.reactions.loop import on_loop
 from service.reactions.matrices import Step
 from service.reactions.mode_ladder import fewer_than
-from service.state import AcquisitionStage, Level, TrackerState
+from service.state import AcquisitionStage, Level, LoopFound, TrackerState
 
 MOST_ATTEMPTS = 3
 """Times the loop is opened for one acquisition."""
 
-_CLOSED = (AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING)
+_BELIEVED = (
+    AcquisitionStage.PARTIAL,
+    AcquisitionStage.WIDENING,
+    AcquisitionStage.INTERRUPTED,
+)
+"""Stages in which α, where there is one, has been found by this acquisition."""
 
 
 def entered(state: TrackerState, stage: AcquisitionStage, text: str, now_ns: int) -> TrackerState:
@@ -104,15 +109,24 @@ def abort(state: TrackerState, why: str, now_ns: int) -> Step:
     As is means open, or closed on a reconstructor that has passed the gate.
     """
     acquisition = state.acquisition
-    found = acquisition.found
     state, effects = without_dither(state)
-    if acquisition.stage not in _CLOSED:
+    if acquisition.stage not in _BELIEVED:
         state = replace(state, registration=None)
-    untouched = found is not None and found.closed and found.held and not acquisition.sent
-    left = "left as it is"
-    if found is not None and untouched and state.rtc is not None:
+    left, found = "left as it is", _to_give_back(state)
+    if found is not None:
         left = "closed as it was found"
         state, more = told(state, ev.SetLoop(closed=True, leak=found.leak), now_ns)
         effects = (*effects, *more)
     text = f"ended {why}; the loop is {left}"
     return entered(state, AcquisitionStage.ABORTED, text, now_ns), effects
+
+
+def _to_give_back(state: TrackerState) -> LoopFound | None:
+    """Return the loop as it was found, if it held then and its matrix is still in the RTC."""
+    acquisition, rtc = state.acquisition, state.rtc
+    found = acquisition.found
+    if rtc is None or found is None or acquisition.sent or not (found.closed and found.held):
+        return None
+    if acquisition.interruption is not None and left_open(state, rtc) is None:
+        return None
+    return found

@@ -100,6 +100,17 @@ def loop_found(state: TrackerState, rtc: RtcView, policy: Policy) -> LoopFound:
     )
 
 
+def left_open(state: TrackerState, rtc: RtcView) -> Acquisition | None:
+    """Return the acquisition of the service before this one, if the loop is as that one left it.
+
+    Opening a loop begins a session: the same one means that nobody has closed it in between.
+    """
+    left = state.acquisition.interruption
+    if left is None or left.session != rtc.session or rtc.loop != "open":
+        return None
+    return state.acquisition
+
+
 def gains_for(found: LoopFound, n_modes: int, of_basis: int) -> tuple[float, ...]:
     """Return the gains ``(of_basis,)`` with which so many modes are closed."""
     return (*found.gains[:n_modes], *(0.0,) * (of_basis - n_modes))
@@ -109,7 +120,9 @@ def begun(
     state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int, *, why: str, commanded: bool
 ) -> TrackerState:
     """Return the state in which an acquisition begins: nothing is known of α any more."""
-    found = loop_found(state, rtc, policy)
+    left = left_open(state, rtc)
+    found = left.found if left is not None else None
+    found = found or loop_found(state, rtc, policy)
     acquisition = Acquisition(
         stage=AcquisitionStage.OPENING,
         text=f"opening the loop: {why}",
@@ -119,6 +132,7 @@ def begun(
         attempt=1,
         found=found,
         n_modes=first_closed(found.n_controlled),
+        sent=left is not None and left.sent,
     )
     return replace(state, acquisition=acquisition, registration=None, margin=None)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service.reactions.acquisition_restart import inherited, left_behind
 from service.reactions.journal import logged
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.validity import aged
@@ -15,17 +16,20 @@ CLOCKS_AGREE_S = 60.0
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     """Return what is worth keeping of a state; None: nothing is known yet."""
-    known = state.registration
-    if known is None:
+    known, acquisition = state.registration, left_behind(state)
+    if known is not None:
+        bias = known.bias and replace(known.bias, earlier=None)
+        known = replace(known, bias=bias, candidate=None, earlier=None)
+    elif acquisition is None:
         return None
-    bias = known.bias and replace(known.bias, earlier=None)
     return Saved(
         system=state.system,
         saved_ns_utc=now_ns,
         session=state.rtc.session if state.rtc is not None else None,
         in_use=state.in_use,
         pointing=state.pointing,
-        registration=replace(known, bias=bias, candidate=None, earlier=None),
+        registration=known,
+        acquisition=acquisition,
     )
 
 
@@ -33,14 +37,19 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
     """Return the state with α taken over, σ grown by the time away, and no window to confirm it.
 
     It is a start for the fit and something to judge the matrix in use with; until windows of this
-    run agree with it nothing is made from it.
+    run agree with it nothing is made from it. An acquisition that was under way comes with it.
     """
     reason = _why_not(state, saved, now_ns)
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"
         return logged(state, "registration.not-restored", text, now_ns, Level.WARNING)
-    away_s = max(now_ns - saved.registration.arrived_ns_utc, 0) / SECOND_NS
-    known = replace(saved.registration, n_windows=0, restored_ns_utc=now_ns)
+    if saved.acquisition is not None:
+        state = inherited(state, saved.acquisition, now_ns)
+    known = saved.registration
+    if known is None:
+        return state
+    away_s = max(now_ns - known.arrived_ns_utc, 0) / SECOND_NS
+    known = replace(known, n_windows=0, restored_ns_utc=now_ns)
     text = f"α of {away_s:.0f} s ago; {saved.in_use or 'no known matrix'} was in use then"
     state = logged(replace(state, registration=known), "registration.restored", text, now_ns)
     return aged(state, policy, now_ns)
@@ -53,6 +62,8 @@ def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:
     if ahead_s > CLOCKS_AGREE_S:
         return f"it was saved {ahead_s:.0f} s in the future: is this machine's clock right?"
     known = saved.registration
+    if known is None:
+        return None
     for name, found, expected in (
         ("basis", known.basis_id, state.basis_id),
         ("configuration", known.config_id, state.config_id),

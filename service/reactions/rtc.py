@@ -10,7 +10,7 @@ from service.reactions.dither import follow_status, found_again
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS
 from service.reactions.shelf import with_in_use, with_state
-from service.state import Level, MatrixState, RtcView, TrackerState
+from service.state import AcquisitionStage, Level, MatrixState, RtcView, TrackerState
 
 ACKNOWLEDGE_WITHIN_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
@@ -65,6 +65,8 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
         state = with_in_use(state, rtc.cm_id)
     measuring = state.measuring
     opened = state.acquisition.under_way or (measuring is not None and measuring.opens_loop)
+    # its alarm tells more, and not to close the loop on any matrix
+    opened = opened or state.acquisition.stage is AcquisitionStage.INTERRUPTED
     if rtc.loop == "open" and not opened:
         state = with_alarm(state, "loop-open", "the loop is open: close it to calibrate", now_ns)
     else:

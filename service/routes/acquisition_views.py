@@ -12,8 +12,8 @@ class AcquisitionView(View):
     """Finding the registration from nothing: under way, or how the last one ended."""
 
     stage: AcquisitionStage
-    """"idle", "opening", "coarse", "confirming", "partial", "widening", "tracking", "failed" or
-    "aborted"."""
+    """"idle", "opening", "coarse", "confirming", "partial", "widening", "tracking", "failed",
+    "aborted" or "interrupted" by the end of the service."""
 
     text: str
     """What it does, or how it ended and what to do."""

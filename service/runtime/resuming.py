@@ -39,8 +39,26 @@ def leave(archive: Archive, state: TrackerState, now_ns: int) -> None:
 
 
 def has_news(before: TrackerState, after: TrackerState) -> bool:
-    """Return whether something has been measured that is not saved yet."""
+    """Return whether something has been measured, or begun, that is not saved yet."""
+    if is_urgent(before, after):
+        return True
     old, new = before.registration, after.registration
     if old is None or new is None:
         return new is not None
     return (old.t_ns_utc, old.doubt) != (new.t_ns_utc, new.doubt)
+
+
+def is_urgent(before: TrackerState, after: TrackerState) -> bool:
+    """Return whether what is not saved yet cannot wait: whose the RTC's open loop is.
+
+    A service killed a second later would leave its own loop open to one that cannot know.
+    """
+    return _course(before) != _course(after)
+
+
+def _course(state: TrackerState) -> tuple[object, ...]:
+    acquisition, rtc = state.acquisition, state.rtc
+    if not acquisition.under_way:
+        return (acquisition.stage,)
+    session = None if rtc is None else rtc.session
+    return acquisition.stage, acquisition.attempt, acquisition.matrix, session

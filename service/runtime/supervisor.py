@@ -28,7 +28,7 @@ from service.runtime.asking import why_not
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.runtime.following import followed, news, shape_news
-from service.runtime.resuming import SAVE_INTERVAL_S, has_news, leave
+from service.runtime.resuming import SAVE_INTERVAL_S, has_news, is_urgent, leave
 from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.windows import fitted, watched
 from service.state import Level, LogEntry, MeasureState, TrackerState
@@ -323,14 +323,14 @@ class Supervisor:
                 self._log.error("archive.failed", text=str(error))
 
     async def _save(self) -> None:
-        """Keep what the service after this one needs; never more often than the disk likes."""
-        saved = self._state
+        """Keep what the service after this one needs; seldom, but for what cannot wait."""
+        saved, next_s = self._state, time.monotonic()
         while True:
             await asyncio.sleep(SAVE_INTERVAL_S / 10)
-            if has_news(saved, self._state):
-                saved = self._state
+            due = is_urgent(saved, self._state) or time.monotonic() >= next_s
+            if due and has_news(saved, self._state):
+                saved, next_s = self._state, time.monotonic() + SAVE_INTERVAL_S
                 await asyncio.to_thread(self._leave, saved)
-                await asyncio.sleep(SAVE_INTERVAL_S)
 
     def _leave(self, state: TrackerState) -> None:
         try:

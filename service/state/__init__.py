@@ -1,6 +1,6 @@
 """What the service knows: one frozen record, replaced as a whole, read by REST and metrics."""
 
-from service.state.acquisition import Acquisition, AcquisitionStage, LoopFound
+from service.state.acquisition import Acquisition, AcquisitionStage, Interruption, LoopFound
 from service.state.dithering import Dithering, DitherPhase, DitherPlan, Precision
 from service.state.journal import Alarm, Level, LogEntry
 from service.state.measurements import MeasurementRecord, MeasurePattern, MeasureState
@@ -38,6 +38,7 @@ __all__ = [
     "Dithering",
     "Earlier",
     "HistoryEntry",
+    "Interruption",
     "Level",
     "LogEntry",
     "LoopCommand",

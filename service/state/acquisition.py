@@ -41,6 +41,9 @@ class AcquisitionStage(StrEnum):
     ABORTED = "aborted"
     """An operator ended it, or the RTC vanished."""
 
+    INTERRUPTED = "interrupted"
+    """The service ended in the middle of it; the text says what the next one does about that."""
+
 
 UNDER_WAY = frozenset(
     {
@@ -70,6 +73,17 @@ class LoopFound:
 
     held: bool
     """Whether it was closed and no alarm said that it did not hold."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Interruption:
+    """What a service was at when it ended in the middle of an acquisition."""
+
+    doing: str
+    """Stage, and the text of it."""
+
+    session: str | None
+    """The RTC's; None: none was there. An open loop in the same session is the one it left."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,6 +136,9 @@ class Acquisition:
 
     windows: int = 0
     """Windows that had been accepted when the reconstructor in use was applied."""
+
+    interruption: Interruption | None = None
+    """How the service before this one left it; None: it is of this one's own."""
 
     @property
     def looks_afar(self) -> bool:

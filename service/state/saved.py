@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from service.state.acquisition import Acquisition
 from service.state.pointing import Pointing
 from service.state.registration import Registration
 
@@ -27,5 +28,9 @@ class Saved:
     pointing: Pointing | None
     """Of the telescope; None: nobody had told."""
 
-    registration: Registration
-    """Without the window that may be waiting for another: that one will not come."""
+    registration: Registration | None
+    """Without the window that may be waiting for another: that one will not come. None: an
+    acquisition has forgotten it, and found no other yet."""
+
+    acquisition: Acquisition | None = None
+    """One under way, or over without an α; None: neither."""

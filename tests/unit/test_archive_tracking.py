@@ -6,12 +6,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from service import events as ev
 from service.archive import Archive
 from service.archive.tracking import TrackingFile
 from service.errors import ArchiveError
 from service.reactions.restoring import saved_of
 from service.state import Mode, Pointing, Registration
 from tests.unit.reactions.situations import START_NS, Story, moved
+from tests.unit.reactions.test_acquisition import Acquiring
 from tests.unit.reactions.test_watchdog import learnt, watch
 
 
@@ -54,6 +56,53 @@ def test_what_is_read_is_what_was_written_but_for_what_depends_on_the_time(file,
     assert same(found, expected)
     assert found.registration.bias is not None
     assert len(found.registration.optical_gains) == 4
+
+
+@pytest.fixture(scope="module")
+def cut_off():
+    """What a service has left that ended while its loop was open."""
+    story = Acquiring()
+    story.tell(ev.Acquire())
+    story.open()
+    return saved_of(story.state, story.now_ns)
+
+
+def test_an_acquisition_under_way_is_read_as_it_was_written(file, cut_off):
+    file.write(cut_off)
+    found = file.read()
+    assert found.registration is None
+    assert same(found, cut_off)
+    assert found.acquisition.found.gains == (0.4,) * 400 + (0.0,) * 194
+    assert found.acquisition.interruption.session == "s2"
+
+
+def test_a_file_from_before_acquisitions_were_saved_is_read(file, saved, tmp_path):
+    file.write(saved)
+    path = tmp_path / "tracking.json"
+    values = json.loads(path.read_text())
+    del values["acquisition"]
+    path.write_text(json.dumps(values))
+    assert same(file.read().registration.alpha, saved.registration.alpha)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"stage": "lost"},
+        {"attempt": "two"},
+        {"found": {"gains": [0.4, None]}},
+        {"interruption": {"doing": "coarse"}},
+        {"shoe_size": 43},
+    ],
+)
+def test_a_damaged_acquisition_is_no_acquisition(file, cut_off, tmp_path, values):
+    file.write(cut_off)
+    path = tmp_path / "tracking.json"
+    found = json.loads(path.read_text())
+    found["acquisition"] |= values
+    path.write_text(json.dumps(found))
+    with pytest.raises(ArchiveError, match="damaged"):
+        file.read()
 
 
 def test_the_newest_replaces_what_was_there(file, saved, tmp_path):

@@ -19,6 +19,7 @@ from service.runtime.supervisor import Supervisor
 from service.state import Level, LogEntry, Mode, TrackerState
 from service.worker import start_worker
 from tests.unit.reactions.situations import POLICY, Story, record
+from tests.unit.reactions.test_acquisition import Acquiring
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 pytestmark = pytest.mark.timeout(60)
@@ -185,6 +186,25 @@ async def test_it_is_saved_while_the_service_runs_and_not_only_at_its_end(
         known = told(Story(Mode.HOLD).meet(), n_windows=1)
         supervisor._state = replace(supervisor._state, registration=known)
         await until(lambda: archive.tracking.read() is not None)
+
+
+async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
+    supervisor, archive, monkeypatch
+):
+    """Five seconds later is too late for a service that is killed."""
+    monkeypatch.setattr("service.runtime.supervisor.SAVE_INTERVAL_S", 1.0)
+    story = Acquiring()
+    story.see(n_windows=3)
+    async with running(supervisor):
+        supervisor._state = replace(supervisor._state, registration=story.state.registration)
+        await until(lambda: archive.tracking.read() is not None)
+        story.tell(ev.Acquire())
+        supervisor._state = replace(
+            supervisor._state, registration=None, acquisition=story.state.acquisition
+        )
+        began = time.monotonic()
+        await until(lambda: archive.tracking.read().acquisition is not None)
+        assert time.monotonic() - began < 0.5
 
 
 def told(story, n_windows):

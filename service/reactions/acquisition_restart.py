@@ -1,0 +1,113 @@
+"""An acquisition in the middle of which the service has ended, and what the next one does about it.
+
+The RTC's loop stays as the acquisition had it, mostly open, and its matrix is for a registration
+that was not believed. The next service begins anew where it may and the loop is as it was left;
+whatever else it finds it says, and leaves to the operator. It never closes a loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service.reactions.acquisition_ends import again, entered
+from service.reactions.acquisition_plan import left_open, why_not_now
+from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.matrices import Step
+from service.reactions.policy import Policy
+from service.state import (
+    Acquisition,
+    AcquisitionStage,
+    Interruption,
+    Level,
+    Mode,
+    RtcView,
+    TrackerState,
+)
+
+_OVER = (AcquisitionStage.FAILED, AcquisitionStage.ABORTED)
+
+
+def left_behind(state: TrackerState) -> Acquisition | None:
+    """Return what the next service must know of an acquisition; None: nothing.
+
+    One that is over matters while α is not known: it says why, and why the loop may be open.
+    """
+    acquisition = state.acquisition
+    kept = replace(acquisition, alpha=None, covariance=None, command=None, applied=None, windows=0)
+    if acquisition.under_way:
+        session = None if state.rtc is None else state.rtc.session
+        doing = f"{acquisition.stage}: {acquisition.text}"
+        return replace(kept, interruption=Interruption(doing=doing, session=session))
+    over = acquisition.stage in _OVER and state.registration is None
+    return kept if over or acquisition.stage is AcquisitionStage.INTERRUPTED else None
+
+
+def inherited(state: TrackerState, left: Acquisition, now_ns: int) -> TrackerState:
+    """Return the state of a service to which the one before it has left this acquisition."""
+    state = replace(state, acquisition=left)
+    if left.stage is AcquisitionStage.FAILED:
+        return with_alarm(state, "acquisition", left.text, now_ns)
+    if left.stage is AcquisitionStage.ABORTED:
+        return state
+    return _waiting(state, "no RTC is there yet", now_ns)
+
+
+def after_restart(state: TrackerState, policy: Policy, now_ns: int) -> Step:
+    """Begin an interrupted acquisition anew, or say why not and what the operator can do."""
+    rtc = state.rtc
+    if rtc is None:
+        return state, ()
+    if rtc.loop != "open":
+        return _closed(state, rtc, now_ns), ()
+    why_not = _why_not_by_itself(state, rtc, policy)
+    if why_not is not None:
+        return _waiting(state, why_not, now_ns), ()
+    state = replace(state, acquisition=replace(state.acquisition, interruption=None))
+    state = without_alarm(state, "acquisition", now_ns)
+    return again(state, "the service was restarted", now_ns)
+
+
+def _why_not_by_itself(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
+    if left_open(state, rtc) is None:
+        return "the RTC has begun another session since, and who left its loop open is not known"
+    if state.mode is not Mode.AUTO:
+        return f"the mode is {state.mode}"
+    if not policy.acquires:
+        return "the settings forbid that"
+    if state.dither_stopped:
+        return "the dither was stopped"
+    return why_not_now(state, policy)
+
+
+def _waiting(state: TrackerState, why: str, now_ns: int) -> TrackerState:
+    """Return the state that says what was going on, why that does not go on, and what to do."""
+    text = (
+        f"{_cut_off(state)}; it does not begin anew by itself: {why}. The loop may be open, and "
+        "its matrix is for a registration that was not believed: acquire again, or close the loop "
+        "on a matrix of your own"
+    )
+    if any((alarm.name, alarm.text) == ("acquisition", text) for alarm in state.alarms):
+        return state
+    acquisition = replace(
+        state.acquisition, stage=AcquisitionStage.INTERRUPTED, text=text, since_ns_utc=now_ns
+    )
+    state = replace(state, acquisition=acquisition)
+    note = f"it does not begin anew by itself: {why}"
+    state = logged(state, "acquisition.interrupted", note, now_ns, Level.WARNING)
+    return with_alarm(state, "acquisition", text, now_ns)
+
+
+def _closed(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
+    """Return the state after somebody, or the acquisition itself, has closed the loop."""
+    matrix, told = rtc.cm_id or "an unknown matrix", "which it has not judged"
+    if rtc.cm_id is not None and rtc.cm_id == state.acquisition.matrix:
+        told = "which had passed the gate: the registration is followed from there"
+    text = f"{_cut_off(state)}; the loop is closed on {matrix}, {told}"
+    state = without_alarm(state, "acquisition", now_ns)
+    return entered(state, AcquisitionStage.ABORTED, text, now_ns)
+
+
+def _cut_off(state: TrackerState) -> str:
+    left = state.acquisition.interruption
+    doing = "unknown" if left is None else left.doing
+    return f"the service ended during an acquisition ({doing})"

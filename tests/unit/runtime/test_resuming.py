@@ -1,0 +1,153 @@
+"""What a service leaves on the disk and when, and a small telescope whose service is restarted."""
+
+from pathlib import Path
+
+import pytest
+from threadpoolctl import threadpool_limits
+
+from service import events as ev
+from service.archive import Archive
+from service.config import load_instrument, load_settings
+from service.config.policy import policy_of
+from service.reactions.shelf import restored
+from service.runtime.resuming import has_news, is_urgent, leave, taken_up
+from service.runtime.streams import Streams
+from service.state import AcquisitionStage, Mode, TrackerState
+from service.worker import Compute, Workbench
+from studies.campaign.acquisition import Start
+from studies.campaign.observatory import Observatory
+from tests.unit.reactions.situations import START_NS
+from tests.unit.reactions.test_acquisition import Acquiring
+
+SMALL = Path(__file__).parents[2] / "system" / "small.toml"
+START = Start(instrument=str(SMALL), n_controlled=60, seed=0)
+
+
+class TestWhatCannotWait:
+    def test_every_stage_of_an_acquisition_and_the_session_it_opened_the_loop_in(self):
+        story = Acquiring()
+        before = story.state
+        story.tell(ev.Acquire())
+        assert is_urgent(before, story.state)
+        for follow in (story.open, story.see_afar, story.see_afar, lambda: story.close(150)):
+            before = story.state
+            follow()
+            assert is_urgent(before, story.state)
+            assert has_news(before, story.state)
+
+    def test_a_window_can_wait_but_is_news(self):
+        story = Acquiring()
+        story.see()
+        before = story.state
+        story.see()
+        assert has_news(before, story.state)
+        assert not is_urgent(before, story.state)
+
+    def test_nothing_new_is_no_news(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        before = story.state
+        story.tell(ev.Tick(), 1.0)
+        assert not has_news(before, story.state)
+
+
+def test_the_alpha_on_the_disk_goes_when_an_acquisition_forgets_it(tmp_path):
+    with Archive(tmp_path) as archive:
+        archive.open()
+        story = Acquiring()
+        story.see(n_windows=3)
+        leave(archive, story.state, story.now_ns)
+        assert archive.tracking.read().registration is not None
+        story.tell(ev.Acquire())
+        leave(archive, story.state, story.now_ns)
+        state = taken_up(archive, TrackerState(system="flao"), story.policy, story.now_ns)
+    assert state.registration is None
+    assert state.acquisition.stage is AcquisitionStage.INTERRUPTED
+
+
+def test_nothing_is_written_over_what_another_night_has_left(tmp_path):
+    with Archive(tmp_path) as archive:
+        archive.open()
+        story = Acquiring()
+        story.see(n_windows=3)
+        leave(archive, story.state, story.now_ns)
+        leave(archive, TrackerState(system="flao"), START_NS)
+        assert archive.tracking.read().registration is not None
+
+
+class Restartable(Observatory):
+    """A night whose service can end and begin again while the telescope goes on."""
+
+    def restart_service(self, archive, mode, bench):
+        old, now_ns = self.state, self.dome.now_ns
+        leave(archive, old, now_ns)
+        self._agenda.clear()
+        self._link.sent.clear()
+        self._fitting, self._waiting, self._worker_free_ns = False, None, 0
+        self.streams = Streams(description=bench.describe())
+        shelf = restored(old.reconstructors)
+        fresh = TrackerState(system=old.system, mode=mode, reconstructors=shelf)
+        self.state = taken_up(archive, fresh, self.policy, now_ns)
+        self._begin()
+
+    def until(self, stage, within_s=30.0):
+        over_s = self.time_s + within_s
+        while self.state.acquisition.stage is not stage:
+            assert self.time_s < over_s, [entry.text for entry in self.state.log]
+            self.advance(0.05)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    compute = Compute(threads=1, pupil_sampling=3, detector_nodes=3)
+    return Workbench(load_instrument(str(SMALL)), compute)
+
+
+@pytest.fixture
+def interrupted(bench, tmp_path):
+    """Return a night whose loop diverged and was opened; its service was restarted then."""
+
+    def play(stage, mode):
+        settings = load_settings(None, {}, {"control.n_modes_target": 60})
+        night = Restartable(START.words, policy_of(settings), Mode.AUTO, bench, with_poles=True)
+        night.until(stage)
+        night.advance(0.3)
+        with Archive(tmp_path) as archive:
+            archive.open()
+            night.restart_service(archive, mode, bench)
+        return night
+
+    with threadpool_limits(1):
+        yield play
+
+
+def test_the_next_service_ends_tracking_where_the_mirror_is(interrupted):
+    night = interrupted(AcquisitionStage.CONFIRMING, Mode.AUTO)
+    assert not night.dome.moments[-1].closed
+    assert night.state.acquisition.stage is AcquisitionStage.INTERRUPTED
+    night.until(AcquisitionStage.TRACKING)
+    assert night.dome.moments[-1].closed
+    assert night.state.acquisition.attempt == 2
+    error = night.state.registration.alpha.vector - night.dome.alpha.vector
+    assert (abs(error) < 5.0 * night.state.registration.sigma).all()
+    assert all(swap.radius < 0.95 for swap in night.swaps)
+
+
+def test_one_that_may_not_leaves_the_loop_open_and_asks_nothing_of_the_rtc(interrupted):
+    night = interrupted(AcquisitionStage.COARSE, Mode.PROPOSE)
+    n_orders = len(night.dome.orders)
+    night.advance(3.0)
+    assert not night.dome.moments[-1].closed
+    assert len(night.dome.orders) == n_orders
+    assert "the mode is propose" in night.state.acquisition.text
+
+
+def test_one_whose_loop_had_just_been_closed_goes_on_from_there(interrupted):
+    night = interrupted(AcquisitionStage.WIDENING, Mode.AUTO)
+    matrix = night.dome.moments[-1].cm_id
+    night.advance(2.0)
+    assert night.dome.moments[-1].closed
+    assert night.state.acquisition.stage is AcquisitionStage.ABORTED
+    assert matrix in night.state.acquisition.text
+    error = night.state.registration.alpha.vector - night.dome.alpha.vector
+    assert (abs(error) < 5.0 * night.state.registration.sigma).all()

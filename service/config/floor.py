@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from service.config.settings import Settings
 
-FLAT = (0.006, 0.015, 0.0015)
+FLAT = (0.004, 0.01, 0.001)
 """Shift in subapertures, rotation in degrees, magnification: where telemetry of a working pyramid
-is compared with the response to a flat wavefront."""
+is compared with the response to a flat wavefront. What a window's misfit tells comes on top."""
 
-AT_WORK = (0.002, 0.01, 0.0007)
+AT_WORK = (0.001, 0.005, 0.0005)
 """The same where it is compared with the response at the working point."""
 
 

@@ -10,9 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import PARAMETERS, Misregistration
+
+MODEL_ERROR = 15.0
+"""Variance of α per unit of misfit above 1, over that of its scatter: what the model leaves over is
+smooth across the pupil and pulls at α more than noise of the same power. From campaigns on the
+diffractive telescope, two truths and two models (docs/results/night.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,3 +135,13 @@ class DitheredEstimate(Estimate, Protocol):
     @property
     def session(self) -> str:
         """The RTC's session."""
+
+
+def model_error(covariance: NDArray[Any], misfit: float) -> NDArray[Any]:
+    """Return ``(4,)`` the 1 σ by which the model leads a window astray, numeric units.
+
+    As much as it leaves unexplained: bright stars show what a faint one's noise hides, and neither
+    needs to be told which telescope it is. It does not average down, for the next window has the
+    same.
+    """
+    return np.sqrt(MODEL_ERROR * max(misfit - 1.0, 0.0) * np.diag(covariance))

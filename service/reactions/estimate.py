@@ -52,6 +52,9 @@ class Measured:
     optical_gains: tuple[ModeGain, ...]
     """Those of every mode known, this window's included."""
 
+    floor: Array
+    """``(4,)`` 1 σ of the model error, numeric units: it does not average down."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Folded:
@@ -124,7 +127,7 @@ def accepted(
     registration = Registration(
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
-        floor=policy.floor,
+        floor=measured.floor,
         t_ns_utc=measured.t_ns_utc,
         arrived_ns_utc=now_ns,
         n_windows=folded.n_windows,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimator import DitheredEstimate
+from service.estimation.estimator import DitheredEstimate, model_error
 from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
 from service.estimation.noisymatrix import RandomEstimate
 from service.model.misregistration import Misregistration
@@ -20,7 +20,7 @@ from service.reactions.modal_gain import followed_gains
 from service.reactions.policy import Policy
 from service.reactions.tracking import with_window
 from service.reactions.validity import USELESS_SIGMA
-from service.state import Level, Source, TrackerState
+from service.state import Level, Registration, Source, TrackerState
 
 Array = NDArray[Any]
 
@@ -37,6 +37,9 @@ mirror is seen twice."""
 
 GAIN_GROUPS = 16
 """A random dither on more modes than this is believed on the gains of neighbours together."""
+
+MISFIT_WINDOWS = 10
+"""So many tell the model error together: the misfit of a faint star's window is mostly chance."""
 
 OUT_OF_HAND = {
     "loop-diverging": "the loop was diverging",
@@ -69,8 +72,18 @@ def on_window(
             gain_sigma,
             estimate.t_ns_utc,
         ),
+        floor=_floor(known, estimate, policy),
     )
     return with_window(state, measured, policy, now_ns)
+
+
+def _floor(known: Registration | None, estimate: DitheredEstimate, policy: Policy) -> Array:
+    """Return the model error by all windows so far: what is set, and what they do not explain."""
+    squared = policy.floor**2 + model_error(estimate.covariance, estimate.misfit) ** 2
+    if known is None:
+        return np.asarray(np.sqrt(squared))
+    share = 1.0 / min(known.n_windows + 1, MISFIT_WINDOWS)
+    return np.asarray(np.sqrt(known.floor**2 + share * (squared - known.floor**2)))
 
 
 def _gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from studies.campaign.summary import Row, distances
+from studies.campaign.summary import Row, distances, model_errors
 
 LABELS = ("shift x, subap", "shift y, subap", "rotation, deg", "magnification")
 
@@ -19,7 +19,7 @@ def plot(path: Path, rows: list[Row], floor: NDArray[np.float64]) -> None:
 
     good = [row for row in rows if row["refused"] is None]
     errors = np.array([row["error"] for row in good])
-    covariances = np.array([row["covariance"] for row in good])
+    covariances = np.array([row["covariance"] for row in good]) + model_errors(good)
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2) + floor**2)
     figure, axes = plt.subplots(5, 1, figsize=(9, 11), layout="constrained")
     order = np.lexsort((np.arange(len(good)), [row["magnitude"] for row in good]))
@@ -29,7 +29,7 @@ def plot(path: Path, rows: list[Row], floor: NDArray[np.float64]) -> None:
         axis.errorbar(np.arange(len(error)), error, 2 * width, fmt=".", elinewidth=0.6)
         axis.axhline(0.0, color="k", linewidth=0.8)
         axis.set_ylabel(label)
-    axes[3].set_xlabel("window, by magnitude; bars are 2 σ with the model-error floor")
+    axes[3].set_xlabel("window, by magnitude; bars are 2 σ, model error included")
     squares = np.sort(distances(errors, covariances, floor))
     share = np.arange(1, len(squares) + 1) / len(squares)
     axes[4].plot(squares, share, drawstyle="steps-post", label="found")

@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from service.estimation.estimator import model_error
+from studies.campaign.night import Estimator
+
 Array = NDArray[np.float64]
 Row = dict[str, Any]
 
@@ -54,7 +57,7 @@ def line(key: tuple[Any, ...], rows: list[Row], floor: Array) -> str:
     seeds = np.array([row["seed"] for row in good])
     sigma = np.sqrt(np.mean(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
     scatter = _within(errors, seeds)
-    squares = distances(errors, covariances, floor)
+    squares = distances(errors, covariances + model_errors(good), floor)
     inside = np.mean(squares < chi2.ppf(0.95, 4))
     cells = (
         _four(errors.mean(axis=0) * UNITS),
@@ -66,6 +69,13 @@ def line(key: tuple[Any, ...], rows: list[Row], floor: Array) -> str:
         error_nm,
     )
     return f"| {name} | {counted} | " + " | ".join(cells) + " |\n"
+
+
+def model_errors(rows: list[Row]) -> Array:
+    """Return ``(n, 4, 4)`` what the misfit of each window adds, which the service adds as well."""
+    if rows[0]["estimator"] == Estimator.PASSIVE:
+        return np.zeros((len(rows), 4, 4))
+    return np.array([np.diag(model_error(row["covariance"], row["misfit"]) ** 2) for row in rows])
 
 
 def distances(errors: Array, covariances: Array, floor: Array) -> Array:

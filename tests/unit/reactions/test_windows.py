@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from service import events as ev
+from service.estimation.estimator import MODEL_ERROR
 from service.estimation.lockin import WindowRefused
 from service.reactions.estimate import HISTORY_LENGTH
 from service.state import Level, Mode
@@ -32,6 +33,21 @@ def test_two_equal_windows_halve_the_variance_but_for_the_walk_between_them(stor
     expected = np.linalg.inv(np.linalg.inv(walked) + np.linalg.inv(PRECISE))
     np.testing.assert_allclose(story.state.registration.covariance, expected)
     assert story.state.registration.n_windows == 2
+
+
+def test_what_the_model_does_not_explain_stays_in_sigma_however_many_windows_agree(story):
+    story.see(n_windows=20, misfit=3.0)
+    known, noise = story.state.registration, np.diag(PRECISE)
+    np.testing.assert_allclose(known.floor**2, story.policy.floor**2 + MODEL_ERROR * 2.0 * noise)
+    assert np.all(known.sigma > known.floor)
+
+
+def test_one_odd_misfit_among_many_moves_the_model_error_by_a_tenth(story):
+    story.see(n_windows=15, misfit=0.98)
+    np.testing.assert_allclose(story.state.registration.floor, story.policy.floor)
+    story.see(misfit=1.5)
+    added = story.state.registration.floor**2 - story.policy.floor**2
+    np.testing.assert_allclose(added, 0.1 * MODEL_ERROR * 0.5 * np.diag(PRECISE))
 
 
 def test_each_window_leaves_its_own_estimate_in_the_history(story):

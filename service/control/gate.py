@@ -52,6 +52,10 @@ class LoopSettings:
     """How much of the model's response the sensor shows, of all modes or ``(n_controlled,)``:
     below 1 on sky, up to 2 in double pass."""
 
+    n_holding: int | None = None
+    """Modes with which it is closed now, at these gains, and does not slip; None: it is not, or
+    nobody knows."""
+
     outer: Outer | None = None
     """The mirror's outermost ring; None: the modes are measured, it is not known."""
 
@@ -79,7 +83,8 @@ def judge(
     Tries the estimate and the eight ends of the axes of its 3σ ellipsoid; ``covariance``
     ``(4, 4)`` includes the model-error floor. The bound is never tighter than half-way between
     the aligned loop and the edge of stability, or a slow loop could never be served at all. A
-    loop that is stable must not let its outer ring slip either: ``service.control.edge``.
+    loop that is stable must not let its outer ring slip either (``service.control.edge``); as many
+    modes as hold already may move it a little more, or the noise of α would cost modes.
     """
     n = len(reconstructor)
     centre = reconstructor @ linearisation.matrix_at(registration)[:, :n]
@@ -102,7 +107,7 @@ def judge(
         leak=loop.leak,
         delay_frames=loop.delay_frames,
     )
-    slippery = why_slippery(motion_m, loop.leak)
+    slippery = why_slippery(motion_m, loop.leak, holds=n == loop.n_holding)
     return replace(
         stable,
         accepted=slippery is None,

@@ -15,8 +15,12 @@ from service.state import (
     TrackerState,
 )
 
-LADDER = (594, 500, 400, 300, 200, 150, 100, 60, 30)
-"""Numbers of modes that are tried: each leaves the mirror a good deal calmer than the last."""
+LADDER = (
+    *(594, 550, 500, 450, 400, 350, 300, 260, 230, 200, 175, 150),
+    *(130, 115, 100, 90, 80, 70, 60, 52, 45, 40, 35, 30),
+)
+"""Numbers of modes that are tried. A step costs 2 nm of wavefront at 594 modes, 6 at 400, 11 at 100
+(FLAO, 1", where 400 leave 117); halves are tried, so that a finer list costs a trial at most."""
 
 FIRST_WAIT_S = 60.0
 """After modes were lowered, before more are tried."""

@@ -24,7 +24,7 @@ from service.rtc_bridge import Bridge
 from service.runtime import translate
 from service.runtime.asking import Question, ask
 from service.runtime.crew import Crew
-from service.runtime.loops import loop_settings, timing
+from service.runtime.loops import loop_settings, modes_that_hold, timing
 from service.runtime.noisy import NoisyDesk
 from service.state import (
     MatrixState,
@@ -162,7 +162,7 @@ class Deeds:
             Workbench.make,
             registration.alpha,
             registration.total_covariance,
-            loop_settings(rtc, gains, registration),
+            loop_settings(rtc, gains, registration, n_holding=modes_that_hold(state, gains)),
             self._publishing.pole_radius_bound,
             effect.fewer,
         )
@@ -188,7 +188,7 @@ class Deeds:
         gate = None
         if registration is not None:
             gains = extended_gains(rtc, len(matrix))[: len(matrix)]
-            gate = await self._verdict(matrix, gains, rtc, registration)
+            gate = await self._verdict(matrix, gains, state, registration)
         refused = gate is not None and not gate.accepted
         record = replace(
             self._record(len(matrix), effect.why, None, effect.source),
@@ -206,7 +206,7 @@ class Deeds:
     async def _judge(self, matrix_id: str, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
         matrix = await asyncio.to_thread(self.matrix, matrix_id)
-        verdict = await self._verdict(matrix, rtc.gains[: len(matrix)], rtc, registration)
+        verdict = await self._verdict(matrix, rtc.gains[: len(matrix)], state, registration)
         expected = await self._crew.call(
             Workbench.assess,
             matrix,
@@ -222,25 +222,26 @@ class Deeds:
         self,
         matrix: NDArray[np.float32],
         gains: tuple[float, ...],
-        rtc: RtcView,
+        state: TrackerState,
         registration: Registration,
     ) -> GateVerdict:
+        n_holding = modes_that_hold(state, gains)
         return await self._crew.call(
             Workbench.judge,
             matrix,
             registration.alpha,
             registration.total_covariance,
-            loop_settings(rtc, gains, registration),
+            loop_settings(_there(state), gains, registration, n_holding=n_holding),
             self._publishing.pole_radius_bound,
         )
 
     async def _ask_judged(self, effect: ev.AskLoop, state: TrackerState) -> Event | None:
         """Ask for gains only if the gate lets the matrix in use run with them."""
-        rtc, registration = _there(state), _registered(state)
+        registration = _registered(state)
         if state.in_use is None or effect.gains is None:
             raise CommandError("the reconstructor in use is not known: its gains cannot be judged")
         matrix = await asyncio.to_thread(self.matrix, state.in_use)
-        verdict = await self._verdict(matrix, effect.gains[: len(matrix)], rtc, registration)
+        verdict = await self._verdict(matrix, effect.gains[: len(matrix)], state, registration)
         if not verdict.accepted:
             return ev.LoopAnswered(id=effect.id, accepted=False, reason=verdict.reason)
         return await self._ask(effect)

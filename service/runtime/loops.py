@@ -8,14 +8,19 @@ from numpy.typing import NDArray
 from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
 from service.reactions.gain_tables import table_of
-from service.state import Registration, RtcView
+from service.reactions.windows import OUT_OF_HAND
+from service.state import Registration, RtcView, TrackerState
 
 GAIN_SAFETY = 1.1
 """Above a mean optical gain that nobody says which modes it is of."""
 
 
 def loop_settings(
-    rtc: RtcView, gains: tuple[float, ...], registration: Registration
+    rtc: RtcView,
+    gains: tuple[float, ...],
+    registration: Registration,
+    *,
+    n_holding: int | None = None,
 ) -> LoopSettings:
     """Return the loop the gate is to judge, with the largest optical gains it may have."""
     return LoopSettings(
@@ -23,7 +28,17 @@ def loop_settings(
         leak=rtc.leak,
         delay_frames=rtc.delay_frames,
         optical_gain=_highest(registration, len(gains)),
+        n_holding=n_holding,
     )
+
+
+def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None:
+    """Return how many modes the loop holds with, if these are its gains; None: it does not."""
+    rtc = state.rtc
+    if rtc is None or rtc.loop == "open" or any(a.name in OUT_OF_HAND for a in state.alarms):
+        return None
+    n_modes = rtc.n_controlled
+    return n_modes if gains[:n_modes] == rtc.gains[:n_modes] else None
 
 
 def timing(rtc: RtcView, n_controlled: int, registration: Registration) -> Timing:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.edge import FORGIVING_LEAK, LIMIT_M, Outer, edge_motion_m, why_slippery
+from service.control.edge import (
+    FORGIVING_LEAK,
+    HELD_LIMIT_M,
+    LIMIT_M,
+    Outer,
+    edge_motion_m,
+    why_slippery,
+)
 
 N = 6
 
@@ -67,3 +74,17 @@ def test_a_slippery_loop_is_named_with_what_to_do_and_a_leak_forgives_it():
     reason = why_slippery(2.0 * LIMIT_M, 0.999)
     assert reason is not None
     assert "fewer modes, a lower gain or more leak" in reason
+
+
+def test_a_loop_that_holds_may_move_its_edge_a_little_more_and_no_further():
+    between_m = (LIMIT_M + HELD_LIMIT_M) / 2
+    assert why_slippery(between_m, 0.999) is not None
+    assert why_slippery(between_m, 0.999, holds=True) is None
+    reason = why_slippery(1.001 * HELD_LIMIT_M, 0.999, holds=True)
+    assert reason is not None
+    assert f"{HELD_LIMIT_M * 1e9:.0f} at most" in reason
+
+
+def test_what_is_borne_of_a_loop_that_holds_lies_below_every_slip_that_was_seen():
+    """201 nm is the least motion with which a loop without leak has slipped (edge_slip.md)."""
+    assert LIMIT_M < HELD_LIMIT_M < 201e-9

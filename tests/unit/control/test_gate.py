@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.control.edge import FORGIVING_LEAK, LIMIT_M, Outer
+from service.control.edge import FORGIVING_LEAK, HELD_LIMIT_M, LIMIT_M, Outer
 from service.control.gate import LoopSettings, judge
 from service.control.reconstructor import invert
 from service.control.stability import pole_radius
@@ -191,3 +191,34 @@ def test_a_stable_loop_whose_edge_would_slip_is_refused_and_a_leak_forgives_it()
     assert not loud.accepted
     assert loud.reason.startswith("its outer ring would slip")
     assert verdict(loop=with_ring(10.0, FORGIVING_LEAK)).accepted
+
+
+class TestHolding:
+    """The edge of a loop that is closed already with as many modes, and holds."""
+
+    @staticmethod
+    def loop(motion_m: float, **changes) -> LoopSettings:
+        of_unit = verdict(loop=with_ring(1.0)).edge_motion_m
+        return replace(with_ring(motion_m / of_unit), **changes)
+
+    def test_it_may_move_a_little_more_than_one_that_is_to_be_closed(self):
+        between_m = (LIMIT_M + HELD_LIMIT_M) / 2
+        assert not verdict(loop=self.loop(between_m)).accepted
+        held = verdict(loop=self.loop(between_m, n_holding=N_CONTROLLED))
+        assert held.accepted
+        assert held.edge_motion_m == pytest.approx(between_m)
+
+    @pytest.mark.parametrize("n_holding", [N_CONTROLLED - 1, N_CONTROLLED + 1])
+    def test_not_with_other_modes_than_those_it_holds_with(self, n_holding):
+        between_m = (LIMIT_M + HELD_LIMIT_M) / 2
+        assert not verdict(loop=self.loop(between_m, n_holding=n_holding)).accepted
+
+    def test_not_without_end(self):
+        beyond = self.loop(1.001 * HELD_LIMIT_M, n_holding=N_CONTROLLED)
+        assert not verdict(loop=beyond).accepted
+
+    def test_poles_that_are_refused_are_refused_however_well_it_holds(self):
+        calm = self.loop(0.5 * LIMIT_M, n_holding=N_CONTROLLED)
+        refused = verdict(truth=turned(30.0), loop=calm)
+        assert not refused.accepted
+        assert "pole radius" in refused.reason

@@ -19,6 +19,7 @@ from service.reactions.acquisition_plan import (
     OUT_OF_HAND_S,
     far_dither,
 )
+from service.reactions.mode_ladder import fewer_than
 from service.state import AcquisitionStage, MatrixState, Mode
 from tests.unit.reactions.situations import POLICY, Story, estimate, moved, rtc, verdict
 
@@ -292,7 +293,7 @@ class TestNothingWrong:
     def test_fewer_modes_are_made_where_the_gate_refuses_many(self):
         story = Acquiring().to_partial()
         (made,) = story.asked(ev.MakeMatrix)
-        assert (made.n_modes, made.fewer) == (150, (100, 60, 30))
+        assert (made.n_modes, made.fewer) == (150, fewer_than(150))
         story.close(60)
         (sent,) = story.asked(ev.SendMatrix)
         assert sent.gains == (0.4,) * 60 + (0.0,) * 534
@@ -339,7 +340,7 @@ class TestNothingWrong:
         story = Acquiring().to_widening()
         story.see(FAR)
         asked = story.asked(ev.MakeMatrix)[-1]
-        assert (asked.n_modes, asked.fewer) == (400, (300, 200))
+        assert (asked.n_modes, asked.fewer) == (400, (350, 300, 260, 230, 200, 175))
         story.make("cm-400", MatrixState.REFUSED, n_modes=400)
         story.see(FAR)
         story.widen(150)
@@ -359,7 +360,7 @@ class TestTrouble:
         story.open()
         story.see_afar()
         story.see_afar()
-        assert story.asked(ev.MakeMatrix)[-1].n_modes == 60
+        assert story.asked(ev.MakeMatrix)[-1].n_modes == 70
 
     def test_windows_that_lead_nowhere_begin_it_anew_and_end_it_after_a_few_attempts(self):
         story = Acquiring()

@@ -5,17 +5,22 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from service import events as ev
 from service.archive import Archive
+from service.control.edge import HELD_LIMIT_M, LIMIT_M
+from service.control.gate import LoopSettings
 from service.errors import CommandError
+from service.model.misregistration import Misregistration
+from service.reactions.mode_ladder import fewer_than
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds, Publishing
-from service.runtime.loops import GAIN_SAFETY, loop_settings, timing
-from service.state import MatrixState, ModeGain
-from service.worker import start_worker
+from service.runtime.loops import GAIN_SAFETY, loop_settings, modes_that_hold, timing
+from service.state import Alarm, MatrixState, ModeGain
+from service.worker import Workbench, start_worker
 from tests.unit.reactions.situations import START_NS, rtc
-from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, small_instrument
+from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
 from tests.unit.runtime.test_deeds import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
 
 pytestmark = pytest.mark.timeout(60)
@@ -81,6 +86,14 @@ async def make(deeds, state, n_modes=N_CONTROLLED, fewer=()):
     return await deeds.carry_out(ev.MakeMatrix(n_modes=n_modes, why="a test", fewer=fewer), state)
 
 
+def make_in(bench, loop, fewer=()):
+    return bench.make(Misregistration(), np.diag(SIGMA**2), loop, 0.95, fewer)
+
+
+def slip_alarm():
+    return Alarm(name="edge-slip", since_ns_utc=START_NS, text="found", seen_ns_utc=START_NS)
+
+
 class TestFewer:
     """What is made where the gate refuses as many modes as were asked for."""
 
@@ -106,6 +119,59 @@ class TestFewer:
         made = await make(deeds, state, fewer=(30, 10))
         assert made.record.state is MatrixState.REFUSED
         assert (made.record.n_modes, made.why_fewer) == (45, "")
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return Workbench(small_instrument(), COMPUTE)
+
+
+@pytest.fixture(scope="module")
+def just_beyond(bench):
+    """A loop whose ring moves by a nanometre more than that of one to be closed may."""
+
+    def loop(gain):
+        return LoopSettings(gains=np.full(N_CONTROLLED, gain), leak=0.999, delay_frames=2.0)
+
+    def excess_m(gain):
+        return make_in(bench, loop(gain)).gate.edge_motion_m - (LIMIT_M + 1e-9)
+
+    return loop(brentq(excess_m, 0.2, 0.6, xtol=1e-5))
+
+
+class TestEdge:
+    """The most modes where the outer ring decides, and a loop that has them already."""
+
+    def test_one_that_is_to_be_closed_gets_fewer(self, bench, just_beyond):
+        made = make_in(bench, just_beyond, fewer_than(N_CONTROLLED))
+        assert len(made.matrix) == fewer_than(N_CONTROLLED)[0] == 40
+        assert "outer ring" in made.why_fewer
+
+    def test_one_that_holds_with_as_many_keeps_them(self, bench, just_beyond):
+        held = replace(just_beyond, n_holding=N_CONTROLLED)
+        made = make_in(bench, held, fewer_than(N_CONTROLLED))
+        assert made.gate.accepted
+        assert (len(made.matrix), made.why_fewer) == (N_CONTROLLED, "")
+        assert LIMIT_M < made.gate.edge_motion_m < HELD_LIMIT_M
+
+    def test_one_that_holds_with_fewer_is_not_given_more(self, bench, just_beyond):
+        made = make_in(bench, replace(just_beyond, n_holding=40), (40,))
+        assert len(made.matrix) == 40
+
+    async def test_the_one_in_use_is_judged_by_the_same_measure(self, deeds, just_beyond):
+        """Or it would be replaced by its like again and again."""
+        gain = float(just_beyond.gains[0])
+        known = replace(REGISTRATION, alpha=Misregistration(), optical_gain=None)
+        state = replace(STATE, registration=known, rtc=loop_of(gain))
+        made = await make(deeds, state, fewer=fewer_than(N_CONTROLLED))
+        assert made.record.n_modes == N_CONTROLLED
+        assert LIMIT_M < made.record.gate.edge_motion_m < HELD_LIMIT_M
+        state = replace(state, reconstructors=(made.record,))
+        judged = await deeds.carry_out(ev.JudgeMatrix(id=made.record.id), state)
+        assert judged.verdict.accepted
+        slipping = replace(state, alarms=(slip_alarm(),))
+        judged = await deeds.carry_out(ev.JudgeMatrix(id=made.record.id), slipping)
+        assert not judged.verdict.accepted
 
 
 class TestLoss:
@@ -193,3 +259,27 @@ class TestLoopOfTheGate:
     def test_with_nothing_measured_the_model_is_believed(self):
         blind = replace(REGISTRATION, optical_gain=None)
         assert loop_settings(loop_of(0.4), (0.4,) * N_CONTROLLED, blind).optical_gain == 1.0
+
+
+class TestModesThatHold:
+    """Which loop the gate may take for one that holds."""
+
+    def test_the_loop_that_is_closed_with_these_gains(self):
+        state = replace(STATE, rtc=loop_of(0.4))
+        assert modes_that_hold(state, (0.4,) * N_CONTROLLED) == N_CONTROLLED
+        assert modes_that_hold(state, (0.4,) * (N_CONTROLLED + 9)) == N_CONTROLLED
+
+    def test_not_with_other_gains_or_fewer_of_them(self):
+        state = replace(STATE, rtc=loop_of(0.4))
+        assert modes_that_hold(state, (0.5,) * N_CONTROLLED) is None
+        assert modes_that_hold(state, (0.4,) * (N_CONTROLLED - 1)) is None
+
+    def test_not_one_that_is_open_or_gone(self):
+        opened = replace(loop_of(0.4), loop="open")
+        assert modes_that_hold(replace(STATE, rtc=opened), (0.4,) * N_CONTROLLED) is None
+        assert modes_that_hold(replace(STATE, rtc=None), (0.4,) * N_CONTROLLED) is None
+
+    @pytest.mark.parametrize("name", ["edge-slip", "loop-diverging", "commands-off-loop"])
+    def test_not_one_that_is_out_of_hand(self, name):
+        state = replace(STATE, rtc=loop_of(0.4), alarms=(replace(slip_alarm(), name=name),))
+        assert modes_that_hold(state, (0.4,) * N_CONTROLLED) is None

@@ -1,7 +1,8 @@
 """The registration and the bias of its passive estimate, followed together.
 
-Under frozen flow the passive watchdog reads ``α + b``: it scatters by 0.1 to 0.3 % of a subaperture
-and is wrong by up to 16 %, steadily, until wind, flux or gain change. A dithered window reads α
+Under frozen flow the passive watchdog reads ``α + b``: a look scatters by 0.3 to 0.5 % of a
+subaperture and is wrong by up to 9 % on the diffractive telescope, 24 % on the linear plant
+(docs/results/passive.md), steadily, until wind, flux or gain change. A dithered window reads α
 alone. Between them b is learnt, and a sparse dither then suffices.
 
 b has four parts. Those of rotation and magnification are small, but no more than the shifts' do

@@ -11,7 +11,7 @@ from service.estimation.wind import Drift, Joint, begin_joint, predicted
 from service.model.misregistration import Misregistration
 from service.reactions.journal import without_alarm
 from service.reactions.policy import SECOND_NS, Policy
-from service.reactions.surprise import CLOCK_SET_BACK_S
+from service.reactions.surprise import CLOCK_SET_BACK_S, last_of
 from service.reactions.validity import aged, flexure, slewed_deg, without_dither_due
 from service.state import (
     Earlier,
@@ -19,6 +19,7 @@ from service.state import (
     ModeGain,
     PassiveBias,
     Registration,
+    Seen,
     Source,
     TrackerState,
 )
@@ -66,6 +67,9 @@ class Folded:
 
     innovation: float
     """Normalised innovation squared (4 degrees of freedom)."""
+
+    jumped: bool = False
+    """Whether it is of a new place, to which what was known before says nothing."""
 
 
 def brought_forward(
@@ -123,7 +127,7 @@ def accepted(
     joint = folded.joint
     known = state.registration
     bias = None if known is None else known.bias
-    jumped = known is not None and known.candidate is not None
+    anew = folded.jumped or (known is not None and known.candidate is not None)
     registration = Registration(
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
@@ -137,10 +141,11 @@ def accepted(
         bias=bias_of(
             joint,
             0 if bias is None else bias.looked_ns_utc,
-            None if bias is None or jumped else bias.earlier,
+            None if bias is None or anew else bias.earlier,
         ),
         passive_after_ns_utc=known.passive_after_ns_utc if known is not None else 0,
-        earlier=_earlier(known, folded),
+        earlier=None if anew else _earlier(known, folded, measured),
+        jumped_ns_utc=_jumped_ns_utc(known, folded, now_ns),
         pointing=state.pointing,
         window_pointing=state.pointing,
         restored_ns_utc=known.restored_ns_utc if known is not None else None,
@@ -154,14 +159,21 @@ def accepted(
     return aged(state, policy, now_ns)
 
 
-def _earlier(known: Registration | None, folded: Folded) -> Earlier | None:
-    if known is None or folded.n_windows == 1 or known.candidate is not None:
+def _jumped_ns_utc(known: Registration | None, folded: Folded, now_ns: int) -> int | None:
+    if folded.jumped:
+        return now_ns
+    return None if known is None else known.jumped_ns_utc
+
+
+def _earlier(known: Registration | None, folded: Folded, measured: Measured) -> Earlier | None:
+    """Return what was known before a window, and before the one that came before it."""
+    if known is None or folded.n_windows == 1:
         return None
-    return Earlier(
-        alpha=known.alpha,
-        covariance=known.covariance,
-        t_ns_utc=known.t_ns_utc,
-        pointing=known.pointing,
+    before = known.earlier
+    return replace(
+        last_of(known),
+        then=Seen(alpha=measured.alpha, covariance=measured.covariance, t_ns_utc=measured.t_ns_utc),
+        earlier=None if before is None else replace(before, then=None, earlier=None),
     )
 
 

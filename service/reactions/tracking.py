@@ -2,7 +2,7 @@
 
 One window far out may be a jump or a mistake. It is held, nothing is made from α meanwhile, and
 the next window decides: one that agrees with it makes it a jump, one that agrees with all before
-makes it an outlier.
+makes it an outlier. A jump that one window alone cannot tell from noise is told by two together.
 """
 
 from __future__ import annotations
@@ -10,10 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.estimation.wind import (
-    JUMP_THRESHOLD,
     Joint,
     begin_joint,
     dithered_innovation,
@@ -33,11 +31,16 @@ from service.reactions.estimate import (
 )
 from service.reactions.journal import logged, with_alarm
 from service.reactions.policy import SECOND_NS, Policy
-from service.reactions.surprise import VARYING, Reading, window_surprise
+from service.reactions.surprise import (
+    Distance,
+    Reading,
+    pair_surprise,
+    wholly_after,
+    window_before,
+    window_surprise,
+)
 from service.reactions.validity import aged, with_dither_due
-from service.state import Candidate, Level, Registration, TrackerState
-
-Array = NDArray[np.float64]
+from service.state import Candidate, Level, Registration, Seen, TrackerState
 
 
 def with_window(
@@ -49,15 +52,16 @@ def with_window(
         joint = begin_joint(measured.alpha.vector, measured.covariance)
         folded = Folded(joint=joint, n_windows=1, innovation=0.0)
         return accepted(state, folded, measured, policy, now_ns)
-    prior = brought_forward(state, known, measured.t_ns_utc, policy, now_ns)
-    far = window_surprise(known, _reading(measured, state), policy)
+    reading = _reading(measured, state)
+    first = window_before(known)
+    if first is not None and pair_surprise(known, reading, policy).far:
+        return _jumped(state, first, measured, policy, now_ns)
+    far = window_surprise(known, reading, policy)
     if known.candidate is not None:
-        aside = _distance(known.candidate, measured, policy)
-        if aside <= JUMP_THRESHOLD and aside < far:
-            return _jumped(state, prior, measured, policy, now_ns)
         state = _outlier(state, known.candidate, measured, now_ns)
-    if far > JUMP_THRESHOLD:
+    if far.far:
         return _held(state, measured, far, policy, now_ns)
+    prior = brought_forward(state, known, measured.t_ns_utc, policy, now_ns)
     folded = Folded(
         joint=with_dithered(prior, measured.alpha.vector, measured.covariance),
         n_windows=counted(state, known, prior, policy),
@@ -67,13 +71,14 @@ def with_window(
 
 
 def _held(
-    state: TrackerState, measured: Measured, innovation: float, policy: Policy, now_ns: int
+    state: TrackerState, measured: Measured, far: Distance, policy: Policy, now_ns: int
 ) -> TrackerState:
     """Put a window that is far out aside, and doubt α until another one has come."""
-    known = _known(state)
+    known, innovation = _known(state), far.innovation
     text = (
-        f"a window lies {_step(measured, known)} from α (innovation {innovation:.0f}, expected 4): "
-        "the next one decides; nothing is made or sent meanwhile"
+        f"a window lies {_step(measured, known)} from α (innovation {innovation:.0f}, expected 4, "
+        f"rotation {np.sqrt(far.rotation):.1f} sigma): the next one decides; nothing is made or "
+        "sent meanwhile"
     )
     candidate = Candidate(
         alpha=measured.alpha,
@@ -105,22 +110,34 @@ def _outlier(
 
 
 def _jumped(
-    state: TrackerState, prior: Joint, measured: Measured, policy: Policy, now_ns: int
+    state: TrackerState, first: Seen, measured: Measured, policy: Policy, now_ns: int
 ) -> TrackerState:
-    """Return the state at the new place, which two windows have now seen."""
+    """Return the state at the new place, which two windows have now seen.
+
+    The first of them is used if it is wholly of the new place.
+    """
     known = _known(state)
-    candidate = known.candidate
-    if candidate is None:
-        raise ValueError("no window is held: nothing has jumped")
-    noise = candidate.covariance + _walked(candidate, measured, policy)
-    joint = with_dithered(widened(prior, noise), candidate.alpha.vector, noise)
+    prior = brought_forward(state, known, measured.t_ns_utc, policy, now_ns)
+    noise = measured.covariance
+    whole = wholly_after(first, _reading(measured, state), known.alpha.vector, policy)
+    if whole:
+        elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
+        noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
+    joint = widened(prior, noise)
+    if whole:
+        joint = with_dithered(joint, first.alpha.vector, noise)
     joint = with_dithered(joint, measured.alpha.vector, measured.covariance)
     state = replace(
         state,
-        windows_accepted=state.windows_accepted + 1,
-        registration=replace(known, passive_after_ns_utc=candidate.t_ns_utc),
+        windows_accepted=state.windows_accepted + (whole and known.candidate is not None),
+        registration=replace(known, passive_after_ns_utc=first.t_ns_utc),
     )
-    folded = Folded(joint=joint, n_windows=2, innovation=_innovation(prior, measured))
+    folded = Folded(
+        joint=joint,
+        n_windows=2 if whole else 1,
+        innovation=_innovation(prior, measured),
+        jumped=True,
+    )
     state = accepted(state, folded, measured, policy, now_ns)
     text = f"jumped by {_step(measured, known)}, as two windows have seen"
     return logged(state, "registration.jump", text, now_ns, Level.WARNING)
@@ -143,21 +160,6 @@ def _known(state: TrackerState) -> Registration:
 
 def _innovation(prior: Joint, measured: Measured) -> float:
     return dithered_innovation(prior, measured.alpha.vector, measured.covariance)
-
-
-def _distance(candidate: Candidate, measured: Measured, policy: Policy) -> float:
-    """Return how far two windows lie apart: squared, normalised, expected 4."""
-    difference = measured.alpha.vector - candidate.alpha.vector
-    walked = _walked(candidate, measured, policy)
-    varied = np.diag(2.0 * (VARYING * policy.floor) ** 2)
-    total = candidate.covariance + measured.covariance + walked + varied
-    return float(difference @ np.linalg.solve(total, difference))
-
-
-def _walked(candidate: Candidate, measured: Measured, policy: Policy) -> Array:
-    """Return ``(4, 4)`` what α may have drifted from one window to the other."""
-    elapsed_s = max(measured.t_ns_utc - candidate.t_ns_utc, 0) / SECOND_NS
-    return np.diag(policy.drift_rate**2 * elapsed_s)
 
 
 def _step(measured: Measured | Candidate, known: Registration) -> str:

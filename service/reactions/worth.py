@@ -37,6 +37,8 @@ def why_worthwhile(
             f"moved by {step[0]:+.3f}, {step[1]:+.3f} subap, {step[2]:+.3f} deg, {step[3]:+.4f} "
             f"since {in_use.id}"
         )
+    if _jumped(state, in_use, known):
+        return f"{in_use.id} was made before the mirror jumped"
     last = state.assessment
     if last is None or last.id != in_use.id:
         return None
@@ -99,6 +101,15 @@ def moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> b
     Whatever is expected of it: the linear model knows nothing of how a pyramid's gains change.
     """
     return _apart(state, record, policy.update_threshold)
+
+
+def _jumped(state: TrackerState, in_use: ReconstructorRecord, known: Registration) -> bool:
+    """Return whether the mirror has jumped since, further than the gate's verdict reaches.
+
+    What a new one wins does not matter: what has jumped once may jump again.
+    """
+    since = known.jumped_ns_utc is not None and known.jumped_ns_utc > in_use.created_ns_utc
+    return since and outdated(state, in_use)
 
 
 def outdated(state: TrackerState, record: ReconstructorRecord) -> bool:

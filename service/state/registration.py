@@ -77,6 +77,18 @@ class ModeGain:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Seen:
+    """A dithered window as it was measured, whatever the filter made of it."""
+
+    alpha: Misregistration
+    covariance: Array
+    """``(4, 4)`` from its own data, numeric units."""
+
+    t_ns_utc: int
+    """End of the window."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Earlier:
     """What was known before the last measurement: a jump inside that one is seen from here."""
 
@@ -89,6 +101,12 @@ class Earlier:
 
     pointing: Pointing | None
     """Of the telescope then; None: not known."""
+
+    then: Seen | None = None
+    """The window that entered next; None: it is not kept."""
+
+    earlier: Earlier | None = None
+    """Before the window before that; None: that was the first, or it is not kept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,6 +145,11 @@ class Candidate:
 
     innovation: float
     """Normalised innovation squared (4 degrees of freedom)."""
+
+    @property
+    def seen(self) -> Seen:
+        """What was measured."""
+        return Seen(alpha=self.alpha, covariance=self.covariance, t_ns_utc=self.t_ns_utc)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -180,6 +203,9 @@ class Registration:
 
     earlier: Earlier | None = None
     """Before the last window; None: that was the first, or it was the first after a jump."""
+
+    jumped_ns_utc: int | None = None
+    """When it was last found to have jumped, by the service's clock; None: it has not."""
 
     candidate: Candidate | None = None
     """A jump that the next window confirms or denies; None: there is none."""

@@ -23,6 +23,9 @@ class Case(StrEnum):
     JUMP = "jump"
     """10 % of a subaperture, then 0.1 deg, at once."""
 
+    JUMP_ROTATION = "jump-rotation"
+    """0.1 deg at once, then 10 % of a subaperture."""
+
     BUSY = "busy"
     """Both of them together."""
 
@@ -63,7 +66,7 @@ class Plan:
     @property
     def jump_times_s(self) -> tuple[float, ...]:
         """When the mirror jumps."""
-        if self.case not in {Case.JUMP, Case.BUSY}:
+        if self.case not in {Case.JUMP, Case.JUMP_ROTATION, Case.BUSY}:
             return ()
         due_s = np.arange(self.period_s, self.seconds - LATER_S - self.period_s / 2, self.period_s)
         later_s = np.random.default_rng((11, self.seed)).uniform(0.0, LATER_S, len(due_s))
@@ -94,11 +97,14 @@ class Plan:
         x, y, turn = np.cos(angle), np.sin(angle), -1.0 if self.seed % 2 else 1.0
         drift = f"--drift={0.05 * x:.4f},{0.05 * y:.4f},{0.05 * turn},0"
         steps = (f"{0.1 * x:.4f},{0.1 * y:.4f},0,0", f"0,0,{0.1 * turn},0")
-        jumps = [f"--jump={time_s}:{steps[k % 2]}" for k, time_s in enumerate(self.jump_times_s)]
+        first = int(self.case is Case.JUMP_ROTATION)
+        jumps = [
+            f"--jump={time_s}:{steps[k % 2]}" for k, time_s in enumerate(self.jump_times_s, first)
+        ]
         match self.case:
             case Case.DRIFT | Case.RESTART:
                 return [drift]
-            case Case.JUMP:
+            case Case.JUMP | Case.JUMP_ROTATION:
                 return jumps
             case Case.BUSY:
                 return [drift, *jumps]

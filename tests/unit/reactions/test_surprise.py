@@ -23,7 +23,7 @@ WINDOW = np.array([0.0057, 0.0057, np.deg2rad(0.014), 0.0006])
 LOOK = np.array([0.01, 0.01, np.deg2rad(0.01), 0.0003])
 BIAS = np.array([0.06, -0.04, 0.0, 0.0])
 WINDOW_S, LOOK_S = 2.5, 4.0
-FLAGS = ("registration.jump-suspected", "registration.passive-jump")
+FLAGS = ("registration.jump-suspected", "registration.jump", "registration.passive-jump")
 
 
 class Sky:

@@ -31,6 +31,14 @@ def story():
     return story
 
 
+@pytest.fixture
+def calm():
+    """A mirror that hardly drifts, well known."""
+    story = Story(Mode.AUTO, replace(POLICY, drift_rate=POLICY.drift_rate / 10.0)).meet()
+    story.see(n_windows=8)
+    return story
+
+
 class TestSuspicion:
     """One window far out."""
 
@@ -144,11 +152,46 @@ class TestDecision:
         story.see(half)
         assert "jump-suspected" not in story.alarms
         story.see(there)
-        assert "jump-suspected" in story.alarms
+        assert "registration.jump" in story.logged
         story.see(there)
         known = story.state.registration
         assert known.alpha.rotation_rad == pytest.approx(there.rotation_rad, abs=5e-5)
         assert "registration.jump" in story.logged
+
+    def test_one_that_no_window_alone_tells_is_named_by_two_that_agree(self, calm):
+        """0.012 deg are 3.4 σ of what is expected of a window, 4.1 σ of the mean of two."""
+        story, there = calm, moved(rotation_rad=np.deg2rad(0.012))
+        story.see(there)
+        assert not {"registration.jump", "registration.jump-suspected"} & {*story.logged}
+        story.see(there)
+        assert "registration.jump" in story.logged
+        assert "registration.jump-suspected" not in story.logged
+        known = story.state.registration
+        assert known.jumped_ns_utc == story.now_ns
+        assert known.alpha.rotation_rad == pytest.approx(there.rotation_rad, abs=1e-5)
+
+    def test_windows_on_either_side_name_none(self, calm):
+        for turn in (0.012, -0.012, 0.012, -0.012):
+            calm.see(moved(rotation_rad=np.deg2rad(turn)))
+        assert "registration.jump" not in calm.logged
+
+    def test_an_outlier_next_to_an_unlucky_window_is_none(self, calm):
+        calm.see(moved(rotation_rad=np.deg2rad(0.006)))
+        calm.see(moved(rotation_rad=np.deg2rad(0.03)))
+        assert "registration.jump" not in calm.logged
+        calm.see(n_windows=1)
+        assert "window.outlier" in calm.logged
+        assert "registration.jump" not in calm.logged
+
+    def test_what_is_half_before_it_does_not_bend_what_is_known_after_it(self, calm):
+        """The first window after a jump agrees with the second by its noise, and is of both."""
+        story, step = calm, np.deg2rad(0.02)
+        story.see(moved(rotation_rad=0.6 * step))
+        story.see(moved(rotation_rad=step))
+        known = story.state.registration
+        assert "registration.jump" in story.logged
+        assert known.n_windows == 1
+        assert known.alpha.rotation_rad == pytest.approx(ALPHA.rotation_rad + step, abs=1e-5)
 
     def test_a_drift_ten_times_faster_than_expected_is_no_jump_after_another(self, story):
         for k in range(1, 20):

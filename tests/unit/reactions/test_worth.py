@@ -81,7 +81,8 @@ def test_a_loss_of_another_matrix_is_not(story):
 
 def test_soon_after_an_update_it_takes_twice_as_much(story):
     story.use("cm-2")
-    story.see(moved(NEAR, shift_x_subap=0.04), n_windows=4)
+    for k in range(1, 9):
+        story.see(moved(NEAR, shift_x_subap=0.005 * k))
     there = moved(NEAR, shift_x_subap=0.04)
     assert not judged(story, told(loss_m=0.8e-9), alpha=there, matrix_id="cm-2")
     assert judged(story, told(loss_m=1.5e-9), alpha=there, matrix_id="cm-2")
@@ -106,6 +107,21 @@ def test_a_registration_that_may_have_jumped_makes_nothing(story):
     story.see(moved(shift_x_subap=0.4))
     assert story.state.registration.candidate is not None
     assert not judged(story, told(loss_m=5e-9))
+
+
+def test_a_jump_asks_for_one_whatever_it_wins(story):
+    story.see(moved(NEAR, rotation_rad=np.deg2rad(0.04)), n_windows=2)
+    assert "registration.jump" in story.logged
+    (made,) = story.asked(ev.MakeMatrix)
+    assert made.why == "cm-1 was made before the mirror jumped"
+
+
+def test_a_jump_that_a_verdict_still_reaches_asks_for_none(story):
+    story.use("cm-2")
+    story.effects.clear()
+    story.see(moved(NEAR, rotation_rad=np.deg2rad(0.018)), n_windows=4)
+    assert "registration.jump" in story.logged
+    assert not story.asked(ev.MakeMatrix)
 
 
 def test_in_hold_nothing_is_worth_it(story):

@@ -35,7 +35,7 @@ from sim_rtc.computer import RealTimeComputer
 from sim_rtc.feed import Ahead
 from sim_rtc.options import parse_options
 from sim_rtc.truth import WavefrontError
-from studies.campaign.night import blocks_of
+from studies.campaign.telemetry import blocks_of
 
 SETTLING_S = 0.5
 N_BATCHES = 20

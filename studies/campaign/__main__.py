@@ -22,7 +22,8 @@ from typing import Any
 
 from service.config import load_settings
 from service.config.floor import floor_of
-from studies.campaign.night import Estimator, Night, play, without_dither
+from studies.campaign.night import play
+from studies.campaign.plan import Estimator, Night, without_dither
 from studies.campaign.plots import plot
 from studies.campaign.summary import Row, table
 from studies.campaign.trouble import Trouble

@@ -28,7 +28,8 @@ from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, Workbench
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer import RealTimeComputer
-from studies.campaign.night import LINE_FRACTIONS, SETTLING_S, blocks_of, loop_of
+from studies.campaign.night import loop_of
+from studies.campaign.telemetry import LINE_FRACTIONS, SETTLING_S, blocks_of
 
 DITHERED = (409, 427, 445, 463)
 AMPLITUDE_M = 5e-9

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from service.estimation.estimator import model_error
-from studies.campaign.night import Estimator
+from studies.campaign.plan import Estimator
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]

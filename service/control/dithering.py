@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -35,6 +35,9 @@ class Demand:
 
     settling_s: float = 0.0
     """Dither before a sitting that comes after a pause, seconds."""
+
+    window_sigma: Array = field(default_factory=lambda: np.full(4, np.inf))
+    """``(4,)`` 1 σ that one window may have where it follows on the last without pause."""
 
     longest_s: float = np.inf
     """From one sitting to the next, whatever α does meanwhile, seconds."""
@@ -137,11 +140,15 @@ def _variance_before(precision: Array, demand: Demand, total_m: float, interval_
 
 
 def _without_pause(precision: Array, demand: Demand) -> float:
-    """Return the weakest dither that, without pause, holds what is asked for or nearly the best."""
+    """Return the weakest dither that, without pause, holds what is asked for or nearly the best.
+
+    Each of its windows tells what one alone must.
+    """
     best = _variance_before(precision, demand, demand.budget_m, demand.window_s)
     allowed = np.maximum(demand.sigma**2, NEARLY_BEST**2 * best)
     noise = allowed**2 / (demand.drift_rate**2 * demand.window_s) - allowed
-    return min(_amplitude(precision, demand, np.sqrt(noise)), demand.budget_m)
+    of_window = np.minimum(np.sqrt(noise), demand.window_sigma)
+    return min(_amplitude(precision, demand, of_window), demand.budget_m)
 
 
 def clear_of(

@@ -42,6 +42,13 @@ USABLE = np.array([0.03, 0.03, np.deg2rad(0.04), 0.003])
 CHANGE = 1.25
 """The amplitude stays while the best one is within this factor of it."""
 
+JUMP = np.array([0.1, 0.1, np.deg2rad(0.1), np.inf])
+"""What two windows must tell when it happens at once (numeric units): a tenth of a subaperture, a
+tenth of a degree."""
+
+STANDS_OUT = 6.0
+"""A jump of so many σ of one window is told by two, wherever in the first it falls."""
+
 _SLOWEST = 1e-9
 """Random walk after a second, numeric units: nothing on a telescope stands stiller."""
 
@@ -143,6 +150,7 @@ def _demand(
         budget_m=budget_m(rtc, policy),
         window_s=policy.window_s,
         settling_s=SETTLING_S,
+        window_sigma=JUMP / STANDS_OUT,
         longest_s=policy.longest_pause_s,
     )
     lengths = window_lengths_s(policy)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -86,6 +88,16 @@ def test_a_small_budget_needs_long_sittings(budget_nm, length_s):
 def test_no_sitting_is_so_long_that_alpha_walks_away_inside_it():
     asked = demand(0.005, budget_m=0.5e-9, drift=20 * SLOW)
     assert sitting_s(KAPPA, asked, (2.0, 5.0, 10.0, 20.0, 60.0)) == 20.0
+
+
+def test_without_pause_each_window_tells_what_one_alone_must():
+    asked = replace(demand(drift=60.0 * SLOW), longest_s=0.0)
+    weak = schedule(KAPPA, asked)
+    told = replace(asked, window_sigma=np.array([np.inf, np.inf, np.deg2rad(0.004), np.inf]))
+    found = schedule(KAPPA, told)
+    assert found.total_m > weak.total_m
+    assert KAPPA[2] / (found.total_m * np.sqrt(5.0)) == pytest.approx(np.deg2rad(0.004))
+    assert schedule(KAPPA, replace(told, budget_m=weak.total_m)).total_m == weak.total_m
 
 
 def test_a_fast_flexure_is_followed_without_pause_by_no_more_than_it_needs():

@@ -256,8 +256,7 @@ class Workbench:
         ``magnitude`` is the star's; None: the noise of the settings.
         """
         model, n_modes = self._model, len(in_use)
-        seen = self._sensor.near(alpha).matrix_at(alpha)
-        timing = replace(timing, optical_gain=timing.optical_gain / self._sensor.ratio())
+        seen = self._sensor.at_unit_gain(alpha).matrix_at(alpha)
         flat = seen if self._sensor.is_flat else model.interaction_matrix(alpha)
         fresh = reconstruct(flat, self._recipe(n_modes)).matrix
         noise = self._compute.slope_noise
@@ -303,13 +302,9 @@ class Workbench:
         bound: float,
     ) -> GateVerdict:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
-        near = self._sensor.near(alpha)
-        loop = replace(
-            loop,
-            outer=outer_of(self._model),
-            optical_gain=loop.optical_gain / self._sensor.ratio()[: len(reconstructor)],
-        )
-        return judge(reconstructor, near, alpha, covariance, loop, bound=bound)
+        loop = replace(loop, outer=outer_of(self._model))
+        at_work = self._sensor.at_unit_gain(alpha)
+        return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
 
     def watch(
         self, state: passive.Passive, start: Misregistration

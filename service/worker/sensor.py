@@ -8,6 +8,7 @@ optical gain is what that residual makes of them, so the model follows them.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,17 @@ class Sensor:
             power = np.einsum("ij,ij->j", flat, flat)
             self._ratio = np.einsum("ij,ij->j", kept.matrix, flat) / power
         return np.asarray(self._ratio, dtype=np.float64)
+
+    def at_unit_gain(self, alpha: Misregistration) -> Linearisation:
+        """Return the linearisation near ``alpha``, each mode as strong as for a flat wavefront.
+
+        An optical gain multiplies it; what the working point does to the shape of a mode stays.
+        """
+        near = self.near(alpha)
+        if self.is_flat:
+            return near
+        ratio = self.ratio().astype(np.float32)
+        return replace(near, matrix=near.matrix / ratio, derivatives=near.derivatives / ratio)
 
     def follow(self, modes: tuple[int, ...], optical_gain: NDArray[np.complex128]) -> bool:
         """Take the working point from the optical gains of dithered modes; whether it moved.

@@ -54,14 +54,17 @@ def edge_motion_m(
     with ``N`` that of ``V^-1 g R n`` and the mean taken over the unit circle.
     """
     eigenvalues, vectors = np.linalg.eig(gains[:, None] * coupling.astype(float))
-    driven = np.linalg.solve(vectors, gains[:, None] * reconstructor.astype(float))
+    commanded = gains[:, None] * reconstructor.astype(float)
+    # V^-1 S V^-H of the real n by n S: the slopes are many, and complex they would cost most of all
+    half = np.linalg.solve(vectors, commanded @ commanded.T)
+    driven = np.linalg.solve(vectors, half.conj().T)
     turns = np.pi * (np.arange(_N_FREQUENCIES) + 0.5) / _N_FREQUENCIES
     delayed = np.exp(-1j * turns * delay_frames)[:, None]
     response = delayed / (1.0 - leak * np.exp(-1j * turns)[:, None] + eigenvalues * delayed)
     # conjugate pairs of eigenvalues make the other half of the circle the conjugate of this one
-    covariance = (driven @ driven.conj().T) * (response.T @ response.conj() / _N_FREQUENCIES)
+    covariance = driven * (response.T @ response.conj() / _N_FREQUENCIES)
     seen = outer.actuators[:, : len(gains)] @ vectors
-    power = np.einsum("ai,ij,aj->a", seen, covariance, seen.conj()).real
+    power = np.einsum("ai,ai->a", seen @ covariance, seen.conj()).real
     return float(np.sqrt(power.max()))
 
 

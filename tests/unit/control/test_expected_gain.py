@@ -116,6 +116,18 @@ def test_it_is_what_a_loop_leaves_when_run_frame_by_frame():
     assert left == pytest.approx(np.sqrt(power), rel=0.02)
 
 
+def test_modes_that_are_the_eigenvectors_and_mixtures_of_them_are_summed_alike():
+    """A ten-thousandth of every mode in every other makes general eigenvectors of single modes."""
+    fresh = invert(matrix_at(Misregistration()), N_CONTROLLED).matrix
+    mixing = np.eye(N_CONTROLLED) + 1e-4 * np.random.default_rng(6).standard_normal(
+        (N_CONTROLLED, N_CONTROLLED)
+    )
+    mixed = (mixing @ fresh).astype(np.float32)
+    found = expected_gain(mixed, fresh, matrix_at(Misregistration()), TIMING, SKY)
+    assert found.pole_radius != found.fresh_pole_radius
+    assert abs(found.loss_m) < 2e-4 * found.wavefront_m
+
+
 def test_the_tail_of_a_power_law_is_its_integral():
     modes = np.arange(1, 301)
     law = modes ** (-11 / 6)

@@ -108,11 +108,11 @@ class TestDither:
 class TestMargin:
     """When the matrix in use is judged."""
 
-    def test_after_two_windows_and_then_every_ten_seconds(self):
+    def test_after_two_windows_and_then_every_fifteen_seconds(self):
         story = Story(Mode.HOLD).meet()
         assert not of_kind(story.see(), ev.JudgeMatrix)
         assert of_kind(story.see(), ev.JudgeMatrix) == [ev.JudgeMatrix(id="initial")]
-        assert not of_kind(story.wait(10), ev.JudgeMatrix)
+        assert not of_kind(story.wait(15), ev.JudgeMatrix)
         assert of_kind(story.wait(1), ev.JudgeMatrix)
 
     def test_not_while_a_reconstructor_is_being_computed(self):

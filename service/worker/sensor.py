@@ -29,8 +29,8 @@ FOLLOWED = 0.04
 0.02 % in magnification. Less is not worth another linearisation."""
 
 STRENGTHS = (0.05, 4.0)
-"""Variance of the residual over that at the instrument's r0. Below the first a wavefront is flat:
-0.1 nm of error of the linear simulator; the second is 2.3" of seeing."""
+"""Variance of the residual over that at the instrument's r0. Of the first a wavefront is all but
+flat, and gains above 1 ask for less; the second is 2.3" of seeing."""
 
 ModelOf = Callable[[Halo | None], RtcInteractionModel]
 
@@ -77,10 +77,6 @@ class Sensor:
         self._linearisation = self._model.linearise(alpha)
         self._ratio = None
         return self._linearisation
-
-    def interaction_matrix(self, alpha: Misregistration) -> NDArray[np.float32]:
-        """Return D(α), ``(n_slopes, n_modes)``, slope per metre OPD."""
-        return self._model.interaction_matrix(alpha)
 
     def ratio(self) -> Array:
         """Return ``(n_modes,)`` how much of the flat response is left of each mode at work.

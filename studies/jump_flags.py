@@ -66,7 +66,7 @@ class Night:
     def mean(self, end_s: float) -> Array:
         """Return where the mirror was on average in the window that ends then."""
         after = np.clip((end_s - self.at_s) / WINDOW_S, 0.0, 1.0)
-        return self.drift * (end_s - WINDOW_S / 2.0) / 60.0 + after * self.jump
+        return np.asarray(self.drift * (end_s - WINDOW_S / 2.0) / 60.0 + after * self.jump)
 
 
 def main() -> int:

@@ -83,6 +83,9 @@ class AlphaView(View):
     restored_ns_utc: int | None
     """When it was taken over from before a restart of the service; null: it was not."""
 
+    jumped_ns_utc: int | None
+    """When it was last found to have jumped, the service's clock; null: it has not."""
+
     suspected: FourView | None
     """Where the last window saw it, too far away to be believed before another one has; null: no
     jump is suspected."""

@@ -336,6 +336,7 @@ async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(cl
         ),
         pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0),
         restored_ns_utc=60 * SECOND,
+        jumped_ns_utc=61 * SECOND,
     )
     service.change(registration=known)
     body = await body_of(client, "/v1/alpha")
@@ -343,6 +344,7 @@ async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(cl
     assert body["valid_until_ns_utc"] == 120 * SECOND
     assert (body["age_s"], body["window_age_s"]) == (10.0, 30.0)
     assert body["restored_ns_utc"] == 60 * SECOND
+    assert body["jumped_ns_utc"] == 61 * SECOND
     assert body["optical_gains"] == [
         {"mode": 501, "gain": 0.6, "gain_sigma": 0.01, "gain_scatter": 0.03, "t_ns_utc": 1}
     ]
@@ -353,7 +355,14 @@ async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(cl
 
 async def test_alpha_of_which_little_is_known_says_null(client):
     body = await body_of(client, "/v1/alpha")
-    unknown = ("passive_bias", "passive_bias_sigma", "pointing", "restored_ns_utc", "suspected")
+    unknown = (
+        "passive_bias",
+        "passive_bias_sigma",
+        "pointing",
+        "restored_ns_utc",
+        "jumped_ns_utc",
+        "suspected",
+    )
     assert all(body[name] is None for name in (*unknown, "window_age_s"))
 
 

@@ -95,7 +95,7 @@ class Listener:
     def close(self) -> None:
         self.session.close()
 
-    def wait_for(self, condition, timeout_s: float = 10.0):
+    def wait_for(self, condition, timeout_s: float = 30.0):
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             found = condition()
@@ -164,7 +164,7 @@ class Listener:
         self.session.declare_queryable(KEYS.matrix(manifest.id), answer)
         self.token = self.session.liveliness().declare_token(KEYS.alive(Role.SERVICE))
 
-    def acknowledgement(self, timeout_s: float = 8.0):
+    def acknowledgement(self, timeout_s: float = 30.0):
         return self.acknowledgements.get(timeout=timeout_s)
 
 

@@ -78,12 +78,17 @@ def on_window(
 
 
 def _floor(known: Registration | None, estimate: DitheredEstimate, policy: Policy) -> Array:
-    """Return the model error by all windows so far: what is set, and what they do not explain."""
+    """Return the model error by all windows so far: what is set, and what they do not explain.
+
+    A window weaker than what is asked of α cannot tell: the chance in its misfit, times its own σ,
+    would be more than any model error.
+    """
+    before = policy.floor if known is None else known.floor
+    if np.any(np.diag(estimate.covariance) > policy.dither_sigma**2):
+        return before
     squared = policy.floor**2 + model_error(estimate.covariance, estimate.misfit) ** 2
-    if known is None:
-        return np.asarray(np.sqrt(squared))
-    share = 1.0 / min(known.n_windows + 1, MISFIT_WINDOWS)
-    return np.asarray(np.sqrt(known.floor**2 + share * (squared - known.floor**2)))
+    share = 1.0 if known is None else 1.0 / min(known.n_windows + 1, MISFIT_WINDOWS)
+    return np.asarray(np.sqrt(before**2 + share * (squared - before**2)))
 
 
 def _gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:

@@ -50,6 +50,12 @@ def test_one_odd_misfit_among_many_moves_the_model_error_by_a_tenth(story):
     np.testing.assert_allclose(added, 0.1 * MODEL_ERROR * 0.5 * np.diag(PRECISE))
 
 
+def test_a_window_weaker_than_what_is_asked_of_alpha_says_nothing_of_the_model(story):
+    weak = np.diag(np.maximum(np.diag(PRECISE), (1.1 * story.policy.dither_sigma) ** 2))
+    story.see(n_windows=5, misfit=1.5, covariance=weak)
+    np.testing.assert_array_equal(story.state.registration.floor, story.policy.floor)
+
+
 def test_each_window_leaves_its_own_estimate_in_the_history(story):
     story.see()
     story.see(moved(shift_x_subap=0.004))

@@ -16,6 +16,7 @@ from service.reactions.shelf import (
     with_record,
     with_state,
 )
+from service.reactions.worth import outdated
 from service.state import (
     Assessment,
     Level,
@@ -32,15 +33,30 @@ Step = tuple[TrackerState, tuple[Effect, ...]]
 def on_matrix(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
     """Shelve a new reconstructor; send it if it passed the gate and nobody need approve."""
     record, wanted = made.record, made.wanted
+    overtaken = not wanted and _jumped_since(state, record, state.making_since_ns_utc)
     state = shelved(state, record, now_ns)
     if made.asked_modes is not None:
         state = with_limit(state, record, made.asked_modes, made.why_fewer, now_ns)
     if record.state is MatrixState.REFUSED:
         return state, ()
+    if overtaken:
+        text = f"{record.id}: the mirror jumped while it was made"
+        state = with_state(state, record.id, MatrixState.DISCARDED, text)
+        return logged(state, "reconstructor.discarded", text, now_ns), ()
     believed = state.registration is None or state.registration.usable
     if why_unsendable(state) is None and (wanted or (state.mode is Mode.AUTO and believed)):
         return send(state, record.id, now_ns)
     return state, ()
+
+
+def _jumped_since(
+    state: TrackerState, record: ReconstructorRecord, began_ns_utc: int | None
+) -> bool:
+    """Return whether a jump has been named since, to where the gate's verdict does not reach."""
+    known = state.registration
+    if known is None or known.jumped_ns_utc is None or began_ns_utc is None:
+        return False
+    return known.jumped_ns_utc >= began_ns_utc and outdated(state, record)
 
 
 def shelved(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> TrackerState:

@@ -11,7 +11,14 @@ from service.reactions.matrices import Step
 from service.reactions.mode_ladder import fewer_than, more_to_try
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.worth import outdated, why_worthwhile
-from service.state import MatrixState, Mode, Registration, RtcView, TrackerState
+from service.state import (
+    MatrixState,
+    Mode,
+    ReconstructorRecord,
+    Registration,
+    RtcView,
+    TrackerState,
+)
 
 MIN_WINDOWS = 2
 """Windows that must agree before anything is made from them."""
@@ -101,7 +108,7 @@ def _next_attempt_ns(state: TrackerState, rtc: RtcView, policy: Policy) -> int:
 
     One refused for another α, or for more modes than are controlled, holds back no other.
     """
-    own = [r for r in state.reconstructors if r.parent is not None]
+    own = [r for r in state.reconstructors if r.parent is not None and not _overtaken(state, r)]
     if not own:
         return 0
     last = own[-1]
@@ -109,3 +116,8 @@ def _next_attempt_ns(state: TrackerState, rtc: RtcView, policy: Policy) -> int:
     again = last.state in failed and not outdated(state, last) and last.n_modes <= rtc.n_controlled
     wait_s = policy.refused_interval_s if again else policy.minimum_interval_s
     return last.created_ns_utc + int(wait_s * SECOND_NS)
+
+
+def _overtaken(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether a reconstructor was never sent, and α is elsewhere by now."""
+    return record.state is MatrixState.DISCARDED and outdated(state, record)

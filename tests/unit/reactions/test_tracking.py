@@ -72,6 +72,20 @@ class TestSuspicion:
         with pytest.raises(CommandError, match="jump is suspected"):
             story.tell(ev.Approve(id="cm-1"))
 
+    def test_one_that_is_made_while_it_jumps_is_not_sent_and_another_is_made_at_once(self, story):
+        assert story.state.making_since_ns_utc is not None
+        story.see(THERE, n_windows=3)
+        effects = story.make("cm-1", alpha=ALPHA)
+        assert not of_kind(effects, ev.SendMatrix)
+        assert of_kind(effects, ev.MakeMatrix)
+        assert story.matrix_state("cm-1") is MatrixState.DISCARDED
+        assert "jumped while it was made" in story.state.reconstructor("cm-1").reason
+        assert of_kind(story.make("cm-2"), ev.SendMatrix)
+
+    def test_one_that_an_operator_wants_back_is_sent_all_the_same(self, story):
+        story.see(THERE, n_windows=3)
+        assert of_kind(story.make("cm-1", alpha=ALPHA, wanted=True), ev.SendMatrix)
+
     def test_a_dither_is_due_until_a_window_has_decided(self, story):
         story.see(THERE)
         assert story.state.dither_due_since_ns_utc == story.now_ns

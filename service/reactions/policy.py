@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.misregistration import Misregistration
+
 SECOND_NS = 1_000_000_000
 
 
@@ -37,6 +39,9 @@ class Policy:
 
     mode_information: NDArray[np.float64] | None = None
     """``(n_modes, 4, 4)`` what each mode tells of α; None: the model is not known yet."""
+
+    start: Misregistration = field(default_factory=Misregistration)
+    """Where the fit of a window begins while α is not known: the mirror's nominal rotation."""
 
     dither_frequencies_hz: tuple[float, ...] | None = None
     """None: spread over 0.2-0.35 of the frame rate."""

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from service.estimation.estimator import DitheredEstimate, model_error
 from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
 from service.estimation.noisymatrix import RandomEstimate
-from service.model.misregistration import Misregistration
 from service.reactions.acquisition_plan import missed
 from service.reactions.dither import found_again
 from service.reactions.estimate import Measured
@@ -53,7 +52,7 @@ def on_window(
     state: TrackerState, estimate: WindowEstimate | RandomEstimate, policy: Policy, now_ns: int
 ) -> TrackerState:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
-    reason = _why_useless(state, estimate)
+    reason = _why_useless(state, estimate, policy)
     if reason is not None:
         return refuse_window(state, reason, now_ns)
     state = without_alarm(found_again(state, now_ns), "columns-misaligned", now_ns)
@@ -98,7 +97,7 @@ def _gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
     return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
 
 
-def _why_useless(state: TrackerState, estimate: DitheredEstimate) -> str | None:
+def _why_useless(state: TrackerState, estimate: DitheredEstimate, policy: Policy) -> str | None:
     """Return why a window's estimate must not be used, or None."""
     if state.rtc is None or estimate.session != state.rtc.session:
         return "the RTC has restarted since"
@@ -118,10 +117,13 @@ def _why_useless(state: TrackerState, estimate: DitheredEstimate) -> str | None:
     if np.any(sigma > USELESS_SIGMA):
         return "too uncertain: raise the dither's amplitude or the window's length"
     known = state.registration
-    near = Misregistration() if known is None else known.alpha
+    near = policy.start if known is None else known.alpha
     distance = np.abs(estimate.alpha.vector - near.vector)
     if np.any(distance > CAPTURE_RANGE):
-        return f"outside the capture range: {estimate.alpha.to_boundary()}"
+        return (
+            f"outside the capture range: {estimate.alpha.to_boundary()}, "
+            f"the fit began at {near.to_boundary()}"
+        )
     return None
 
 

@@ -140,8 +140,11 @@ class Supervisor:
             group.create_task(self._save())
             description = await self._described()
             self._streams = Streams(description=description)
-            known = description.mode_information
-            self._policy = replace(self._policy, mode_information=known)
+            self._policy = replace(
+                self._policy,
+                mode_information=description.mode_information,
+                start=description.start,
+            )
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"
             self._post(ev.Noted(name="service.ready", text=text))
             for work in (self._listen, self._tick, self._fit, self._watch):

@@ -96,6 +96,7 @@ class Workbench:
             mode_variance_m2=self._model.basis.variance_m2,
             actuators=actuators_of(self._model),
             mode_information=information(linearisation),
+            start=self._start,
         )
 
     def fit(

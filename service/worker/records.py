@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from service.control.gate import GateVerdict
 from service.control.recipe import Method
 from service.control.reconstructor import MAX_CONDITION
 from service.estimation.edge import Actuators
+from service.model.misregistration import Misregistration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +55,9 @@ class Description:
 
     mode_information: NDArray[np.float64] | None = None
     """``(n_modes, 4, 4)`` what a dither of each mode tells of α; None: not worked out."""
+
+    start: Misregistration = field(default_factory=Misregistration)
+    """Where a fit starts while nothing is known of α: the mirror's nominal rotation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -111,7 +111,9 @@ class Observatory:
         """
         self.dome = Dome(options)
         description = workbench.describe()
-        self.policy = replace(policy, mode_information=description.mode_information)
+        self.policy = replace(
+            policy, mode_information=description.mode_information, start=description.start
+        )
         self.latencies = latencies or Latencies()
         system = self.dome.computer.identity.system
         self.state = TrackerState(system=system, mode=mode)

@@ -7,9 +7,18 @@ import pytest
 from service import events as ev
 from service.estimation.estimator import MODEL_ERROR
 from service.estimation.lockin import WindowRefused
+from service.model.misregistration import Misregistration
 from service.reactions.estimate import HISTORY_LENGTH
 from service.state import Level, Mode
-from tests.unit.reactions.situations import ALPHA, PRECISE, START_NS, Story, estimate, moved
+from tests.unit.reactions.situations import (
+    ALPHA,
+    POLICY,
+    PRECISE,
+    START_NS,
+    Story,
+    estimate,
+    moved,
+)
 
 
 @pytest.fixture
@@ -102,6 +111,18 @@ def test_a_useless_window_is_refused_with_its_reason(story, changes, reason):
     assert (story.state.windows_accepted, story.state.windows_refused) == (1, 1)
     assert story.state.log[-1].name == "window.refused"
     assert re.search(reason, story.state.log[-1].text)
+
+
+def test_while_alpha_is_not_known_the_capture_range_is_about_the_nominal_rotation():
+    """65.08 deg, as at the LBT; the fit of the window began there."""
+    nominal = Misregistration(rotation_rad=np.deg2rad(65.08))
+    story = Story(Mode.AUTO, policy=replace(POLICY, start=nominal, acquires=True)).meet()
+    story.see(Misregistration(), n_windows=2)
+    assert story.state.registration is None
+    assert re.search("outside the capture range.*rotation_deg': 65.08", story.state.log[-1].text)
+    story.see(moved(nominal, rotation_rad=0.01), n_windows=3)
+    assert story.state.registration.alpha.rotation_rad == pytest.approx(nominal.rotation_rad + 0.01)
+    assert not story.state.acquisition.under_way
 
 
 def test_misaligned_columns_are_an_alarm_until_a_window_is_good_again(story):

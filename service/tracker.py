@@ -23,6 +23,7 @@ from service.reactions.matrices import (
     shelved,
 )
 from service.reactions.measurements import MEASURING, meanwhile, on_measurement
+from service.reactions.mode_ladder import declined
 from service.reactions.noisy import awaits_its_dither, gather, on_noisy
 from service.reactions.operator import on_command
 from service.reactions.policy import Policy
@@ -54,6 +55,7 @@ def step(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step
     refuse_meanwhile(state, event)
     before = state
     state, effects = _react(meanwhile(state, event, now_ns), event, policy, now_ns)
+    state = declined(before, state, event, now_ns)
     if state.measuring is not None:
         return state, effects
     state, more = acquire(before, state, event, policy, now_ns)

@@ -1,9 +1,10 @@
-"""How many modes to control: fewer where the gate will not have more, and more again later."""
+"""How many modes to control: fewer where gate, RTC or operator will not have more; more later."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from service.events import Event, Reject
 from service.reactions.journal import logged
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import (
@@ -26,6 +27,9 @@ FIRST_WAIT_S = 60.0
 """After modes were lowered, before more are tried."""
 
 LONGEST_WAIT_S = 1800.0
+
+OPERATORS_WAIT_S = 3600.0
+"""After an operator declined more modes: who has said no is not asked again in the same hour."""
 
 FORGIVEN_AFTER_S = 3600.0
 """A limit found again later than this has nothing to do with the last one."""
@@ -81,10 +85,50 @@ def with_limit(
     return state
 
 
-def _limited(state: TrackerState, n_modes: int, reason: str, now_ns: int) -> TrackerState:
-    before, wait_s = state.mode_limit, FIRST_WAIT_S
+def declined(before: TrackerState, state: TrackerState, event: Event, now_ns: int) -> TrackerState:
+    """Note that a reconstructor which had passed the gate was declined by the RTC or an operator.
+
+    If it has more modes than are controlled, that is what it was made for: no more are tried for a
+    while, longer each time. An acquisition counts its own failures.
+    """
+    if state.reconstructors is before.reconstructors or state.acquisition.under_way:
+        return state
+    rtc = state.rtc or before.rtc
+    if rtc is None or rtc.n_controlled == 0:
+        return state
+    earlier = {record.id: record.state for record in before.reconstructors}
+    for record in state.reconstructors:
+        wait_s = _wait_after(record, earlier.get(record.id), event)
+        if wait_s is not None and record.n_modes > rtc.n_controlled:
+            reason = f"{record.id} was {record.state}: {record.reason}"
+            state = _limited(state, rtc.n_controlled, reason, now_ns, wait_s)
+    return state
+
+
+def _wait_after(
+    record: ReconstructorRecord, earlier: MatrixState | None, event: Event
+) -> float | None:
+    """Return for how long more modes are not tried after what became of one; None: no matter."""
+    if earlier is None or earlier is record.state:
+        return None
+    if record.state in {MatrixState.REJECTED, MatrixState.FAILED}:
+        return FIRST_WAIT_S
+    if record.state is MatrixState.DISCARDED and isinstance(event, Reject):
+        return OPERATORS_WAIT_S
+    return None
+
+
+def _limited(
+    state: TrackerState,
+    n_modes: int,
+    reason: str,
+    now_ns: int,
+    first_wait_s: float = FIRST_WAIT_S,
+) -> TrackerState:
+    before, wait_s = state.mode_limit, first_wait_s
     if before is not None and now_ns - before.since_ns_utc < FORGIVEN_AFTER_S * SECOND_NS:
-        wait_s = min(2.0 * before.wait_s, LONGEST_WAIT_S)
+        left_s = (before.until_ns_utc - now_ns) / SECOND_NS
+        wait_s = max(first_wait_s, min(2.0 * before.wait_s, LONGEST_WAIT_S), left_s)
     limit = ModeLimit(
         n_modes=n_modes,
         since_ns_utc=now_ns,

@@ -9,6 +9,15 @@ from service.state import MatrixState, ReconstructorRecord, TrackerState
 
 RECONSTRUCTORS_KEPT = 200
 
+RETURNS_KEPT = 100
+"""Newest of those that have been in use before: what an operator may want to go back to."""
+
+UNSENT_KEPT = 50
+"""Newest of those that were never sent: enough to see what is being refused, and why."""
+
+_UNSENT = frozenset({MatrixState.REFUSED, MatrixState.DISCARDED})
+_SPARE = frozenset({MatrixState.REJECTED, MatrixState.FAILED, MatrixState.SUPERSEDED})
+
 _RESTARTED = {
     MatrixState.PUBLISHED: MatrixState.FAILED,
     MatrixState.STAGED: MatrixState.FAILED,
@@ -23,20 +32,39 @@ def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRec
     time. What was under way has failed; a proposal's verdict is of another day.
     """
     own = [record for record in records if record.parent is not None]
-    return tuple(
+    taken_over = [
         replace(record, state=_RESTARTED[record.state], reason="the service restarted")
         if record.state in _RESTARTED
         else record
-        for record in own[-RECONSTRUCTORS_KEPT:]
-    )
+        for record in own
+    ]
+    return _thinned(taken_over, None)
 
 
 def with_record(state: TrackerState, record: ReconstructorRecord) -> TrackerState:
-    """Return the state with one more reconstructor; the oldest not in use gives way."""
+    """Return the state with one more reconstructor; what is needed least gives way."""
     shelf = [*(r for r in state.reconstructors if r.id != record.id), record]
-    if len(shelf) > RECONSTRUCTORS_KEPT:
-        shelf.remove(next(r for r in shelf if r.id != state.in_use))
-    return replace(state, reconstructors=tuple(shelf))
+    return replace(state, reconstructors=_thinned(shelf, state.in_use))
+
+
+def _thinned(
+    shelf: list[ReconstructorRecord], in_use: str | None
+) -> tuple[ReconstructorRecord, ...]:
+    """Return as many as are kept, oldest first.
+
+    First to go is what was never sent, however new what is worth going back to: a flood of
+    proposals that nobody wants must not wash away the way back.
+    """
+    excess = len(shelf) - RECONSTRUCTORS_KEPT
+    if excess <= 0:
+        return tuple(shelf)
+    unsent = [r.id for r in shelf if r.state in _UNSENT and r.id != in_use]
+    used = [r.id for r in shelf if r.state is MatrixState.SUPERSEDED]
+    kept = frozenset((*used[-RETURNS_KEPT:], in_use))
+    spare = [r.id for r in shelf if r.state in _SPARE and r.id not in kept]
+    first_to_go = [*unsent[:-UNSENT_KEPT], *spare, *unsent[-UNSENT_KEPT:]]
+    gone = frozenset(first_to_go[:excess])
+    return tuple(r for r in shelf if r.id not in gone)
 
 
 def with_changed(state: TrackerState, record: ReconstructorRecord) -> TrackerState:

@@ -25,7 +25,7 @@ class Assessment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModeLimit:
-    """More modes than these would not have passed the gate; they are tried again later."""
+    """More modes than these gate, RTC or operator would not have; they are tried again later."""
 
     n_modes: int
     """As many as may be controlled for now."""
@@ -38,4 +38,4 @@ class ModeLimit:
     """From one to the other; doubled each time the limit is found again."""
 
     reason: str
-    """What the gate said of more."""
+    """What was said of more: the words of the gate, the RTC or the operator."""

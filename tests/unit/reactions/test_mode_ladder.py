@@ -6,7 +6,13 @@ from itertools import pairwise
 import pytest
 
 from service import events as ev
-from service.reactions.mode_ladder import FIRST_WAIT_S, LADDER, LONGEST_WAIT_S, fewer_than
+from service.reactions.mode_ladder import (
+    FIRST_WAIT_S,
+    LADDER,
+    LONGEST_WAIT_S,
+    OPERATORS_WAIT_S,
+    fewer_than,
+)
 from service.state import MatrixState, Mode
 from tests.unit.reactions.situations import (
     POLICY,
@@ -172,3 +178,113 @@ def test_an_operators_own_number_is_neither_lowered_nor_raised():
     night.see(n_windows=2)
     (effect,) = of_kind(night.tell(ev.Refit(n_modes=450)), ev.MakeMatrix)
     assert effect.fewer == ()
+
+
+class Declined(Night):
+    """A night with 400 modes in use whose 500 somebody will not have."""
+
+    def __init__(self, mode=Mode.AUTO):
+        super().__init__()
+        (first,) = of_kind(self.see(n_windows=2), ev.MakeMatrix)
+        self.make_for(first, 400)
+        self.tell(ev.SetMode(mode=mode))
+
+    def for_s(self, seconds, decline):
+        """Let windows come for so long; every reconstructor asked for is made and declined."""
+        asked, effects = [], ()
+        for _ in range(round(seconds / 2.0)):
+            effects = (*effects, *self.see())
+            for effect in of_kind(effects, ev.MakeMatrix):
+                asked.append(effect)
+                made = self.make_for_nobody(effect)
+                decline(self, f"cm-{self.made}", made)
+            effects = ()
+        return asked
+
+    def make_for_nobody(self, effect):
+        self.made += 1
+        known = self.state.registration
+        made = record(
+            f"cm-{self.made}",
+            n_modes=effect.n_modes,
+            created_ns_utc=self.now_ns,
+            alpha=known.alpha,
+            sigma=known.sigma,
+        )
+        return self.tell(ev.MatrixMade(record=made, wanted=False, asked_modes=effect.n_modes))
+
+
+def the_operator(night, name, _effects):
+    night.tell(ev.Reject(id=name, reason="400 will do"))
+
+
+def the_rtc_rejects(night, name, _effects):
+    night.acknowledge(name, MatrixState.REJECTED, reason="at most 400")
+
+
+def the_rtc_refuses_the_modes(night, _name, effects):
+    (sent,) = of_kind(effects, ev.SendMatrix)
+    night.tell(ev.JobFailed(effect=sent, text="the RTC will not control 500 modes: range"))
+
+
+def nobody_answers(night, _name, _effects):
+    night.wait(5)
+
+
+def test_an_operator_who_declines_more_modes_is_not_asked_again_for_an_hour():
+    night = Declined(Mode.PROPOSE)
+    assert [made.n_modes for made in night.for_s(OPERATORS_WAIT_S - 60, the_operator)] == [500]
+    limit = night.state.mode_limit
+    assert (limit.n_modes, limit.wait_s) == (400, OPERATORS_WAIT_S)
+    assert limit.reason == "cm-2 was discarded: 400 will do"
+    assert [made.n_modes for made in night.for_s(120, the_operator)] == [500]
+
+
+@pytest.mark.parametrize("decline", [the_rtc_rejects, the_rtc_refuses_the_modes, nobody_answers])
+def test_an_rtc_that_will_not_have_more_modes_is_asked_less_and_less(decline):
+    night = Declined()
+    asked = night.for_s(900, decline)
+    assert [made.n_modes for made in asked] == [500] * 4  # 60, 120, 240, 480 s
+    assert night.state.mode_limit.wait_s == 480.0
+
+
+def test_updates_of_the_modes_in_use_go_on_meanwhile():
+    night = Declined(Mode.PROPOSE)
+    night.for_s(20, the_operator)
+    (update,) = of_kind(night.see(moved(shift_x_subap=0.05), n_windows=4), ev.MakeMatrix)
+    assert (update.n_modes, update.why[:8]) == (400, "moved by")
+
+
+def test_declining_an_update_of_the_modes_in_use_says_nothing_of_more():
+    night = Declined(Mode.PROPOSE)
+    night.policy = replace(WANTED, n_modes_target=400)
+    (update,) = of_kind(night.see(moved(shift_x_subap=0.05), n_windows=4), ev.MakeMatrix)
+    night.make_for(update, 400)
+    night.tell(ev.Reject(id="cm-2"))
+    assert night.state.mode_limit is None
+
+
+def test_a_proposal_that_another_one_replaces_has_not_been_declined():
+    night = Declined(Mode.PROPOSE)
+    (more,) = of_kind(night.wait(6), ev.MakeMatrix)
+    night.make_for(more, 500)
+    night.make("cm-other", n_modes=400)
+    assert night.matrix_state("cm-2") is MatrixState.DISCARDED
+    assert night.state.mode_limit is None
+
+
+def test_an_operators_own_request_for_more_is_heard_at_once_and_lifts_the_limit():
+    night = Declined(Mode.PROPOSE)
+    night.for_s(20, the_operator)
+    (asked,) = of_kind(night.tell(ev.Refit(n_modes=500)), ev.MakeMatrix)
+    night.make_for(asked, 500)
+    assert night.state.mode_limit.n_modes == 500
+
+
+def test_a_limit_found_by_the_gate_does_not_shorten_an_operators_no():
+    night = Declined(Mode.PROPOSE)
+    night.for_s(20, the_operator)
+    until_ns = night.state.mode_limit.until_ns_utc
+    (asked,) = of_kind(night.tell(ev.Refit(n_modes=500)), ev.MakeMatrix)
+    night.make_for(asked, 500, state=MatrixState.REFUSED)
+    assert night.state.mode_limit.until_ns_utc >= until_ns

@@ -3,6 +3,8 @@ import pytest
 from service.errors import UnknownIdError
 from service.reactions.shelf import (
     RECONSTRUCTORS_KEPT,
+    RETURNS_KEPT,
+    UNSENT_KEPT,
     restored,
     with_in_use,
     with_record,
@@ -59,6 +61,38 @@ def test_the_reconstructor_in_use_stays_on_a_full_shelf():
     assert len(state.reconstructors) == RECONSTRUCTORS_KEPT
     assert state.reconstructor("initial") is not None
     assert state.reconstructors[-1].id == f"cm-{RECONSTRUCTORS_KEPT + 4}"
+
+
+@pytest.mark.parametrize(
+    "unwanted", [MatrixState.REFUSED, MatrixState.DISCARDED, MatrixState.REJECTED]
+)
+def test_no_flood_of_what_nobody_wants_washes_away_the_way_back(unwanted):
+    state = with_record(with_in_use(with_record(STATE, foreign()), "initial"), record("cm-good"))
+    state = with_in_use(with_in_use(state, "cm-good"), "initial")
+    for number in range(2 * RECONSTRUCTORS_KEPT):
+        state = with_record(state, record(f"cm-{number}", unwanted))
+    assert len(state.reconstructors) == RECONSTRUCTORS_KEPT
+    assert state.reconstructor("cm-good").state is MatrixState.SUPERSEDED
+    assert state.in_use == "initial"
+    assert state.reconstructor("initial") is not None
+    assert state.reconstructors[-1].id == f"cm-{2 * RECONSTRUCTORS_KEPT - 1}"
+
+
+def test_after_many_updates_the_newest_to_go_back_to_and_the_newest_refused_are_kept():
+    state = STATE
+    for number in range(RECONSTRUCTORS_KEPT + 20):
+        state = with_record(state, record(f"cm-{number}", MatrixState.SUPERSEDED))
+        state = with_record(state, record(f"no-{number}", MatrixState.REFUSED))
+    last = RECONSTRUCTORS_KEPT + 19
+    assert len(state.reconstructors) == RECONSTRUCTORS_KEPT
+    assert all(state.reconstructor(f"cm-{last - n}") is not None for n in range(RETURNS_KEPT))
+    assert all(state.reconstructor(f"no-{last - n}") is not None for n in range(UNSENT_KEPT))
+
+
+def test_a_restarted_service_still_knows_the_way_back_after_a_flood():
+    flood = tuple(record(f"cm-{n}", MatrixState.DISCARDED) for n in range(RECONSTRUCTORS_KEPT))
+    kept = restored((record("cm-good", MatrixState.SUPERSEDED), *flood))
+    assert (len(kept), kept[0].id) == (RECONSTRUCTORS_KEPT, "cm-good")
 
 
 def test_a_reconstructor_nobody_knows_is_named():

@@ -201,6 +201,7 @@ def _bias(values: dict[str, Any]) -> PassiveBias:
         covariance=_covariance(values["covariance"]),
         shared=_numbers(values["shared"], (4, 4)),
         looked_ns_utc=int(values["looked_ns_utc"]),
+        excess=_numbers(values.get("excess", [0.0] * 4), (4,)),
     )
 
 

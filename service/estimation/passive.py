@@ -57,10 +57,16 @@ class PassiveEstimate:
     """``(4,)`` distance from the linearisation, numeric units."""
 
     @property
+    def bias_excess(self) -> NDArray[np.float64]:
+        """``(4,)`` variance of the bias beyond that of ``BIAS_FLOOR``, by what the scatter tells of
+        the wind; numeric units squared.
+        """
+        return np.asarray(np.diag(self.covariance) * BIAS_OVER_SCATTER**2)
+
+    @property
     def sigma(self) -> NDArray[np.float64]:
         """``(4,)`` 1 σ in numeric units where nothing is known of the bias."""
-        scatter = np.diag(self.covariance)
-        return np.asarray(np.sqrt(scatter * (1.0 + BIAS_OVER_SCATTER**2) + BIAS_FLOOR**2))
+        return np.asarray(np.sqrt(np.diag(self.covariance) + BIAS_FLOOR**2 + self.bias_excess))
 
     @property
     def determines(self) -> Determines:

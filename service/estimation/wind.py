@@ -6,12 +6,13 @@ subaperture and is wrong by up to 9 % on the diffractive telescope, 24 % on the 
 alone. Between them b is learnt, and a sparse dither then suffices.
 
 b has four parts. Those of rotation and magnification are small, but no more than the shifts' do
-they average out over consecutive looks, as a noise would.
+they average out over consecutive looks, as a noise would. How large b may be each look's own
+scatter tells: what it tells beyond all looks before is new, and may have changed b by as much.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,10 @@ class Joint:
 
     covariance: Array
     """``(8, 8)``."""
+
+    excess: Array = field(default_factory=lambda: np.zeros(4))
+    """``(4,)`` variance of the bias beyond ``BIAS_FLOOR`` that looks have told of, and that is in
+    the covariance or has been learnt away since."""
 
     @property
     def alpha(self) -> Array:
@@ -74,12 +79,29 @@ def begin_joint(measured: Array, covariance: Array) -> Joint:
     return forgotten(Joint(mean=np.concatenate([measured, np.zeros(4)]), covariance=full))
 
 
-def forgotten(joint: Joint) -> Joint:
-    """Return the estimate with nothing known of the bias any more; α stands."""
+def forgotten(joint: Joint, excess: Array | None = None) -> Joint:
+    """Return the estimate with nothing known of the bias any more; α stands.
+
+    ``excess`` ``(4,)`` is the bias' variance beyond ``BIAS_FLOOR`` by the look at hand, if any.
+    """
+    excess = np.zeros(4) if excess is None else excess
     covariance = joint.covariance.copy()
     covariance[4:] = covariance[:, 4:] = 0.0
-    covariance[4:, 4:] = np.diag(BIAS_FLOOR**2)
-    return Joint(mean=np.concatenate([joint.alpha, np.zeros(4)]), covariance=covariance)
+    covariance[4:, 4:] = np.diag(BIAS_FLOOR**2 + excess)
+    mean = np.concatenate([joint.alpha, np.zeros(4)])
+    return Joint(mean=mean, covariance=covariance, excess=excess)
+
+
+def allowing(joint: Joint, excess: Array) -> Joint:
+    """Return the estimate as a look finds it whose scatter tells of so much excess.
+
+    Only what is more than looks before have told is added: a steady wind adds it once, and what
+    has been learnt of the bias stays learnt.
+    """
+    more = np.maximum(excess - joint.excess, 0.0)
+    covariance = joint.covariance.copy()
+    covariance[4:, 4:] += np.diag(more)
+    return replace(joint, covariance=covariance, excess=joint.excess + more)
 
 
 def predicted(joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | None = None) -> Joint:
@@ -96,7 +118,9 @@ def predicted(joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | Non
         growth[:4] += flexure**2
     growth[4:] = BIAS_FLOOR**2 * (1.0 - keep[4:] ** 2)
     covariance = joint.covariance * np.outer(keep, keep) + np.diag(growth)
-    return replace(joint, mean=keep * joint.mean, covariance=covariance)
+    # what fades of the excess the next look that tells of it brings back
+    excess = keep[4:] ** 2 * joint.excess
+    return replace(joint, mean=keep * joint.mean, covariance=covariance, excess=excess)
 
 
 def dithered_innovation(prior: Joint, measured: Array, noise: Array) -> float:
@@ -140,7 +164,8 @@ def _corrected(prior: Joint, measured: Array, noise: Array, sees: Array) -> Join
     gain = np.linalg.solve(total, sees @ prior.covariance).T
     keep = np.eye(8) - gain @ sees
     posterior = keep @ prior.covariance @ keep.T + gain @ noise @ gain.T
-    return Joint(
+    return replace(
+        prior,
         mean=prior.mean + gain @ (measured - sees @ prior.mean),
         covariance=(posterior + posterior.T) / 2,
     )

@@ -94,7 +94,8 @@ def joint_of(known: Registration) -> Joint:
     covariance = fresh.covariance.copy()
     covariance[4:, 4:] = bias.covariance
     covariance[4:, :4], covariance[:4, 4:] = bias.shared, bias.shared.T
-    return Joint(mean=np.concatenate([known.alpha.vector, bias.offset]), covariance=covariance)
+    mean = np.concatenate([known.alpha.vector, bias.offset])
+    return Joint(mean=mean, covariance=covariance, excess=bias.excess)
 
 
 def bias_of(joint: Joint, looked_ns_utc: int, earlier: Earlier | None = None) -> PassiveBias:
@@ -105,6 +106,7 @@ def bias_of(joint: Joint, looked_ns_utc: int, earlier: Earlier | None = None) ->
         covariance=joint.covariance[4:, 4:],
         shared=joint.covariance[4:, :4],
         looked_ns_utc=looked_ns_utc,
+        excess=joint.excess,
     )
 
 

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import events as ev
-from service.estimation.passive import BIAS_FLOOR, PassiveEstimate
+from service.estimation.passive import PassiveEstimate
 from service.estimation.wind import (
     JUMP_THRESHOLD,
     Joint,
+    allowing,
     forgotten,
     passive_innovation,
     with_passive,
@@ -43,8 +44,11 @@ def on_watchdog(
     """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
     known = state.registration
     if known is None:
-        return _shown(state, event, BIAS_FLOOR, np.zeros(4), "no dithered estimate to compare with")
-    prior = brought_forward(state, known, event.t_ns_utc, policy, now_ns)
+        text = "no dithered estimate to compare with"
+        return _shown(state, event, event.estimate.sigma, np.zeros(4), text)
+    excess = event.estimate.bias_excess
+    known = _expecting(known, excess)
+    prior = allowing(brought_forward(state, known, event.t_ns_utc, policy, now_ns), excess)
     if _mixed(known):
         text = "not used: its telemetry may be from both sides of a jump"
         state = replace(state, registration=_looked(known, event))
@@ -77,6 +81,17 @@ def on_watchdog(
     return _shown(remembered(state, entry), event, sigma, joint.bias, text)
 
 
+def _expecting(known: Registration, excess: Array) -> Registration:
+    """Return what is known with the bias as large as the first look at it says that it may be.
+
+    A later look that says more is allowed for by the filter alone: whether the mirror has jumped is
+    told with less patience.
+    """
+    if known.bias is not None and known.bias.looked_ns_utc:
+        return known
+    return replace(known, bias=bias_of(forgotten(joint_of(known), excess), 0))
+
+
 def _looked(known: Registration, event: ev.Watched) -> Registration:
     return replace(known, bias=bias_of(joint_of(known), event.t_ns_utc))
 
@@ -107,7 +122,7 @@ def _barking(
         "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
         "dithered window must tell which"
     )
-    gone = forgotten(prior)
+    gone = forgotten(prior, event.estimate.bias_excess)
     registration = _after(state, known, gone, event, now_ns)
     registration = replace(registration, doubt=text, bias=bias_of(gone, event.t_ns_utc))
     state = replace(state, registration=registration)
@@ -115,7 +130,7 @@ def _barking(
     state = logged(state, "registration.passive-jump", detail, now_ns, Level.WARNING)
     state = with_dither_due(with_alarm(state, DISAGREES, text, now_ns), text, now_ns)
     state = aged(state, policy, now_ns)
-    return _shown(state, event, BIAS_FLOOR, np.zeros(4), text, consistent=False)
+    return _shown(state, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
 
 
 def _after(

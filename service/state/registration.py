@@ -125,6 +125,9 @@ class PassiveBias:
     looked_ns_utc: int
     """End of the telemetry of the last passive estimate, the RTC's clock; 0: there was none."""
 
+    excess: Array = field(default_factory=lambda: np.zeros(4))
+    """``(4,)`` variance beyond the least that the scatter of passive estimates has told of."""
+
     earlier: Earlier | None = None
     """α and bias together before that one; None: it was the first, or has been doubted."""
 

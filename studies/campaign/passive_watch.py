@@ -17,6 +17,7 @@ from service.estimation.passive import Passive, accumulate
 from service.estimation.wind import (
     Drift,
     Joint,
+    allowing,
     begin_joint,
     predicted,
     with_dithered,
@@ -181,6 +182,7 @@ class Watch:
         measured, sigma = {"passive": found.alpha.vector}, {"passive": found.sigma}
         prior = self._forward(t_s)
         if prior is not None:
+            prior = allowing(prior, found.bias_excess)
             self._joint = with_passive(prior, found.alpha.vector, found.covariance)
             measured["followed"] = self._joint.alpha
             own = np.diag(self._joint.alpha_covariance)

@@ -41,6 +41,15 @@ def same(one, other):
     return one == other
 
 
+def test_a_file_of_before_the_scatter_told_of_the_wind_is_read(file, saved):
+    assert saved.registration.bias.excess[0] > 0.0
+    file.write(saved)
+    values = json.loads(file._path.read_text(encoding="utf-8"))
+    del values["registration"]["bias"]["excess"]
+    file._path.write_text(json.dumps(values), encoding="utf-8")
+    np.testing.assert_array_equal(file.read().registration.bias.excess, np.zeros(4))
+
+
 def test_there_is_nothing_before_the_first_night(file):
     assert file.read() is None
 

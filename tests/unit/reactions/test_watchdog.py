@@ -71,6 +71,39 @@ def test_before_a_bias_is_learnt_a_shift_is_worth_ten_percent_and_says_so(story)
     assert after.window_ns_utc == before.window_ns_utc
 
 
+def test_the_more_a_look_scatters_the_larger_its_bias_may_be_and_it_says_so(story):
+    """A bright star in 25 m/s: 20 % of a subaperture, seen at a scatter of 1.25 %, is no jump."""
+    scatter = SCATTER + np.array([0.0095, 0.0095, 0.0, 0.0])
+    before = story.state.registration
+    watch(story, moved(shift_x_subap=0.20), scatter=scatter)
+    expected = watched(ALPHA, scatter).sigma
+    np.testing.assert_allclose(story.state.watchdog.sigma, expected)
+    assert expected[0] == pytest.approx(0.16, abs=0.005)
+    assert story.state.watchdog.consistent
+    after = story.state.registration.alpha
+    assert after.shift_x_subap == pytest.approx(before.alpha.shift_x_subap, abs=0.005)
+
+
+def test_a_bias_of_which_nothing_is_known_is_not_taken_for_a_jump_of_the_mirror(story):
+    """40 % is 2.5 times the σ of a look that scatters by 1.25 %, and 3.8 that of a quiet one."""
+    far = moved(shift_x_subap=0.40, shift_y_subap=0.40)
+    watch(story, far, scatter=SCATTER + np.array([0.0095, 0.0095, 0.0, 0.0]))
+    assert "watchdog" not in story.alarms
+    quiet = Story(Mode.AUTO).meet()
+    quiet.see(n_windows=3)
+    watch(quiet, far)
+    assert "watchdog" in quiet.alarms
+
+
+def test_a_bias_that_was_learnt_is_not_excused_by_a_look_that_scatters_more(story):
+    """A tenth of a subaperture is a jump even while the scatter rises to three times as much."""
+    learnt(story)
+    watch(story, moved(shift_x_subap=0.16), after_s=4.0, scatter=3 * SCATTER)
+    assert "watchdog" in story.alarms
+    expected = watched(ALPHA, 3 * SCATTER).sigma
+    np.testing.assert_allclose(story.state.watchdog.sigma, expected)
+
+
 def test_the_bias_is_learnt_between_windows_and_shown(story):
     known = learnt(story).state.registration
     assert known.bias.offset[0] == pytest.approx(0.06, abs=0.004)

@@ -58,9 +58,7 @@ class PassiveEstimate:
 
     @property
     def bias_excess(self) -> NDArray[np.float64]:
-        """``(4,)`` variance of the bias beyond that of ``BIAS_FLOOR``, by what the scatter tells of
-        the wind; numeric units squared.
-        """
+        """``(4,)`` variance that the scatter tells the bias to have beyond ``BIAS_FLOOR``."""
         return np.asarray(np.diag(self.covariance) * BIAS_OVER_SCATTER**2)
 
     @property

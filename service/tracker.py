@@ -20,6 +20,7 @@ from service.reactions.matrices import (
     on_fetched,
     on_margin,
     on_matrix,
+    on_proposal_judged,
     shelved,
 )
 from service.reactions.measurements import MEASURING, meanwhile, on_measurement
@@ -121,7 +122,9 @@ def _react(  # noqa: C901 - one line for each event
             return _react_to_matrices(state, event, policy, now_ns)
 
 
-def _react_to_matrices(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
+def _react_to_matrices(  # noqa: C901 - one line for each event
+    state: TrackerState, event: Event, policy: Policy, now_ns: int
+) -> Step:
     match event:
         case ev.MatrixMade():
             return on_matrix(state, event, now_ns)
@@ -129,6 +132,8 @@ def _react_to_matrices(state: TrackerState, event: Event, policy: Policy, now_ns
             return on_fetched(state, record, now_ns), ()
         case ev.MarginJudged():
             return on_margin(state, event, now_ns), ()
+        case ev.ProposalJudged():
+            return on_proposal_judged(state, event, now_ns)
         case ev.Acknowledged():
             return on_acknowledgement(state, event, now_ns), ()
         case ev.DitherAnswered():

@@ -20,10 +20,15 @@ from service.state import (
     ReconstructorRecord,
 )
 
+_OF_THIS_RUN = {"judged"}
+"""What a restarted service must find out anew."""
+
 
 def record_to_json(record: ReconstructorRecord) -> str:
     """Return the record as JSON; a pole radius may be ``Infinity``, as Python writes it."""
-    values: dict[str, Any] = {f.name: getattr(record, f.name) for f in fields(record)}
+    values: dict[str, Any] = {
+        f.name: getattr(record, f.name) for f in fields(record) if f.name not in _OF_THIS_RUN
+    }
     if record.alpha is not None:
         values["alpha"] = record.alpha.to_boundary()
     if record.sigma is not None:

@@ -36,6 +36,15 @@ class JudgeMatrix:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class JudgeProposal:
+    """Judge a reconstructor that is to be sent, at the current α and with these gains."""
+
+    id: str
+    gains: tuple[float, ...]
+    """Of the modes it commands."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SendMatrix:
     """Publish a reconstructor; first tell the RTC how many modes it commands."""
 
@@ -109,6 +118,7 @@ Effect = (
     MakeMatrix
     | CopyMatrix
     | JudgeMatrix
+    | JudgeProposal
     | SendMatrix
     | FetchMatrix
     | AskDither

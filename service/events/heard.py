@@ -15,6 +15,7 @@ from service.events.commands import Command
 from service.events.effects import Effect
 from service.model.misregistration import Misregistration
 from service.state import (
+    Judged,
     Level,
     MatrixState,
     MeasurementRecord,
@@ -130,6 +131,18 @@ class MarginJudged:
     expected: ExpectedGain | None = None
     """What a new one would win; None: not computed."""
 
+    judged: Judged | None = None
+    """What the verdict is of; None: not told."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ProposalJudged:
+    """The gate's verdict on a reconstructor that is to be sent."""
+
+    id: str
+    verdict: GateVerdict
+    judged: Judged
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledged:
@@ -217,6 +230,7 @@ Event = (
     | MatrixMade
     | MatrixFetched
     | MarginJudged
+    | ProposalJudged
     | Acknowledged
     | DitherAnswered
     | DitherSilent

@@ -13,6 +13,8 @@ from service.reactions.journal import logged, without_alarm
 from service.reactions.matrices import Step, send, why_unsendable
 from service.reactions.mode_ladder import fewer_than
 from service.reactions.policy import SECOND_NS, Policy
+from service.reactions.shelf import with_state
+from service.reactions.verdicts import why_stale
 from service.reactions.worth import moved
 from service.state import (
     Acquisition,
@@ -64,13 +66,17 @@ def on_made(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
     found = acquisition.found
     if rtc is None or found is None or reason is not None:
         return again(state, f"{record.id} cannot be sent: {reason}", now_ns)
+    gains = gains_for(found, record.n_modes, rtc.n_modes)
+    stale = why_stale(state, record.judged, gains[: record.n_modes])
+    if stale is not None:
+        state = with_state(state, record.id, MatrixState.DISCARDED, f"while it was made, {stale}")
+        return logged(state, "reconstructor.discarded", f"{record.id}: {stale}", now_ns), ()
     state, _ = send(state, record.id, now_ns)
     acquisition = replace(
         acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None
     )
     if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
         acquisition = replace(acquisition, most_modes=record.n_modes)
-    gains = gains_for(found, record.n_modes, rtc.n_modes)
     effect = ev.SendMatrix(id=record.id, n_modes=record.n_modes, gains=gains)
     return replace(state, acquisition=acquisition), (effect,)
 

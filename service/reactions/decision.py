@@ -6,20 +6,21 @@ from dataclasses import replace
 
 from service.events import Effect, FetchMatrix
 from service.reactions.dither_schedule import choose_dither
-from service.reactions.journal import WRONG_RTC
+from service.reactions.dither_unwanted import without_unwanted
+from service.reactions.journal import PARALYSING, WRONG_RTC
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.update_choice import choose_update, judge_in_use
 from service.state import RtcView, TrackerState
 
-PARALYSING = (*WRONG_RTC, "loop-diverging", "edge-slip")
-"""Alarms under which nothing is done by itself."""
-
 
 def decide(state: TrackerState, policy: Policy, now_ns: int) -> Step:
     """Return what is to be done now, and the state that remembers having asked for it."""
-    if state.rtc is None or any(a.name in PARALYSING for a in state.alarms):
+    alarms = {alarm.name for alarm in state.alarms}
+    if state.rtc is None or not alarms.isdisjoint(WRONG_RTC):
         return state, ()
+    if not alarms.isdisjoint(PARALYSING):
+        return without_unwanted(state, state.rtc, policy, now_ns)
     effects: list[Effect] = []
     for choose in (_fetch, choose_dither, judge_in_use, choose_update):
         state, wanted = choose(state, state.rtc, policy, now_ns)

@@ -11,6 +11,8 @@ LOG_LENGTH = 500
 WRONG_RTC = ("second-rtc", "basis-mismatch", "instrument-mismatch")
 """Alarms while which nobody knows whose telemetry comes, or whom a reconstructor would reach."""
 
+PARALYSING = (*WRONG_RTC, "loop-diverging", "edge-slip")
+"""Alarms under which nothing is done by itself."""
 
 OFF_LOOP = "commands-off-loop"
 """The alarm of a saturated mirror, or of an RTC whose account of its loop is wrong."""

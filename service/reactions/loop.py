@@ -194,11 +194,9 @@ def _ended(
         state = replace(state, loop_command=replace(asked, state=outcome, reason=reason))
         text = asked.text
         if outcome is CommandState.ACCEPTED:
-            # the margin is another now; while gains are only tried nothing is made or sent
+            # while gains are only tried nothing is made or sent
             until_ns = now_ns + round(asked.lasts_s * SECOND_NS)
-            state = replace(
-                state, judged_ns_utc=None, retry_ns_utc=max(state.retry_ns_utc, until_ns)
-            )
+            state = replace(state, retry_ns_utc=max(state.retry_ns_utc, until_ns))
     level = Level.INFO if outcome is CommandState.ACCEPTED else Level.WARNING
     return logged(state, f"loop.{outcome}", f"{text}: {reason}" if reason else text, now_ns, level)
 

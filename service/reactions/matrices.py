@@ -7,7 +7,7 @@ from dataclasses import replace
 from service import events as ev
 from service.errors import CommandError
 from service.events import Effect
-from service.reactions.journal import WRONG_RTC, logged, with_alarm, without_alarm
+from service.reactions.journal import PARALYSING, WRONG_RTC, logged, with_alarm, without_alarm
 from service.reactions.mode_ladder import with_limit
 from service.reactions.shelf import (
     known_record,
@@ -16,6 +16,7 @@ from service.reactions.shelf import (
     with_record,
     with_state,
 )
+from service.reactions.verdicts import settled, why_of_another_loop, why_stale
 from service.reactions.worth import outdated
 from service.state import (
     Assessment,
@@ -31,7 +32,11 @@ Step = tuple[TrackerState, tuple[Effect, ...]]
 
 
 def on_matrix(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
-    """Shelve a new reconstructor; send it if it passed the gate and nobody need approve."""
+    """Shelve a new reconstructor; send it if it passed the gate and nobody need approve.
+
+    What an operator wants is sent whatever else is known; what nobody asked for only to a closed
+    loop that behaves, and if α may be believed.
+    """
     record, wanted = made.record, made.wanted
     overtaken = not wanted and _jumped_since(state, record, state.making_since_ns_utc)
     state = shelved(state, record, now_ns)
@@ -43,10 +48,66 @@ def on_matrix(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
         text = f"{record.id}: the mirror jumped while it was made"
         state = with_state(state, record.id, MatrixState.DISCARDED, text)
         return logged(state, "reconstructor.discarded", text, now_ns), ()
-    believed = state.registration is None or state.registration.usable
-    if why_unsendable(state) is None and (wanted or (state.mode is Mode.AUTO and believed)):
-        return send(state, record.id, now_ns)
+    if why_unsendable(state) is None and (wanted or _may_follow(state)):
+        return send_once_judged(state, record.id, now_ns)
     return state, ()
+
+
+def _may_follow(state: TrackerState) -> bool:
+    """Return whether a reconstructor that nobody asked for may be sent."""
+    rtc, known = state.rtc, state.registration
+    if state.mode is not Mode.AUTO or rtc is None or rtc.loop != "closed":
+        return False
+    if any(alarm.name in PARALYSING for alarm in state.alarms):
+        return False
+    return known is not None and settled(known)
+
+
+def send_once_judged(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
+    """Send a reconstructor; where its verdict is not of the present loop and α, judge it first.
+
+    Raises
+    ------
+    CommandError
+        If it cannot be sent now, whatever the gate would say.
+    """
+    record, rtc = known_record(state, matrix_id), state.rtc
+    reason = why_unsendable(state)
+    if record.gate is not None and not record.gate.accepted:
+        reason = record.gate.reason
+    if rtc is None or reason is not None:
+        raise CommandError(f"{matrix_id} cannot be sent: {reason}")
+    gains = commanded_gains(rtc, record.n_modes)
+    stale = why_stale(state, record.judged, gains)
+    if stale is None:
+        return send(state, matrix_id, now_ns)
+    if rtc.loop == "open":
+        gains = record.judged.gains if record.judged is not None else gains
+    text = f"{matrix_id} is judged again before it is sent: {stale}"
+    state = logged(state, "reconstructor.judged-again", text, now_ns)
+    return state, (ev.JudgeProposal(id=matrix_id, gains=gains),)
+
+
+def on_proposal_judged(state: TrackerState, event: ev.ProposalJudged, now_ns: int) -> Step:
+    """Send a reconstructor that has passed the gate anew; what has changed meanwhile ends it."""
+    record, rtc = state.reconstructor(event.id), state.rtc
+    if record is None or record.state is not MatrixState.PROPOSED:
+        return state, ()
+    verdict = event.verdict
+    record = replace(record, gate=verdict, judged=event.judged)
+    if not verdict.accepted:
+        record = replace(record, state=MatrixState.REFUSED, reason=verdict.reason)
+        state = with_changed(state, record)
+        text = f"{record.id}: {verdict.reason}"
+        return logged(state, "reconstructor.refused", text, now_ns, Level.WARNING), ()
+    state = with_changed(state, record)
+    reason = why_unsendable(state)
+    if rtc is not None and reason is None:
+        reason = why_stale(state, record.judged, commanded_gains(rtc, record.n_modes))
+    if reason is None:
+        return send(state, record.id, now_ns)
+    text = f"{record.id} was not sent: while it was judged, {reason}; approve it again"
+    return logged(state, "reconstructor.not-sent", text, now_ns, Level.WARNING), ()
 
 
 def _jumped_since(
@@ -107,6 +168,11 @@ def why_unsendable(state: TrackerState) -> str | None:
     return next((alarm.text for alarm in state.alarms if alarm.name in WRONG_RTC), None)
 
 
+def commanded_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:
+    """Return the gains of the modes that a reconstructor of ``n_modes`` would command."""
+    return extended_gains(rtc, n_modes)[:n_modes]
+
+
 def extended_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:
     """Return gains for ``n_modes`` controlled modes: those in force, the last one for new modes."""
     last = rtc.gains[rtc.n_controlled - 1]
@@ -127,7 +193,13 @@ def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int)
         state = with_in_use(with_changed(state, record), event.id)
         state = without_alarm(state, "no-acknowledgement", now_ns)
         state = without_alarm(state, "margin", now_ns)
-        state = replace(state, margin=record.gate, judged_ns_utc=now_ns)
+        gains = () if state.rtc is None else commanded_gains(state.rtc, record.n_modes)
+        other = why_of_another_loop(state, record.judged, gains)
+        state = replace(
+            state,
+            margin=None if other else record.gate,
+            judged_ns_utc=None if other else now_ns,
+        )
         text = f"{event.id} applied from frame {event.frame_seq}"
         return logged(state, "reconstructor.applied", text, now_ns)
     state = with_state(state, event.id, event.state, event.reason)
@@ -160,7 +232,11 @@ def on_margin(state: TrackerState, judged: ev.MarginJudged, now_ns: int) -> Trac
     record = state.reconstructor(matrix_id)
     if record is None:
         return state
-    state = with_changed(state, replace(record, gate=verdict))
+    gains = () if state.rtc is None else state.rtc.gains[: record.n_modes]
+    of = judged.judged
+    if of is not None and why_of_another_loop(state, of, gains) is not None:
+        return replace(state, judged_ns_utc=None) if matrix_id == state.in_use else state
+    state = with_changed(state, replace(record, gate=verdict, judged=of))
     if matrix_id != state.in_use:
         return state
     state = replace(state, margin=verdict, assessment=_assessment(judged, now_ns))

@@ -16,8 +16,9 @@ from service.reactions.dither_choice import (
     why_unusable,
 )
 from service.reactions.dither_pace import by_hand
+from service.reactions.dither_unwanted import told_to_stop
 from service.reactions.journal import logged
-from service.reactions.matrices import Step, send
+from service.reactions.matrices import Step, send_once_judged
 from service.reactions.policy import Policy
 from service.reactions.random_dither import RANDOM_TOTAL_M, Asked, plan_random
 from service.reactions.shelf import known_record, with_state
@@ -50,6 +51,7 @@ def on_command(  # noqa: C901 - one line for each command
             return replace(state, pointing=pointing), ()
         case ev.StopDither():
             state = found_again(replace(state, dither=None, dither_stopped=True), now_ns)
+            state = told_to_stop(state, now_ns)
             return logged(state, "dither.stopped", "by the operator", now_ns), (ev.AskNoDither(),)
         case ev.StartDither():
             return _start_dither(state, event, policy, now_ns)
@@ -71,11 +73,14 @@ def on_command(  # noqa: C901 - one line for each command
 
 
 def _approve(state: TrackerState, matrix_id: str, policy: Policy, now_ns: int) -> Step:
-    """Send a proposal, unless its verdict is of a registration that is no longer true."""
+    """Send a proposal, judged anew where need be, unless α is no longer what it was made for."""
     _proposed(state, matrix_id)
+    known = state.registration
+    if known is not None and not known.usable:
+        raise CommandError(f"{matrix_id} cannot be judged: α is invalid ({known.standing.reason})")
     if outdated(state, known_record(state, matrix_id)):
-        raise CommandError(f"{matrix_id} was judged for another α than the present one: refit")
-    return send(state, matrix_id, now_ns)
+        raise CommandError(f"{matrix_id} was made for another α than the present one: refit")
+    return send_once_judged(state, matrix_id, now_ns)
 
 
 def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, now_ns: int) -> Step:

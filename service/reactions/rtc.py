@@ -7,6 +7,7 @@ from dataclasses import replace
 from service import events as ev
 from service.events import Effect
 from service.reactions.dither import follow_status, found_again
+from service.reactions.dither_unwanted import gone
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS
 from service.reactions.shelf import with_in_use, with_state
@@ -52,7 +53,8 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     """Take over what the RTC says of itself."""
     state = without_alarm(state, "rtc-vanished", now_ns)
     if state.rtc is not None and _loop(state.rtc) != _loop(rtc):
-        state = _without_bias(state)
+        # nor is the margin what it was
+        state = replace(_without_bias(state), judged_ns_utc=None)
     state = replace(
         state,
         rtc=rtc,
@@ -113,7 +115,7 @@ def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerSta
         retry_ns_utc=0,
         registration=registration and replace(registration, n_windows=0),
     )
-    state = found_again(state, now_ns)
+    state = gone(found_again(state, now_ns), now_ns)
     return logged(state, "rtc.session", f"the RTC started session {session}", now_ns)
 
 
@@ -125,6 +127,8 @@ def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> T
             state = replace(state, making_since_ns_utc=None, retry_ns_utc=later)
         case ev.AskDither():
             state = replace(state, dither=None, retry_ns_utc=later)
+        case ev.AskNoDither():
+            pass  # it is asked again while it must be; nothing else has to wait for that
         case ev.SendMatrix(id=matrix_id):
             state = with_state(state, matrix_id, MatrixState.FAILED, text)
         case _:
@@ -134,6 +138,6 @@ def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> T
 
 def on_vanished(state: TrackerState, now_ns: int) -> TrackerState:
     """Forget what belonged to the RTC, and nothing else."""
-    state = found_again(replace(state, rtc=None, dither=None), now_ns)
+    state = gone(found_again(replace(state, rtc=None, dither=None), now_ns), now_ns)
     text = "the RTC vanished; α and every reconstructor are kept: restart the RTC"
     return with_alarm(state, "rtc-vanished", text, now_ns)

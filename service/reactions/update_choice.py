@@ -10,6 +10,7 @@ from service.events import JudgeMatrix, MakeMatrix
 from service.reactions.matrices import Step
 from service.reactions.mode_ladder import fewer_than, more_to_try
 from service.reactions.policy import SECOND_NS, Policy
+from service.reactions.verdicts import settled
 from service.reactions.worth import outdated, why_worthwhile
 from service.state import (
     MatrixState,
@@ -19,9 +20,6 @@ from service.state import (
     RtcView,
     TrackerState,
 )
-
-MIN_WINDOWS = 2
-"""Windows that must agree before anything is made from them."""
 
 JUDGE_INTERVAL_S = 15.0
 """Least time between two looks at the margin of the matrix in use, while α stays: with 594 modes
@@ -39,7 +37,7 @@ _SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
 def judge_in_use(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
     """Look at the margin of the matrix in use once α is known, when it moves, and now and then."""
     known = state.registration
-    if known is None or state.in_use is None or not _settled(known):
+    if known is None or state.in_use is None or not settled(known):
         return state, ()
     if state.making_since_ns_utc is not None or not _judgement_due(state, known, now_ns):
         return state, ()
@@ -58,15 +56,10 @@ def _judgement_due(state: TrackerState, known: Registration, now_ns: int) -> boo
     return waited_s > JUDGE_AGAIN_S and bool(np.any(moved > np.maximum(NOTICED, noise)))
 
 
-def _settled(known: Registration) -> bool:
-    """Return whether α may be believed: windows agree, and none of them hints at a jump."""
-    return known.n_windows >= MIN_WINDOWS and known.candidate is None and known.usable
-
-
 def choose_update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
     """Compute a reconstructor when it is worthwhile, or could command more modes."""
     known = state.registration
-    if state.mode is Mode.HOLD or known is None or not _settled(known):
+    if state.mode is Mode.HOLD or known is None or not settled(known):
         return state, ()
     if rtc.loop != "closed" or state.making_since_ns_utc is not None:
         return state, ()

@@ -19,12 +19,12 @@ from service.errors import CommandError, LinkError, UnknownIdError
 from service.events import Effect, Event
 from service.link.events import MeasuredMatrix
 from service.model.instrument import Instrument
-from service.reactions.matrices import extended_gains
+from service.reactions.matrices import commanded_gains, extended_gains
 from service.rtc_bridge import Bridge
 from service.runtime import translate
 from service.runtime.asking import Question, ask
 from service.runtime.crew import Crew
-from service.runtime.loops import loop_settings, modes_that_hold, timing
+from service.runtime.loops import judged_now, loop_settings, modes_that_hold, timing
 from service.runtime.noisy import NoisyDesk
 from service.state import (
     MatrixState,
@@ -90,8 +90,8 @@ class Deeds:
                 return await self._make(effect, state)
             case ev.CopyMatrix():
                 return await self._copy(effect, state)
-            case ev.JudgeMatrix(id=matrix_id):
-                return await self._judge(matrix_id, state)
+            case ev.JudgeMatrix() | ev.JudgeProposal():
+                return await self._judge(effect, state)
             case ev.FetchMatrix(id=matrix_id):
                 return await self._fetch(matrix_id)
             case ev.SendMatrix():
@@ -174,6 +174,7 @@ class Deeds:
             state=MatrixState.PROPOSED if accepted else MatrixState.REFUSED,
             condition_number=made.condition_number,
             gate=made.gate,
+            judged=judged_now(rtc, gains[: len(made.matrix)], registration),
             sha256=checksum(made.matrix),
         )
         await self._keep(record, made.matrix, registration, effect.why)
@@ -185,10 +186,11 @@ class Deeds:
         rtc, registration = _there(state), state.registration
         source = state.reconstructor(effect.source)
         matrix = await asyncio.to_thread(self.matrix, effect.source)
-        gate = None
-        if registration is not None:
-            gains = extended_gains(rtc, len(matrix))[: len(matrix)]
+        gate = judged = None
+        gains = commanded_gains(rtc, len(matrix))
+        if registration is not None and any(gains):
             gate = await self._verdict(matrix, gains, state, registration)
+            judged = judged_now(rtc, gains, registration)
         refused = gate is not None and not gate.accepted
         record = replace(
             self._record(len(matrix), effect.why, None, effect.source),
@@ -197,16 +199,21 @@ class Deeds:
             sigma=None if source is None else source.sigma,
             condition_number=None if source is None else source.condition_number,
             gate=gate,
+            judged=judged,
             optical_gains=() if registration is None else registration.optical_gains,
             sha256=checksum(matrix),
         )
         await self._keep(record, matrix, None, effect.why)
         return ev.MatrixMade(record=record, wanted=True)
 
-    async def _judge(self, matrix_id: str, state: TrackerState) -> Event:
+    async def _judge(self, effect: ev.JudgeMatrix | ev.JudgeProposal, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
-        matrix = await asyncio.to_thread(self.matrix, matrix_id)
-        verdict = await self._verdict(matrix, rtc.gains[: len(matrix)], state, registration)
+        matrix = await asyncio.to_thread(self.matrix, effect.id)
+        gains = rtc.gains[: len(matrix)] if isinstance(effect, ev.JudgeMatrix) else effect.gains
+        judged = judged_now(rtc, gains, registration)
+        verdict = await self._verdict(matrix, gains, state, registration)
+        if isinstance(effect, ev.JudgeProposal):
+            return ev.ProposalJudged(id=effect.id, verdict=verdict, judged=judged)
         expected = await self._crew.call(
             Workbench.assess,
             matrix,
@@ -215,7 +222,11 @@ class Deeds:
             rtc.magnitude,
         )
         return ev.MarginJudged(
-            id=matrix_id, verdict=verdict, alpha=registration.alpha, expected=expected
+            id=effect.id,
+            verdict=verdict,
+            alpha=registration.alpha,
+            expected=expected,
+            judged=judged,
         )
 
     async def _verdict(

@@ -9,7 +9,7 @@ from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
 from service.reactions.gain_tables import table_of
 from service.reactions.windows import OUT_OF_HAND
-from service.state import Registration, RtcView, TrackerState
+from service.state import Judged, Registration, RtcView, TrackerState
 
 GAIN_SAFETY = 1.1
 """Above a mean optical gain that nobody says which modes it is of."""
@@ -29,6 +29,18 @@ def loop_settings(
         delay_frames=rtc.delay_frames,
         optical_gain=_highest(registration, len(gains)),
         n_holding=n_holding,
+    )
+
+
+def judged_now(rtc: RtcView, gains: tuple[float, ...], registration: Registration) -> Judged:
+    """Return what a verdict that is asked for now will be of."""
+    return Judged(
+        session=rtc.session,
+        gains=tuple(gains),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        alpha=registration.alpha,
+        sigma=registration.sigma,
     )
 
 

@@ -6,7 +6,7 @@ from service.state.journal import Alarm, Level, LogEntry
 from service.state.measurements import MeasurementRecord, MeasurePattern, MeasureState
 from service.state.noisy import ModeSet, NoisyFinding, NoisyRecord, NoisyState
 from service.state.pointing import Pointing
-from service.state.reconstructors import MatrixState, ReconstructorRecord
+from service.state.reconstructors import Judged, MatrixState, ReconstructorRecord
 from service.state.registration import (
     Candidate,
     Earlier,
@@ -40,6 +40,7 @@ __all__ = [
     "Earlier",
     "HistoryEntry",
     "Interruption",
+    "Judged",
     "Level",
     "LogEntry",
     "LoopCommand",

@@ -45,6 +45,23 @@ class MatrixState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Judged:
+    """What a verdict of the gate is of: of another loop, or of another α, it says nothing."""
+
+    session: str
+    """Of the RTC."""
+
+    gains: tuple[float, ...]
+    """Of the modes that the reconstructor commands."""
+
+    leak: float
+    delay_frames: float
+    alpha: Misregistration
+    sigma: NDArray[np.float64]
+    """``(4,)`` 1 σ, floor included, numeric units."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReconstructorRecord:
     """All that is known of one reconstructor but its numbers."""
 
@@ -77,6 +94,9 @@ class ReconstructorRecord:
 
     gate: GateVerdict | None = None
     """The stability gate's latest verdict; None: not judged yet."""
+
+    judged: Judged | None = None
+    """What that verdict is of, in this run of the service; None: nobody knows any more."""
 
     optical_gains: tuple[ModeGain, ...] = ()
     """Measured when it was made, for the table of loop gains beside it; never folded in."""

@@ -344,7 +344,7 @@ class Observatory:
         match effect:
             case ev.MakeMatrix():
                 return self._worked(wait.make_s)
-            case ev.CopyMatrix() | ev.JudgeMatrix():
+            case ev.CopyMatrix() | ev.JudgeMatrix() | ev.JudgeProposal():
                 return self._worked(wait.judge_s)
             case ev.FetchMatrix():
                 return now_ns + round(wait.fetch_s * SECOND_NS)

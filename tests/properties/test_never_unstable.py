@@ -1,4 +1,4 @@
-"""Whatever happens, no reconstructor is sent whose latest verdict is not yes."""
+"""Whatever happens, no reconstructor is sent whose verdict is not yes, of this loop and this α."""
 
 from dataclasses import replace
 
@@ -7,9 +7,11 @@ from hypothesis import given
 
 from service import events as ev
 from service.control.expected_gain import ExpectedGain
+from service.reactions.matrices import commanded_gains
+from service.reactions.verdicts import why_stale
 from service.state import MatrixState, Mode
 from tests.properties.test_tracker_laws import LAWS, Night, commands, heard, ids
-from tests.unit.reactions.situations import ALPHA, moved, record, verdict
+from tests.unit.reactions.situations import ALPHA, moved, record, rtc, verdict
 
 MADE = [f"made-{k}" for k in range(1, 6)]
 any_id = st.one_of(ids, st.sampled_from(MADE))
@@ -46,6 +48,11 @@ more_commands = st.one_of(
     st.builds(ev.Publish, id=any_id),
     st.builds(ev.SetLoop, effective_gain=st.sampled_from([0.3, 1.5])),
 )
+retuned = st.builds(
+    lambda gain, leak: ev.StatusSeen(rtc=rtc(gains=(gain,) * 400 + (0.0,) * 194, leak=leak)),
+    st.sampled_from([0.4, 0.8]),
+    st.sampled_from([0.999, 0.99]),
+)
 stories = st.lists(
     st.tuples(
         st.one_of(
@@ -55,6 +62,7 @@ stories = st.lists(
             judged,
             made,
             more_commands,
+            retuned,
             *[st.just("done")] * 8,
             st.just("refused"),
         ),
@@ -67,7 +75,7 @@ stories = st.lists(
 
 @LAWS
 @given(stories, st.sampled_from(list(Mode)))
-def test_nothing_is_sent_whose_latest_verdict_is_not_yes(story, mode):
+def test_nothing_is_sent_whose_verdict_is_not_yes_or_of_another_loop(story, mode):
     night = Night(mode)
     for event, after_s in story:
         night.tell(event, after_s)
@@ -77,6 +85,13 @@ def test_nothing_is_sent_whose_latest_verdict_is_not_yes(story, mode):
                 assert found.gate.accepted
                 assert found.state is MatrixState.PUBLISHED
                 assert effect.n_modes == found.n_modes
+                assert night.state.registration is None or of_now(night.state, found, effect)
+
+
+def of_now(state, found, effect):
+    """Whether the verdict is of the loop and the α there are."""
+    gains = effect.gains or commanded_gains(state.rtc, found.n_modes)
+    return why_stale(state, found.judged, gains[: found.n_modes]) is None
 
 
 def test_a_proposal_whose_verdict_has_changed_since_cannot_be_approved():

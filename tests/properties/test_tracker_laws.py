@@ -29,6 +29,7 @@ from tests.unit.reactions.situations import (
     START_NS,
     estimate,
     foreign,
+    judged,
     moved,
     record,
     rtc,
@@ -231,18 +232,35 @@ class Night:
             case _:
                 return None
 
+    def judged(self, n_modes):
+        """What a verdict given now would be of."""
+        known, view = self.state.registration, self.state.rtc
+        return None if known is None or view is None else judged(known, view, n_modes)
+
     def of_matrices(self, effect, how):
         match effect:
             case ev.MakeMatrix() | ev.CopyMatrix() as asked:
                 self.n_made += 1
                 state = MatrixState.REFUSED if how == "refused" else MatrixState.PROPOSED
                 n = asked.n_modes if isinstance(asked, ev.MakeMatrix) else 400
-                made = record(f"made-{self.n_made}", state, n_modes=n, created_ns_utc=self.now_ns)
+                made = record(
+                    f"made-{self.n_made}",
+                    state,
+                    n_modes=n,
+                    created_ns_utc=self.now_ns,
+                    judged=self.judged(n),
+                )
                 return ev.MatrixMade(record=made, wanted=isinstance(asked, ev.CopyMatrix))
             case ev.FetchMatrix(id=matrix_id):
                 return ev.MatrixFetched(record=foreign(matrix_id))
             case ev.JudgeMatrix(id=matrix_id):
                 return ev.MarginJudged(id=matrix_id, verdict=verdict(accepted=how == "done"))
+            case ev.JudgeProposal(id=matrix_id, gains=gains):
+                found = self.judged(len(gains))
+                if found is None:
+                    return ev.JobFailed(effect=effect, text="α is not known")
+                passed = verdict(accepted=how == "done")
+                return ev.ProposalJudged(id=matrix_id, verdict=passed, judged=found)
             case ev.SendMatrix(id=matrix_id):
                 done = MatrixState.APPLIED if how == "done" else MatrixState.REJECTED
                 return ev.Acknowledged(id=matrix_id, state=done, reason="r", frame_seq=1)

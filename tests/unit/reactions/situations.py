@@ -8,8 +8,9 @@ from service import events as ev
 from service.control.gate import GateVerdict
 from service.estimation.instrumental import WindowEstimate
 from service.model.misregistration import Misregistration
+from service.reactions.matrices import commanded_gains
 from service.reactions.policy import Policy
-from service.state import MatrixState, Mode, ReconstructorRecord, RtcView, TrackerState
+from service.state import Judged, MatrixState, Mode, ReconstructorRecord, RtcView, TrackerState
 from service.tracker import step
 
 SECOND = 1_000_000_000
@@ -58,6 +59,19 @@ def verdict(*, accepted=True, radius=0.7):
         n_points=9,
         reason="stable" if accepted else "too little margin",
     )
+
+
+def judged(known, view, n_modes=400, **changes):
+    """What a verdict given now is of."""
+    values = {
+        "session": view.session,
+        "gains": commanded_gains(view, n_modes),
+        "leak": view.leak,
+        "delay_frames": view.delay_frames,
+        "alpha": known.alpha,
+        "sigma": known.sigma,
+    }
+    return Judged(**(values | changes))
 
 
 def record(matrix_id, state=MatrixState.PROPOSED, **changes):
@@ -146,8 +160,11 @@ class Story:
 
     def make(self, matrix_id, state=MatrixState.PROPOSED, *, wanted=False, **changes):
         """Hand in a reconstructor, made for the current registration."""
-        known = self.state.registration
+        known, view = self.state.registration, self.state.rtc
         changes = {"created_ns_utc": self.now_ns, "alpha": known and known.alpha} | changes
+        if view is not None and known is not None:
+            n_modes = changes.get("n_modes", 400)
+            changes = {"judged": judged(known, view, n_modes)} | changes
         made = record(matrix_id, state, **changes)
         return self.tell(ev.MatrixMade(record=made, wanted=wanted))
 

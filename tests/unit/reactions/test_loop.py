@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import pytest
 
 from service import events as ev
 from service.errors import CommandError
 from service.reactions.loop import CLOSE_AGAIN_EVERY_S
 from service.state import CommandState, MeasurePattern, Mode
-from tests.unit.reactions.situations import Story, of_kind, rtc
+from tests.unit.reactions.situations import Story, judged, of_kind, rtc, verdict
 
 
 @pytest.fixture
@@ -96,10 +98,28 @@ def test_other_gains_have_another_margin():
     story = Story(Mode.HOLD).meet()
     story.see(n_windows=2)
     story.wait(3)
-    judged = len(story.asked(ev.JudgeMatrix))
+    before = len(story.asked(ev.JudgeMatrix))
     asked = ask(story, gains=(group(0, 1, 0.5),))
     story.tell(ev.LoopAnswered(id=asked.id, accepted=True, reason=""))
-    assert len(story.asked(ev.JudgeMatrix)) == judged + 1
+    assert len(story.asked(ev.JudgeMatrix)) == before
+    gains = (0.5, 0.5, *rtc().gains[2:])
+    story.tell(ev.StatusSeen(rtc=replace(rtc(), gains=gains, cm_id="initial")))
+    assert len(story.asked(ev.JudgeMatrix)) == before + 1
+
+
+def test_a_verdict_on_the_gains_before_is_dropped_and_asked_for_again():
+    story = Story(Mode.HOLD).meet()
+    story.see(n_windows=2)
+    known = story.state.registration
+    before = ev.MarginJudged(
+        id="initial", verdict=verdict(accepted=False), judged=judged(known, rtc())
+    )
+    story.tell(ev.StatusSeen(rtc=replace(rtc(), leak=0.99)))
+    assert of_kind(story.tell(before), ev.JudgeMatrix)
+    assert "margin" not in story.alarms
+    now = replace(before, judged=judged(known, rtc(), leak=0.99))
+    story.tell(now)
+    assert "margin" in story.alarms
 
 
 def test_a_ramp_tries_the_papers_groups(story):

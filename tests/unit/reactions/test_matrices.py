@@ -38,6 +38,7 @@ def test_fewer_modes_keep_their_gains_and_release_the_rest():
 
 def test_in_auto_a_matrix_that_passed_is_sent_at_once():
     story = Story(Mode.AUTO).meet()
+    story.see(n_windows=2)
     assert of_kind(story.make("cm-1"), ev.SendMatrix)
     assert story.matrix_state("cm-1") is MatrixState.PUBLISHED
     assert story.state.reconstructor("cm-1").published_ns_utc == story.now_ns

@@ -17,6 +17,7 @@ from service.state import MatrixState, Mode
 from tests.unit.reactions.situations import (
     POLICY,
     Story,
+    judged,
     moved,
     of_kind,
     record,
@@ -45,6 +46,7 @@ class Night(Story):
             n_modes=n_modes,
             created_ns_utc=self.now_ns,
             alpha=self.state.registration.alpha,
+            judged=judged(self.state.registration, self.state.rtc, n_modes),
         )
         effects = self.tell(
             ev.MatrixMade(record=made, wanted=False, asked_modes=effect.n_modes, why_fewer=why)
@@ -210,6 +212,7 @@ class Declined(Night):
             created_ns_utc=self.now_ns,
             alpha=known.alpha,
             sigma=known.sigma,
+            judged=judged(known, self.state.rtc, effect.n_modes),
         )
         return self.tell(ev.MatrixMade(record=made, wanted=False, asked_modes=effect.n_modes))
 

@@ -9,23 +9,25 @@ from service import events as ev
 from service.errors import CommandError
 from service.state import MatrixState, Registration, TrackerState
 from service.tracker import step
-from tests.unit.reactions.situations import ALPHA, POLICY, START_NS, moved, record, rtc
+from tests.unit.reactions.situations import ALPHA, POLICY, START_NS, judged, moved, record, rtc
 
 
 def proposed(alpha):
     """The service believes in ``alpha``; a proposal for ``ALPHA`` waits."""
+    known = Registration(
+        alpha=alpha,
+        covariance=np.diag([0.001, 0.001, 1e-5, 1e-4]) ** 2,
+        floor=POLICY.floor,
+        t_ns_utc=START_NS,
+        arrived_ns_utc=START_NS,
+        n_windows=5,
+    )
+    then = judged(replace(known, alpha=ALPHA), rtc())
     return TrackerState(
         system="flao",
         rtc=rtc(),
-        reconstructors=(record("cm-1"),),
-        registration=Registration(
-            alpha=alpha,
-            covariance=np.diag([0.001, 0.001, 1e-5, 1e-4]) ** 2,
-            floor=POLICY.floor,
-            t_ns_utc=START_NS,
-            arrived_ns_utc=START_NS,
-            n_windows=5,
-        ),
+        reconstructors=(record("cm-1", judged=then),),
+        registration=known,
     )
 
 

@@ -1,0 +1,60 @@
+"""Whether the gate's verdict on a reconstructor still says anything of the loop there is now."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.reactions.worth import VERDICT_REACH
+from service.state import Judged, Registration, TrackerState
+
+MIN_WINDOWS = 2
+"""Windows that must agree before anything is made from them."""
+
+SAME_GAIN = 1e-3
+"""Relative: gains that differ by less are the same."""
+
+SAME_DELAY = 0.05
+"""Frames."""
+
+SAME_LEAK = 1e-6
+
+
+def settled(known: Registration) -> bool:
+    """Return whether α may be believed: windows agree, and none of them hints at a jump."""
+    return known.n_windows >= MIN_WINDOWS and known.candidate is None and known.usable
+
+
+def why_stale(state: TrackerState, judged: Judged | None, gains: tuple[float, ...]) -> str | None:
+    """Return why a verdict says nothing of a loop with these gains now; None: it does.
+
+    It was taken over α ± 3σ as they were then, which must hold all of α ± 3σ as they are now.
+    """
+    known = state.registration
+    if known is None or judged is None:
+        return None if known is None else why_of_another_loop(state, judged, gains)
+    moved = np.abs(known.alpha.vector - judged.alpha.vector)
+    if np.any(moved + 3.0 * known.sigma > 3.0 * judged.sigma + VERDICT_REACH):
+        return "α ± 3σ reaches further than it was judged for"
+    return why_of_another_loop(state, judged, gains)
+
+
+def why_of_another_loop(
+    state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
+) -> str | None:
+    """Return what is different in the loop since a verdict; None: nothing, or no RTC is there.
+
+    An open loop does not tell the gains it will close with.
+    """
+    rtc = state.rtc
+    if rtc is None:
+        return None
+    if judged is None:
+        return "nobody knows of which loop its verdict is"
+    if judged.session != rtc.session:
+        return "the RTC has begun a new session"
+    if abs(judged.leak - rtc.leak) > SAME_LEAK:
+        return f"the leak was {judged.leak:g}, it is {rtc.leak:g}"
+    if abs(judged.delay_frames - rtc.delay_frames) > SAME_DELAY:
+        return f"the delay was {judged.delay_frames:g} frames, it is {rtc.delay_frames:g}"
+    same = len(gains) == len(judged.gains) and np.allclose(gains, judged.gains, rtol=SAME_GAIN)
+    return None if rtc.loop == "open" or same else "the gains have changed"

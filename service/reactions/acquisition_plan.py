@@ -15,6 +15,7 @@ from service.control.continuation import (
     lines_of,
     modes_of,
 )
+from service.reactions.dither_choice import ACQUIRING_DITHER
 from service.reactions.journal import WRONG_RTC
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import (
@@ -74,7 +75,7 @@ def far_dither(
             f"has {rtc.n_modes}"
         )
     return DitherView(
-        id=f"acquire-{now_ns}",
+        id=f"{ACQUIRING_DITHER}{now_ns}",
         modes=modes,
         amplitude_m=(min(policy.acquisition_amplitude_m, rtc.max_dither_m),) * len(modes),
         frequency_hz=lines[: len(modes)],

@@ -32,8 +32,9 @@ SPARE_S = 0.3
 OWN_DITHER = "dither-"
 ASKED_DITHER = "operator-"
 NOISY_DITHER = "noisy-"
-"""How the id of a dither begins that the service has chosen, an operator, and one that measures a
-noisy interaction matrix."""
+ACQUIRING_DITHER = "acquire-"
+"""How the id of a dither begins that the service has chosen, an operator, one that measures a
+noisy interaction matrix, and one that finds α from nothing."""
 
 _N_LINES = 4
 

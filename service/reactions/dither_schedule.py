@@ -25,11 +25,11 @@ from service.reactions.dither_pace import (
     wanted,
     window_lengths_s,
 )
+from service.reactions.dither_unwanted import own_sine, stopped, without_unwanted
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import (
-    DitherKind,
     DitherPhase,
     DitherView,
     Level,
@@ -58,12 +58,13 @@ def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
     good as a new one and the RTC plays no second one beside it.
     """
     state = _accounted(state, rtc, policy, now_ns)
+    state, stopping = without_unwanted(state, rtc, policy, now_ns)
     dither = state.dither
-    if dither is not None and not _own(dither):
-        return _shown(state, DitherPhase.OPERATOR, f"{dither.id} runs"), ()
+    if dither is not None and not own_sine(dither):
+        return _shown(state, DitherPhase.OPERATOR, f"{dither.id} runs"), stopping
     forbidden = _why_none(state, rtc, policy)
     if forbidden is not None:
-        return _shown(state, DitherPhase.OFF, forbidden), ()
+        return _shown(state, DitherPhase.OFF, forbidden), stopping
     wish, plan = wanted(state, rtc, policy, now_ns)
     later_ns = wish.next_ns_utc if wish.next_ns_utc > now_ns else None
     dithering = replace(state.dithering, plan=plan, next_ns_utc=later_ns)
@@ -79,7 +80,7 @@ def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
     if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
         # left behind by this service: over budget, its window of another length, or to stop
         state = replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS)
-        return _stopped(state, rtc.dither_id, now_ns), (AskNoDither(),)
+        return stopped(state, rtc.dither_id, now_ns), (AskNoDither(),)
     if now_ns < wish.next_ns_utc or _awaits_a_result(state, wish, now_ns):
         return state, ()
     return _ask(state, rtc, policy, wish, now_ns)
@@ -102,15 +103,13 @@ def learnt(
     return replace(after, dithering=replace(after.dithering, precision=precision))
 
 
-def _own(dither: DitherView) -> bool:
-    return dither.id.startswith(OWN_DITHER) and dither.kind is DitherKind.SINE
-
-
 def _accounted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState:
     """Keep count of what the dither costs, and of who has looked at α last."""
     dithering, known, dither = state.dithering, state.registration, state.dither
     on = dither is not None and dither.start_seq is not None
-    power = total_m(dither) ** 2 if dither is not None and on else 0.0
+    # what nobody has asked for costs as much
+    playing = dither if on else rtc.dither
+    power = 0.0 if playing is None else total_m(playing) ** 2
     since_ns = now_ns if dithering.seen_ns_utc is None else dithering.seen_ns_utc
     share = -np.expm1(-max(now_ns - since_ns, 0) / (MEMORY_S * SECOND_NS))
     passive_ns = dithering.passive_ns_utc
@@ -134,10 +133,12 @@ def _shown(state: TrackerState, phase: DitherPhase, reason: str) -> TrackerState
 
 
 def _why_none(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
+    still = state.dithering.unwanted_id
+    left = "" if still is None else f"; the RTC still plays {still}"
     if state.dither_stopped:
-        return "stopped by the operator"
+        return f"stopped by the operator{left}"
     if not policy.dither_enabled and state.dither is None:
-        return "the settings forbid it"
+        return f"the settings forbid it{left}"
     if rtc.loop != "closed":
         return f"the loop is {rtc.loop}"
     if state.in_use is None and state.dither is None and rtc.dither is None:
@@ -159,18 +160,10 @@ def _running(state: TrackerState, dither: DitherView, wish: Wish, now_ns: int) -
     if not (done or weak):
         return state, ()
     text = f"{dither.id}: {wish.reason}" if done else f"{dither.id} is too weak: {wish.reason}"
-    state = replace(_stopped(state, dither.id, now_ns), dither=None)
+    state = replace(stopped(state, dither.id, now_ns), dither=None)
     # the next one must not overtake the command to stop
     state = replace(state, retry_ns_utc=max(state.retry_ns_utc, now_ns + SECOND_NS))
     return logged(state, "dither.stopped", text, now_ns), (AskNoDither(),)
-
-
-def _stopped(state: TrackerState, dither_id: str, now_ns: int) -> TrackerState:
-    """Note that the RTC is asked to stop a dither, and since when."""
-    if state.dithering.stopped_id == dither_id:
-        return state
-    dithering = replace(state.dithering, stopped_id=dither_id, ended_ns_utc=None)
-    return replace(state, dithering=replace(dithering, stopped_ns_utc=now_ns))
 
 
 def _adopted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState | None:
@@ -178,11 +171,11 @@ def _adopted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> 
     running = rtc.dither
     if running is None or running.id == state.dither_lost:
         return None
-    over = _own(running) and total_m(running) > 1.001 * state.dithering.budget_m
-    stopped = running.id == state.dithering.stopped_id
+    over = own_sine(running) and total_m(running) > 1.001 * state.dithering.budget_m
+    asked_to_stop = running.id == state.dithering.stopped_id
     # a recorded night stops nothing: what it goes on playing is read all the same
     heard_ns = state.dithering.stopped_ns_utc + round(STOPPED_WITHIN_S * SECOND_NS)
-    if now_ns < heard_ns if stopped else over:
+    if now_ns < heard_ns if asked_to_stop else over:
         return None
     for window_s in window_lengths_s(policy):
         dither = replace(running, asked_ns_utc=now_ns, window_s=window_s)

@@ -104,6 +104,15 @@ class Dithering:
     stopped_ns_utc: int = 0
     """When it did."""
 
+    unwanted_id: str | None = None
+    """A dither the RTC plays and should not; None: none."""
+
+    unwanted_since_ns_utc: int = 0
+    """Since when the service knows of it."""
+
+    told_ns_utc: int = 0
+    """When the RTC was last told to stop one that nobody wants."""
+
     mean_square_m2: float = 0.0
     """Mean square of what has been on the mirror, over ten minutes, metres OPD squared."""
 

@@ -1,0 +1,90 @@
+"""Dithers the RTC plays although it should not: nobody wants one, or it is too strong.
+
+A stop that was not answered, or a start that has overtaken it, leaves a dither on the mirror that
+nobody follows. It is asked to end until the RTC's status shows that it has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service.events import AskNoDither
+from service.reactions.dither_choice import (
+    ACQUIRING_DITHER,
+    ASKED_DITHER,
+    NOISY_DITHER,
+    OWN_DITHER,
+    total_m,
+)
+from service.reactions.journal import with_alarm, without_alarm
+from service.reactions.matrices import Step
+from service.reactions.policy import SECOND_NS, Policy
+from service.state import DitherKind, DitherView, RtcView, TrackerState
+
+NOT_STOPPED = "dither-not-stopped"
+"""Alarm while a dither goes on that was asked to stop."""
+
+TELL_EVERY_S = 2.0
+GONE_WITHIN_S = 3.0
+"""For a stop to be answered, and for the next status to show it."""
+
+_OURS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
+
+
+def own_sine(dither: DitherView) -> bool:
+    """Return whether a dither is one that the service has chosen by itself."""
+    return dither.id.startswith(OWN_DITHER) and dither.kind is DitherKind.SINE
+
+
+def without_unwanted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+    """Ask the RTC, again and again, to stop what it should not play."""
+    running, why = rtc.dither_id, _why_unwanted(state, rtc, policy)
+    if running is None or why is None:
+        return gone(state, now_ns), ()
+    if state.dithering.unwanted_id != running:
+        state = stopped(state, running, now_ns)
+        dithering = replace(state.dithering, unwanted_id=running, unwanted_since_ns_utc=now_ns)
+        state = replace(state, dithering=dithering)
+    if now_ns - state.dithering.unwanted_since_ns_utc >= GONE_WITHIN_S * SECOND_NS:
+        cost = "" if rtc.dither is None else f", {1e9 * total_m(rtc.dither):.3g} nm RMS in all"
+        text = (
+            f"{why}, and the RTC plays {running}{cost}: it is asked every {TELL_EVERY_S:.0f} s to "
+            "stop it; stop it at the RTC"
+        )
+        state = with_alarm(state, NOT_STOPPED, text, now_ns)
+    if now_ns - state.dithering.told_ns_utc < TELL_EVERY_S * SECOND_NS:
+        return state, ()
+    return told_to_stop(state, now_ns), (AskNoDither(),)
+
+
+def stopped(state: TrackerState, dither_id: str, now_ns: int) -> TrackerState:
+    """Note that the RTC is asked to stop a dither, and since when."""
+    if state.dithering.stopped_id == dither_id:
+        return state
+    dithering = replace(state.dithering, stopped_id=dither_id, ended_ns_utc=None)
+    return replace(state, dithering=replace(dithering, stopped_ns_utc=now_ns))
+
+
+def told_to_stop(state: TrackerState, now_ns: int) -> TrackerState:
+    """Return the state in which the RTC has just been told to play no dither."""
+    return replace(state, dithering=replace(state.dithering, told_ns_utc=now_ns))
+
+
+def gone(state: TrackerState, now_ns: int) -> TrackerState:
+    """Return the state in which no unwanted dither plays, or nobody knows of one."""
+    if state.dithering.unwanted_id is None:
+        return state
+    state = replace(state, dithering=replace(state.dithering, unwanted_id=None))
+    return without_alarm(state, NOT_STOPPED, now_ns)
+
+
+def _why_unwanted(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
+    running = rtc.dither_id
+    if running is None or not running.startswith(_OURS):
+        return None
+    wanted = state.dither is not None and state.dither.id == running
+    if state.dither_stopped and not wanted:
+        return "the operator wants no dither"
+    if not policy.dither_enabled and state.dither is None and running.startswith(OWN_DITHER):
+        return "the settings forbid a dither"
+    return None

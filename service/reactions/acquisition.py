@@ -18,6 +18,7 @@ from service.events import Event
 from service.reactions.acquisition_closed import closed_stage, on_made
 from service.reactions.acquisition_ends import abort, again, fail, without_dither
 from service.reactions.acquisition_far import far_stage, on_far, on_missed
+from service.reactions.acquisition_over import forgotten
 from service.reactions.acquisition_plan import (
     begun,
     why_needed,
@@ -94,6 +95,7 @@ def acquire(
     if not acquisition.under_way:
         if state.windows_accepted > before.windows_accepted:
             state = replace(state, acquisition=replace(acquisition, misses=0))
+        state = forgotten(state, now_ns)
         why = why_needed(state, policy, now_ns)
         if why is None:
             return state, ()

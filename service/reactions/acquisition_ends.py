@@ -91,7 +91,8 @@ def fail(state: TrackerState, reason: str, now_ns: int) -> Step:
     closed = state.rtc is not None and state.rtc.loop != "open"
     out_of_hand = any(alarm.name in OUT_OF_HAND for alarm in state.alarms)
     state, effects = without_dither(state)
-    state = replace(state, registration=None)
+    over = replace(state.acquisition, windows=state.windows_accepted)
+    state = replace(state, registration=None, acquisition=over)
     if closed and out_of_hand:
         state, more = told(state, ev.SetLoop(closed=False), now_ns)
         effects = (*effects, *more)

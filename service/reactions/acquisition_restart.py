@@ -24,13 +24,14 @@ from service.state import (
     TrackerState,
 )
 
-_OVER = (AcquisitionStage.FAILED, AcquisitionStage.ABORTED)
+_LASTING = (AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED)
+"""Stages that an operator, or windows, must end."""
 
 
 def left_behind(state: TrackerState) -> Acquisition | None:
     """Return what the next service must know of an acquisition; None: nothing.
 
-    One that is over matters while α is not known: it says why, and why the loop may be open.
+    One that was aborted matters while α is not known: it says why, and why the loop may be open.
     """
     acquisition = state.acquisition
     kept = replace(acquisition, alpha=None, covariance=None, command=None, applied=None, windows=0)
@@ -38,8 +39,8 @@ def left_behind(state: TrackerState) -> Acquisition | None:
         session = None if state.rtc is None else state.rtc.session
         doing = f"{acquisition.stage}: {acquisition.text}"
         return replace(kept, interruption=Interruption(doing=doing, session=session))
-    over = acquisition.stage in _OVER and state.registration is None
-    return kept if over or acquisition.stage is AcquisitionStage.INTERRUPTED else None
+    aborted = acquisition.stage is AcquisitionStage.ABORTED and state.registration is None
+    return kept if aborted or acquisition.stage in _LASTING else None
 
 
 def inherited(state: TrackerState, left: Acquisition, now_ns: int) -> TrackerState:

@@ -135,7 +135,7 @@ class Acquisition:
     """Whether anything was sent: the RTC's own matrix is then no longer in use."""
 
     windows: int = 0
-    """Windows that had been accepted when the reconstructor in use was applied."""
+    """Windows that had been accepted when the reconstructor in use was applied, or it was over."""
 
     interruption: Interruption | None = None
     """How the service before this one left it; None: it is of this one's own."""

@@ -6,6 +6,8 @@ night therefore replays exactly, and every reaction of the service can be tested
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from service import events as ev
 from service.events import Command, Event
 from service.reactions.acquisition import acquire, on_acquire, refuse_meanwhile
@@ -118,6 +120,8 @@ def _react(  # noqa: C901 - one line for each event
             return on_vibrations(state, event, now_ns), ()
         case ev.Watched():
             return on_watchdog(state, event, policy, now_ns), ()
+        case ev.Unwatched(text=text):
+            return replace(state, unwatched=text), ()
         case _:
             return _react_to_matrices(state, event, policy, now_ns)
 

@@ -53,7 +53,8 @@ RANDOM = Determines(
 PASSIVE = Determines(
     parameters=("rotation_deg", "magnification"),
     text="no dither: rotation and magnification; shifts carry the wind's bias, 10 % of a "
-    "subaperture or more unless a dither has taught it",
+    "subaperture or more unless a dither has taught it; needs a closed loop, a delay of two frames "
+    "or more, and telemetry with few gaps",
 )
 
 

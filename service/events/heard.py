@@ -97,6 +97,14 @@ class Watched:
     t_ns_utc: int
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unwatched:
+    """The watchdog cannot estimate α from ordinary telemetry as it is."""
+
+    text: str
+    """Why, and what it would need."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatrixMade:
     """A reconstructor has been computed, or copied, and judged."""
@@ -227,6 +235,7 @@ Event = (
     | FarFitted
     | WindowLost
     | Watched
+    | Unwatched
     | MatrixMade
     | MatrixFetched
     | MarginJudged

@@ -26,6 +26,7 @@ from service.reactions.journal import logged, with_alarm
 from service.reactions.policy import Policy
 from service.reactions.surprise import Reading, look_surprise, sum_of
 from service.reactions.validity import aged, with_dither_due
+from service.reactions.windows import CAPTURE_RANGE
 from service.state import (
     HistoryEntry,
     Level,
@@ -44,8 +45,7 @@ def on_watchdog(
     """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
     known = state.registration
     if known is None:
-        text = "no dithered estimate to compare with"
-        return _shown(state, event, event.estimate.sigma, np.zeros(4), text)
+        return _alone(state, event, policy)
     excess = event.estimate.bias_excess
     known = _expecting(known, excess)
     prior = allowing(brought_forward(state, known, event.t_ns_utc, policy, now_ns), excess)
@@ -79,6 +79,27 @@ def on_watchdog(
     )
     text = "agrees with α and with what is known of its own bias"
     return _shown(remembered(state, entry), event, sigma, joint.bias, text)
+
+
+def fit_begins_at(state: TrackerState) -> Misregistration | None:
+    """Return about what a look is to be fitted: α, or the last look; None: the nominal rotation."""
+    if state.registration is not None:
+        return state.registration.alpha
+    last = state.watchdog
+    return last.alpha if last is not None and np.isfinite(last.sigma).all() else None
+
+
+def _alone(state: TrackerState, event: ev.Watched, policy: Policy) -> TrackerState:
+    """Show a look while α is not known: it is all there is, and no more than it says it is."""
+    step = event.estimate.alpha.vector - policy.start.vector
+    if np.any(np.abs(step) > CAPTURE_RANGE):
+        text = (
+            f"it cannot tell: {event.estimate.alpha.to_boundary()} is too far from where its fit "
+            "begins, the nominal rotation; let the service acquire, or dither"
+        )
+        return _shown(state, event, np.full(4, np.inf), np.zeros(4), text)
+    text = "no dithered estimate to compare with: nothing is made from this reading alone"
+    return _shown(state, event, event.estimate.sigma, np.zeros(4), text)
 
 
 def _expecting(known: Registration, excess: Array) -> Registration:
@@ -170,4 +191,4 @@ def _shown(
         text=text,
         bias=bias,
     )
-    return replace(state, watchdog=watchdog)
+    return replace(state, watchdog=watchdog, unwatched="")

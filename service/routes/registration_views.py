@@ -185,7 +185,7 @@ class WatchdogView(View):
     """As read: its bias is in it."""
 
     sigma: FourView
-    """1 σ of it as a reading of α, once the bias known is taken off."""
+    """1 σ of it as a reading of α, once the bias known is taken off; null: it cannot tell."""
 
     bias: FourView
     """What is known of its bias."""

@@ -252,6 +252,12 @@ class StateView(View):
     """Why."""
 
     watchdog: WatchdogView | None
+    """The last look at ordinary telemetry; null: there was none."""
+
+    unwatched: str
+    """Why ordinary telemetry says nothing of α now, and what it would need; empty: it does, or was
+    not looked at yet."""
+
     alarms: tuple[AlarmView, ...]
     windows_accepted: int
     windows_refused: int

@@ -250,15 +250,25 @@ def _dithered(
     return streams, ()
 
 
-def taken(streams: Streams) -> tuple[Streams, Passive | None]:
-    """Return streams that begin new passive sums, and the old ones if they hold enough for a look.
+def taken(streams: Streams) -> tuple[Streams, Passive | str]:
+    """Return streams that begin new passive sums, and the old ones, or why there is no look yet.
 
     No two looks then share telemetry: their errors are independent, and one that lies wholly after
     a jump says so.
     """
-    sums = streams.passive
-    if sums is None or sums.n_effective < passive.MIN_FRAMES_PER_MODE * sums.n_modes:
-        return streams, None
+    rtc, sums = streams.rtc, streams.passive
+    if rtc is None or sums is None:
+        return streams, "no passive estimate: there is no telemetry that could be used"
+    if rtc.loop != "closed":
+        return streams, f"no passive estimate: the loop is {rtc.loop}, it must be closed"
+    if sums.why_unusable is not None:
+        return streams, sums.why_unusable
+    least = passive.MIN_FRAMES_PER_MODE * sums.n_modes
+    if sums.n_effective < least:
+        return streams, (
+            f"no passive estimate yet: {sums.n_effective:.0f} frames in runs without gaps, "
+            f"{least} are needed for {sums.n_modes} modes"
+        )
     begun = replace(sums, cross=None, moved=None, power=None, n_effective=0.0)
     return replace(streams, passive=begun), sums
 

@@ -14,6 +14,7 @@ from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.passive import Passive
 from service.estimation.randomdither import Correlated
 from service.events import Event
+from service.reactions.watchdog import fit_begins_at
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.state import Level, TrackerState
@@ -80,15 +81,20 @@ async def _found(spectra: Spectra, state: TrackerState, crew: Crew) -> Event:
 
 
 async def watched(
-    sums: Passive | None, state: TrackerState, crew: Crew
-) -> ev.Watched | ev.Noted | None:
-    """Return what the watchdog makes of ordinary telemetry; None: there is too little of it."""
-    if state.registration is None or sums is None or sums.tail is None:
-        return None
+    sums: Passive | str, state: TrackerState, crew: Crew
+) -> ev.Watched | ev.Unwatched | ev.Noted | None:
+    """Return what the watchdog makes of ordinary telemetry, or why it can make nothing of it.
+
+    None: there is no more to tell than before.
+    """
+    if isinstance(sums, str):
+        return None if sums == state.unwatched else ev.Unwatched(text=sums)
     last = sums.tail
+    if last is None:
+        return None
     end_ns = last.t0_ns_utc + (last.n_frames - 1) * last.dt_ns
     try:
-        estimate = await crew.call(Workbench.watch, sums, state.registration.alpha)
+        estimate = await crew.call(Workbench.watch, sums, fit_begins_at(state))
     except PyrcalError as error:
         return ev.Noted(name="watchdog.failed", text=str(error), level=Level.WARNING)
     return None if estimate is None else ev.Watched(estimate=estimate, t_ns_utc=end_ns)

@@ -281,7 +281,8 @@ class Watchdog:
     """As read: the bias is in it."""
 
     sigma: Array
-    """``(4,)`` 1 σ of it as a reading of α, once the bias known is taken off; numeric units."""
+    """``(4,)`` 1 σ of it as a reading of α, once the bias known is taken off; numeric units.
+    Infinite where it cannot tell."""
 
     t_ns_utc: int
     consistent: bool

@@ -121,6 +121,9 @@ class TrackerState:
     """Of the telescope, from the RTC's status or the observatory; None: nobody has told."""
 
     watchdog: Watchdog | None = None
+    unwatched: str = ""
+    """Why ordinary telemetry says nothing of α now; empty: it does, or was not looked at yet."""
+
     alarms: tuple[Alarm, ...] = ()
     log: tuple[LogEntry, ...] = ()
     """Oldest first, bounded."""

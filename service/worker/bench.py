@@ -308,10 +308,13 @@ class Workbench:
         return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
 
     def watch(
-        self, state: passive.Passive, start: Misregistration
+        self, state: passive.Passive, start: Misregistration | None
     ) -> passive.PassiveEstimate | None:
-        """Estimate α from ordinary telemetry; None when there is too little of it."""
-        found = passive.fit(state, self._sensor.near(start))
+        """Estimate α from ordinary telemetry; None when there is too little of it.
+
+        About ``start``, or without one about the nominal rotation.
+        """
+        found = passive.fit(state, self._sensor.near(start or self._start))
         if found is None:
             return None
         return replace(

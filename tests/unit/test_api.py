@@ -320,6 +320,20 @@ async def test_the_state_of_a_service_that_knows_nothing_is_readable(client, ser
     service.now = replace(service.now, tracker=TrackerState(system="bench"))
     body = await body_of(client, "/v1/state")
     assert body["rtc"] is body["margin"] is body["dither"] is body["watchdog"] is None
+    assert body["unwatched"] == ""
+
+
+async def test_the_state_says_why_ordinary_telemetry_says_nothing(client, service):
+    silent = replace(STATE, unwatched="no passive estimate: the loop's delay is 1.5 frames")
+    service.now = replace(service.now, tracker=silent)
+    assert (await body_of(client, "/v1/state"))["unwatched"] == silent.unwatched
+
+
+async def test_a_reading_that_cannot_tell_has_no_sigma(client, service):
+    lost = replace(STATE.watchdog, sigma=np.full(4, np.inf), text="it cannot tell")
+    service.now = replace(service.now, tracker=replace(STATE, watchdog=lost))
+    body = await body_of(client, "/v1/state")
+    assert set(body["watchdog"]["sigma"].values()) == {None}
 
 
 async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(client, service):

@@ -8,9 +8,11 @@ import pytest
 from service import events as ev
 from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
+from service.reactions.watchdog import fit_begins_at
 from service.state import Mode, Source, Validity
 from tests.unit.reactions.situations import (
     ALPHA,
+    POLICY,
     SECOND,
     Story,
     moved,
@@ -58,7 +60,36 @@ def test_it_only_reports_while_there_is_nothing_to_compare_with():
     watch(story, Misregistration())
     assert story.state.watchdog.consistent
     assert "no dithered estimate" in story.state.watchdog.text
+    np.testing.assert_array_equal(story.state.watchdog.sigma, watched(ALPHA).sigma)
     assert story.state.registration is None
+
+
+def test_while_alpha_is_unknown_each_look_begins_at_the_last_one():
+    story = Story(Mode.AUTO).meet()
+    assert fit_begins_at(story.state) is None
+    watch(story, moved(shift_x_subap=0.1))
+    assert fit_begins_at(story.state) == moved(shift_x_subap=0.1)
+    story.see()
+    assert fit_begins_at(story.state) == story.state.registration.alpha
+
+
+def test_a_reading_too_far_away_for_its_fit_is_worth_nothing_and_says_so():
+    """2 deg and 0.8 subapertures: the range of one linearised fit, about the nominal rotation."""
+    story = Story(Mode.AUTO).meet()
+    watch(story, moved(rotation_rad=np.deg2rad(3.0)))
+    assert np.isinf(story.state.watchdog.sigma).all()
+    assert "cannot tell" in story.state.watchdog.text
+    assert fit_begins_at(story.state) is None
+    turned = Story(Mode.AUTO, replace(POLICY, start=moved(rotation_rad=np.deg2rad(3.0)))).meet()
+    watch(turned, moved(rotation_rad=np.deg2rad(3.0)))
+    assert np.isfinite(turned.state.watchdog.sigma).all()
+
+
+def test_why_there_is_no_look_is_told_until_there_is_one(story):
+    story.tell(ev.Unwatched(text="no passive estimate: the loop is open"))
+    assert story.state.unwatched == "no passive estimate: the loop is open"
+    watch(story, ALPHA)
+    assert story.state.unwatched == ""
 
 
 def test_before_a_bias_is_learnt_a_shift_is_worth_ten_percent_and_says_so(story):

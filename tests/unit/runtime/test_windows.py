@@ -1,0 +1,53 @@
+"""Looks at ordinary telemetry: taken whether or not α is known, or the reason why not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service import events as ev
+from service.estimation import passive
+from service.runtime.windows import watched
+from service.state import Mode
+from service.worker import Workbench
+from tests.numerics import block_of
+from tests.unit.reactions.situations import ALPHA, Story
+from tests.unit.reactions.test_watchdog import watched as look
+
+
+class Worker:
+    """Answers every job with the same look, and remembers about what it was to be fitted."""
+
+    def __init__(self):
+        self.begun_at = []
+
+    async def call(self, job, sums, start):
+        assert job is Workbench.watch
+        self.begun_at.append(start)
+        return look(ALPHA)
+
+
+@pytest.fixture
+def sums():
+    frames = block_of(np.zeros((40, 6)), np.zeros((40, 4)), None)
+    return replace(passive.Passive(n_modes=4, memory_frames=1000.0), tail=frames)
+
+
+async def test_a_look_is_taken_though_alpha_is_not_known(sums):
+    """It says what it can tell, from the nominal rotation on; the tracker says what it is worth."""
+    worker, story = Worker(), Story(Mode.HOLD).meet()
+    event = await watched(sums, story.state, worker)
+    assert worker.begun_at == [None]
+    assert event.t_ns_utc == sums.tail.t0_ns_utc + 39 * sums.tail.dt_ns
+    story.tell(event)
+    await watched(sums, story.state, worker)
+    assert worker.begun_at[1] == ALPHA
+
+
+async def test_why_there_is_none_is_told_once():
+    worker, story = Worker(), Story(Mode.HOLD).meet()
+    event = await watched("the loop is open", story.state, worker)
+    assert event == ev.Unwatched(text="the loop is open")
+    story.tell(event)
+    assert await watched("the loop is open", story.state, worker) is None
+    assert worker.begun_at == []

@@ -43,6 +43,7 @@ _ACQUISITION_KEPT = (
     "most_modes",
     "matrix",
     "sent",
+    "held_off",
     "interruption",
 )
 """The rest is of telemetry that the next one will not have."""

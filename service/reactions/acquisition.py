@@ -74,7 +74,8 @@ def on_acquire(state: TrackerState, event: Event, policy: Policy, now_ns: int) -
         interrupted = state.acquisition.stage is AcquisitionStage.INTERRUPTED
         if not state.acquisition.under_way and not interrupted:
             raise CommandError("acquisition: none is under way")
-        return abort(without_alarm(state, "acquisition", now_ns), "by the operator", now_ns)
+        state = without_alarm(state, "acquisition", now_ns)
+        return abort(state, "by the operator", now_ns, held_off=True)
     reason = why_not_now(state, policy)
     if state.rtc is None or reason is not None:
         raise CommandError(f"acquisition: {reason}")
@@ -95,7 +96,7 @@ def acquire(
     if not acquisition.under_way:
         if state.windows_accepted > before.windows_accepted:
             state = replace(state, acquisition=replace(acquisition, misses=0))
-        state = forgotten(state, now_ns)
+        state = forgotten(state, event, now_ns)
         why = why_needed(state, policy, now_ns)
         if why is None:
             return state, ()

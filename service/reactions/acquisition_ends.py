@@ -15,6 +15,12 @@ from service.state import AcquisitionStage, Level, LoopFound, TrackerState
 MOST_ATTEMPTS = 3
 """Times the loop is opened for one acquisition."""
 
+HELD_OFF = (
+    "; none begins by itself until windows agree in a closed loop, the mode is set anew, or one is "
+    "asked for"
+)
+"""After an operator ended one, in the text of it."""
+
 _BELIEVED = (
     AcquisitionStage.PARTIAL,
     AcquisitionStage.WIDENING,
@@ -104,10 +110,11 @@ def fail(state: TrackerState, reason: str, now_ns: int) -> Step:
     return with_alarm(state, "acquisition", text, now_ns), effects
 
 
-def abort(state: TrackerState, why: str, now_ns: int) -> Step:
+def abort(state: TrackerState, why: str, now_ns: int, *, held_off: bool = False) -> Step:
     """End it at once: the loop as it was found, if it held then and nothing was sent; else as is.
 
-    As is means open, or closed on a reconstructor that has passed the gate.
+    As is means open, or closed on a reconstructor that has passed the gate. ``held_off``: none
+    begins by itself for now, though what made this one begin may last.
     """
     acquisition = state.acquisition
     state, effects = without_dither(state)
@@ -118,7 +125,9 @@ def abort(state: TrackerState, why: str, now_ns: int) -> Step:
         left = "closed as it was found"
         state, more = told(state, ev.SetLoop(closed=True, leak=found.leak), now_ns)
         effects = (*effects, *more)
-    text = f"ended {why}; the loop is {left}"
+    text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
+    over = replace(state.acquisition, held_off=held_off, windows=state.windows_accepted)
+    state = replace(state, acquisition=over)
     return entered(state, AcquisitionStage.ABORTED, text, now_ns), effects
 
 

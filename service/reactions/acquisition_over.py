@@ -4,19 +4,29 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service.events import Event, SetMode
 from service.reactions.acquisition_closed import ENOUGH_WINDOWS
 from service.reactions.journal import logged, without_alarm
 from service.state import Acquisition, AcquisitionStage, TrackerState
 
 
-def forgotten(state: TrackerState, now_ns: int) -> TrackerState:
-    """Return the state without an acquisition that had failed, once α is known without it.
+def forgotten(state: TrackerState, event: Event, now_ns: int) -> TrackerState:
+    """Return the state without an acquisition that holds back the next, once it need not.
 
-    Whoever closed the loop has mended what it could not; the next trouble is another one.
+    One that had failed: when α is known without it, for whoever closed the loop has mended what it
+    could not, and the next trouble is another one. One that an operator ended: then too, or when an
+    operator sets the mode, which is to say what the service may do by itself.
     """
-    if state.acquisition.stage is not AcquisitionStage.FAILED or not _followed(state):
+    acquisition = state.acquisition
+    failed = acquisition.stage is AcquisitionStage.FAILED
+    if not failed and not acquisition.held_off:
         return state
-    text = f"{ENOUGH_WINDOWS} windows agree in the closed loop: none is needed any more"
+    if acquisition.held_off and isinstance(event, SetMode):
+        text = f"an operator has set the mode, {event.mode}, since the last was ended"
+    elif _followed(state):
+        text = f"{ENOUGH_WINDOWS} windows agree in the closed loop: none is needed any more"
+    else:
+        return state
     idle = Acquisition(text=text, since_ns_utc=now_ns)
     state = without_alarm(replace(state, acquisition=idle), "acquisition", now_ns)
     return logged(state, "acquisition.idle", text, now_ns)

@@ -145,7 +145,8 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
         return None
     if not policy.dither_enabled or state.dither_stopped or state.measuring is not None:
         return None
-    if acquisition.stage is AcquisitionStage.FAILED or _wrong_rtc(state):
+    failed = acquisition.stage is AcquisitionStage.FAILED
+    if failed or acquisition.held_off or _wrong_rtc(state):
         return None
     for alarm in state.alarms:
         lasted_ns = now_ns - alarm.since_ns_utc

@@ -31,7 +31,8 @@ _LASTING = (AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED)
 def left_behind(state: TrackerState) -> Acquisition | None:
     """Return what the next service must know of an acquisition; None: nothing.
 
-    One that was aborted matters while α is not known: it says why, and why the loop may be open.
+    One that was aborted matters while α is not known: it says why, and why the loop may be open. So
+    does one that holds back the next.
     """
     acquisition = state.acquisition
     kept = replace(acquisition, alpha=None, covariance=None, command=None, applied=None, windows=0)
@@ -40,7 +41,8 @@ def left_behind(state: TrackerState) -> Acquisition | None:
         doing = f"{acquisition.stage}: {acquisition.text}"
         return replace(kept, interruption=Interruption(doing=doing, session=session))
     aborted = acquisition.stage is AcquisitionStage.ABORTED and state.registration is None
-    return kept if aborted or acquisition.stage in _LASTING else None
+    lasts = acquisition.stage in _LASTING or acquisition.held_off
+    return kept if aborted or lasts else None
 
 
 def inherited(state: TrackerState, left: Acquisition, now_ns: int) -> TrackerState:

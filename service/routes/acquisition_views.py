@@ -27,6 +27,9 @@ class AcquisitionView(View):
     since_ns_utc: int
     """Since when it is in this stage."""
 
+    held_off: bool
+    """An operator ended it: none begins by itself; the text says until when."""
+
     commanded: bool
     """An operator asked for it."""
 

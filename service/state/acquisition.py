@@ -137,6 +137,10 @@ class Acquisition:
     windows: int = 0
     """Windows that had been accepted when the reconstructor in use was applied, or it was over."""
 
+    held_off: bool = False
+    """An operator ended it: none begins by itself until windows agree in a closed loop, an operator
+    sets the mode, or asks for one."""
+
     interruption: Interruption | None = None
     """How the service before this one left it; None: it is of this one's own."""
 

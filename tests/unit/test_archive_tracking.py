@@ -85,6 +85,20 @@ def test_an_acquisition_under_way_is_read_as_it_was_written(file, cut_off):
     assert found.acquisition.interruption.session == "s2"
 
 
+def test_that_an_operator_ended_one_is_read_as_it_was_written(file, cut_off):
+    file.write(replace(cut_off, acquisition=replace(cut_off.acquisition, held_off=True)))
+    assert file.read().acquisition.held_off is True
+
+
+def test_a_file_from_before_operators_could_hold_one_off_is_read(file, cut_off, tmp_path):
+    file.write(cut_off)
+    path = tmp_path / "tracking.json"
+    values = json.loads(path.read_text())
+    del values["acquisition"]["held_off"]
+    path.write_text(json.dumps(values))
+    assert file.read().acquisition.held_off is False
+
+
 def test_a_file_from_before_acquisitions_were_saved_is_read(file, saved, tmp_path):
     file.write(saved)
     path = tmp_path / "tracking.json"

@@ -5,9 +5,9 @@ import pytest
 from service import events as ev
 from service.reactions.acquisition_closed import ENOUGH_WINDOWS
 from service.reactions.acquisition_plan import MISSES_DESPITE
-from service.state import AcquisitionStage, MatrixState
+from service.state import AcquisitionStage, MatrixState, Mode
 from tests.unit.reactions.situations import foreign, moved
-from tests.unit.reactions.test_acquisition import CALM, DIVERGING, Acquiring
+from tests.unit.reactions.test_acquisition import CALM, DIVERGING, FAR, Acquiring
 from tests.unit.reactions.test_acquisition_restart import Again
 
 SLIPPED = ev.Trouble(name="edge-slip", text="found")
@@ -90,3 +90,101 @@ def test_a_restarted_service_can_leave_it_too(n_before):
     again.see(n_windows=ENOUGH_WINDOWS)
     assert again.stage is AcquisitionStage.IDLE
     assert "acquisition" not in again.alarms
+
+
+class Ended(Acquiring):
+    """Begun by itself, and ended by the operator while the alarm that began it lasts."""
+
+    def __init__(self, trouble=DIVERGING):
+        super().__init__()
+        self.tell(trouble)
+        self.wait(4)
+        assert self.stage is AcquisitionStage.OPENING
+        self.tell(ev.AbortAcquisition(), 1.0)
+
+    @property
+    def began(self):
+        return self.logged.count("acquisition.begun")
+
+
+@pytest.mark.parametrize("trouble", [DIVERGING, SLIPPED])
+def test_what_an_operator_ended_does_not_begin_again_while_its_alarm_lasts(trouble):
+    story = Ended(trouble)
+    story.wait(600, every_s=10)
+    assert story.stage is AcquisitionStage.ABORTED
+    assert story.began == 1
+    assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
+    assert "ended by the operator" in story.text
+    assert "none begins by itself until" in story.text
+
+
+def test_nor_when_the_alarm_goes_and_comes():
+    story = Ended()
+    for _ in range(3):
+        story.tell(CALM)
+        story.tell(DIVERGING, 1.0)
+        story.wait(10)
+    assert story.began == 1
+
+
+def test_nor_when_windows_find_nothing():
+    story = Ended()
+    story.tell(CALM)
+    for _ in range(MISSES_DESPITE):
+        story.miss_afar("the fit did not settle: it is far away")
+    assert story.began == 1
+
+
+def test_windows_that_agree_in_a_closed_loop_let_the_next_trouble_count():
+    story = Ended()
+    story.tell(CALM)
+    story.see(n_windows=ENOUGH_WINDOWS)
+    assert (story.stage, story.state.acquisition.held_off) == (AcquisitionStage.IDLE, False)
+    story.tell(DIVERGING)
+    story.wait(4)
+    assert story.stage is AcquisitionStage.OPENING
+
+
+def test_windows_from_before_it_was_ended_do_not_count():
+    story = Acquiring().to_widening()
+    story.see(FAR)
+    story.widen(400)
+    story.see(FAR)
+    assert story.state.registration.n_windows >= ENOUGH_WINDOWS
+    story.tell(ev.AbortAcquisition())
+    assert story.stage is AcquisitionStage.ABORTED
+    story.tell(DIVERGING)
+    story.wait(10)
+    assert story.stage is AcquisitionStage.ABORTED
+
+
+def test_setting_the_mode_anew_lets_it_begin():
+    story = Ended()
+    story.tell(ev.SetMode(mode=Mode.AUTO))
+    assert story.stage is AcquisitionStage.OPENING
+    assert story.began == 2
+
+
+def test_so_does_an_operator_who_asks():
+    story = Ended()
+    story.tell(ev.Acquire())
+    assert story.stage is AcquisitionStage.OPENING
+    assert not story.state.acquisition.held_off
+
+
+def test_a_restarted_service_does_not_begin_what_an_operator_ended():
+    again = Again(Ended())
+    again.find(loop="closed", gains=(0.4,) * 400 + (0.0,) * 194)
+    again.tell(DIVERGING)
+    again.wait(60)
+    assert again.stage is AcquisitionStage.ABORTED
+    assert not again.asked(ev.AskLoop)
+
+
+def test_one_that_hold_ended_is_not_held_off():
+    story = Acquiring()
+    story.tell(DIVERGING)
+    story.wait(4)
+    story.tell(ev.SetMode(mode=Mode.HOLD))
+    assert (story.stage, story.state.acquisition.held_off) == (AcquisitionStage.ABORTED, False)
+    assert "none begins" not in story.text

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.reactions.worth import VERDICT_REACH
 from service.state import Judged, Registration, TrackerState
 
 MIN_WINDOWS = 2
 """Windows that must agree before anything is made from them."""
+
+REACH = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
+"""Half of what 594 modes tolerate without loss (Heritier et al. 2018): a verdict is as good so far
+beyond α ± 3σ (numeric units)."""
 
 SAME_GAIN = 1e-3
 """Relative: gains that differ by less are the same."""
@@ -27,13 +30,14 @@ def settled(known: Registration) -> bool:
 def why_stale(state: TrackerState, judged: Judged | None, gains: tuple[float, ...]) -> str | None:
     """Return why a verdict says nothing of a loop with these gains now; None: it does.
 
-    It was taken over α ± 3σ as they were then, which must hold all of α ± 3σ as they are now.
+    It was taken over α ± 3σ as they were then, which must hold all of α ± 3σ as they are now, but
+    for a small ``REACH``: σ grows between two windows, and another verdict takes as long.
     """
     known = state.registration
     if known is None or judged is None:
         return None if known is None else why_of_another_loop(state, judged, gains)
     moved = np.abs(known.alpha.vector - judged.alpha.vector)
-    if np.any(moved + 3.0 * known.sigma > 3.0 * judged.sigma + VERDICT_REACH):
+    if np.any(moved + 3.0 * known.sigma > 3.0 * judged.sigma + REACH):
         return "α ± 3σ reaches further than it was judged for"
     return why_of_another_loop(state, judged, gains)
 

@@ -18,7 +18,7 @@ from service.archive import Archive, AuditEntry
 from service.control.gate import GateVerdict
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.model.misregistration import Misregistration
-from service.state import MatrixState, ReconstructorRecord
+from service.state import Judged, MatrixState, ReconstructorRecord
 from service.wire import checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4)
@@ -116,6 +116,19 @@ def test_a_record_without_registration_or_verdict_comes_back_as_it_was(archive):
     bare = ReconstructorRecord(id="rtc-7", state=MatrixState.APPLIED, n_modes=400, created_ns_utc=5)
     archive.update(bare)
     assert_same(archive.records()[0], bare)
+
+
+def test_what_a_verdict_was_of_is_not_kept_and_must_be_found_out_anew(archive):
+    then = Judged(
+        session="s1",
+        gains=(0.4,) * 3,
+        leak=0.999,
+        delay_frames=2.0,
+        alpha=Misregistration(),
+        sigma=np.full(4, 1e-3),
+    )
+    archive.update(record_of(judged=then))
+    assert_same(archive.records()[0], record_of())
 
 
 def test_an_update_changes_the_index_but_not_the_product(archive):
@@ -326,7 +339,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from service.archive import Archive
-from service.state import MatrixState, ReconstructorRecord
+from service.state import Judged, MatrixState, ReconstructorRecord
 
 archive = Archive(Path(sys.argv[1]))
 archive.open()

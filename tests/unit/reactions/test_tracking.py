@@ -82,10 +82,6 @@ class TestSuspicion:
         assert "jumped while it was made" in story.state.reconstructor("cm-1").reason
         assert of_kind(story.make("cm-2"), ev.SendMatrix)
 
-    def test_one_that_an_operator_wants_back_is_sent_all_the_same(self, story):
-        story.see(THERE, n_windows=3)
-        assert of_kind(story.make("cm-1", alpha=ALPHA, wanted=True), ev.SendMatrix)
-
     def test_a_dither_is_due_until_a_window_has_decided(self, story):
         story.see(THERE)
         assert story.state.dither_due_since_ns_utc == story.now_ns

@@ -133,6 +133,7 @@ def _measured(night: Night, end_s: float, rng: np.random.Generator, policy: Poli
         alpha=Misregistration.from_vector(Misregistration().vector + read / BOUNDARY_SCALE),
         covariance=np.diag(said**2),
         floor=policy.floor,
+        misfit=1.0,
         t_ns_utc=START_NS + round(end_s * SECOND_NS),
         source=Source.LOCK_IN,
         optical_gain=0.6,

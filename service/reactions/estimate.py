@@ -56,6 +56,9 @@ class Measured:
     floor: Array
     """``(4,)`` 1 σ of the model error, numeric units: it does not average down."""
 
+    misfit: float
+    """Residual power over what noise explains; 1: the model explains the window."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Folded:
@@ -190,6 +193,7 @@ def entry_of(
         filtered=registration.alpha,
         filtered_sigma=registration.sigma,
         innovation=innovation,
+        misfit=measured.misfit,
         source=measured.source,
         entered=entered,
     )

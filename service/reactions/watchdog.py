@@ -75,6 +75,7 @@ def on_watchdog(
         filtered=registration.alpha,
         filtered_sigma=registration.sigma,
         innovation=innovation,
+        misfit=event.estimate.misfit,
         source=Source.PASSIVE,
     )
     text = "agrees with α and with what is known of its own bias"
@@ -186,6 +187,7 @@ def _shown(
     watchdog = Watchdog(
         alpha=event.estimate.alpha,
         sigma=sigma,
+        misfit=event.estimate.misfit,
         t_ns_utc=event.t_ns_utc,
         consistent=consistent,
         text=text,

@@ -72,6 +72,7 @@ def on_window(
             estimate.t_ns_utc,
         ),
         floor=_floor(known, estimate, policy),
+        misfit=estimate.misfit,
     )
     return with_window(state, measured, policy, now_ns)
 

@@ -15,7 +15,15 @@ from service import __version__
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.routes.registration_views import age_s
 from service.routes.service import Link, Snapshot
-from service.state import DitherPhase, MatrixState, MeasurePattern, Mode, TrackerState, Validity
+from service.state import (
+    DitherPhase,
+    MatrixState,
+    MeasurePattern,
+    Mode,
+    Source,
+    TrackerState,
+    Validity,
+)
 
 _LINK_COUNTERS = {
     "batches_received": "Telemetry batches taken in",
@@ -90,6 +98,8 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
         "outlying": tracker.windows_outlying,
     }
     yield _labelled_counter("windows", "Windows of telemetry, by verdict", "verdict", windows)
+    explained = "Residual power over what noise explains, last of each kind: 1 is all explained"
+    yield _labelled_gauge("misfit_ratio", explained, "source", _misfits(tracker))
     registration = tracker.registration
     if registration is None:
         return
@@ -102,6 +112,19 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     yield _gauge("dither_due", "1 while a dithered window is wanted before all else", due)
     gain = "Mean optical gain of the dithered modes"
     yield _gauge("optical_gain_ratio", gain, registration.optical_gain)
+
+
+def _misfits(tracker: TrackerState) -> dict[str, float]:
+    """Return the last goodness of fit of each way of looking at telemetry."""
+    newest_first = tuple(reversed(tracker.history))
+    found = {}
+    for source in Source:
+        last = next((entry for entry in newest_first if entry.source is source), None)
+        if last is not None:
+            found[str(source)] = last.misfit
+    if tracker.watchdog is not None:
+        found[str(Source.PASSIVE)] = tracker.watchdog.misfit
+    return found
 
 
 def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:
@@ -150,7 +173,7 @@ def _gauge(name: str, text: str, value: float | None) -> Metric:
     return GaugeMetricFamily(f"pyrcal_{name}", text, value=math.nan if value is None else value)
 
 
-def _labelled_gauge(name: str, text: str, label: str, values: Mapping[str, int]) -> Metric:
+def _labelled_gauge(name: str, text: str, label: str, values: Mapping[str, float]) -> Metric:
     family = GaugeMetricFamily(f"pyrcal_{name}", text, labels=[label])
     for key, value in values.items():
         family.add_metric([key], value)

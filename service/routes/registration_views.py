@@ -164,6 +164,10 @@ class HistoryEntryView(View):
     innovation: Number
     """Normalised innovation squared (4 degrees of freedom)."""
 
+    misfit: Number
+    """Goodness of fit: residual power over what noise explains. 1: the model explains the data;
+    more: the floor of α grows with it; null: not known."""
+
     source: Source
     """What it was made from."""
 
@@ -189,6 +193,11 @@ class WatchdogView(View):
 
     bias: FourView
     """What is known of its bias."""
+
+    misfit: Number
+    """Goodness of fit: residual power over what noise explains. 1: the model explains the
+    telemetry; far from it, either way: turbulence is in it, and the shifts are worth less; null:
+    too young to tell."""
 
     t_ns_utc: int
     consistent: bool

@@ -266,6 +266,9 @@ class HistoryEntry:
     innovation: float
     """Normalised innovation squared (4 degrees of freedom); 0 for the first window."""
 
+    misfit: float
+    """Residual power over what noise explains; 1: the model explains the data. NaN: not known."""
+
     source: Source = Source.LOCK_IN
     """What it was made from."""
 
@@ -283,6 +286,10 @@ class Watchdog:
     sigma: Array
     """``(4,)`` 1 σ of it as a reading of α, once the bias known is taken off; numeric units.
     Infinite where it cannot tell."""
+
+    misfit: float
+    """Residual power over what noise explains; 1: the model explains the telemetry. NaN: too young
+    to tell."""
 
     t_ns_utc: int
     consistent: bool

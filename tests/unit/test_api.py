@@ -54,6 +54,7 @@ from service.state import (
     ReconstructorRecord,
     Registration,
     RtcView,
+    Source,
     Standing,
     TrackerState,
     Validity,
@@ -107,6 +108,7 @@ def entry(k):
         filtered=ALPHA,
         filtered_sigma=SIGMA,
         innovation=3.5,
+        misfit=1.2,
     )
 
 
@@ -187,7 +189,12 @@ STATE = TrackerState(
         asked_ns_utc=5,
     ),
     watchdog=Watchdog(
-        alpha=ALPHA, sigma=10 * SIGMA, t_ns_utc=80 * SECOND, consistent=True, text="agrees"
+        alpha=ALPHA,
+        sigma=10 * SIGMA,
+        misfit=float("nan"),
+        t_ns_utc=80 * SECOND,
+        consistent=True,
+        text="agrees",
     ),
     alarms=(Alarm(name="rtc.silent", since_ns_utc=70 * SECOND, text="no status: look at it"),),
     log=tuple(
@@ -311,6 +318,7 @@ async def test_state_shows_everything_at_one_glance(client):
     assert (body["dithering"]["mean_cost_m"], body["dithering"]["n_windows_learnt"]) == (3e-9, 0)
     assert body["vibrations_hz"] == [61.0]
     assert body["watchdog"]["sigma"]["rotation_deg"] == pytest.approx(0.3)
+    assert body["watchdog"]["misfit"] is None
     assert body["alarms"][0]["name"] == "rtc.silent"
     assert (body["windows_accepted"], body["windows_refused"]) == (4, 1)
     assert body["link"]["frames_refused"] == {"basis": 8}
@@ -415,7 +423,19 @@ async def test_history_is_the_newest_entries_oldest_first(client):
     body = await body_of(client, "/v1/alpha/history", limit=2)
     assert [e["t_ns_utc"] for e in body["entries"]] == [3 * SECOND, 4 * SECOND]
     assert body["entries"][0]["measured_sigma"]["rotation_deg"] == pytest.approx(0.06)
+    assert body["entries"][0]["misfit"] == 1.2
     assert len((await body_of(client, "/v1/alpha/history"))["entries"]) == 5
+
+
+async def test_the_last_goodness_of_fit_of_each_kind_is_measured(client, service):
+    last = replace(entry(9), misfit=1.4, source=Source.RANDOM)
+    seen = replace(STATE.watchdog, misfit=0.8)
+    service.change(history=(*STATE.history, last, replace(last, misfit=1.3)), watchdog=seen)
+    metrics = (await client.get("/metrics")).text
+    found = {source: f'pyrcal_misfit_ratio{{source="{source}"}}' for source in Source}
+    assert f"{found[Source.LOCK_IN]} 1.2" in metrics
+    assert f"{found[Source.RANDOM]} 1.3" in metrics
+    assert f"{found[Source.PASSIVE]} 0.8" in metrics
 
 
 async def test_reconstructors_are_listed_with_the_one_in_use(client):

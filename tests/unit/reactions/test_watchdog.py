@@ -155,6 +155,14 @@ def test_once_learnt_it_follows_a_drift_without_any_window(story):
     assert story.state.history[-1].source is Source.PASSIVE
 
 
+def test_how_well_the_model_fits_a_look_is_shown_and_in_the_history(story):
+    now_ns = story.now_ns + 4 * SECOND
+    look = replace(watched(ALPHA), misfit=1.7)
+    story.tell(ev.Watched(estimate=look, t_ns_utc=now_ns), after_s=4.0)
+    assert story.state.watchdog.misfit == 1.7
+    assert story.state.history[-1].misfit == 1.7
+
+
 class TestBark:
     """An estimate that fits neither α nor what is known of its bias."""
 

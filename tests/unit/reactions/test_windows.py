@@ -51,6 +51,13 @@ def test_what_the_model_does_not_explain_stays_in_sigma_however_many_windows_agr
     assert np.all(known.sigma > known.floor)
 
 
+def test_how_well_the_model_fits_each_window_is_in_the_history_whether_it_entered_or_not(story):
+    story.see(misfit=1.1)
+    story.see(moved(shift_x_subap=0.3), misfit=2.0)
+    entries = story.state.history
+    assert [(entry.misfit, entry.entered) for entry in entries] == [(1.1, True), (2.0, False)]
+
+
 def test_one_odd_misfit_among_many_moves_the_model_error_by_a_tenth(story):
     story.see(n_windows=15, misfit=0.98)
     np.testing.assert_allclose(story.state.registration.floor, story.policy.floor)

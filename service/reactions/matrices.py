@@ -81,8 +81,12 @@ def send_once_judged(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
     stale = why_stale(state, record.judged, gains)
     if stale is None:
         return send(state, matrix_id, now_ns)
+    if rtc.loop == "open" and record.gate is None:
+        return send(state, matrix_id, now_ns)
     if rtc.loop == "open":
-        gains = record.judged.gains if record.judged is not None else gains
+        if record.judged is None:
+            raise CommandError(f"{matrix_id}: an open loop does not tell its gains: close it first")
+        gains = record.judged.gains
     text = f"{matrix_id} is judged again before it is sent: {stale}"
     state = logged(state, "reconstructor.judged-again", text, now_ns)
     return state, (ev.JudgeProposal(id=matrix_id, gains=gains),)

@@ -106,6 +106,19 @@ def test_an_open_loop_does_not_tell_its_gains_so_the_verdict_stands(waiting):
     assert of_kind(waiting.tell(ev.Approve(id="cm-1")), ev.SendMatrix)
 
 
+def test_nor_can_one_be_judged_there_that_was_made_before_the_service_restarted(waiting):
+    waiting.make("cm-1", judged=None)
+    waiting.tell(ev.StatusSeen(rtc=rtc(loop="open", gains=(0.0,) * N_MODES)))
+    with pytest.raises(CommandError, match="close it first"):
+        waiting.tell(ev.Approve(id="cm-1"))
+
+
+def test_one_must_be_able_to_go_back_with_the_loop_open(waiting):
+    waiting.tell(ev.StatusSeen(rtc=rtc(loop="open", gains=(0.0,) * N_MODES)))
+    effects = waiting.make("cm-1", judged=None, gate=None, wanted=True)
+    assert of_kind(effects, ev.SendMatrix)
+
+
 def test_with_an_invalid_alpha_nothing_can_be_judged(waiting):
     waiting.see(moved(shift_x_subap=0.3))
     waiting.wait(61)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,9 @@ from service.state import (
     AcquisitionStage,
     Interruption,
     LoopFound,
+    Mode,
     ModeGain,
+    Orders,
     PassiveBias,
     Pointing,
     Registration,
@@ -96,7 +98,8 @@ class TrackingFile:
             aside = self._path.with_suffix(".damaged")
             self._path.replace(aside)
             raise ArchiveError(
-                f"{self._path}: damaged, now {aside.name}; α is measured anew: {error!s:.200}"
+                f"{self._path}: damaged, now {aside.name}; α is measured anew, mode and dither are "
+                f"as the settings say: {error!s:.200}"
             ) from error
 
 
@@ -118,7 +121,7 @@ def _plain(value: object) -> object:
             return {name: _plain(getattr(value, name)) for name in kept}
         case Acquisition():
             return {name: _plain(getattr(value, name)) for name in _ACQUISITION_KEPT}
-        case Pointing() | ModeGain() | LoopFound() | Interruption():
+        case Pointing() | ModeGain() | LoopFound() | Interruption() | Orders():
             return asdict(value)
         case tuple():
             return [_plain(entry) for entry in value]
@@ -130,16 +133,30 @@ def _from_json(values: dict[str, Any]) -> Saved:
     if values.pop("version") != VERSION:
         raise ValueError(f"expected version {VERSION}")
     known, acquisition = values["registration"], values.get("acquisition")
-    if known is None and acquisition is None:
-        raise ValueError("neither an α nor an acquisition")
+    orders = values.get("orders")
+    if known is None and acquisition is None and orders is None:
+        raise ValueError("neither an α nor an acquisition nor an order")
     return Saved(
         **{
             **values,
             "pointing": _pointing(values["pointing"]),
             "registration": None if known is None else _registration(known),
             "acquisition": None if acquisition is None else _acquisition(acquisition),
+            "orders": None if orders is None else _orders(orders),
         }
     )
+
+
+def _orders(values: dict[str, Any]) -> Orders:
+    orders = Orders(**values)
+    if type(orders.dither_stopped) is not bool:
+        raise TypeError(f"dither_stopped is {orders.dither_stopped!r}, expected true or false")
+    mode, of_settings = orders.mode, orders.settings_mode
+    if (mode is None) is not (of_settings is None):
+        raise ValueError(f"mode is {mode!r} and that of the settings {of_settings!r}")
+    if mode is None or of_settings is None:
+        return orders
+    return replace(orders, mode=Mode(mode), settings_mode=Mode(of_settings))
 
 
 def _registration(known: dict[str, Any]) -> Registration:

@@ -19,6 +19,7 @@ from service.reactions.dither_pace import by_hand
 from service.reactions.dither_unwanted import told_to_stop
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send_once_judged
+from service.reactions.orders import with_mode
 from service.reactions.policy import Policy
 from service.reactions.random_dither import RANDOM_TOTAL_M, Asked, plan_random
 from service.reactions.shelf import known_record, with_state
@@ -46,7 +47,7 @@ def on_command(  # noqa: C901 - one line for each command
     """
     match event:
         case ev.SetMode(mode=mode):
-            return logged(replace(state, mode=mode), "mode", f"mode is {mode}", now_ns), ()
+            return logged(with_mode(state, mode), "mode", f"mode is {mode}", now_ns), ()
         case ev.SetPointing(pointing=pointing):
             return replace(state, pointing=pointing), ()
         case ev.StopDither():
@@ -159,7 +160,7 @@ def _copy(state: TrackerState, source: str, why: str, now_ns: int) -> Step:
         raise CommandError("a reconstructor is being computed; wait for it")
     if state.rtc is None:
         raise CommandError("no RTC is there")
-    state = replace(state, mode=Mode.HOLD, making_since_ns_utc=now_ns)
+    state = replace(with_mode(state, Mode.HOLD), making_since_ns_utc=now_ns)
     state = logged(state, "mode", f"hold: {why}", now_ns)
     return state, (ev.CopyMatrix(source=source, why=why),)
 

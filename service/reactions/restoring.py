@@ -6,21 +6,22 @@ from dataclasses import replace
 
 from service.reactions.acquisition_restart import inherited, left_behind
 from service.reactions.journal import logged
+from service.reactions.orders import obeyed, orders_of
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.validity import aged
-from service.state import Level, Saved, TrackerState
+from service.state import Level, Orders, Saved, TrackerState
 
 CLOCKS_AGREE_S = 60.0
 """A state from further in the future than this was saved under another clock."""
 
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
-    """Return what is worth keeping of a state; None: nothing is known yet."""
-    known, acquisition = state.registration, left_behind(state)
+    """Return what is worth keeping of a state; None: nothing is known yet, nor ordered."""
+    known, acquisition, orders = state.registration, left_behind(state), orders_of(state)
     if known is not None:
         bias = known.bias and replace(known.bias, earlier=None)
         known = replace(known, bias=bias, candidate=None, earlier=None)
-    elif acquisition is None:
+    elif acquisition is None and orders == Orders():
         return None
     return Saved(
         system=state.system,
@@ -30,15 +31,28 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
         pointing=state.pointing,
         registration=known,
         acquisition=acquisition,
+        orders=None if orders == Orders() else orders,
     )
+
+
+def with_orders(left: Saved, state: TrackerState) -> Saved | None:
+    """Return what was saved before, with what has been ordered since; None: it is that already.
+
+    While nothing is known of α, what another night has left of it stays.
+    """
+    orders = orders_of(state)
+    return None if (left.orders or Orders()) == orders else replace(left, orders=orders)
 
 
 def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> TrackerState:
     """Return the state with α taken over, σ grown by the time away, and no window to confirm it.
 
     It is a start for the fit and something to judge the matrix in use with; until windows of this
-    run agree with it nothing is made from it. An acquisition that was under way comes with it.
+    run agree with it nothing is made from it. An acquisition that was under way comes with it, and
+    what an operator has ordered stands, whatever becomes of α.
     """
+    if saved.orders is not None and saved.system == state.system:
+        state = obeyed(state, saved.orders, now_ns)
     reason = _why_not(state, saved, now_ns)
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"

@@ -5,8 +5,9 @@ from __future__ import annotations
 from service.archive import Archive
 from service.errors import ArchiveError
 from service.reactions.journal import logged
+from service.reactions.orders import orders_of
 from service.reactions.policy import Policy
-from service.reactions.restoring import resumed, saved_of
+from service.reactions.restoring import resumed, saved_of, with_orders
 from service.state import Level, TrackerState
 
 SAVE_INTERVAL_S = 5.0
@@ -31,9 +32,13 @@ def leave(archive: Archive, state: TrackerState, now_ns: int) -> None:
     Raises
     ------
     ArchiveError
-        If the disk refuses.
+        If the disk refuses, or what is there is damaged; it has been put aside then.
     """
     saved = saved_of(state, now_ns)
+    if saved is None or not saved.tells_of_alpha:
+        left = archive.tracking.read()
+        if left is not None and left.system == state.system:
+            saved = with_orders(left, state)
     if saved is not None:
         archive.tracking.write(saved)
 
@@ -49,11 +54,12 @@ def has_news(before: TrackerState, after: TrackerState) -> bool:
 
 
 def is_urgent(before: TrackerState, after: TrackerState) -> bool:
-    """Return whether what is not saved yet cannot wait: whose the RTC's open loop is.
+    """Return whether what is not saved yet cannot wait: whose the RTC's open loop is, and orders.
 
-    A service killed a second later would leave its own loop open to one that cannot know.
+    A service killed a second later would leave its own loop open to one that cannot know, or one
+    that undoes what an operator has ordered.
     """
-    return _course(before) != _course(after)
+    return orders_of(before) != orders_of(after) or _course(before) != _course(after)
 
 
 def _course(state: TrackerState) -> tuple[object, ...]:

@@ -21,7 +21,7 @@ from service.state.registration import (
     Watchdog,
 )
 from service.state.rtc import CommandState, DitherKind, DitherView, LoopCommand, RtcView
-from service.state.saved import Saved
+from service.state.saved import Orders, Saved
 from service.state.tracker import Mode, TrackerState
 from service.state.updates import Assessment, ModeLimit
 
@@ -56,6 +56,7 @@ __all__ = [
     "NoisyFinding",
     "NoisyRecord",
     "NoisyState",
+    "Orders",
     "PassiveBias",
     "Pointing",
     "Precision",

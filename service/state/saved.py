@@ -7,6 +7,20 @@ from dataclasses import dataclass
 from service.state.acquisition import Acquisition
 from service.state.pointing import Pointing
 from service.state.registration import Registration
+from service.state.tracker import Mode
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Orders:
+    """What an operator has ordered that a restart of the service does not undo."""
+
+    mode: Mode | None = None
+    """None: that of the settings holds."""
+
+    settings_mode: Mode | None = None
+    """What the settings said then; where they say something else now, they have the last word."""
+
+    dither_stopped: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,3 +48,11 @@ class Saved:
 
     acquisition: Acquisition | None = None
     """One under way, or over without an α; None: neither."""
+
+    orders: Orders | None = None
+    """None: nothing was ordered that the settings do not say."""
+
+    @property
+    def tells_of_alpha(self) -> bool:
+        """Whether it says what α was, or why it is not known."""
+        return self.registration is not None or self.acquisition is not None

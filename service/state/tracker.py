@@ -39,6 +39,9 @@ class TrackerState:
     """The ``{system}`` of the wire."""
 
     mode: Mode = Mode.PROPOSE
+    settings_mode: Mode | None = None
+    """What the settings say while an operator has ordered another; None: ``mode`` is theirs."""
+
     registration: Registration | None = None
     """None until the first accepted window."""
 

@@ -11,7 +11,7 @@ from service.archive import Archive
 from service.archive.tracking import TrackingFile
 from service.errors import ArchiveError
 from service.reactions.restoring import saved_of
-from service.state import Mode, Pointing, Registration
+from service.state import Mode, Orders, Pointing, Registration
 from tests.unit.reactions.situations import START_NS, Story, moved
 from tests.unit.reactions.test_acquisition import Acquiring
 from tests.unit.reactions.test_watchdog import learnt, watch
@@ -125,6 +125,45 @@ def test_a_damaged_acquisition_is_no_acquisition(file, cut_off, tmp_path, values
     found["acquisition"] |= values
     path.write_text(json.dumps(found))
     with pytest.raises(ArchiveError, match="damaged"):
+        file.read()
+
+
+ORDERS = Orders(mode=Mode.HOLD, settings_mode=Mode.AUTO, dither_stopped=True)
+
+
+def test_orders_are_read_as_they_were_given(file, saved):
+    file.write(replace(saved, orders=ORDERS))
+    assert file.read().orders == ORDERS
+    assert file.read().orders.mode is Mode.HOLD
+
+
+def test_orders_alone_are_worth_a_file(file, saved):
+    file.write(replace(saved, registration=None, orders=ORDERS))
+    found = file.read()
+    assert (found.registration, found.orders) == (None, ORDERS)
+
+
+def test_a_file_from_before_orders_were_saved_is_read(file, saved, tmp_path):
+    file.write(saved)
+    path = tmp_path / "tracking.json"
+    values = json.loads(path.read_text())
+    del values["orders"]
+    path.write_text(json.dumps(values))
+    assert file.read().orders is None
+    assert same(file.read().registration.alpha, saved.registration.alpha)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"mode": "fast"}, {"mode": None}, {"dither_stopped": "no"}, {"shoe_size": 43}],
+)
+def test_damaged_orders_are_none(file, saved, tmp_path, values):
+    file.write(replace(saved, orders=ORDERS))
+    path = tmp_path / "tracking.json"
+    found = json.loads(path.read_text())
+    found["orders"] |= values
+    path.write_text(json.dumps(found))
+    with pytest.raises(ArchiveError, match="mode and dither are as the settings say"):
         file.read()
 
 

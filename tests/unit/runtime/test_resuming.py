@@ -1,5 +1,6 @@
 """What a service leaves on the disk and when, and a small telescope whose service is restarted."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,16 @@ class TestWhatCannotWait:
         for follow in (story.open, story.see_afar, story.see_afar, lambda: story.close(150)):
             before = story.state
             follow()
+            assert is_urgent(before, story.state)
+            assert has_news(before, story.state)
+
+    @pytest.mark.parametrize("order", [ev.SetMode(mode=Mode.HOLD), ev.StopDither()])
+    def test_what_an_operator_orders_and_takes_back(self, order):
+        story = Acquiring()
+        back = {"SetMode": ev.SetMode(mode=story.state.mode), "StopDither": ev.StartDither()}
+        for command in (order, back[type(order).__name__]):
+            before = story.state
+            story.tell(command)
             assert is_urgent(before, story.state)
             assert has_news(before, story.state)
 
@@ -73,6 +84,45 @@ def test_nothing_is_written_over_what_another_night_has_left(tmp_path):
         leave(archive, story.state, story.now_ns)
         leave(archive, TrackerState(system="flao"), START_NS)
         assert archive.tracking.read().registration is not None
+
+
+def test_orders_are_left_beside_the_alpha_of_another_night_and_taken_back_there(tmp_path):
+    """Of this night nothing is known yet."""
+    with Archive(tmp_path) as archive:
+        archive.open()
+        story = Acquiring()
+        story.see(n_windows=3)
+        leave(archive, story.state, story.now_ns)
+        fresh = TrackerState(system="flao", mode=Mode.AUTO)
+        leave(archive, replace(fresh, dither_stopped=True), START_NS)
+        ordered = archive.tracking.read()
+        assert ordered.orders.dither_stopped
+        assert ordered.registration.alpha == story.state.registration.alpha
+        leave(archive, fresh, START_NS)
+        state = taken_up(archive, fresh, story.policy, story.now_ns)
+    assert state.registration is not None
+    assert not state.dither_stopped
+
+
+def test_orders_are_left_where_nothing_else_is_and_taken_back_there(tmp_path):
+    fresh = TrackerState(system="flao", mode=Mode.AUTO)
+    with Archive(tmp_path) as archive:
+        archive.open()
+        story = Acquiring()
+        for stopped in (True, False):
+            leave(archive, replace(fresh, dither_stopped=stopped), START_NS)
+            state = taken_up(archive, fresh, story.policy, START_NS)
+            assert state.dither_stopped is stopped
+
+
+def test_what_another_system_has_left_is_neither_read_nor_kept(tmp_path):
+    fresh = TrackerState(system="flao", mode=Mode.AUTO)
+    with Archive(tmp_path) as archive:
+        archive.open()
+        leave(archive, replace(fresh, system="other", dither_stopped=True), START_NS)
+        assert not taken_up(archive, fresh, Acquiring().policy, START_NS).dither_stopped
+        leave(archive, replace(fresh, dither_stopped=True), START_NS)
+        assert archive.tracking.read().system == "flao"
 
 
 class Restartable(Observatory):

@@ -207,6 +207,22 @@ async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
         assert time.monotonic() - began < 0.5
 
 
+async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_forget_it(
+    supervisor, archive, monkeypatch
+):
+    monkeypatch.setattr("service.runtime.supervisor.SAVE_INTERVAL_S", 1.0)
+    async with running(supervisor):
+        known = told(Story(Mode.HOLD).meet(), n_windows=1)
+        supervisor._state = replace(supervisor._state, registration=known)
+        await until(lambda: archive.tracking.read() is not None)
+        began = time.monotonic()
+        await supervisor.submit(ev.StopDither())
+        await until(lambda: archive.tracking.read().orders is not None)
+        assert time.monotonic() - began < 0.5
+    again = TrackerState(system="small", mode=Mode.AUTO)
+    assert taken_up(archive, again, POLICY, time.time_ns()).dither_stopped
+
+
 def told(story, n_windows):
     story.see(n_windows=n_windows)
     return story.state.registration

@@ -24,7 +24,7 @@ from service.reactions.acquisition_plan import (
     why_needed,
     why_not_now,
 )
-from service.reactions.acquisition_restart import after_restart
+from service.reactions.acquisition_restart import on_gap, taken_up
 from service.reactions.journal import logged, without_alarm
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
@@ -92,7 +92,7 @@ def acquire(
     """
     acquisition = state.acquisition
     if acquisition.stage is AcquisitionStage.INTERRUPTED:
-        return after_restart(state, policy, now_ns)
+        return taken_up(state, policy, now_ns)
     if not acquisition.under_way:
         if state.windows_accepted > before.windows_accepted:
             state = replace(state, acquisition=replace(acquisition, misses=0))
@@ -101,6 +101,8 @@ def acquire(
         if why is None:
             return state, ()
         return _begin(state, policy, now_ns, why, commanded=False)
+    if isinstance(event, ev.RtcVanished):
+        return on_gap(before, state, now_ns), ()
     state, effects = _ended_by(state, event, now_ns) or _heard(state, event, policy, now_ns)
     if effects or not state.acquisition.under_way or state.rtc is None:
         return state, effects
@@ -128,8 +130,6 @@ def _ended_by(state: TrackerState, event: Event, now_ns: int) -> Step | None:
             return abort(state, "because the dither was stopped", now_ns)
         case ev.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
             return abort(state, f"because the mode is {mode}", now_ns)
-        case ev.RtcVanished():
-            return abort(state, "because the RTC vanished", now_ns)
         case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
             return again(state, "the RTC began a new session", now_ns)
         case ev.Tick() if _late(acquisition, now_ns):

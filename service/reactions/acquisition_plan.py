@@ -102,7 +102,7 @@ def loop_found(state: TrackerState, rtc: RtcView, policy: Policy) -> LoopFound:
 
 
 def left_open(state: TrackerState, rtc: RtcView) -> Acquisition | None:
-    """Return the acquisition of the service before this one, if the loop is as that one left it.
+    """Return the acquisition that was cut off, if the loop is as it left it.
 
     Opening a loop begins a session: the same one means that nobody has closed it in between.
     """

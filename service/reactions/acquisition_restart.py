@@ -1,8 +1,9 @@
-"""An acquisition in the middle of which the service has ended, and what the next one does about it.
+"""An acquisition cut off by the end of the service or a gap in the link, and what follows.
 
 The RTC's loop stays as the acquisition had it, mostly open, and its matrix is for a registration
-that was not believed. The next service begins anew where it may and the loop is as it was left;
-whatever else it finds it says, and leaves to the operator. It never closes a loop.
+that was not believed. The next service, or the same one when the RTC is back, begins anew where it
+may and the loop is as it was left; whatever else it finds it says, and leaves to the operator. It
+never closes a loop.
 """
 
 from __future__ import annotations
@@ -35,14 +36,32 @@ def left_behind(state: TrackerState) -> Acquisition | None:
     does one that holds back the next.
     """
     acquisition = state.acquisition
-    kept = replace(acquisition, alpha=None, covariance=None, command=None, applied=None, windows=0)
     if acquisition.under_way:
-        session = None if state.rtc is None else state.rtc.session
-        doing = f"{acquisition.stage}: {acquisition.text}"
-        return replace(kept, interruption=Interruption(doing=doing, session=session))
+        return _cut_off(state, "the service ended")
     aborted = acquisition.stage is AcquisitionStage.ABORTED and state.registration is None
     lasts = acquisition.stage in _LASTING or acquisition.held_off
-    return kept if aborted or lasts else None
+    return _kept(acquisition) if aborted or lasts else None
+
+
+def _kept(acquisition: Acquisition) -> Acquisition:
+    """Return it without what is of telemetry and commands that have been overtaken."""
+    return replace(acquisition, alpha=None, covariance=None, command=None, applied=None, windows=0)
+
+
+def _cut_off(state: TrackerState, cause: str) -> Acquisition:
+    session = None if state.rtc is None else state.rtc.session
+    doing = f"{state.acquisition.stage}: {state.acquisition.text}"
+    interruption = Interruption(doing=doing, session=session, cause=cause)
+    return replace(_kept(state.acquisition), interruption=interruption)
+
+
+def on_gap(before: TrackerState, state: TrackerState, now_ns: int) -> TrackerState:
+    """Return the state in which an acquisition waits for an RTC that has vanished.
+
+    ``before`` still knows in which session that was.
+    """
+    state = replace(state, acquisition=_cut_off(before, "the RTC vanished"))
+    return _waiting(state, "no RTC is there", now_ns)
 
 
 def inherited(state: TrackerState, left: Acquisition, now_ns: int) -> TrackerState:
@@ -52,11 +71,11 @@ def inherited(state: TrackerState, left: Acquisition, now_ns: int) -> TrackerSta
         return with_alarm(state, "acquisition", left.text, now_ns)
     if left.stage is AcquisitionStage.ABORTED:
         return state
-    return _waiting(state, "no RTC is there yet", now_ns)
+    return _waiting(state, "no RTC is there", now_ns)
 
 
-def after_restart(state: TrackerState, policy: Policy, now_ns: int) -> Step:
-    """Begin an interrupted acquisition anew, or say why not and what the operator can do."""
+def taken_up(state: TrackerState, policy: Policy, now_ns: int) -> Step:
+    """Begin an acquisition that was cut off anew, or say why not and what the operator can do."""
     rtc = state.rtc
     if rtc is None:
         return state, ()
@@ -65,9 +84,10 @@ def after_restart(state: TrackerState, policy: Policy, now_ns: int) -> Step:
     why_not = _why_not_by_itself(state, rtc, policy)
     if why_not is not None:
         return _waiting(state, why_not, now_ns), ()
+    cause = _cause(state.acquisition)
     state = replace(state, acquisition=replace(state.acquisition, interruption=None))
     state = without_alarm(state, "acquisition", now_ns)
-    return again(state, "the service was restarted", now_ns)
+    return again(state, cause, now_ns)
 
 
 def _why_not_by_itself(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
@@ -85,9 +105,9 @@ def _why_not_by_itself(state: TrackerState, rtc: RtcView, policy: Policy) -> str
 def _waiting(state: TrackerState, why: str, now_ns: int) -> TrackerState:
     """Return the state that says what was going on, why that does not go on, and what to do."""
     text = (
-        f"{_cut_off(state)}; it does not begin anew by itself: {why}. The loop may be open, and "
-        "its matrix is for a registration that was not believed: acquire again, or close the loop "
-        "on a matrix of your own"
+        f"{_said(state.acquisition)}; it does not begin anew by itself: {why}. The loop may be "
+        "open, and its matrix is for a registration that was not believed: acquire again, or close "
+        "the loop on a matrix of your own"
     )
     if any((alarm.name, alarm.text) == ("acquisition", text) for alarm in state.alarms):
         return state
@@ -105,12 +125,17 @@ def _closed(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     matrix, told = rtc.cm_id or "an unknown matrix", "which it has not judged"
     if rtc.cm_id is not None and rtc.cm_id == state.acquisition.matrix:
         told = "which had passed the gate: the registration is followed from there"
-    text = f"{_cut_off(state)}; the loop is closed on {matrix}, {told}"
+    text = f"{_said(state.acquisition)}; the loop is closed on {matrix}, {told}"
     state = without_alarm(state, "acquisition", now_ns)
     return entered(state, AcquisitionStage.ABORTED, text, now_ns)
 
 
-def _cut_off(state: TrackerState) -> str:
-    left = state.acquisition.interruption
+def _said(acquisition: Acquisition) -> str:
+    left = acquisition.interruption
     doing = "unknown" if left is None else left.doing
-    return f"the service ended during an acquisition ({doing})"
+    return f"{_cause(acquisition)} during an acquisition ({doing})"
+
+
+def _cause(acquisition: Acquisition) -> str:
+    left = acquisition.interruption
+    return "it was cut off" if left is None else left.cause

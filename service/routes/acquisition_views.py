@@ -13,7 +13,7 @@ class AcquisitionView(View):
 
     stage: AcquisitionStage
     """"idle", "opening", "coarse", "confirming", "partial", "widening", "tracking", "failed",
-    "aborted" or "interrupted" by the end of the service."""
+    "aborted" or "interrupted" by the end of the service or of the link."""
 
     text: str
     """What it does, or how it ended and what to do."""

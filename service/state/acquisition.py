@@ -39,10 +39,10 @@ class AcquisitionStage(StrEnum):
     """Given up; the text says why, and what to do."""
 
     ABORTED = "aborted"
-    """An operator ended it, or the RTC vanished."""
+    """An operator ended it."""
 
     INTERRUPTED = "interrupted"
-    """The service ended in the middle of it; the text says what the next one does about that."""
+    """The service ended, or the RTC vanished, in the middle of it; the text says what is done."""
 
 
 UNDER_WAY = frozenset(
@@ -77,13 +77,15 @@ class LoopFound:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interruption:
-    """What a service was at when it ended in the middle of an acquisition."""
+    """What an acquisition was at when it was cut off: the service ended, or the RTC vanished."""
 
     doing: str
     """Stage, and the text of it."""
 
     session: str | None
     """The RTC's; None: none was there. An open loop in the same session is the one it left."""
+
+    cause: str = "the service ended"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -142,7 +144,7 @@ class Acquisition:
     sets the mode, or asks for one."""
 
     interruption: Interruption | None = None
-    """How the service before this one left it; None: it is of this one's own."""
+    """How it was left by the service before this one, or at a gap in the link; None: it was not."""
 
     @property
     def looks_afar(self) -> bool:

@@ -83,6 +83,7 @@ def test_an_acquisition_under_way_is_read_as_it_was_written(file, cut_off):
     assert same(found, cut_off)
     assert found.acquisition.found.gains == (0.4,) * 400 + (0.0,) * 194
     assert found.acquisition.interruption.session == "s2"
+    assert found.acquisition.interruption.cause == "the service ended"
 
 
 def test_that_an_operator_ended_one_is_read_as_it_was_written(file, cut_off):

@@ -254,3 +254,97 @@ def test_one_that_ended_tracking_is_not_spoken_of():
     again = Again(story)
     assert again.stage is AcquisitionStage.IDLE
     assert again.state.registration is not None
+
+
+class TestGap:
+    """The RTC's token goes away for some seconds, and the same session comes back."""
+
+    def test_in_auto_it_begins_anew_in_the_same_session(self, opened):
+        opened.tell(ev.RtcVanished())
+        assert opened.stage is AcquisitionStage.INTERRUPTED
+        assert {"acquisition", "rtc-vanished"} <= opened.alarms
+        assert "the RTC vanished during an acquisition (coarse" in opened.text
+        opened.still_open()
+        opened.still_open()
+        assert opened.stage is AcquisitionStage.COARSE
+        assert opened.state.acquisition.attempt == 2
+        assert not {"acquisition", "rtc-vanished", "loop-open"} & opened.alarms
+        opened.see_afar()
+        opened.see_afar()
+        opened.close(150)
+        assert opened.stage is AcquisitionStage.WIDENING
+
+    def test_it_ends_in_the_same_state_as_after_a_restart_of_the_service(self, opened):
+        again = Again(opened).find()
+        opened.tell(ev.RtcVanished())
+        opened.still_open()
+        one, other = again.state.acquisition, opened.state.acquisition
+        assert (one.stage, one.attempt, one.found) == (other.stage, other.attempt, other.found)
+
+    def test_what_the_gap_left_playing_is_stopped_before_another_dither_is_asked_for(self, opened):
+        left, n_before = opened.state.dither.id, len(opened.asked(ev.AskDither))
+        opened.tell(ev.RtcVanished())
+        opened.still_open(dither_id=left)
+        assert opened.asked(ev.AskNoDither)
+        assert len(opened.asked(ev.AskDither)) == n_before
+        opened.still_open()
+        assert len(opened.asked(ev.AskDither)) == n_before + 1
+
+    def test_in_another_mode_it_waits_and_says_what_to_do(self):
+        story = Acquiring(Mode.PROPOSE)
+        story.tell(ev.Acquire())
+        story.open()
+        story.tell(ev.RtcVanished())
+        story.still_open()
+        story.wait(60)
+        assert story.stage is AcquisitionStage.INTERRUPTED
+        assert "acquire again" in story.text
+        assert "acquisition" in story.alarms
+
+    def test_in_another_session_nobody_touches_the_loop(self, opened):
+        n_asked = len(opened.asked(ev.AskLoop)), len(opened.asked(ev.AskDither))
+        opened.tell(ev.RtcVanished())
+        opened.tell(ev.SessionStarted(session="s9"))
+        opened.status(session="s9", **OPEN)
+        opened.wait(60)
+        assert opened.stage is AcquisitionStage.INTERRUPTED
+        assert "another session" in opened.text
+        assert (len(opened.asked(ev.AskLoop)), len(opened.asked(ev.AskDither))) == n_asked
+
+    def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there(self):
+        story = Acquiring().to_widening()
+        matrix, n_asked = story.state.in_use, len(story.asked(ev.AskLoop))
+        story.tell(ev.RtcVanished())
+        story.status(gains=(0.4,) * 150 + (0.0,) * 444, n_controlled=150, cm_id=matrix)
+        assert story.stage is AcquisitionStage.ABORTED
+        assert f"closed on {matrix}, which had passed the gate" in story.text
+        assert "acquisition" not in story.alarms
+        assert story.state.registration is not None
+        assert len(story.asked(ev.AskLoop)) == n_asked
+
+    def test_a_link_that_fails_again_and_again_ends_it(self, opened):
+        for _ in range(MOST_ATTEMPTS):
+            assert opened.stage is AcquisitionStage.COARSE
+            opened.tell(ev.RtcVanished())
+            opened.still_open()
+            opened.still_open()
+        assert opened.stage is AcquisitionStage.FAILED
+        assert "the RTC vanished, after 3 attempts" in opened.text
+
+    def test_a_service_that_ends_in_the_gap_leaves_it_to_the_next(self, opened):
+        opened.tell(ev.RtcVanished())
+        again = Again(opened)
+        assert "the RTC vanished during an acquisition" in again.text
+        again.find()
+        again.still_open()
+        assert again.stage is AcquisitionStage.COARSE
+
+    def test_who_aborts_after_it_gets_a_healthy_loop_back_as_it_was(self):
+        story = Acquiring(Mode.PROPOSE)
+        story.tell(ev.Acquire())
+        story.open()
+        story.tell(ev.RtcVanished())
+        story.still_open()
+        story.tell(ev.AbortAcquisition())
+        last = story.asked(ev.AskLoop)[-1]
+        assert (last.closed, last.leak) == (True, 0.999)

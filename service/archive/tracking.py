@@ -214,12 +214,14 @@ def _pointing(values: dict[str, float] | None) -> Pointing | None:
 
 
 def _bias(values: dict[str, Any]) -> PassiveBias:
+    loop = values.get("loop", [])
     return PassiveBias(
         offset=_numbers(values["offset"], (4,)),
         covariance=_covariance(values["covariance"]),
         shared=_numbers(values["shared"], (4, 4)),
         looked_ns_utc=int(values["looked_ns_utc"]),
         excess=_numbers(values.get("excess", [0.0] * 4), (4,)),
+        loop=tuple(_numbers(loop, (len(loop),)).tolist()),
     )
 
 

@@ -101,9 +101,15 @@ def joint_of(known: Registration) -> Joint:
     return Joint(mean=mean, covariance=covariance, excess=bias.excess)
 
 
-def bias_of(joint: Joint, looked_ns_utc: int, earlier: Earlier | None = None) -> PassiveBias:
-    """Return what the filter knows of the passive estimate's bias."""
+def bias_of(
+    joint: Joint,
+    looked_ns_utc: int,
+    loop: tuple[float, ...],
+    earlier: Earlier | None = None,
+) -> PassiveBias:
+    """Return what the filter knows of the passive estimate's bias, in the loop of its last look."""
     return PassiveBias(
+        loop=loop,
         earlier=earlier,
         offset=joint.bias,
         covariance=joint.covariance[4:, 4:],
@@ -146,6 +152,7 @@ def accepted(
         bias=bias_of(
             joint,
             0 if bias is None else bias.looked_ns_utc,
+            () if bias is None else bias.loop,
             None if bias is None or anew else bias.earlier,
         ),
         passive_after_ns_utc=known.passive_after_ns_utc if known is not None else 0,

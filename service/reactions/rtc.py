@@ -52,9 +52,10 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
 def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     """Take over what the RTC says of itself."""
     state = without_alarm(state, "rtc-vanished", now_ns)
-    if state.rtc is not None and _loop(state.rtc) != _loop(rtc):
-        # nor is the margin what it was
-        state = replace(_without_bias(state), judged_ns_utc=None)
+    if state.rtc is not None and state.rtc.loop_numbers != rtc.loop_numbers:
+        # the margin is not what it was
+        state = replace(state, judged_ns_utc=None)
+    state = _of_this_loop(state, rtc)
     state = replace(
         state,
         rtc=rtc,
@@ -76,14 +77,14 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     return follow_status(state, rtc, now_ns)
 
 
-def _loop(rtc: RtcView) -> tuple[object, ...]:
-    return rtc.n_controlled, rtc.gains, rtc.leak, rtc.delay_frames, rtc.frame_rate_hz
-
-
-def _without_bias(state: TrackerState) -> TrackerState:
-    """Forget the passive estimate's bias: it was that of another loop."""
+def _of_this_loop(state: TrackerState, rtc: RtcView) -> TrackerState:
+    """Forget the passive estimate's bias if it was learnt in another loop, in whichever session."""
     known = state.registration
-    return state if known is None else replace(state, registration=replace(known, bias=None))
+    if known is None or known.bias is None or not known.bias.looked_ns_utc:
+        return state
+    if known.bias.loop == rtc.loop_numbers:
+        return state
+    return replace(state, registration=replace(known, bias=None))
 
 
 def _of_this_basis(state: TrackerState, now_ns: int) -> TrackerState:

@@ -51,7 +51,8 @@ def on_watchdog(
     prior = allowing(brought_forward(state, known, event.t_ns_utc, policy, now_ns), excess)
     if _mixed(known):
         text = "not used: its telemetry may be from both sides of a jump"
-        state = replace(state, registration=_looked(known, event))
+        bias = bias_of(joint_of(known), event.t_ns_utc, _loop(state, known))
+        state = replace(state, registration=replace(known, bias=bias))
         return _shown(state, event, _reading_sigma(event.estimate, prior), prior.bias, text)
     measured = event.estimate.alpha.vector
     reading = Reading(
@@ -111,11 +112,14 @@ def _expecting(known: Registration, excess: Array) -> Registration:
     """
     if known.bias is not None and known.bias.looked_ns_utc:
         return known
-    return replace(known, bias=bias_of(forgotten(joint_of(known), excess), 0))
+    return replace(known, bias=bias_of(forgotten(joint_of(known), excess), 0, ()))
 
 
-def _looked(known: Registration, event: ev.Watched) -> Registration:
-    return replace(known, bias=bias_of(joint_of(known), event.t_ns_utc))
+def _loop(state: TrackerState, known: Registration) -> tuple[float, ...]:
+    """Return the loop that is looked at; while no RTC is there, the one of the last look."""
+    if state.rtc is not None:
+        return state.rtc.loop_numbers
+    return () if known.bias is None else known.bias.loop
 
 
 def _mixed(known: Registration) -> bool:
@@ -146,7 +150,8 @@ def _barking(
     )
     gone = forgotten(prior, event.estimate.bias_excess)
     registration = _after(state, known, gone, event, now_ns)
-    registration = replace(registration, doubt=text, bias=bias_of(gone, event.t_ns_utc))
+    bias = bias_of(gone, event.t_ns_utc, _loop(state, known))
+    registration = replace(registration, doubt=text, bias=bias)
     state = replace(state, registration=registration)
     detail = f"{text} (innovation {far:.0f}, expected 4)"
     state = logged(state, "registration.passive-jump", detail, now_ns, Level.WARNING)
@@ -165,7 +170,7 @@ def _after(
         covariance=joint.alpha_covariance,
         t_ns_utc=max(event.t_ns_utc, known.t_ns_utc),
         arrived_ns_utc=now_ns,
-        bias=bias_of(joint, event.t_ns_utc, sum_of(known, joint_of(known))),
+        bias=bias_of(joint, event.t_ns_utc, _loop(state, known), sum_of(known, joint_of(known))),
         pointing=state.pointing,
     )
 

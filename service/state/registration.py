@@ -128,6 +128,9 @@ class PassiveBias:
     excess: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` variance beyond the least that the scatter of passive estimates has told of."""
 
+    loop: tuple[float, ...] = ()
+    """``RtcView.loop_numbers`` of the loop it is the bias of; empty: not known."""
+
     earlier: Earlier | None = None
     """α and bias together before that one; None: it was the first, or has been doubted."""
 

@@ -87,6 +87,17 @@ class RtcView:
     pointing: Pointing | None = None
     """Of the telescope; None: the RTC does not know."""
 
+    @property
+    def loop_numbers(self) -> tuple[float, ...]:
+        """Return all of the loop that the bias of its passive estimate depends on."""
+        return (
+            float(self.n_controlled),
+            self.leak,
+            self.delay_frames,
+            self.frame_rate_hz,
+            *self.gains,
+        )
+
 
 class CommandState(StrEnum):
     """What has become of a command to the RTC."""

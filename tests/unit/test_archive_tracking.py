@@ -12,7 +12,7 @@ from service.archive.tracking import TrackingFile
 from service.errors import ArchiveError
 from service.reactions.restoring import saved_of
 from service.state import Mode, Orders, Pointing, Registration
-from tests.unit.reactions.situations import START_NS, Story, moved
+from tests.unit.reactions.situations import START_NS, Story, moved, rtc
 from tests.unit.reactions.test_acquisition import Acquiring
 from tests.unit.reactions.test_watchdog import learnt, watch
 
@@ -42,12 +42,16 @@ def same(one, other):
 
 
 def test_a_file_of_before_the_scatter_told_of_the_wind_is_read(file, saved):
+    """Of which loop the bias was is not in it either: it will be forgotten."""
     assert saved.registration.bias.excess[0] > 0.0
+    assert saved.registration.bias.loop == rtc().loop_numbers
     file.write(saved)
     values = json.loads(file._path.read_text(encoding="utf-8"))
-    del values["registration"]["bias"]["excess"]
+    del values["registration"]["bias"]["excess"], values["registration"]["bias"]["loop"]
     file._path.write_text(json.dumps(values), encoding="utf-8")
-    np.testing.assert_array_equal(file.read().registration.bias.excess, np.zeros(4))
+    found = file.read().registration.bias
+    np.testing.assert_array_equal(found.excess, np.zeros(4))
+    assert found.loop == ()
 
 
 def test_there_is_nothing_before_the_first_night(file):

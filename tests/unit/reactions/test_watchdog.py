@@ -9,7 +9,7 @@ from service import events as ev
 from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.reactions.watchdog import fit_begins_at
-from service.state import Mode, Source, Validity
+from service.state import Mode, Source, TrackerState, Validity
 from tests.unit.reactions.situations import (
     ALPHA,
     POLICY,
@@ -258,3 +258,27 @@ def test_another_loop_has_another_bias(story, changes):
     story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns, **changes)))
     assert story.state.registration.bias is None
     assert story.state.registration.usable
+
+
+@pytest.mark.parametrize(("n_controlled", "kept"), [(400, True), (300, False)])
+def test_so_it_has_when_the_rtc_was_restarted_in_between(story, n_controlled, kept):
+    learnt(story)
+    story.tell(ev.SessionStarted(session="s2"))
+    story.tell(ev.StatusSeen(rtc=rtc(n_controlled, session="s2")))
+    assert (story.state.registration.bias is not None) is kept
+
+
+@pytest.mark.parametrize(("n_controlled", "kept"), [(400, True), (300, False)])
+def test_so_it_has_when_the_service_was(story, n_controlled, kept):
+    learnt(story)
+    left = replace(TrackerState(system="flao"), registration=story.state.registration)
+    after = Story(Mode.AUTO, state=left)
+    after.now_ns = story.now_ns
+    after.meet(n_controlled=n_controlled)
+    assert (after.state.registration.bias is not None) is kept
+
+
+def test_a_bias_of_which_nothing_was_learnt_is_of_no_loop(story):
+    before = story.state.registration.bias
+    story.tell(ev.StatusSeen(rtc=rtc(300, t_ns_utc=story.now_ns)))
+    assert story.state.registration.bias is before

@@ -10,7 +10,7 @@ from service.reactions.dither import follow_status, found_again
 from service.reactions.dither_unwanted import gone
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS
-from service.reactions.shelf import with_in_use, with_state
+from service.reactions.shelf import known_record, with_in_use, with_state
 from service.state import AcquisitionStage, Level, MatrixState, RtcView, TrackerState
 
 ACKNOWLEDGE_WITHIN_S = 3.0
@@ -65,7 +65,7 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     )
     state = _of_this_basis(state, now_ns)
     if rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None:
-        state = with_in_use(state, rtc.cm_id)
+        state = _used_by_status(state, rtc.cm_id, now_ns)
     measuring = state.measuring
     opened = state.acquisition.under_way or (measuring is not None and measuring.opens_loop)
     # its alarm tells more, and not to close the loop on any matrix
@@ -85,6 +85,20 @@ def _of_this_loop(state: TrackerState, rtc: RtcView) -> TrackerState:
     if known.bias.loop == rtc.loop_numbers:
         return state
     return replace(state, registration=replace(known, bias=None))
+
+
+def _used_by_status(state: TrackerState, matrix_id: str, now_ns: int) -> TrackerState:
+    """Take a reconstructor for applied, whatever became of its acknowledgement."""
+    before = known_record(state, matrix_id).state
+    state = with_in_use(state, matrix_id)
+    if before not in {MatrixState.PUBLISHED, MatrixState.STAGED, MatrixState.FAILED}:
+        return state
+    state = without_alarm(state, "no-acknowledgement", now_ns)
+    if before is not MatrixState.FAILED:
+        return state
+    text = f"{matrix_id} is in use after all, by the RTC's status; nobody acknowledged it"
+    state = with_state(state, matrix_id, MatrixState.APPLIED, text)
+    return logged(state, "reconstructor.applied", text, now_ns)
 
 
 def _of_this_basis(state: TrackerState, now_ns: int) -> TrackerState:

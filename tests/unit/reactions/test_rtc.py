@@ -58,6 +58,38 @@ def test_a_status_tells_which_matrix_is_in_use_even_when_its_acknowledgement_was
     assert story.matrix_state("initial") is MatrixState.SUPERSEDED
 
 
+def test_a_status_that_shows_a_reconstructor_in_use_ends_the_alarm_that_it_was_not_applied(story):
+    story.make("cm-1", wanted=True)
+    story.wait(5)
+    assert story.matrix_state("cm-1") is MatrixState.FAILED
+    assert "no-acknowledgement" in story.alarms
+    story.tell(ev.StatusSeen(rtc=rtc()))
+    assert "no-acknowledgement" in story.alarms
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    assert story.matrix_state("cm-1") is MatrixState.APPLIED
+    assert "no-acknowledgement" not in story.alarms
+    assert "in use after all" in story.state.reconstructor("cm-1").reason
+    assert story.logged[-1] == "reconstructor.applied"
+
+
+def test_so_does_one_that_shows_the_next_in_use(story):
+    story.make("cm-1", wanted=True)
+    story.wait(5)
+    story.make("cm-2", wanted=True)
+    assert "no-acknowledgement" in story.alarms
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-2")))
+    assert "no-acknowledgement" not in story.alarms
+    assert story.matrix_state("cm-1") is MatrixState.FAILED
+
+
+def test_but_not_one_that_shows_an_old_one(story):
+    story.use("cm-0")
+    story.make("cm-1", wanted=True)
+    story.wait(5)
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="initial")))
+    assert "no-acknowledgement" in story.alarms
+
+
 def test_a_vanished_rtc_is_an_alarm_that_ends_with_its_next_status(story):
     story.tell(ev.RtcVanished())
     assert story.state.rtc is None

@@ -111,12 +111,14 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
 
 
 def _watching_the_edge(streams: Streams, rtc: RtcView) -> Streams:
-    """Watch the ring that this loop drives; a loop closed anew begins with a clean slate."""
+    """Watch the ring that this loop drives; what is closed, or watched, anew has a clean slate."""
     known = streams.description
     if rtc.loop != "closed" or known.actuators is None:
         return replace(streams, edge_watch=None, edge=EdgeHealth())
     watch = edge_watch(known.actuators, known.mode_variance_m2, rtc.n_controlled)
-    return replace(streams, edge_watch=watch)
+    # a ring nobody can watch any more has not slipped for ever
+    edge = EdgeHealth() if watch is None else streams.edge
+    return replace(streams, edge_watch=watch, edge=edge)
 
 
 def _cut(streams: Streams, rtc: RtcView) -> Streams:

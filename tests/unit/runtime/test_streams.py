@@ -5,7 +5,7 @@ import pytest
 
 from service import events as ev
 from service.errors import ModelError
-from service.estimation.edge import Actuators
+from service.estimation.edge import LOW_MODES, Actuators
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra, WindowRefused
 from service.runtime.following import news
@@ -326,7 +326,9 @@ def driven(first_seq, outermost_m):
     )
 
 
-def test_an_edge_that_has_slipped_is_named_until_the_loop_is_closed_anew():
+@pytest.fixture(name="slipped")
+def slipped_edge():
+    """A loop whose outermost actuator has gone away, and that says so."""
     description = replace(
         DESCRIPTION, n_modes=N_MANY, mode_variance_m2=np.full(N_MANY, 1e-16), actuators=RING
     )
@@ -338,8 +340,32 @@ def test_an_edge_that_has_slipped_is_named_until_the_loop_is_closed_anew():
     for first_seq in range(1000, 2000, 10):
         streams, _ = fed(streams, driven(first_seq, 2e-6))
     assert "the edge has slipped" in dict(told(streams))["edge-slip"]
-    opened = with_rtc(streams, replace(MANY, loop="open", seq=2000))
+    return streams
+
+
+def of_modes(n_controlled, seq):
+    gains = (0.4,) * n_controlled + (0.0,) * (N_MANY - n_controlled)
+    return replace(MANY, n_controlled=n_controlled, gains=gains, seq=seq)
+
+
+def test_an_edge_that_has_slipped_is_named_until_the_loop_is_closed_anew(slipped):
+    opened = with_rtc(slipped, replace(MANY, loop="open", seq=2000))
     assert dict(told(opened))["edge-slip"] is None
+
+
+def test_or_until_so_few_modes_are_controlled_that_nobody_can_tell(slipped):
+    few = with_rtc(slipped, of_modes(2 * LOW_MODES, seq=2000))
+    assert few.edge_watch is None
+    assert dict(told(few))["edge-slip"] is None
+    many = with_rtc(few, replace(MANY, seq=3000))
+    for first_seq in range(3000, 4000, 10):
+        many, _ = fed(many, driven(first_seq, 2e-6))
+    assert "the edge has slipped" in dict(told(many))["edge-slip"]
+
+
+def test_but_not_because_a_few_modes_less_are_controlled(slipped):
+    fewer = with_rtc(slipped, of_modes(2 * LOW_MODES + 10, seq=2000))
+    assert "the edge has slipped" in dict(told(fewer))["edge-slip"]
 
 
 def told(streams):

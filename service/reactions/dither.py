@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service import events as ev
+from service.reactions.dither_choice import total_m
+from service.reactions.dither_unwanted import ROUNDING
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS
 from service.state import DitherView, Level, RtcView, TrackerState
@@ -62,8 +64,9 @@ def follow_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerStat
     if rtc.seq < dither.start_seq if rtc.seq >= 0 else elapsed_s <= _ON_ITS_WAY_S:
         return state
     played_s = (rtc.seq - dither.start_seq) / rtc.frame_rate_hz if rtc.seq >= 0 else elapsed_s
+    told_to_stop = dither.id == state.dithering.stopped_id
     # a status a second old may be the first to show the end
-    if played_s >= dither.duration_s - SILENT_S:
+    if told_to_stop or played_s >= dither.duration_s - SILENT_S:
         dithering = replace(state.dithering, ended_ns_utc=now_ns)
         state = replace(state, dither=None, dithering=dithering)
         state = without_alarm(state, _ALARM, now_ns)
@@ -95,12 +98,17 @@ def on_silence(state: TrackerState, event: ev.DitherSilent, now_ns: int) -> Trac
 def _corrected(
     state: TrackerState, asked: DitherView, running: DitherView | None, now_ns: int
 ) -> TrackerState:
-    """Take the RTC's word on what it plays, where that is not what was asked for."""
+    """Take the RTC's word on what it plays, where that is not what was asked for.
+
+    It is true, and not for that tolerated: one too strong is stopped.
+    """
     if running is None:
         return state
     running = replace(running, asked_ns_utc=asked.asked_ns_utc, window_s=asked.window_s)
     if running == asked:
         return state
+    if total_m(running) > ROUNDING * max(total_m(asked), state.dithering.budget_m):
+        state = replace(state, dithering=replace(state.dithering, loud_id=running.id))
     text = (
         f"{asked.id}: the RTC plays modes {running.modes}, {running.frequency_hz} Hz, "
         f"{running.amplitude_m} m from frame {running.start_seq}; asked for were modes "

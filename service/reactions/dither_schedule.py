@@ -25,7 +25,13 @@ from service.reactions.dither_pace import (
     wanted,
     window_lengths_s,
 )
-from service.reactions.dither_unwanted import own_sine, stopped, without_unwanted
+from service.reactions.dither_unwanted import (
+    ROUNDING,
+    calm_ns_utc,
+    own_sine,
+    stopped,
+    without_unwanted,
+)
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
@@ -59,12 +65,17 @@ def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
     """
     state = _accounted(state, rtc, policy, now_ns)
     state, stopping = without_unwanted(state, rtc, policy, now_ns)
+    state, effects = _chosen(state, rtc, policy, now_ns)
+    return state, (*stopping, *effects)
+
+
+def _chosen(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
     dither = state.dither
     if dither is not None and not own_sine(dither):
-        return _shown(state, DitherPhase.OPERATOR, f"{dither.id} runs"), stopping
+        return _shown(state, DitherPhase.OPERATOR, f"{dither.id} runs"), ()
     forbidden = _why_none(state, rtc, policy)
     if forbidden is not None:
-        return _shown(state, DitherPhase.OFF, forbidden), stopping
+        return _shown(state, DitherPhase.OFF, forbidden), ()
     wish, plan = wanted(state, rtc, policy, now_ns)
     later_ns = wish.next_ns_utc if wish.next_ns_utc > now_ns else None
     dithering = replace(state.dithering, plan=plan, next_ns_utc=later_ns)
@@ -75,10 +86,17 @@ def choose_dither(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
     adopted = _adopted(state, rtc, policy, now_ns)
     if adopted is not None:
         return adopted, ()
+    return _begun(state, rtc, policy, wish, now_ns)
+
+
+def _begun(state: TrackerState, rtc: RtcView, policy: Policy, wish: Wish, now_ns: int) -> Step:
+    """Ask for a dither if it is time, and nothing left behind is in its way."""
+    if now_ns < calm_ns_utc(state):
+        return _shown(state, DitherPhase.OFF, "the RTC has played the last one too strong"), ()
     if now_ns < state.retry_ns_utc:
         return state, ()
     if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
-        # left behind by this service: over budget, its window of another length, or to stop
+        # left behind by this service: its window of another length, or to stop
         state = replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS)
         return stopped(state, rtc.dither_id, now_ns), (AskNoDither(),)
     if now_ns < wish.next_ns_utc or _awaits_a_result(state, wish, now_ns):
@@ -171,7 +189,7 @@ def _adopted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> 
     running = rtc.dither
     if running is None or running.id == state.dither_lost:
         return None
-    over = own_sine(running) and total_m(running) > 1.001 * state.dithering.budget_m
+    over = own_sine(running) and total_m(running) > ROUNDING * state.dithering.budget_m
     asked_to_stop = running.id == state.dithering.stopped_id
     # a recorded night stops nothing: what it goes on playing is read all the same
     heard_ns = state.dithering.stopped_ns_utc + round(STOPPED_WITHIN_S * SECOND_NS)

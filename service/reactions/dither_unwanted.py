@@ -16,6 +16,7 @@ from service.reactions.dither_choice import (
     OWN_DITHER,
     total_m,
 )
+from service.reactions.dither_pace import budget_m
 from service.reactions.journal import with_alarm, without_alarm
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
@@ -23,6 +24,15 @@ from service.state import DitherKind, DitherView, RtcView, TrackerState
 
 NOT_STOPPED = "dither-not-stopped"
 """Alarm while a dither goes on that was asked to stop."""
+
+OVER_BUDGET = "dither-over-budget"
+"""Alarm from when the RTC plays a dither stronger than it may until it plays one as it may."""
+
+ROUNDING = 1.001
+"""What a dither may be stronger by than what was asked for."""
+
+CALM_S = 60.0
+"""After one that was too strong, before another is tried."""
 
 TELL_EVERY_S = 2.0
 GONE_WITHIN_S = 3.0
@@ -38,18 +48,17 @@ def own_sine(dither: DitherView) -> bool:
 
 def without_unwanted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
     """Ask the RTC, again and again, to stop what it should not play."""
-    running, why = rtc.dither_id, _why_unwanted(state, rtc, policy)
+    running, loud = rtc.dither_id, _too_strong(state, rtc, policy)
+    why = loud or _why_unwanted(state, rtc, policy)
     if running is None or why is None:
-        return gone(state, now_ns), ()
+        return _forgiven(gone(state, now_ns), rtc, policy, now_ns), ()
     if state.dithering.unwanted_id != running:
-        state = stopped(state, running, now_ns)
-        dithering = replace(state.dithering, unwanted_id=running, unwanted_since_ns_utc=now_ns)
-        state = replace(state, dithering=dithering)
+        state = _met(state, running, now_ns)
+        state = state if loud is None else _alarmed(state, running, loud, now_ns)
     if now_ns - state.dithering.unwanted_since_ns_utc >= GONE_WITHIN_S * SECOND_NS:
-        cost = "" if rtc.dither is None else f", {1e9 * total_m(rtc.dither):.3g} nm RMS in all"
         text = (
-            f"{why}, and the RTC plays {running}{cost}: it is asked every {TELL_EVERY_S:.0f} s to "
-            "stop it; stop it at the RTC"
+            f"{why}, and the RTC goes on playing {running}: it is asked every {TELL_EVERY_S:.0f} s "
+            "to stop it; stop it at the RTC"
         )
         state = with_alarm(state, NOT_STOPPED, text, now_ns)
     if now_ns - state.dithering.told_ns_utc < TELL_EVERY_S * SECOND_NS:
@@ -76,6 +85,56 @@ def gone(state: TrackerState, now_ns: int) -> TrackerState:
         return state
     state = replace(state, dithering=replace(state.dithering, unwanted_id=None))
     return without_alarm(state, NOT_STOPPED, now_ns)
+
+
+def calm_ns_utc(state: TrackerState) -> int:
+    """Return until when no dither is tried because the last one was too strong; 0: none was."""
+    loud_ns = state.dithering.loud_ns_utc
+    return loud_ns and loud_ns + round(CALM_S * SECOND_NS)
+
+
+def _met(state: TrackerState, running: str, now_ns: int) -> TrackerState:
+    """Return the state that knows of a dither that must go, and follows it no more."""
+    state = stopped(state, running, now_ns)
+    if state.dither is not None and state.dither.id == running:
+        state = replace(state, dither=None)
+    dithering = replace(state.dithering, unwanted_id=running, unwanted_since_ns_utc=now_ns)
+    return replace(state, dithering=dithering)
+
+
+def _alarmed(state: TrackerState, running: str, loud: str, now_ns: int) -> TrackerState:
+    text = (
+        f"{loud}: it was told to stop {running}, and another is tried after {CALM_S:.0f} s; look "
+        "at the RTC's dither, or stop the dither to do without"
+    )
+    state = replace(state, dithering=replace(state.dithering, loud_ns_utc=now_ns))
+    return with_alarm(state, OVER_BUDGET, text, now_ns)
+
+
+def _forgiven(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState:
+    """End the alarm of a dither too strong once one is played as it may, or none is wanted."""
+    fine = state.dither is not None and rtc.dither is not None and rtc.dither.id == state.dither.id
+    if fine or state.dither_stopped or not policy.dither_enabled:
+        return without_alarm(state, OVER_BUDGET, now_ns)
+    return state
+
+
+def _too_strong(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
+    """Return why a dither that is played costs more than it may, or None.
+
+    An operator's own may cost more than the budget, but not more than was asked for.
+    """
+    running = rtc.dither
+    if running is None:
+        return None
+    found_m, most_m = total_m(running), budget_m(rtc, policy)
+    over = own_sine(running) and found_m > ROUNDING * most_m
+    if not over and running.id != state.dithering.loud_id:
+        return None
+    return (
+        f"the RTC plays a dither of {1e9 * found_m:.3g} nm RMS in all, more than the budget of "
+        f"{1e9 * most_m:.3g} nm"
+    )
 
 
 def _why_unwanted(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:

@@ -113,6 +113,12 @@ class Dithering:
     told_ns_utc: int = 0
     """When the RTC was last told to stop one that nobody wants."""
 
+    loud_id: str | None = None
+    """The last dither the RTC played stronger than was asked for, and than the budget."""
+
+    loud_ns_utc: int = 0
+    """When one that was too strong was last told to stop; 0: none ever was."""
+
     mean_square_m2: float = 0.0
     """Mean square of what has been on the mirror, over ten minutes, metres OPD squared."""
 

@@ -6,6 +6,7 @@ import pytest
 
 from service import events as ev
 from service.reactions.dither_choice import plan_dither, why_unusable
+from service.reactions.dither_unwanted import OVER_BUDGET
 from service.runtime.translate import rtc_view
 from service.wire import (
     DitherAction,
@@ -94,9 +95,10 @@ def test_one_over_budget_from_before_a_restart_is_stopped_and_read_only_where_it
     story.tell(ev.SessionStarted(session="s1"))
     assert story.tell(ev.StatusSeen(rtc=rtc(**with_dither(loud)))) == (
         ev.FetchMatrix(id="initial"),
+        ev.AskNoDither(),
     )
+    assert OVER_BUDGET in story.alarms
     story.tell(ev.MatrixFetched(record=foreign()))
-    assert story.asked(ev.AskNoDither)
     assert story.state.dither is None
     story.tell(ev.StatusSeen(rtc=rtc(**with_dither(loud))), after_s=1)
     assert story.state.dither is None

@@ -1,4 +1,4 @@
-"""A dither the RTC plays although nobody wants one."""
+"""A dither the RTC plays although nobody wants one, or stronger than it may."""
 
 from dataclasses import replace
 
@@ -6,7 +6,13 @@ import pytest
 
 from service import events as ev
 from service.reactions.dither_choice import total_m
-from service.reactions.dither_unwanted import GONE_WITHIN_S, NOT_STOPPED, TELL_EVERY_S
+from service.reactions.dither_unwanted import (
+    CALM_S,
+    GONE_WITHIN_S,
+    NOT_STOPPED,
+    OVER_BUDGET,
+    TELL_EVERY_S,
+)
 from service.state import DitherPhase
 from tests.unit.reactions.situations import POLICY, Story, of_kind, rtc
 
@@ -132,6 +138,95 @@ class TestOffByTheOperator:
         story.tell(ev.StartDither())
         assert not of_kind(playing(story, dither, 10), ev.AskNoDither)
         assert NOT_STOPPED not in story.alarms
+
+
+def louder(dither, by=10.0):
+    return replace(dither, amplitude_m=tuple(by * a for a in dither.amplitude_m))
+
+
+class TestTooStrong:
+    @pytest.fixture
+    def loud(self, story):
+        """80 nm where 8 nm were asked for."""
+        dither = story.state.dither
+        accept(story, dither)
+        return louder(dither)
+
+    def test_it_is_stopped_at_once_with_an_alarm_that_tells_how_strong_it_was(self, story, loud):
+        assert playing(story, loud) == (ev.AskNoDither(),)
+        assert story.state.dither is None
+        text = next(a.text for a in story.state.alarms if a.name == OVER_BUDGET)
+        assert "a dither of 80 nm RMS in all, more than the budget of 8 nm" in text
+        assert "dither.other" in story.logged
+
+    def test_another_is_tried_after_a_minute_and_ends_the_alarm_if_it_is_as_it_may_be(
+        self, story, loud
+    ):
+        playing(story, loud)
+        assert not of_kind(silent(story, round(CALM_S) - 2), ev.AskDither)
+        assert OVER_BUDGET in story.alarms
+        assert "too strong" in story.state.dithering.reason
+        (asked,) = of_kind(silent(story, 4), ev.AskDither)
+        accept(story, asked.dither)
+        assert OVER_BUDGET in story.alarms
+        playing(story, asked.dither)
+        assert OVER_BUDGET not in story.alarms
+
+    def test_an_rtc_that_does_so_always_does_it_for_a_second_a_minute(self, story, loud):
+        on, n_tried, lived_s = loud, 0, 0
+        for _ in range(600):
+            lived_s += on is not None
+            for effect in playing(story, on) if on is not None else silent(story):
+                match effect:
+                    case ev.AskDither(dither=dither):
+                        accept(story, dither)
+                        on, n_tried = louder(dither), n_tried + 1
+                    case ev.AskNoDither():
+                        on = None
+        assert n_tried == pytest.approx(600 / CALM_S, abs=1)
+        assert lived_s <= n_tried + 1
+        assert OVER_BUDGET in story.alarms
+
+    def test_one_that_does_not_stop_is_asked_again_and_again_and_read_all_the_same(
+        self, story, loud
+    ):
+        asked = of_kind(playing(story, loud, 20), ev.AskNoDither)
+        assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+        assert {OVER_BUDGET, NOT_STOPPED} <= story.alarms
+        assert story.state.dither.id == loud.id
+        silent(story)
+        assert NOT_STOPPED not in story.alarms
+        assert "dither-lost" not in story.alarms
+
+    def test_rounding_is_no_excess(self, story, loud):
+        assert not playing(story, louder(loud, 0.1 * 1.0005), 3)
+        assert not story.alarms
+        assert story.state.dither is not None
+
+    def test_within_the_budget_the_rtcs_word_counts(self, story):
+        story.see(n_windows=12)
+        weak = louder(story.state.dither, 0.5)
+        accept(story, weak)
+        assert not playing(story, weak, 3)
+        assert not story.alarms
+
+    @pytest.mark.parametrize(("by", "stopped"), [(1.0, False), (1.0005, False), (4.0, True)])
+    def test_an_operators_may_exceed_the_budget_but_not_what_was_asked_for(
+        self, story, by, stopped
+    ):
+        story.tell(ev.StopDither())
+        story.tell(ev.StartDither(amplitude_m=10e-9, over_budget=True))
+        dither = story.state.dither
+        accept(story, dither)
+        effects = playing(story, louder(dither, by), 3)
+        assert bool(of_kind(effects, ev.AskNoDither)) is stopped
+        assert (OVER_BUDGET in story.alarms) is stopped
+
+    def test_an_operator_who_wants_none_has_no_alarm(self, story, loud):
+        playing(story, loud)
+        story.tell(ev.StopDither())
+        silent(story, 2)
+        assert not story.alarms
 
 
 def test_settings_that_forbid_it_do_not_tolerate_what_an_earlier_service_has_left():

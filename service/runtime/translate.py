@@ -217,4 +217,5 @@ def state_message(state: TrackerState, now_ns: int) -> StateMessage:
         alpha=None if alpha is None else alpha.to_boundary(),
         sigma=None if sigma is None else dict(zip(PARAMETERS, sigma.tolist(), strict=True)),
         in_use=state.in_use,
+        validity=None if known is None else known.standing.validity.value,
     )

@@ -141,6 +141,10 @@ class StateMessage:
     in_use: str | None
     """The reconstructor the RTC multiplies with; None: unknown."""
 
+    validity: str | None = None
+    """Whether ``alpha`` may be relied on: fresh, ageing, stale or invalid; None: nothing is known,
+    or a service of before this key said it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmMessage:
@@ -291,6 +295,7 @@ def decode_state(data: bytes) -> StateMessage:
         alpha=message.optional("alpha", lambda key: message.named_numbers(key, PARAMETERS)),
         sigma=message.optional("sigma", lambda key: message.named_numbers(key, PARAMETERS)),
         in_use=message.optional("in_use", message.identifier),
+        validity=message.extension("validity", message.text),
     )
 
 

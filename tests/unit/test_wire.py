@@ -28,6 +28,7 @@ from service.wire import (
     PointingStatus,
     RampRequest,
     Role,
+    StateMessage,
     Status,
     checksum,
     command_id,
@@ -38,12 +39,14 @@ from service.wire import (
     decode_manifest,
     decode_measured_manifest,
     decode_reply,
+    decode_state,
     decode_status,
     encode_acknowledgement,
     encode_command,
     encode_frames,
     encode_manifest,
     encode_measured_manifest,
+    encode_state,
     encode_status,
     layout_of,
     split,
@@ -233,6 +236,20 @@ def test_a_status_keeps_everything_it_says():
     assert decode_status(encode_status(STATUS)) == STATUS
     assert STATUS.flux_images.shape == (4, 2, 2)
     assert STATUS.flux_images[3, 1, 1] == 15.0
+
+
+def test_the_state_says_what_alpha_is_worth_and_one_of_before_that_is_read_too():
+    said = StateMessage(
+        system="flao",
+        t_ns=1,
+        mode="auto",
+        alpha=ALPHA,
+        sigma=ALPHA,
+        in_use="cm-1",
+        validity="stale",
+    )
+    assert decode_state(encode_state(said)) == said
+    assert decode_state(changed(encode_state(said), validity=...)) == replace(said, validity=None)
 
 
 def test_an_rtc_may_say_where_the_telescope_looks_or_know_nothing_of_it():

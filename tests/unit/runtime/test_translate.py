@@ -172,9 +172,11 @@ def test_a_matrix_of_the_rtc_is_for_no_registration_we_can_vouch_for():
 
 def test_the_state_on_the_network_is_short_and_in_boundary_units():
     story = Story(Mode.HOLD).meet()
-    assert translate.state_message(story.state, 5).alpha is None
+    nothing = translate.state_message(story.state, 5)
+    assert nothing.alpha is nothing.validity is None
     story.see()
     message = translate.state_message(story.state, 5)
+    assert message.validity == story.state.registration.standing.validity
     assert (message.mode, message.in_use, message.t_ns) == ("hold", "initial", 5)
     assert message.alpha == pytest.approx(ALPHA.to_boundary())
     assert message.sigma["shift_x_subap"] == pytest.approx(np.hypot(0.002, 0.003))

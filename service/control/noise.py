@@ -1,4 +1,4 @@
-"""How noisy a slope is: from the light on the four images, from the star, or from telemetry.
+"""How noisy a slope is: from the light on the four images, or from the star.
 
 A slope is a difference of four pixels over the mean flux of a subaperture (global normalisation):
 its variance is that of the four pixels, x and y alike.
@@ -76,21 +76,3 @@ def noise_of_star(
     own = flux * camera.throughput / frame_rate_hz / n_valid
     variance = camera.excess_noise * own + 4 * camera.read_noise_electrons**2
     return np.full(2 * n_valid, np.sqrt(variance) / own)
-
-
-def noise_of_telemetry(slopes: NDArray[Any]) -> Array:
-    """Return 1 σ of each slope ``(n_slopes,)`` from consecutive frames ``(n_frames, n_slopes)``.
-
-    Noise is white, the wavefront is not: what is left of the second differences is noise, and
-    what the wavefront does within three frames. In a closed loop it reads somewhat high.
-
-    Raises
-    ------
-    ModelError
-        If there are fewer than 3 frames.
-    """
-    if len(slopes) < 3:
-        raise ModelError(f"slope noise: found {len(slopes)} frames; expected at least 3")
-    change = np.diff(np.asarray(slopes, dtype=np.float64), n=2, axis=0)
-    # white noise of variance 1 has second differences of variance 1 + 4 + 1
-    return np.asarray(np.sqrt(np.mean(change**2, axis=0) / 6.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.noise import Camera, noise_of_counts, noise_of_star, noise_of_telemetry
+from service.control.noise import Camera, noise_of_counts, noise_of_star
 from service.errors import ModelError
 from service.model.interaction import reference_slopes
 from tests.numerics import small_instrument
@@ -49,17 +49,7 @@ def test_five_magnitudes_are_ten_times_the_photon_noise():
     np.testing.assert_allclose(faint, 10.0 * bright)
 
 
-def test_white_noise_is_found_under_a_slow_wavefront():
-    """2 %: 70 slopes of 4000 frames; a wavefront of period 400 frames adds 1e-4 of its power."""
-    rng = np.random.default_rng(2)
-    slow = np.sin(2 * np.pi * np.arange(4000) / 400.0)[:, None] * rng.normal(size=70)
-    found = noise_of_telemetry(slow + 0.1 * rng.normal(size=(4000, 70)))
-    assert np.sqrt(np.mean(found**2)) == pytest.approx(0.1, rel=0.02)
-
-
 def test_what_tells_nothing_of_noise_is_refused():
-    with pytest.raises(ModelError, match="found 2 frames"):
-        noise_of_telemetry(np.zeros((2, 8)))
     with pytest.raises(ModelError, match=r"found counts \(4, 5, 5\); expected \(4, 6, 6\)"):
         noise_of_counts(np.ones((4, 5, 5)), VALID)
     with pytest.raises(ModelError, match="found 0 electrons"):

@@ -95,6 +95,10 @@ class Watched:
 
     estimate: PassiveEstimate
     t_ns_utc: int
+    """End of the telemetry it is of."""
+
+    loop: tuple[float, ...] = ()
+    """``RtcView.loop_numbers`` of the loop it is of; empty: not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

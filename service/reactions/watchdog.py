@@ -26,7 +26,7 @@ from service.reactions.journal import logged, with_alarm
 from service.reactions.policy import Policy
 from service.reactions.surprise import Reading, look_surprise, sum_of
 from service.reactions.validity import aged, with_dither_due
-from service.reactions.windows import CAPTURE_RANGE
+from service.reactions.windows import CAPTURE_RANGE, why_out_of_hand
 from service.state import (
     HistoryEntry,
     Level,
@@ -43,6 +43,9 @@ def on_watchdog(
     state: TrackerState, event: ev.Watched, policy: Policy, now_ns: int
 ) -> TrackerState:
     """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
+    reason = _why_useless(state, event)
+    if reason is not None:
+        return replace(state, unwatched=f"a look was not used: {reason}")
     known = state.registration
     if known is None:
         return _alone(state, event, policy)
@@ -89,6 +92,13 @@ def fit_begins_at(state: TrackerState) -> Misregistration | None:
         return state.registration.alpha
     last = state.watchdog
     return last.alpha if last is not None and np.isfinite(last.sigma).all() else None
+
+
+def _why_useless(state: TrackerState, event: ev.Watched) -> str | None:
+    """Return why a look says nothing of the telescope as it is, or None."""
+    if event.loop and state.rtc is not None and event.loop != state.rtc.loop_numbers:
+        return "the loop has changed since"
+    return why_out_of_hand(state)
 
 
 def _alone(state: TrackerState, event: ev.Watched, policy: Policy) -> TrackerState:

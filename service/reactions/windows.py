@@ -45,7 +45,7 @@ OUT_OF_HAND = {
     "edge-slip": "the edge had slipped",
     OFF_LOOP: "the commands were off the loop equation",
 }
-"""Alarms under which no window is believed."""
+"""Alarms under which no window and no look is believed."""
 
 
 def on_window(
@@ -102,9 +102,9 @@ def _why_useless(state: TrackerState, estimate: DitheredEstimate, policy: Policy
     """Return why a window's estimate must not be used, or None."""
     if state.rtc is None or estimate.session != state.rtc.session:
         return "the RTC has restarted since"
-    out_of_hand = next((OUT_OF_HAND[a.name] for a in state.alarms if a.name in OUT_OF_HAND), None)
-    if out_of_hand is not None:
-        return f"{out_of_hand}: its telemetry is no measurement"
+    reason = why_out_of_hand(state)
+    if reason is not None:
+        return reason
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
         return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
@@ -126,6 +126,12 @@ def _why_useless(state: TrackerState, estimate: DitheredEstimate, policy: Policy
             f"the fit began at {near.to_boundary()}"
         )
     return None
+
+
+def why_out_of_hand(state: TrackerState) -> str | None:
+    """Return why nothing the loop does now measures anything, or None."""
+    reason = next((OUT_OF_HAND[a.name] for a in state.alarms if a.name in OUT_OF_HAND), None)
+    return None if reason is None else f"{reason}: its telemetry is no measurement"
 
 
 def refuse_window(state: TrackerState, reason: str, now_ns: int) -> TrackerState:

@@ -97,7 +97,10 @@ async def watched(
         estimate = await crew.call(Workbench.watch, sums, fit_begins_at(state))
     except PyrcalError as error:
         return ev.Noted(name="watchdog.failed", text=str(error), level=Level.WARNING)
-    return None if estimate is None else ev.Watched(estimate=estimate, t_ns_utc=end_ns)
+    if estimate is None:
+        return None
+    loop = () if state.rtc is None else state.rtc.loop_numbers
+    return ev.Watched(estimate=estimate, t_ns_utc=end_ns, loop=loop)
 
 
 def lost(window: Window, reason: str) -> Event:

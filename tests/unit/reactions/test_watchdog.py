@@ -278,6 +278,32 @@ def test_so_it_has_when_the_service_was(story, n_controlled, kept):
     assert (after.state.registration.bias is not None) is kept
 
 
+def test_a_look_that_was_under_way_when_the_loop_changed_is_not_used(story):
+    learnt(story)
+    before = rtc().loop_numbers
+    story.tell(ev.StatusSeen(rtc=rtc(300, t_ns_utc=story.now_ns)))
+    look = ev.Watched(estimate=watched(ALPHA), t_ns_utc=story.now_ns, loop=before)
+    known = story.state.registration
+    story.tell(look, after_s=1.0)
+    assert story.state.registration.alpha == known.alpha
+    assert story.state.registration.bias is None
+    assert "the loop has changed" in story.state.unwatched
+
+
+@pytest.mark.parametrize("alarm", ["loop-diverging", "edge-slip", "commands-off-loop"])
+def test_a_look_at_a_loop_out_of_hand_moves_nothing(story, alarm):
+    learnt(story)
+    known = story.state.registration
+    story.tell(ev.Trouble(name=alarm, text="it is"))
+    watch(story, moved(shift_x_subap=0.08), after_s=4.0)
+    assert story.state.registration.alpha == known.alpha
+    assert "no measurement" in story.state.unwatched
+    story.tell(ev.Trouble(name=alarm, text="over", over=True))
+    watch(story, moved(shift_x_subap=0.06), after_s=4.0)
+    assert story.state.history[-1].source is Source.PASSIVE
+    assert story.state.unwatched == ""
+
+
 def test_a_bias_of_which_nothing_was_learnt_is_of_no_loop(story):
     before = story.state.registration.bias
     story.tell(ev.StatusSeen(rtc=rtc(300, t_ns_utc=story.now_ns)))

@@ -66,7 +66,7 @@ class Reject:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Publish:
-    """Send a known reconstructor again, under a new id, after it has passed the gate anew."""
+    """Send a known reconstructor again, under a new id, unless the gate refuses it now."""
 
     id: str
 

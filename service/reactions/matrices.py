@@ -131,7 +131,7 @@ def shelved(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> Tr
         if older.state is MatrixState.PROPOSED:
             state = with_state(state, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
     state = with_record(state, record)
-    verdict = record.gate.reason if record.gate is not None else "not judged: α is unknown"
+    verdict = record.gate.reason if record.gate is not None else record.reason
     if record.state is MatrixState.REFUSED:
         text = f"{record.id}: {verdict}"
         return logged(state, "reconstructor.refused", text, now_ns, Level.WARNING)
@@ -153,14 +153,21 @@ def send(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
         reason = record.gate.reason
     if rtc is None or reason is not None:
         raise CommandError(f"{matrix_id} cannot be sent: {reason}")
-    state = with_changed(
-        state, replace(record, state=MatrixState.PUBLISHED, published_ns_utc=now_ns, reason="")
-    )
-    state = logged(state, "reconstructor.published", f"{matrix_id} sent to the RTC", now_ns)
+    unjudged = _why_unjudged(record)
+    sent = replace(record, state=MatrixState.PUBLISHED, published_ns_utc=now_ns, reason=unjudged)
+    text = f"{matrix_id} sent to the RTC{'; ' if unjudged else ''}{unjudged}"
+    level = Level.WARNING if unjudged else Level.INFO
+    state = logged(with_changed(state, sent), "reconstructor.published", text, now_ns, level)
     gains = None
     if record.n_modes != rtc.n_controlled:
         gains = extended_gains(rtc, record.n_modes)
     return state, (ev.SendMatrix(id=matrix_id, n_modes=record.n_modes, gains=gains),)
+
+
+def _why_unjudged(record: ReconstructorRecord) -> str:
+    """Return why the gate has said nothing of one on its way to the RTC; empty: it has."""
+    on_its_way = {MatrixState.PROPOSED, MatrixState.PUBLISHED, MatrixState.STAGED}
+    return record.reason if record.gate is None and record.state in on_its_way else ""
 
 
 def why_unsendable(state: TrackerState) -> str | None:
@@ -193,7 +200,8 @@ def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int)
     if _is_old(state, record, event):
         return state
     if event.state is MatrixState.APPLIED:
-        record = replace(record, applied_frame_seq=event.frame_seq, reason=event.reason)
+        reason = event.reason or _why_unjudged(record)
+        record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
         state = with_in_use(with_changed(state, record), event.id)
         state = without_alarm(state, "no-acknowledgement", now_ns)
         state = without_alarm(state, "margin", now_ns)
@@ -206,7 +214,10 @@ def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int)
         )
         text = f"{event.id} applied from frame {event.frame_seq}"
         return logged(state, "reconstructor.applied", text, now_ns)
-    state = with_state(state, event.id, event.state, event.reason)
+    reason = event.reason
+    if event.state is MatrixState.STAGED:
+        reason = reason or _why_unjudged(record)
+    state = with_state(state, event.id, event.state, reason)
     if event.state is MatrixState.REJECTED:
         text = f"the RTC rejected {event.id}: {event.reason}"
         return logged(state, "reconstructor.rejected", text, now_ns, Level.WARNING)

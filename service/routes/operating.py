@@ -206,13 +206,19 @@ async def reject(
 async def publish(
     service: ServiceDep, matrix_id: MatrixId, _body: NoFields | None = None
 ) -> AcceptedView:
-    """Send a known reconstructor again, under a new id, after it has passed the gate anew."""
+    """Send a known reconstructor again, under a new id, unless the gate refuses it now.
+
+    What has been in use is sent even where the gate cannot judge it: α unknown, or the loop open.
+    """
     return await accepted(service, Publish(id=matrix_id), reconstructors=_ALL)
 
 
 @router.post("/rollback", status_code=202)
 async def rollback(service: ServiceDep, _body: NoFields | None = None) -> AcceptedView:
-    """Go back to the reconstructor that was in use before the present one."""
+    """Go back to the one in use before, unless the gate refuses it.
+
+    It is sent even where the gate cannot judge it: α unknown, or the loop open.
+    """
     return await accepted(service, Rollback(), reconstructors=_ALL)
 
 

@@ -186,14 +186,17 @@ class Deeds:
         rtc, registration = _there(state), state.registration
         source = state.reconstructor(effect.source)
         matrix = await asyncio.to_thread(self.matrix, effect.source)
-        gate = judged = None
+        gate, judged, why = None, None, effect.why
         gains = commanded_gains(rtc, len(matrix))
         if registration is not None and any(gains):
             gate = await self._verdict(matrix, gains, state, registration)
             judged = judged_now(rtc, gains, registration)
+        else:
+            unknown = "α is unknown" if registration is None else "an open loop tells no gains"
+            why = f"{why}; the gate could not judge it: {unknown}"
         refused = gate is not None and not gate.accepted
         record = replace(
-            self._record(len(matrix), effect.why, None, effect.source),
+            self._record(len(matrix), why, None, effect.source),
             state=MatrixState.REFUSED if refused else MatrixState.PROPOSED,
             alpha=None if source is None else source.alpha,
             sigma=None if source is None else source.sigma,
@@ -203,7 +206,7 @@ class Deeds:
             optical_gains=() if registration is None else registration.optical_gains,
             sha256=checksum(matrix),
         )
-        await self._keep(record, matrix, None, effect.why)
+        await self._keep(record, matrix, None, why)
         return ev.MatrixMade(record=record, wanted=True)
 
     async def _judge(self, effect: ev.JudgeMatrix | ev.JudgeProposal, state: TrackerState) -> Event:

@@ -4,7 +4,7 @@ import pytest
 
 from service import events as ev
 from service.errors import CommandError, UnknownIdError
-from service.state import MatrixState, Mode
+from service.state import Level, MatrixState, Mode
 from tests.unit.reactions.situations import Story, of_kind, rtc
 
 
@@ -137,6 +137,28 @@ class TestGoingBack:
         story.state = replace(story.state, registration=None)
         refused(story, ev.Publish(id="cm-3"), "α is not known yet")
         assert of_kind(story.tell(ev.Publish(id="cm-1")), ev.CopyMatrix)
+
+    def test_what_the_gate_could_not_judge_is_sent_and_said_to_be(self, story):
+        story.state = replace(story.state, registration=None)
+        story.tell(ev.Rollback())
+        why = "the operator goes back to cm-1; the gate could not judge it: α is unknown"
+        effects = story.make("cm-3", wanted=True, gate=None, judged=None, alpha=None, reason=why)
+        assert of_kind(effects, ev.SendMatrix)
+        made, published = story.state.log[-2:]
+        assert (made.name, published.name) == ("reconstructor.made", "reconstructor.published")
+        assert why in made.text
+        assert why in published.text
+        assert published.level is Level.WARNING
+        for state in (MatrixState.STAGED, MatrixState.APPLIED):
+            story.acknowledge("cm-3", state)
+            assert story.state.reconstructor("cm-3").reason == why
+
+    def test_of_what_it_judged_nothing_of_the_kind_is_said(self, story):
+        story.tell(ev.Rollback())
+        story.make("cm-3", wanted=True, reason="the operator goes back to cm-1")
+        assert story.state.log[-1].text == "cm-3 sent to the RTC"
+        story.acknowledge("cm-3")
+        assert story.state.reconstructor("cm-3").reason == ""
 
     def test_there_must_be_something_to_go_back_to(self):
         refused(Story().meet(), ev.Rollback(), "no earlier reconstructor has been in use")

@@ -221,7 +221,23 @@ async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(deeds, arc
     assert copy.id != source.id
     assert (copy.parent, copy.sha256, copy.alpha) == (source.id, source.sha256, ALPHA)
     assert copy.gate is not source.gate
+    assert copy.reason == "back"
     np.testing.assert_array_equal(archive.matrix(copy.id), archive.matrix(source.id))
+
+
+@pytest.mark.parametrize(
+    ("changes", "unknown"),
+    [
+        ({"registration": None}, "α is unknown"),
+        ({"rtc": replace(RTC, loop="open", gains=(0.0,) * RTC.n_modes)}, "an open loop"),
+    ],
+)
+async def test_a_copy_that_cannot_be_judged_says_so(deeds, changes, unknown):
+    source, state = await made(deeds)
+    copied = ev.CopyMatrix(source=source.id, why="back")
+    copy = (await deeds.carry_out(copied, replace(state, **changes))).record
+    assert (copy.gate, copy.state) == (None, MatrixState.PROPOSED)
+    assert copy.reason.startswith(f"back; the gate could not judge it: {unknown}")
 
 
 async def test_a_copy_that_would_not_hold_the_loop_any_more_is_refused(deeds):

@@ -37,6 +37,9 @@ FORGIVEN_AFTER_S = 3600.0
 COMFORT = 1.5
 """More modes are tried only while there is this times the margin that the gate asks for."""
 
+_DECLINED = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
+"""By the gate when it judged it again, or by the RTC."""
+
 
 def fewer_than(n_modes: int) -> tuple[int, ...]:
     """Return the rungs below ``n_modes``, largest first."""
@@ -86,7 +89,7 @@ def with_limit(
 
 
 def declined(before: TrackerState, state: TrackerState, event: Event, now_ns: int) -> TrackerState:
-    """Note that a reconstructor which had passed the gate was declined by the RTC or an operator.
+    """Note that a reconstructor which had passed the gate was declined before it came into use.
 
     If it has more modes than are controlled, that is what it was made for: no more are tried for a
     while, longer each time. An acquisition counts its own failures.
@@ -111,7 +114,7 @@ def _wait_after(
     """Return for how long more modes are not tried after what became of one; None: no matter."""
     if earlier is None or earlier is record.state:
         return None
-    if record.state in {MatrixState.REJECTED, MatrixState.FAILED}:
+    if record.state in _DECLINED:
         return FIRST_WAIT_S
     if record.state is MatrixState.DISCARDED and isinstance(event, Reject):
         return OPERATORS_WAIT_S

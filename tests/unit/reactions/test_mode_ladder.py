@@ -251,6 +251,18 @@ def test_an_rtc_that_will_not_have_more_modes_is_asked_less_and_less(decline):
     assert night.state.mode_limit.wait_s == 480.0
 
 
+def test_so_is_a_gate_that_judges_more_modes_again_and_then_refuses_them():
+    night = Declined(Mode.PROPOSE)
+    (more,) = of_kind(night.wait(6), ev.MakeMatrix)
+    night.make_for(more, 500)
+    judged = night.state.reconstructor("cm-2").judged
+    no = verdict(accepted=False, radius=0.97)
+    night.tell(ev.ProposalJudged(id="cm-2", verdict=no, judged=judged))
+    assert night.matrix_state("cm-2") is MatrixState.REFUSED
+    assert (night.state.mode_limit.n_modes, night.state.mode_limit.wait_s) == (400, FIRST_WAIT_S)
+    assert not of_kind(night.wait(FIRST_WAIT_S - 5), ev.MakeMatrix)
+
+
 def test_updates_of_the_modes_in_use_go_on_meanwhile():
     night = Declined(Mode.PROPOSE)
     night.for_s(20, the_operator)

@@ -17,7 +17,7 @@ worth the swap.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -117,16 +117,21 @@ def expected_gain(
     """Return what ``fresh`` would win over ``in_use``, both ``(n_controlled, n_slopes)``.
 
     ``interaction_matrix`` ``(n_slopes, n_basis)`` is the sensor's at the present registration.
+    A mode without gain is one beyond the loop, whichever its number.
     """
-    seen = interaction_matrix * timing.optical_gain.astype(np.float32)
-    spectra = _Spectra(timing, sky)
-    now_m2, radius = _left(in_use, seen, timing, sky, spectra)
-    then_m2, fresh_radius = _left(fresh, seen, timing, sky, spectra)
-    rest_m2 = float(sky.variance_m2[len(in_use) :].sum()) + sky.beyond_m2
+    moving = np.flatnonzero(timing.gains if timing.gains.any() else timing.gains == 0.0)
+    order = np.concatenate([moving, np.setdiff1d(np.arange(len(sky.variance_m2)), moving)])
+    seen = (interaction_matrix * timing.optical_gain.astype(np.float32))[:, order]
+    spectra = _Spectra(timing, sky, order)
+    timing = replace(timing, gains=timing.gains[moving])
+    sky = replace(sky, variance_m2=sky.variance_m2[order])
+    now_m2, radius = _left(in_use[moving], seen, timing, sky, spectra)
+    then_m2, fresh_radius = _left(fresh[moving], seen, timing, sky, spectra)
+    rest_m2 = float(sky.variance_m2[len(moving) :].sum()) + sky.beyond_m2
     wavefront = float(np.sqrt(then_m2 + rest_m2))
     loss = float(np.sqrt(now_m2 + rest_m2)) - wavefront
     if max(radius, fresh_radius) >= 1.0:
-        # a mode without gain and leak never moves: a new reconstructor would not change that
+        # what no reconstructor holds is no reason for another one
         loss = float("inf") if fresh_radius < 1.0 else 0.0
     return ExpectedGain(
         loss_m=loss, wavefront_m=wavefront, pole_radius=radius, fresh_pole_radius=fresh_radius
@@ -149,7 +154,7 @@ def explained_by_noise(loss_m: float, step: Array, covariance: Array) -> float:
 class _Spectra:
     """Frequencies of a frame, their weights, and the temporal spectrum of groups of modes."""
 
-    def __init__(self, timing: Timing, sky: Sky) -> None:
+    def __init__(self, timing: Timing, sky: Sky, order: NDArray[np.intp]) -> None:
         edges = np.geomspace(1e-3, 0.5, N_FREQUENCIES + 1)
         per_frame = np.sqrt(edges[1:] * edges[:-1])
         z: Complex = np.exp(-2j * np.pi * per_frame)
@@ -157,6 +162,7 @@ class _Spectra:
         self.widths: Array = np.diff(edges)
         corners = _CORNER * (radial_order(len(sky.variance_m2)) + 1.0) * sky.crossing_hz
         bounds = np.geomspace(corners[0] * 0.999, corners[-1] * 1.001, _N_GROUPS + 1)
+        corners = corners[order]
         self.group: NDArray[np.intp] = np.searchsorted(bounds, corners) - 1
         self.shapes: Array = np.zeros((_N_GROUPS, N_FREQUENCIES))
         for k in range(_N_GROUPS):

@@ -84,8 +84,11 @@ def judge(
     ``(4, 4)`` includes the model-error floor. The bound is never tighter than half-way between
     the aligned loop and the edge of stability, or a slow loop could never be served at all. A
     loop that is stable must not let its outer ring slip either (``service.control.edge``); as many
-    modes as hold already may move it a little more, or the noise of α would cost modes.
+    modes as hold already may move it a little more, or the noise of α would cost modes. Modes
+    without gain are not in the loop, and have no say: their command only fades.
     """
+    holds = len(reconstructor) == loop.n_holding
+    reconstructor, linearisation, loop = _moving(reconstructor, linearisation, loop)
     n = len(reconstructor)
     centre = reconstructor @ linearisation.matrix_at(registration)[:, :n]
     slopes = [reconstructor @ derivative[:, :n] for derivative in linearisation.derivatives]
@@ -107,13 +110,35 @@ def judge(
         leak=loop.leak,
         delay_frames=loop.delay_frames,
     )
-    slippery = why_slippery(motion_m, loop.leak, holds=n == loop.n_holding)
+    slippery = why_slippery(motion_m, loop.leak, holds=holds)
     return replace(
         stable,
         accepted=slippery is None,
         reason=slippery or stable.reason,
         edge_motion_m=motion_m,
     )
+
+
+def _moving(
+    reconstructor: NDArray[np.float32], linearisation: Linearisation, loop: LoopSettings
+) -> tuple[NDArray[np.float32], Linearisation, LoopSettings]:
+    """Return what is left of them without the modes that have no gain; all have none: all."""
+    modes = np.flatnonzero(loop.gains)
+    if len(modes) in {0, len(loop.gains)}:
+        return reconstructor, linearisation, loop
+    gain, outer = loop.optical_gain, loop.outer
+    loop = replace(
+        loop,
+        gains=loop.gains[modes],
+        optical_gain=gain if isinstance(gain, float) else gain[modes],
+        outer=outer and Outer(actuators=outer.actuators[:, modes]),
+    )
+    linearisation = replace(
+        linearisation,
+        matrix=linearisation.matrix[:, modes],
+        derivatives=linearisation.derivatives[:, :, modes],
+    )
+    return reconstructor[modes], linearisation, loop
 
 
 def _worst_pole(

@@ -71,10 +71,32 @@ def test_what_is_unstable_loses_everything():
     assert judged(shifted(0.3), timing=fast).loss_m == float("inf")
 
 
-def test_a_mode_that_never_moves_is_no_reason_for_another_matrix():
+def still(*modes):
     gains = np.full(N_CONTROLLED, 0.4)
-    gains[3] = 0.0
-    found = judged(shifted(0.1), timing=replace(TIMING, gains=gains))
+    gains[list(modes)] = 0.0
+    return replace(TIMING, gains=gains)
+
+
+def test_a_mode_without_gain_is_one_beyond_the_loop():
+    """The last of them: as if the matrices had a row less."""
+    matrix, n_fewer = matrix_at(shifted(0.1)), N_CONTROLLED - 1
+    in_use, fresh = (invert(m, N_CONTROLLED).matrix for m in (matrix_at(Misregistration()), matrix))
+    fewer = replace(TIMING, gains=np.full(n_fewer, 0.4))
+    expected = expected_gain(in_use[:n_fewer], fresh[:n_fewer], matrix, fewer, SKY)
+    found = judged(shifted(0.1), timing=still(n_fewer))
+    for name in ("loss_m", "wavefront_m", "pole_radius", "fresh_pole_radius"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6)
+
+
+def test_whichever_of_them_it_is_the_others_still_gain_from_another_matrix():
+    found = judged(shifted(0.1), timing=still(3, 7))
+    assert 0.0 < found.loss_m < float("inf")
+    assert found.fresh_pole_radius == pytest.approx(np.sqrt(0.4), rel=1e-2)
+    assert found.wavefront_m > judged(shifted(0.1)).wavefront_m
+
+
+def test_a_loop_without_any_gain_is_no_reason_for_another_matrix():
+    found = judged(shifted(0.1), timing=still(*range(N_CONTROLLED)))
     assert (found.loss_m, found.fresh_pole_radius) == (0.0, pytest.approx(1.0))
 
 

@@ -177,6 +177,55 @@ def test_a_reconstructor_of_fewer_modes_is_judged_on_its_own_modes():
     assert found.worst_pole_radius < verdict(truth=turned(8.0)).worst_pole_radius
 
 
+class TestModesWithoutGain:
+    """A loop some of whose gains an operator has set to 0."""
+
+    @staticmethod
+    def loop(*still: int, leak: float = 0.999) -> LoopSettings:
+        gains = np.full(N_CONTROLLED, 0.5)
+        gains[list(still)] = 0.0
+        return replace(settings(), gains=gains, leak=leak)
+
+    @pytest.mark.parametrize("leak", [1.0, 0.999])
+    @pytest.mark.parametrize("degrees", [1.0, 5.0, 15.0])
+    def test_they_have_no_say_as_if_the_reconstructor_had_no_row_for_them(self, degrees, leak):
+        n_fewer = N_CONTROLLED - 5
+        fewer = replace(settings(), gains=np.full(n_fewer, 0.5), leak=leak)
+        expected = judge(
+            reconstructor_for(Misregistration())[:n_fewer],
+            small_linearisation(),
+            turned(degrees),
+            np.diag(SIGMA**2),
+            fewer,
+            bound=BOUND,
+        )
+        found = verdict(
+            truth=turned(degrees), loop=self.loop(*range(n_fewer, N_CONTROLLED), leak=leak)
+        )
+        assert found.accepted is expected.accepted
+        assert found.worst_pole_radius == pytest.approx(expected.worst_pole_radius, rel=1e-4)
+        assert found.bound == expected.bound == BOUND
+
+    def test_they_do_not_make_the_gate_tolerate_the_others(self):
+        """Their command fades with the leak: a pole of 0.999 would be a bound of 0.9995."""
+        refused = verdict(truth=turned(5.0), loop=self.loop(0))
+        assert BOUND < refused.worst_pole_radius < 0.999
+        assert not refused.accepted
+
+    def test_optical_gains_and_the_outer_ring_are_those_of_the_modes_that_are_left(self):
+        ring = Outer(actuators=np.eye(3, N_CONTROLLED))
+        gain = np.linspace(0.5, 0.9, N_CONTROLLED)
+        whole = replace(settings(), outer=ring, optical_gain=gain)
+        still = replace(self.loop(0, 1, 2, leak=1.0), outer=ring, optical_gain=gain)
+        moves, does_not = verdict(loop=whole).edge_motion_m, verdict(loop=still).edge_motion_m
+        assert moves > 0.0
+        assert does_not == 0.0
+
+    def test_a_loop_without_any_gain_is_judged_by_its_leak(self):
+        none = self.loop(*range(N_CONTROLLED))
+        assert verdict(loop=none).worst_pole_radius == pytest.approx(0.999)
+
+
 def with_ring(scale: float, leak: float = 1.0) -> LoopSettings:
     """The aligned loop with an outer ring that a mode moves by this many metres per metre."""
     ring = Outer(actuators=scale * np.random.default_rng(1).normal(size=(9, N_CONTROLLED)))

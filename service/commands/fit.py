@@ -12,15 +12,18 @@ from pathlib import Path
 from service.archive.product import write_whole
 from service.commands.terminal import check_folder, parsed_by, say, show_progress
 from service.config import load_instrument
+from service.errors import ConfigurationError
 from service.fits.figures.sheet import check_plots, write_sheet
-from service.fits.light import read_light
+from service.fits.light import Light, read_light
 from service.fits.product import fill_fit
 from service.fits.recorded import DATASET
 from service.fits.report import document
-from service.fits.request import parse_alpha, parse_count, parse_modes
+from service.fits.request import parse_alpha, parse_arms, parse_count, parse_modes
 from service.fits.run import fit_file
 from service.fits.table import table
+from service.model.instrument import Instrument
 from service.registration.options import FitOptions, Method
+from service.registration.turned_light import Arms
 
 ACCEPTED, REFUSED = 0, 1
 
@@ -75,6 +78,20 @@ def add_fit_arguments(commands: argparse._SubParsersAction[argparse.ArgumentPars
         help="mean counts of the four pupil images, array flux (4, n, n): the model is lit as it "
         "says",
     )
+    turned = fit.add_mutually_exclusive_group()
+    turned.add_argument(
+        "--flux-reference",
+        type=Path,
+        metavar="FILE",
+        help="a flux map of another day: by how much the light is turned since is told",
+    )
+    turned.add_argument(
+        "--arms",
+        type=parsed_by(parse_arms),
+        metavar="WIDTH:DEG,DEG...",
+        help="the spider's arms at rotation 0: the rotation is told that their shadows in the "
+        "flux map have",
+    )
     fit.add_argument("--gain-map", action="store_true", help="fit a gain over the pupil, too")
     fit.add_argument("--anamorphosis", action="store_true", help="fit a stretched image, too")
     fit.add_argument("--json", action="store_true", help="print one JSON object, not a table")
@@ -102,7 +119,7 @@ def run_fit(options: argparse.Namespace) -> int:
     for path in (options.plot, options.output):
         check_folder(path)
     instrument = load_instrument(options.instrument)
-    light = None if options.flux_map is None else read_light(options.flux_map, instrument)
+    light = _light(options, instrument)
     asked = FitOptions(
         method=options.method,
         modes=options.modes,
@@ -132,3 +149,14 @@ def run_fit(options: argparse.Namespace) -> int:
     if options.plot is not None:
         write_sheet(report, instrument, options.plot)
     return ACCEPTED if report.fit.accepted else REFUSED
+
+
+def _light(options: argparse.Namespace, instrument: Instrument) -> Light | None:
+    reference: Path | Arms | None = options.flux_reference or options.arms
+    if options.flux_map is not None:
+        return read_light(options.flux_map, instrument, reference)
+    if reference is not None:
+        raise ConfigurationError(
+            "found a reference for the light and no light, expected --flux-map beside it"
+        )
+    return None

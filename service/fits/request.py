@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import PARAMETERS, Misregistration
+from service.registration.turned_light import Arms
 
 MOST_MODES = 100_000
 
@@ -73,3 +74,25 @@ def parse_alpha(text: str) -> Misregistration:
     if len(values) != len(PARAMETERS) or not np.all(np.isfinite(values)) or values[3] <= 0.0:
         raise ValueError(f"found {text.strip()!r}, {expected}")
     return Misregistration.from_boundary(dict(zip(PARAMETERS, values, strict=True)))
+
+
+def parse_arms(text: str) -> Arms:
+    """Return the spider's arms ``WIDTH:DEG,DEG,...``: subapertures, degrees from +x towards +y.
+
+    Raises
+    ------
+    ValueError
+        If it is not a width above 0 and at least one finite angle.
+    """
+    expected = "expected WIDTH:DEG,DEG,... of the spider's arms, like 0.9:90,210,330"
+    width, _, angles = text.partition(":")
+    try:
+        arms = Arms(
+            angles_rad=tuple(np.deg2rad([float(angle) for angle in angles.split(",")]).tolist()),
+            width_subap=float(width),
+        )
+    except ValueError:
+        raise ValueError(f"found {text.strip()!r}, {expected}") from None
+    if not (0.0 < arms.width_subap < np.inf and np.all(np.isfinite(arms.angles_rad))):
+        raise ValueError(f"found {text.strip()!r}, {expected}")
+    return arms

@@ -189,3 +189,9 @@ def test_an_option_that_means_nothing_is_named(capsys, words):
         main(["fit", TINY, MATRIX, *words])
     assert end.value.code == 2
     assert words[0] in capsys.readouterr().err
+
+
+def test_a_reference_for_the_light_wants_the_light(run):
+    status, _, err = run(MATRIX, "--arms", "0.9:90,210,330")
+    assert status == 2
+    assert "expected --flux-map" in err

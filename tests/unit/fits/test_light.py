@@ -16,6 +16,8 @@ from service.model.slopes import Orientation
 from service.registration.options import FitOptions
 from sim_rtc.diffractive_plant import DiffractivePlant
 from tests.data.tiny.make import ALPHA, HERE, ORIENTATION, SEED
+from tests.unit.registration.lamps import beam, counts_of, flao, gaussian
+from tests.unit.registration.test_turned_light import SHIFT, TRIPOD, arms, shaded, turned
 
 
 def oriented(orientation):
@@ -104,3 +106,48 @@ def test_a_map_without_a_pupil_is_refused(tmp_path, instrument):
         file["flux"] = np.random.default_rng(1).exponential(size=(4, 12, 12))
     with pytest.raises(MatrixError, match=str(path)):
         read_light(path, instrument)
+
+
+class TestTurn:
+    """How far the light is turned, told beside where it lies."""
+
+    @pytest.fixture
+    def telescope(self):
+        """FLAO with its axes written down, its mirror hung at about 65 deg."""
+        plain = flao()
+        return replace(
+            plain,
+            slopes=replace(plain.slopes, orientation=Orientation()),
+            mirror=replace(plain.mirror, nominal_rotation_rad=np.deg2rad(65.0)),
+        )
+
+    @staticmethod
+    def stored(path, counts):
+        with h5py.File(path, "w") as file:
+            file["flux"] = counts
+        return path
+
+    def test_three_arms_tell_the_rotation_about_the_nominal_one(self, telescope, tmp_path):
+        """Alike after 120 deg: 50.3 deg it is, and not 170.3, for the mirror is at about 65."""
+        counts = counts_of(telescope, SHIFT, shaded(TRIPOD, 50.3))
+        path = self.stored(tmp_path / "flux.h5", counts)
+        found = read_light(path, telescope, arms(TRIPOD))
+        assert np.rad2deg(found.turn.rotation_rad) == pytest.approx(50.3, abs=1.0)
+        assert "turned by +50." in found.note
+
+    def test_without_a_nominal_rotation_alike_arms_are_ambiguous(self, telescope, tmp_path):
+        anywhere = replace(telescope, mirror=replace(telescope.mirror, nominal_rotation_rad=None))
+        counts = counts_of(telescope, SHIFT, shaded(TRIPOD, 50.3))
+        path = self.stored(tmp_path / "flux.h5", counts)
+        assert "it does not tell: ambiguous" in read_light(path, anywhere, arms(TRIPOD)).note
+
+    def test_uneven_light_tells_it_against_another_day(self, telescope, tmp_path):
+        before = self.stored(tmp_path / "before.h5", counts_of(telescope, light=beam(gaussian)))
+        now = counts_of(telescope, SHIFT, turned(gaussian, -30.0))
+        found = read_light(self.stored(tmp_path / "now.h5", now), telescope, before)
+        assert np.rad2deg(found.turn.rotation_rad) == pytest.approx(-30.0, abs=2.0)
+
+    def test_who_gives_no_reference_is_not_told(self, path, instrument):
+        found = read_light(path, instrument)
+        assert found.turn is None
+        assert found.note.endswith("subapertures")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from service.fits.request import parse_alpha, parse_count, parse_modes
+from service.fits.request import parse_alpha, parse_arms, parse_count, parse_modes
 
 
 @pytest.mark.parametrize(
@@ -42,3 +42,15 @@ def test_a_count_is_above_zero():
     for text in ("0", "-1", "1.5", "x", ""):
         with pytest.raises(ValueError, match="above 0"):
             parse_count(text)
+
+
+def test_arms_are_a_width_and_angles():
+    arms = parse_arms("0.9:90,-150,330")
+    assert arms.width_subap == 0.9
+    assert np.rad2deg(arms.angles_rad) == pytest.approx([90.0, -150.0, 330.0])
+
+
+@pytest.mark.parametrize("text", ["", "0.9", "0.9:", "0:90", "90,210", "inf:90", "1:nan", "1:a"])
+def test_other_arms_are_refused(text):
+    with pytest.raises(ValueError, match="expected WIDTH:DEG"):
+        parse_arms(text)

@@ -25,6 +25,8 @@ from service.state import (
     TrackerState,
 )
 
+NO_RTC = "no RTC is there: when one is, it begins anew or says why not; the loop may be open"
+
 _LASTING = (AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED)
 """Stages that an operator, or windows, must end."""
 
@@ -61,7 +63,7 @@ def on_gap(before: TrackerState, state: TrackerState, now_ns: int) -> TrackerSta
     ``before`` still knows in which session that was.
     """
     state = replace(state, acquisition=_cut_off(before, "the RTC vanished"))
-    return _waiting(state, "no RTC is there", now_ns)
+    return _waiting(state, NO_RTC, now_ns)
 
 
 def inherited(state: TrackerState, left: Acquisition, now_ns: int) -> TrackerState:
@@ -71,7 +73,7 @@ def inherited(state: TrackerState, left: Acquisition, now_ns: int) -> TrackerSta
         return with_alarm(state, "acquisition", left.text, now_ns)
     if left.stage is AcquisitionStage.ABORTED:
         return state
-    return _waiting(state, "no RTC is there", now_ns)
+    return _waiting(state, NO_RTC, now_ns)
 
 
 def taken_up(state: TrackerState, policy: Policy, now_ns: int) -> Step:
@@ -83,7 +85,7 @@ def taken_up(state: TrackerState, policy: Policy, now_ns: int) -> Step:
         return _closed(state, rtc, now_ns), ()
     why_not = _why_not_by_itself(state, rtc, policy)
     if why_not is not None:
-        return _waiting(state, why_not, now_ns), ()
+        return _refusing(state, why_not, now_ns), ()
     cause = _cause(state.acquisition)
     state = replace(state, acquisition=replace(state.acquisition, interruption=None))
     state = without_alarm(state, "acquisition", now_ns)
@@ -102,21 +104,25 @@ def _why_not_by_itself(state: TrackerState, rtc: RtcView, policy: Policy) -> str
     return why_not_now(state, policy)
 
 
-def _waiting(state: TrackerState, why: str, now_ns: int) -> TrackerState:
-    """Return the state that says what was going on, why that does not go on, and what to do."""
-    text = (
-        f"{_said(state.acquisition)}; it does not begin anew by itself: {why}. The loop may be "
-        "open, and its matrix is for a registration that was not believed: acquire again, or close "
-        "the loop on a matrix of your own"
+def _refusing(state: TrackerState, why: str, now_ns: int) -> TrackerState:
+    """Return the state that says why what was cut off does not go on, and what to do."""
+    do = (
+        "The loop may be open, and its matrix is for a registration that was not believed: acquire "
+        "again, or close the loop on a matrix of your own"
     )
+    return _waiting(state, f"it does not begin anew by itself: {why}", now_ns, do)
+
+
+def _waiting(state: TrackerState, what: str, now_ns: int, do: str = "") -> TrackerState:
+    """Return the state that says what was going on, and what it waits for."""
+    text = f"{_said(state.acquisition)}; {what}{'. ' if do else ''}{do}"
     if any((alarm.name, alarm.text) == ("acquisition", text) for alarm in state.alarms):
         return state
     acquisition = replace(
         state.acquisition, stage=AcquisitionStage.INTERRUPTED, text=text, since_ns_utc=now_ns
     )
     state = replace(state, acquisition=acquisition)
-    note = f"it does not begin anew by itself: {why}"
-    state = logged(state, "acquisition.interrupted", note, now_ns, Level.WARNING)
+    state = logged(state, "acquisition.interrupted", what, now_ns, Level.WARNING)
     return with_alarm(state, "acquisition", text, now_ns)
 
 

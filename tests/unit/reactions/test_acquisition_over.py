@@ -22,10 +22,10 @@ class Failed(Acquiring):
         self.make("cm-150", MatrixState.REFUSED, n_modes=150)
         assert self.stage is AcquisitionStage.FAILED
 
-    def close_on_their_own(self):
+    def close_on_their_own(self, **changes):
         """The operator closes the loop as the alarm says, on a matrix of nobody here."""
         self.tell(ev.SetLoop(closed=True))
-        self.status(cm_id="own")
+        self.status(cm_id="own", **changes)
         self.tell(ev.MatrixFetched(record=foreign("own")))
         return self
 
@@ -40,6 +40,13 @@ def test_a_failure_is_over_when_windows_agree_in_a_loop_somebody_has_closed():
     assert "acquisition" not in story.alarms
     assert "acquisition.idle" in story.logged
     assert "windows agree" in story.text
+
+
+def test_a_loop_of_a_part_of_the_modes_will_do():
+    gains = (0.0,) + (0.4,) * 399 + (0.0,) * 194
+    story = Failed().close_on_their_own(loop="partial", gains=gains)
+    story.see(n_windows=ENOUGH_WINDOWS)
+    assert story.stage is AcquisitionStage.IDLE
 
 
 def test_the_next_trouble_is_met_as_the_first_was():

@@ -136,11 +136,11 @@ def _watchers() -> Iterator[Part]:
     """Yield what guards the loop."""
     instrument = load_instrument("flao-lbt")
     basis = karhunen_loeve_basis(instrument)
-    variance = basis.variance_m2
+    variance, in_loop = basis.variance_m2, np.arange(N_CONTROLLED)
     yield Part(
         name="loop health",
         begin=LoopHealth(),
-        feed=lambda state, block: observe(state, block, variance, N_CONTROLLED),
+        feed=lambda state, block: observe(state, block, variance, in_loop),
     )
     watch = _edge_watch(instrument.mirror, basis.mode_to_actuator, variance)
     yield Part(
@@ -169,7 +169,7 @@ def _edge_watch(mirror: object, strokes: Array, variance: Array) -> EdgeWatch:
     if not isinstance(mirror, Mirror):
         raise TypeError(f"benchmark: found {type(mirror).__name__}; expected a mirror of actuators")
     actuators = Actuators(positions=mirror.positions_m, strokes=strokes)
-    watch = edge_watch(actuators, variance, N_CONTROLLED)
+    watch = edge_watch(actuators, variance, np.arange(N_CONTROLLED))
     if watch is None:
         raise TypeError("benchmark: found no edge to watch; expected the ring of 400 modes")
     return watch

@@ -119,7 +119,7 @@ def run(case: Case, given: argparse.Namespace, instrument: Instrument) -> Outcom
         f"--n-controlled {case.n_controlled} --wind {given.wind},40".split()
     )
     actuators, variance_m2 = actuators_of(instrument), modes_of(instrument).variance_m2
-    watch = edge_watch(actuators, variance_m2, case.n_controlled)
+    watch = edge_watch(actuators, variance_m2, np.arange(case.n_controlled))
     if watch is None:
         raise SystemExit(f"{case.n_controlled} modes are too few to watch")
     telescope = build_telescope(options, instrument)

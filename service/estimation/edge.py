@@ -77,16 +77,16 @@ class EdgeHealth:
 
 
 def edge_watch(
-    actuators: Actuators, mode_variance_m2: NDArray[np.float64], n_controlled: int
+    actuators: Actuators, mode_variance_m2: NDArray[np.float64], in_loop: NDArray[np.intp]
 ) -> EdgeWatch | None:
-    """Return what to watch; None when the loop controls too few modes to say.
+    """Return what to watch in a loop of these modes; None when they are too few to say.
 
     The same when nothing is known of the turbulence in the modes.
     """
-    used = np.zeros(len(mode_variance_m2))
-    used[LOW_MODES:n_controlled] = 1.0
+    used, high = np.zeros(len(mode_variance_m2)), in_loop[in_loop >= LOW_MODES]
+    used[high] = 1.0
     expected = np.sqrt(actuators.strokes**2 @ (used * mode_variance_m2))
-    if n_controlled <= 2 * LOW_MODES or expected.min() <= 0.0:
+    if len(high) <= LOW_MODES or expected.min() <= 0.0:
         return None
     shapes = (actuators.strokes * used / expected[:, None]).astype(np.float32)
     outer = actuators.outer

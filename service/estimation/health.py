@@ -33,10 +33,15 @@ class LoopHealth:
 
 
 def observe(
-    health: LoopHealth, block: FrameBlock, mode_variance_m2: NDArray[np.float64], n_controlled: int
+    health: LoopHealth,
+    block: FrameBlock,
+    mode_variance_m2: NDArray[np.float64],
+    in_loop: NDArray[np.intp],
 ) -> LoopHealth:
-    """Return the health after one more block of frames."""
-    upper = slice(n_controlled // 2, n_controlled)
+    """Return the health of a loop of these modes after one more block; open, it is well."""
+    if not len(in_loop):
+        return LoopHealth()
+    upper = in_loop[len(in_loop) // 2 :]
     commands = block.commands_m[:, upper]
     power = float(np.mean(np.sum(commands.astype(np.float64) ** 2, axis=1)))
     expected = float(mode_variance_m2[upper].sum())

@@ -35,7 +35,7 @@ def forgotten(state: TrackerState, event: Event, now_ns: int) -> TrackerState:
 def _followed(state: TrackerState) -> bool:
     """Return whether windows that came since agree on α, in a closed loop."""
     rtc, known = state.rtc, state.registration
-    if rtc is None or rtc.loop == "open" or known is None:
+    if rtc is None or not rtc.in_loop or known is None:
         return False
     since = state.windows_accepted - state.acquisition.windows
     believed = known.usable and known.candidate is None

@@ -157,8 +157,8 @@ def _why_none(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
         return f"stopped by the operator{left}"
     if not policy.dither_enabled and state.dither is None:
         return f"the settings forbid it{left}"
-    if rtc.loop != "closed":
-        return f"the loop is {rtc.loop}"
+    if not rtc.in_loop:
+        return rtc.why_open
     if state.in_use is None and state.dither is None and rtc.dither is None:
         return "the reconstructor in use is not known yet"
     return None

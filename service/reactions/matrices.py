@@ -56,7 +56,7 @@ def on_matrix(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
 def _may_follow(state: TrackerState) -> bool:
     """Return whether a reconstructor that nobody asked for may be sent."""
     rtc, known = state.rtc, state.registration
-    if state.mode is not Mode.AUTO or rtc is None or rtc.loop != "closed":
+    if state.mode is not Mode.AUTO or rtc is None or not rtc.in_loop:
         return False
     if any(alarm.name in PARALYSING for alarm in state.alarms):
         return False

@@ -227,7 +227,7 @@ def _watched(state: TrackerState, record: MeasurementRecord, now_ns: int) -> Tra
     over = (
         record.opens_loop
         and rtc is not None
-        and rtc.loop == "closed"
+        and rtc.loop != "open"
         and record.start_seq is not None
     )
     if not over:

@@ -47,7 +47,12 @@ def fewer_than(n_modes: int) -> tuple[int, ...]:
 
 
 def more_to_try(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> tuple[int, ...]:
-    """Return the numbers of modes above the present one that may be tried now, largest first."""
+    """Return the numbers of modes above the present one that may be tried now, largest first.
+
+    New modes get the gain of the last: where that is 0 they would not be in the loop.
+    """
+    if not rtc.gains[rtc.n_controlled - 1]:
+        return ()
     target = min(policy.n_modes_target, rtc.n_modes)
     limit = state.mode_limit
     if limit is not None and (now_ns < limit.until_ns_utc or not _comfortable(state)):

@@ -51,7 +51,7 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
 
 def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     """Take over what the RTC says of itself."""
-    state = without_alarm(state, "rtc-vanished", now_ns)
+    state, before = without_alarm(state, "rtc-vanished", now_ns), state.rtc
     if state.rtc is not None and state.rtc.loop_numbers != rtc.loop_numbers:
         # the margin is not what it was
         state = replace(state, judged_ns_utc=None)
@@ -64,14 +64,15 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
         pointing=rtc.pointing or state.pointing,
     )
     state = _of_this_basis(state, now_ns)
+    state = _told_of_gains(before, state, rtc, now_ns)
     if rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None:
         state = _used_by_status(state, rtc.cm_id, now_ns)
     measuring = state.measuring
     opened = state.acquisition.under_way or (measuring is not None and measuring.opens_loop)
     # its alarm tells more, and not to close the loop on any matrix
     opened = opened or state.acquisition.stage is AcquisitionStage.INTERRUPTED
-    if rtc.loop == "open" and not opened:
-        state = with_alarm(state, "loop-open", "the loop is open: close it to calibrate", now_ns)
+    if not rtc.in_loop and not opened:
+        state = with_alarm(state, "loop-open", f"{rtc.why_open}: close it to calibrate", now_ns)
     else:
         state = without_alarm(state, "loop-open", now_ns)
     return follow_status(state, rtc, now_ns)
@@ -99,6 +100,18 @@ def _used_by_status(state: TrackerState, matrix_id: str, now_ns: int) -> Tracker
     text = f"{matrix_id} is in use after all, by the RTC's status; nobody acknowledged it"
     state = with_state(state, matrix_id, MatrixState.APPLIED, text)
     return logged(state, "reconstructor.applied", text, now_ns)
+
+
+def _told_of_gains(
+    before: RtcView | None, state: TrackerState, rtc: RtcView, now_ns: int
+) -> TrackerState:
+    """Say how many modes are in the loop where it is not all that are controlled."""
+    n_before = rtc.n_controlled if before is None else len(before.in_loop)
+    n_now = len(rtc.in_loop)
+    if rtc.loop == "open" or n_now in {n_before, rtc.n_controlled}:
+        return state
+    text = f"{n_now} of {rtc.n_controlled} controlled modes have a gain: the others are let be"
+    return logged(state, "loop.partial", text, now_ns)
 
 
 def _of_this_basis(state: TrackerState, now_ns: int) -> TrackerState:

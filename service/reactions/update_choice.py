@@ -61,7 +61,7 @@ def choose_update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
     known = state.registration
     if state.mode is Mode.HOLD or known is None or not settled(known):
         return state, ()
-    if rtc.loop != "closed" or state.making_since_ns_utc is not None:
+    if not rtc.in_loop or state.making_since_ns_utc is not None:
         return state, ()
     if _busy(state) or now_ns < max(_next_attempt_ns(state, rtc, policy), state.retry_ns_utc):
         return state, ()

@@ -151,7 +151,7 @@ def _why_stale(state: TrackerState, now_ns: int) -> str | None:
                 f"no window was accepted for {patience_s:.0f} s although a dither runs: α may "
                 "have moved; see the log for the reasons"
             )
-    if known is None or state.rtc is None or state.rtc.loop != "closed" or known.n_windows == 0:
+    if known is None or state.rtc is None or not state.rtc.in_loop or known.n_windows == 0:
         return None
     if known.standing.validity in _WORTHLESS and not known.doubt:
         return f"{known.standing.reason}: have it dithered"

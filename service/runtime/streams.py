@@ -42,6 +42,9 @@ class Streams:
     rtc: RtcView | None = None
     """The loop the frames come from."""
 
+    in_loop: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    """Modes it moves by itself; empty: it is open."""
+
     lock_in: LockIn | None = None
     """None while no sine is dithered."""
 
@@ -95,6 +98,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
         )
     if before is not None and _same_loop(before, rtc):
         return streams if before.seq == rtc.seq else _confirmed(streams, rtc)
+    streams = replace(streams, in_loop=np.array(rtc.in_loop, dtype=np.intp))
     streams = _watching_the_edge(streams, rtc)
     # frames that are on their way may have been made by the loop as it was
     streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None)
@@ -113,9 +117,9 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
 def _watching_the_edge(streams: Streams, rtc: RtcView) -> Streams:
     """Watch the ring that this loop drives; what is closed, or watched, anew has a clean slate."""
     known = streams.description
-    if rtc.loop != "closed" or known.actuators is None:
+    if not rtc.in_loop or known.actuators is None:
         return replace(streams, edge_watch=None, edge=EdgeHealth())
-    watch = edge_watch(known.actuators, known.mode_variance_m2, rtc.n_controlled)
+    watch = edge_watch(known.actuators, known.mode_variance_m2, streams.in_loop)
     # a ring nobody can watch any more has not slipped for ever
     edge = EdgeHealth() if watch is None else streams.edge
     return replace(streams, edge_watch=watch, edge=edge)
@@ -223,18 +227,34 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     streams = _listening(streams, rtc, block)
     streams, ended = _dithered(streams, rtc, block)
     windows = [_obeying(streams, window) for window in ended]
-    if streams.hearing is not None and rtc.loop == "closed":
+    if streams.hearing is not None and len(streams.in_loop):
         lines = () if streams.dither is None else streams.dither.frequency_hz
         streams = replace(streams, hearing=heard(streams.hearing, block, lines))
-    if streams.passive is not None and rtc.loop == "closed":
-        streams = replace(streams, passive=passive.accumulate(streams.passive, block))
+    if streams.passive is not None and len(streams.in_loop):
+        streams = replace(
+            streams, passive=passive.accumulate(streams.passive, _moving(streams, block))
+        )
     variance = streams.description.mode_variance_m2
-    health = observe(streams.health, block, variance, rtc.n_controlled)
+    health = observe(streams.health, block, variance, streams.in_loop)
     streams = replace(streams, health=health)
     if streams.edge_watch is not None:
         edge = observe_edge(streams.edge, block, streams.edge_watch)
         streams = replace(streams, edge=edge)
     return streams, windows
+
+
+def _moving(streams: Streams, block: FrameBlock) -> FrameBlock:
+    """Return a block without what stands in controlled modes that have no gain.
+
+    An integrator without leak keeps it for ever; a mode that never moves tells nothing.
+    """
+    n_controlled = streams.rtc.n_controlled if streams.rtc is not None else 0
+    if len(streams.in_loop) == n_controlled:
+        return block
+    still = np.setdiff1d(np.arange(n_controlled), streams.in_loop)
+    commands = block.commands_m.copy()
+    commands[:, still] = 0.0 if block.dither_m is None else block.dither_m[:, still]
+    return replace(block, commands_m=commands)
 
 
 def _dithered(
@@ -261,8 +281,8 @@ def taken(streams: Streams) -> tuple[Streams, Passive | str]:
     rtc, sums = streams.rtc, streams.passive
     if rtc is None or sums is None:
         return streams, "no passive estimate: there is no telemetry that could be used"
-    if rtc.loop != "closed":
-        return streams, f"no passive estimate: the loop is {rtc.loop}, it must be closed"
+    if not rtc.in_loop:
+        return streams, f"no passive estimate: {rtc.why_open}"
     if sums.why_unusable is not None:
         return streams, sums.why_unusable
     least = passive.MIN_FRAMES_PER_MODE * sums.n_modes

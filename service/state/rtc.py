@@ -88,6 +88,21 @@ class RtcView:
     """Of the telescope; None: the RTC does not know."""
 
     @property
+    def in_loop(self) -> tuple[int, ...]:
+        """Modes the loop moves, the controlled ones with a gain; none: it is open.
+
+        Some gains of 0 ("partial") make it a loop of the other modes, no less closed.
+        """
+        if self.loop == "open":
+            return ()
+        return tuple(i for i, gain in enumerate(self.gains[: self.n_controlled]) if gain)
+
+    @property
+    def why_open(self) -> str:
+        """What to tell of a loop with no mode in it."""
+        return "the loop is open" if self.loop == "open" else "all gains of the loop are 0"
+
+    @property
     def loop_numbers(self) -> tuple[float, ...]:
         """Return all of the loop that the bias of its passive estimate depends on."""
         return (

@@ -116,5 +116,7 @@ def test_the_health_ratio_stays_between_the_extremes_it_has_seen(factors):
     health = LoopHealth()
     for factor in factors:
         commands = np.full((10, 4), factor)
-        health = observe(health, block_of(np.zeros((10, 2)), commands, None), np.ones(4), 4)
+        health = observe(
+            health, block_of(np.zeros((10, 2)), commands, None), np.ones(4), np.arange(4)
+        )
         assert 0.0 <= health.ratio <= max(factors) * (1 + 1e-5)

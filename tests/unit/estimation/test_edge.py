@@ -30,7 +30,7 @@ def actuators() -> Actuators:
 
 @cache
 def watch() -> EdgeWatch:
-    found = edge_watch(actuators(), basis().variance_m2, N_MODES)
+    found = edge_watch(actuators(), basis().variance_m2, np.arange(N_MODES))
     assert found is not None
     return found
 
@@ -85,8 +85,22 @@ def test_tip_and_tilt_however_large_are_no_slip():
 
 
 def test_a_loop_of_few_modes_is_not_watched():
-    assert edge_watch(actuators(), basis().variance_m2, 60) is None
+    assert edge_watch(actuators(), basis().variance_m2, np.arange(60)) is None
+    assert edge_watch(actuators(), basis().variance_m2, np.arange(0, N_MODES, 3)) is None
+
+
+def test_modes_without_gain_move_nothing_and_are_asked_for_nothing():
+    """What stands in them was left there when their gain was set to 0."""
+    in_loop = np.setdiff1d(np.arange(N_MODES), np.arange(40, 50))
+    found = edge_watch(actuators(), basis().variance_m2, in_loop)
+    assert found is not None
+    assert not found.outer[:, 40:50].any()
+    rest = np.delete(watch().outer, np.arange(40, 50), axis=1)
+    ratio = np.delete(found.outer, np.arange(40, 50), axis=1)[:, 30:] / rest[:, 30:]
+    # each actuator is expected to move less by what those modes would have moved it
+    assert np.all(ratio > 1.0)
+    np.testing.assert_allclose(ratio, np.repeat(ratio[:, :1], ratio.shape[1], axis=1), rtol=1e-4)
 
 
 def test_modes_of_which_no_turbulence_is_known_are_not_watched():
-    assert edge_watch(actuators(), np.zeros(N_MODES), N_MODES) is None
+    assert edge_watch(actuators(), np.zeros(N_MODES), np.arange(N_MODES)) is None

@@ -21,6 +21,7 @@ from tests.numerics import (
 )
 
 VARIANCE = small_basis().variance_m2
+IN_LOOP = np.arange(N_CONTROLLED)
 UPPER = slice(N_CONTROLLED // 2, N_CONTROLLED)
 
 
@@ -34,7 +35,7 @@ def times_expectation(factor: float, n_frames: int = 100):
 def after(health: LoopHealth, factor: float, n_blocks: int = 60) -> LoopHealth:
     """Six seconds of it: twelve memories."""
     for _ in range(n_blocks):
-        health = observe(health, times_expectation(factor), VARIANCE, N_CONTROLLED)
+        health = observe(health, times_expectation(factor), VARIANCE, IN_LOOP)
     return health
 
 
@@ -66,21 +67,21 @@ def test_only_the_upper_half_of_the_controlled_modes_is_watched():
     commands = np.full((100, N_MODES), 1.0)
     commands[:, UPPER] = 0.0
     block = block_of(np.zeros((100, 2)), commands, None)
-    assert observe(LoopHealth(), block, VARIANCE, N_CONTROLLED).ratio == 0.0
+    assert observe(LoopHealth(), block, VARIANCE, IN_LOOP).ratio == 0.0
 
 
 def test_a_burst_of_one_frame_is_forgotten_within_three_seconds():
     burst = times_expectation(100.0, n_frames=1)
-    health = after(observe(LoopHealth(), burst, VARIANCE, N_CONTROLLED), 1.0, n_blocks=30)
+    health = after(observe(LoopHealth(), burst, VARIANCE, IN_LOOP), 1.0, n_blocks=30)
     assert health.ratio == pytest.approx(1.0, rel=0.1)
 
 
 def test_the_split_into_blocks_hardly_matters():
     block = times_expectation(4.0, 400)
-    whole = observe(LoopHealth(), block, VARIANCE, N_CONTROLLED)
+    whole = observe(LoopHealth(), block, VARIANCE, IN_LOOP)
     health = LoopHealth()
     for start in range(0, 400, 10):
-        health = observe(health, part(block, start, start + 10), VARIANCE, N_CONTROLLED)
+        health = observe(health, part(block, start, start + 10), VARIANCE, IN_LOOP)
     assert health.ratio == pytest.approx(whole.ratio, rel=0.05)
 
 
@@ -90,7 +91,7 @@ def observed(**loop) -> list[bool]:
     block = closed_loop(small_loop(**loop), sky, np.zeros((2000, N_MODES)))
     health, seen = LoopHealth(), []
     for start in range(0, 2000, 50):
-        health = observe(health, part(block, start, start + 50), VARIANCE, N_CONTROLLED)
+        health = observe(health, part(block, start, start + 50), VARIANCE, IN_LOOP)
         seen.append(health.diverging)
     return seen
 
@@ -106,5 +107,21 @@ def test_a_simulated_loop_that_diverges_is_recognised_and_one_that_holds_is_not(
     assert not any(observed(truth=Misregistration(), gain=0.7))
 
 
+def test_modes_without_gain_are_not_in_the_loop_and_hide_no_divergence():
+    """Of the last two thirds none moves: the upper half is that of the first third."""
+    few = IN_LOOP[: N_CONTROLLED // 3]
+    commands = 1.2 * DIVERGING_RATIO * np.sqrt(VARIANCE) * np.ones((3000, N_MODES))
+    commands[:, len(few) :] = 0.0
+    block = block_of(np.zeros((3000, 2)), commands, None)
+    assert observe(LoopHealth(), block, VARIANCE, few).diverging
+    assert not observe(LoopHealth(), block, VARIANCE, IN_LOOP).diverging
+
+
+def test_a_loop_that_is_opened_is_well():
+    assert observe(after(LoopHealth(), 20.0), times_expectation(20.0), VARIANCE, IN_LOOP[:0]) == (
+        LoopHealth()
+    )
+
+
 def test_an_rtc_that_controls_no_mode_is_not_diverging():
-    assert not observe(LoopHealth(), times_expectation(1.0), VARIANCE, 0).diverging
+    assert not observe(LoopHealth(), times_expectation(1.0), VARIANCE, IN_LOOP[:0]).diverging

@@ -98,7 +98,10 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
         )
     if before is not None and _same_loop(before, rtc):
         return streams if before.seq == rtc.seq else _confirmed(streams, rtc)
-    streams = replace(streams, in_loop=np.array(rtc.in_loop, dtype=np.intp))
+    in_loop = np.array(rtc.in_loop, dtype=np.intp)
+    # an RTC of another instrument may have more
+    known = in_loop[in_loop < streams.description.n_modes]
+    streams = replace(streams, in_loop=known)
     streams = _watching_the_edge(streams, rtc)
     # frames that are on their way may have been made by the loop as it was
     streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None)
@@ -249,9 +252,9 @@ def _moving(streams: Streams, block: FrameBlock) -> FrameBlock:
     An integrator without leak keeps it for ever; a mode that never moves tells nothing.
     """
     n_controlled = streams.rtc.n_controlled if streams.rtc is not None else 0
-    if len(streams.in_loop) == n_controlled:
-        return block
     still = np.setdiff1d(np.arange(n_controlled), streams.in_loop)
+    if not len(still):
+        return block
     commands = block.commands_m.copy()
     commands[:, still] = 0.0 if block.dither_m is None else block.dither_m[:, still]
     return replace(block, commands_m=commands)

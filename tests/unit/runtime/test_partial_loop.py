@@ -10,7 +10,7 @@ from service import events as ev
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.estimation.edge import LOW_MODES
-from service.runtime.streams import Streams, fed, taken, with_rtc
+from service.runtime.streams import Streams, fed, shape_mismatch, taken, with_rtc
 from service.state import Mode, Source
 from service.worker import Workbench
 from studies.campaign.observatory import Observatory
@@ -125,3 +125,10 @@ class TestTheStreams:
         assert taken(streams)[1] == "no passive estimate: all gains of the loop are 0"
         streams, _ = fed(streams, driven(0, 1e-3))
         assert not streams.health.diverging
+
+    def test_an_rtc_of_more_modes_than_the_instrument_file_knows_ends_nothing(self, many):
+        """It is named, and its frames are not used, as soon as its status has been seen."""
+        other = replace(MANY, n_modes=2 * N_MANY, n_controlled=100, gains=(0.4,) * 2 * N_MANY)
+        streams = with_rtc(many, other)
+        assert shape_mismatch(streams.description, other)
+        assert streams.in_loop.max() < N_MANY

@@ -3,13 +3,13 @@
 A segment at the edge of the pupil can slip by wavelengths and stay there: the sensor sees little
 light across it, its slopes look healthy, and only the command shows the step. On the diffractive
 telescope the slowly averaged position of the outermost actuators stays below 2.2 times what
-turbulence asks of them in every loop that held, and a slip takes it to 7 to 18
-(docs/results/edge_slip.md).
+turbulence asks of them in every loop that held. A slip takes it to 7 to 18, or leaves it at 3 for
+seconds while the wavefront is lost already (docs/results/edge_slip.md).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,8 +22,11 @@ Array = NDArray[Any]
 SLIPPED_RATIO = 4.5
 """Averaged position of an outer actuator, in σ of turbulence, that no healthy loop shows."""
 
-HEALED_RATIO = 2.5
-"""Below this a ring that had slipped counts as back."""
+SUSPECT_RATIO = 2.5
+"""What no healthy loop shows for longer than ``SUSPECT_FOR_S``; below it, a ring that had slipped
+is back."""
+
+SUSPECT_FOR_S = 0.5
 
 LOW_MODES = 30
 """Left out: tip, tilt and their like move the whole mirror by more than any slip."""
@@ -73,6 +76,9 @@ class EdgeHealth:
     ratio: float = 0.0
     """Largest averaged position of an outer actuator over ``turbulence``."""
 
+    suspect_s: float = 0.0
+    """For how long the ratio has been above ``SUSPECT_RATIO``."""
+
     slipped: bool = False
 
 
@@ -97,14 +103,20 @@ def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> Edg
     """Return the health after one more block, of which the last frame is looked at."""
     command = block.commands_m[-1]
     outer, inner = watch.outer @ command, watch.inner @ command
-    fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / _MEMORY_S))
+    lasted_s = block.n_frames * block.dt_ns * 1e-9
+    fade = float(np.exp(-lasted_s / _MEMORY_S))
     position = (1.0 - fade) * outer
     if health.position is not None:
         position += fade * health.position
     power = fade * health.turbulence**2 + (1.0 - fade) * float(np.mean(inner**2))
     turbulence = float(np.sqrt(power))
     ratio = float(np.abs(position).max()) / max(turbulence, 1e-3)
-    limit = HEALED_RATIO if health.slipped else SLIPPED_RATIO
-    return replace(
-        health, position=position, turbulence=turbulence, ratio=ratio, slipped=ratio > limit
+    suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0
+    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_FOR_S
+    return EdgeHealth(
+        position=position,
+        turbulence=turbulence,
+        ratio=ratio,
+        suspect_s=suspect_s,
+        slipped=slipped or (health.slipped and suspect_s > 0.0),
     )

@@ -20,6 +20,7 @@ from service.reactions.acquisition_ends import abort, again, fail, without_dithe
 from service.reactions.acquisition_far import far_stage, on_far, on_missed
 from service.reactions.acquisition_over import forgotten
 from service.reactions.acquisition_plan import (
+    OUT_OF_HAND,
     begun,
     why_needed,
     why_not_now,
@@ -27,6 +28,7 @@ from service.reactions.acquisition_plan import (
 from service.reactions.acquisition_restart import on_gap, taken_up
 from service.reactions.journal import logged, without_alarm
 from service.reactions.matrices import Step
+from service.reactions.mode_ladder import half_of, limited
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import Acquisition, AcquisitionStage, Mode, TrackerState
 
@@ -116,10 +118,28 @@ def _begin(state: TrackerState, policy: Policy, now_ns: int, why: str, *, comman
     if rtc is None:
         return state, ()
     state, effects = without_dither(without_alarm(state, "acquisition", now_ns))
+    lost = _own_loop_lost(state)
     state = begun(state, rtc, policy, now_ns, why=why, commanded=commanded)
     state = logged(state, "acquisition.begun", why, now_ns)
+    if lost is not None:
+        most = half_of(rtc.n_controlled)
+        first = min(state.acquisition.n_modes, most)
+        acquisition = replace(state.acquisition, most_modes=most, n_modes=first)
+        state = replace(state, acquisition=acquisition)
+        state = limited(state, most, f"{lost} with {rtc.n_controlled} modes", now_ns)
     state, more = far_stage(state, rtc, policy, now_ns)
     return state, (*effects, *more)
+
+
+def _own_loop_lost(state: TrackerState) -> str | None:
+    """Return the alarm of a loop that did not hold on a matrix made for where the mirror is.
+
+    On as many modes it would not hold the next time; the RTC's own matrix says nothing of that.
+    """
+    record = state.reconstructor(state.in_use) if state.in_use is not None else None
+    if record is None or record.alpha is None:
+        return None
+    return next((alarm.name for alarm in state.alarms if alarm.name in OUT_OF_HAND), None)
 
 
 def _ended_by(state: TrackerState, event: Event, now_ns: int) -> Step | None:

@@ -9,7 +9,7 @@ from service.reactions.acquisition_plan import OUT_OF_HAND, left_open
 from service.reactions.journal import logged, with_alarm
 from service.reactions.loop import on_loop
 from service.reactions.matrices import Step
-from service.reactions.mode_ladder import fewer_than
+from service.reactions.mode_ladder import half_of, limited
 from service.state import AcquisitionStage, Level, LoopFound, TrackerState
 
 MOST_ATTEMPTS = 3
@@ -68,8 +68,8 @@ def again(state: TrackerState, reason: str, now_ns: int, *, slipped: bool = Fals
         return fail(state, f"{reason}, after {acquisition.attempt} attempts", now_ns)
     most = acquisition.most_modes
     if slipped:
-        half = [rung for rung in fewer_than(acquisition.n_modes) if 2 * rung <= acquisition.n_modes]
-        most = max(half, default=acquisition.n_modes)
+        most = half_of(acquisition.n_modes)
+        state = limited(state, most, reason, now_ns)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
     state, effects = without_dither(state)
     state = replace(

@@ -41,6 +41,11 @@ _DECLINED = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FA
 """By the gate when it judged it again, or by the RTC."""
 
 
+def half_of(n_modes: int) -> int:
+    """Return the largest rung that is at most half of ``n_modes``, or these where there is none."""
+    return max((rung for rung in LADDER if 2 * rung <= n_modes), default=n_modes)
+
+
 def fewer_than(n_modes: int) -> tuple[int, ...]:
     """Return the rungs below ``n_modes``, largest first."""
     return tuple(rung for rung in LADDER if rung < n_modes)
@@ -77,9 +82,9 @@ def with_limit(
         if asked <= n_now:
             return state
         reason = record.gate.reason if record.gate is not None else record.reason
-        return _limited(state, n_now, reason, now_ns)
+        return limited(state, n_now, reason, now_ns)
     if record.n_modes < asked:
-        state = _limited(state, record.n_modes, why_fewer, now_ns)
+        state = limited(state, record.n_modes, why_fewer, now_ns)
     if record.n_modes < n_now:
         text = f"{record.id} has {record.n_modes} modes, {n_now} are controlled: {why_fewer}"
         return logged(state, "modes.lowered", text, now_ns, Level.WARNING)
@@ -109,7 +114,7 @@ def declined(before: TrackerState, state: TrackerState, event: Event, now_ns: in
         wait_s = _wait_after(record, earlier.get(record.id), event)
         if wait_s is not None and record.n_modes > rtc.n_controlled:
             reason = f"{record.id} was {record.state}: {record.reason}"
-            state = _limited(state, rtc.n_controlled, reason, now_ns, wait_s)
+            state = limited(state, rtc.n_controlled, reason, now_ns, wait_s)
     return state
 
 
@@ -126,13 +131,14 @@ def _wait_after(
     return None
 
 
-def _limited(
+def limited(
     state: TrackerState,
     n_modes: int,
     reason: str,
     now_ns: int,
     first_wait_s: float = FIRST_WAIT_S,
 ) -> TrackerState:
+    """Try no more than these for a while, longer each time that it is found again."""
     before, wait_s = state.mode_limit, first_wait_s
     if before is not None and now_ns - before.since_ns_utc < FORGIVEN_AFTER_S * SECOND_NS:
         left_s = (before.until_ns_utc - now_ns) / SECOND_NS

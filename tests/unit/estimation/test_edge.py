@@ -9,7 +9,15 @@ import pytest
 from scipy.signal import lfilter
 
 from service.config.layouts import rings
-from service.estimation.edge import Actuators, EdgeHealth, EdgeWatch, edge_watch, observe_edge
+from service.estimation.edge import (
+    SLIPPED_RATIO,
+    SUSPECT_RATIO,
+    Actuators,
+    EdgeHealth,
+    EdgeWatch,
+    edge_watch,
+    observe_edge,
+)
 from service.model.instrument import KarhunenLoeve
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from tests.numerics import block_of, small_instrument
@@ -104,3 +112,17 @@ def test_modes_without_gain_move_nothing_and_are_asked_for_nothing():
 
 def test_modes_of_which_no_turbulence_is_known_are_not_watched():
     assert edge_watch(actuators(), np.zeros(N_MODES), np.arange(N_MODES)) is None
+
+
+def test_one_that_stays_a_little_too_far_out_is_a_slip_after_half_a_second():
+    """3 σ on average: the ring had slipped at 1.1 micrometres and stood there for three seconds."""
+    commands = turbulence(3)
+    commands[100:300] += outer_actuator_by(2e-6)
+    found = seen(commands)
+    ratios = [health.ratio for health in found[150:300]]
+    assert min(ratios) > SUSPECT_RATIO
+    assert max(ratios) < SLIPPED_RATIO
+    first = next(k for k, health in enumerate(found) if health.slipped)
+    assert 150 <= first <= 190
+    assert all(health.slipped for health in found[first:300])
+    assert not found[-1].slipped

@@ -361,6 +361,29 @@ class TestTrouble:
         story.see_afar()
         story.see_afar()
         assert story.asked(ev.MakeMatrix)[-1].n_modes == 70
+        assert story.state.mode_limit.n_modes == 70
+
+    def test_one_that_slips_once_it_tracks_is_acquired_anew_on_half_as_many_modes(self):
+        """More are tried after a while, and after a longer one when it slips again."""
+        story = Acquiring(Mode.AUTO).to_widening()
+        story.see(FAR)
+        story.widen(400)
+        story.see(FAR, n_windows=3)
+        assert story.stage is AcquisitionStage.TRACKING
+        story.tell(ev.Trouble(name="edge-slip", text="found"))
+        story.wait(3)
+        assert story.stage is AcquisitionStage.OPENING
+        assert story.state.acquisition.most_modes == 200
+        limit = story.state.mode_limit
+        assert (limit.n_modes, limit.reason) == (200, "edge-slip with 400 modes")
+
+    def test_that_a_loop_slips_on_the_rtcs_own_matrix_says_nothing_of_the_modes(self):
+        story = Acquiring(Mode.AUTO)
+        story.tell(ev.Trouble(name="edge-slip", text="found"))
+        story.wait(3)
+        assert story.stage is AcquisitionStage.OPENING
+        assert story.state.acquisition.most_modes is None
+        assert story.state.mode_limit is None
 
     def test_windows_that_lead_nowhere_begin_it_anew_and_end_it_after_a_few_attempts(self):
         story = Acquiring()

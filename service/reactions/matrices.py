@@ -48,7 +48,8 @@ def on_matrix(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
         text = f"{record.id}: the mirror jumped while it was made"
         state = with_state(state, record.id, MatrixState.DISCARDED, text)
         return logged(state, "reconstructor.discarded", text, now_ns), ()
-    if why_unsendable(state) is None and (wanted or _may_follow(state)):
+    sendable = why_unsendable(state) is None and not _beyond_judging(state, record)
+    if sendable and (wanted or _may_follow(state)):
         return send_once_judged(state, record.id, now_ns)
     return state, ()
 
@@ -83,13 +84,19 @@ def send_once_judged(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
         return send(state, matrix_id, now_ns)
     if rtc.loop == "open" and record.gate is None:
         return send(state, matrix_id, now_ns)
-    if rtc.loop == "open":
-        if record.judged is None:
-            raise CommandError(f"{matrix_id}: an open loop does not tell its gains: close it first")
+    if _beyond_judging(state, record):
+        raise CommandError(f"{matrix_id}: an open loop does not tell its gains: close it first")
+    if rtc.loop == "open" and record.judged is not None:
         gains = record.judged.gains
     text = f"{matrix_id} is judged again before it is sent: {stale}"
     state = logged(state, "reconstructor.judged-again", text, now_ns)
     return state, (ev.JudgeProposal(id=matrix_id, gains=gains),)
+
+
+def _beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether nobody knows the gains it was judged with, nor those it would run with."""
+    opened = state.rtc is not None and state.rtc.loop == "open"
+    return opened and record.gate is not None and record.judged is None
 
 
 def on_proposal_judged(state: TrackerState, event: ev.ProposalJudged, now_ns: int) -> Step:

@@ -11,6 +11,7 @@ from service.reactions.dither_unwanted import gone
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS
 from service.reactions.shelf import known_record, with_in_use, with_state
+from service.reactions.verdicts import same_loop
 from service.state import AcquisitionStage, Level, MatrixState, RtcView, TrackerState
 
 ACKNOWLEDGE_WITHIN_S = 3.0
@@ -52,7 +53,7 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
 def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     """Take over what the RTC says of itself."""
     state, before = without_alarm(state, "rtc-vanished", now_ns), state.rtc
-    if state.rtc is not None and state.rtc.loop_numbers != rtc.loop_numbers:
+    if state.rtc is not None and not same_loop(state.rtc, rtc):
         # the margin is not what it was
         state = replace(state, judged_ns_utc=None)
     state = _of_this_loop(state, rtc)

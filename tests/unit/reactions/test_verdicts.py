@@ -59,6 +59,15 @@ def test_one_judged_for_another_loop_is_judged_again_with_the_gains_of_now(waiti
     assert words in next(e for e in waiting.state.log if "judged-again" in e.name).text
 
 
+def test_gains_that_follow_the_seeing_by_a_few_percent_change_no_verdict(waiting):
+    before = len(waiting.asked(ev.JudgeMatrix))
+    for gain in (0.405, 0.41, 0.415, 0.41):
+        gains = (gain,) * 400 + (0.0,) * (N_MODES - 400)
+        waiting.tell(ev.StatusSeen(rtc=rtc(gains=gains)), after_s=1.0)
+    assert len(waiting.asked(ev.JudgeMatrix)) == before
+    assert of_kind(waiting.tell(ev.Approve(id="cm-1")), ev.SendMatrix)
+
+
 def test_so_is_one_whose_alpha_is_known_much_worse_by_now(waiting):
     waiting.state = replace(
         waiting.state,
@@ -117,6 +126,12 @@ def test_one_must_be_able_to_go_back_with_the_loop_open(waiting):
     waiting.tell(ev.StatusSeen(rtc=rtc(loop="open", gains=(0.0,) * N_MODES)))
     effects = waiting.make("cm-1", judged=None, gate=None, wanted=True)
     assert of_kind(effects, ev.SendMatrix)
+
+
+def test_but_not_with_one_of_whose_verdict_nobody_knows_the_gains(waiting):
+    waiting.tell(ev.StatusSeen(rtc=rtc(loop="open", gains=(0.0,) * N_MODES)))
+    assert not of_kind(waiting.make("cm-1", judged=None, wanted=True), ev.SendMatrix)
+    assert waiting.matrix_state("cm-1") is MatrixState.PROPOSED
 
 
 def test_with_an_invalid_alpha_nothing_can_be_judged(waiting):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
@@ -23,6 +24,8 @@ class Crew:
         self._hire = hire
         self._executor: Executor | None = None
         self.n_lost = 0
+        self.cpu_s: defaultdict[str, float] = defaultdict(float)
+        """Processor time of the worker by name of the job, seconds; a job that fails is not in."""
 
     async def call(
         self, job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
@@ -40,7 +43,7 @@ class Crew:
         work = partial(run_job, job, *args, **kwargs)
         executor = self._executor
         try:
-            return await asyncio.get_running_loop().run_in_executor(executor, work)
+            done = await asyncio.get_running_loop().run_in_executor(executor, work)
         except BrokenProcessPool as error:
             if self._executor is executor:
                 self._executor = None
@@ -50,6 +53,8 @@ class Crew:
             raise
         except Exception as error:
             raise WorkerError(f"{job.__name__} failed in the worker: {error!r}") from error
+        self.cpu_s[job.__name__] += done.cpu_s
+        return done.result
 
     def dismiss(self) -> None:
         """End the worker; jobs that wait are dropped."""

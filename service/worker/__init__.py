@@ -5,12 +5,13 @@ alone. The executor is the seam: anything with ``submit`` may take its place.
 """
 
 from service.worker.bench import Workbench
-from service.worker.process import be_polite, run_job, start_worker
+from service.worker.process import Done, be_polite, run_job, start_worker
 from service.worker.records import Compute, Description, Made
 
 __all__ = [
     "Compute",
     "Description",
+    "Done",
     "Made",
     "Workbench",
     "be_polite",

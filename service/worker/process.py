@@ -8,9 +8,11 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from typing import Concatenate, ParamSpec, TypeVar
+from dataclasses import dataclass
+from typing import Concatenate, Generic, ParamSpec, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -25,6 +27,16 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Done(Generic[R]):
+    """What came of a job, and what it cost."""
+
+    result: R
+    cpu_s: float
+    """Processor time of the whole worker process, all its threads, seconds. The first job's holds
+    the making of the workbench."""
+
+
 def start_worker(instrument: Instrument, compute: Compute) -> ProcessPoolExecutor:
     """Return an executor of one nice'd worker process; nothing runs before the first job."""
     return ProcessPoolExecutor(
@@ -35,11 +47,15 @@ def start_worker(instrument: Instrument, compute: Compute) -> ProcessPoolExecuto
     )
 
 
-def run_job(job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs) -> R:
+def run_job(
+    job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
+) -> Done[R]:
     """Run a method of the workbench in the worker process."""
     if _open_workbench is None:
         raise RuntimeError("not in a worker process")
-    return job(_open_workbench(), *args, **kwargs)
+    before_s = time.process_time()
+    result = job(_open_workbench(), *args, **kwargs)
+    return Done(result=result, cpu_s=time.process_time() - before_s)
 
 
 def _enter(instrument: Instrument, compute: Compute) -> None:

@@ -2,6 +2,7 @@ import asyncio
 import multiprocessing
 import os
 import signal
+import time
 
 import pytest
 
@@ -29,6 +30,12 @@ def interrupted(_bench: Workbench) -> str:
 
 def killed(_bench: Workbench) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def spinning(_bench: Workbench) -> None:
+    end_s = time.process_time() + 0.2
+    while time.process_time() < end_s:
+        pass
 
 
 def failing(_bench: Workbench) -> None:
@@ -90,6 +97,14 @@ async def test_a_job_that_raises_keeps_its_worker(crew, hired):
         await crew.call(failing)
     assert await crew.call(process_id) == before
     assert crew.n_lost == 0
+
+
+async def test_the_worker_tells_the_processor_time_of_every_kind_of_job(crew):
+    for _ in range(2):
+        await crew.call(spinning)
+    await crew.call(process_id)
+    assert set(crew.cpu_s) == {"spinning", "process_id"}
+    assert 0.4 <= crew.cpu_s["spinning"] < 2.0
 
 
 async def test_an_interrupt_from_the_keyboard_is_the_services_business(crew):

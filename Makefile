@@ -24,7 +24,7 @@ demo: $(STAMP) ## service and simulated RTC together; ARGS="--seconds 60" and th
 	@.venv/bin/pyrcal demo $(ARGS)
 
 test: $(STAMP) ## run the tests; ARGS go to pytest
-	@$(PY) -m pytest $(ARGS)
+	@$(PY) -m pytest -n 2 $(ARGS)
 
 check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff check .

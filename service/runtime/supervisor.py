@@ -165,8 +165,10 @@ class Supervisor:
         loop = asyncio.get_running_loop()
         self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set))
         while True:
+            # asyncio.wait_for of Python 3.11 swallows a cancel that meets the bell
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(rung.wait(), POLL_S)
+                async with asyncio.timeout(POLL_S):
+                    await rung.wait()
             rung.clear()
             for heard in self._bridge.events():
                 if isinstance(heard, MeasuredMatrix):

@@ -151,6 +151,23 @@ async def test_cancelled_it_ends_at_once(supervisor):
     assert asyncio.get_running_loop().time() - began < 1.0
 
 
+@pytest.mark.parametrize("turns", range(8))
+async def test_cancelled_in_the_very_moment_a_bell_rings_it_ends(supervisor, bridge, turns):
+    """Where the two meet is a matter of one turn of the event loop: every turn is tried."""
+    task = asyncio.create_task(supervisor.run())
+    await until(lambda: supervisor.snapshot().ready, 30.0)
+    await asyncio.sleep(0.01)  # it listens now
+    bridge.events()  # the bell may ring again
+    bridge._intake._wakeup.ring()
+    for _ in range(turns):
+        await asyncio.sleep(0)
+    task.cancel()
+    done, _ = await asyncio.wait({task}, timeout=0.5)
+    for left in asyncio.all_tasks() - {asyncio.current_task()}:
+        left.cancel()
+    assert done, "the first cancel was swallowed"
+
+
 async def test_alpha_outlives_the_service_that_measured_it(supervisor, archive):
     """As __main__ does it: what one has left, the next takes up from the same directory."""
     before = told(Story(Mode.HOLD).meet(), n_windows=3)

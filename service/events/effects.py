@@ -43,6 +43,9 @@ class JudgeProposal:
     gains: tuple[float, ...]
     """Of the modes it commands."""
 
+    wanted: bool = True
+    """Somebody asked for it to be sent; False: the service would by itself."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SendMatrix:

@@ -154,6 +154,8 @@ class ProposalJudged:
     id: str
     verdict: GateVerdict
     judged: Judged
+    wanted: bool = True
+    """As it was in what asked for the verdict."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,13 +19,9 @@ from service.reactions.acquisition_closed import closed_stage, on_made
 from service.reactions.acquisition_ends import abort, again, fail, without_dither
 from service.reactions.acquisition_far import far_stage, on_far, on_missed
 from service.reactions.acquisition_over import forgotten
-from service.reactions.acquisition_plan import (
-    OUT_OF_HAND,
-    begun,
-    why_needed,
-    why_not_now,
-)
+from service.reactions.acquisition_plan import begun, why_needed, why_not_now
 from service.reactions.acquisition_restart import on_gap, taken_up
+from service.reactions.alarms import Act, forbidding
 from service.reactions.journal import logged, without_alarm
 from service.reactions.matrices import Step
 from service.reactions.mode_ladder import half_of, limited
@@ -139,7 +135,8 @@ def _own_loop_lost(state: TrackerState) -> str | None:
     record = state.reconstructor(state.in_use) if state.in_use is not None else None
     if record is None or record.alpha is None:
         return None
-    return next((alarm.name for alarm in state.alarms if alarm.name in OUT_OF_HAND), None)
+    alarm = forbidding(state, Act.HOLD)
+    return None if alarm is None else alarm.name
 
 
 def _ended_by(state: TrackerState, event: Event, now_ns: int) -> Step | None:

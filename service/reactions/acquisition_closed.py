@@ -7,7 +7,8 @@ from dataclasses import replace
 from service import events as ev
 from service.control.edge import FORGIVING_LEAK
 from service.reactions.acquisition_ends import again, entered, fail, told
-from service.reactions.acquisition_plan import OUT_OF_HAND, gains_for
+from service.reactions.acquisition_plan import gains_for
+from service.reactions.alarms import Act, forbidding
 from service.reactions.dither_schedule import choose_dither
 from service.reactions.journal import logged, without_alarm
 from service.reactions.matrices import Step, send, why_unsendable
@@ -62,7 +63,7 @@ def on_made(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
         return state, ()
     if record.state is MatrixState.REFUSED:
         return _refused(state, record, now_ns)
-    reason = why_unsendable(state)
+    reason = why_unsendable(state, record)
     found = acquisition.found
     if rtc is None or found is None or reason is not None:
         return again(state, f"{record.id} cannot be sent: {reason}", now_ns)
@@ -104,9 +105,10 @@ def _widened(
     now_ns: int,
 ) -> Step:
     acquisition = state.acquisition
-    slipped = next((alarm.name for alarm in state.alarms if alarm.name in OUT_OF_HAND), None)
+    slipped = forbidding(state, Act.HOLD)
     if slipped is not None:
-        return again(state, f"{slipped} with {acquisition.n_modes} modes", now_ns, slipped=True)
+        text = f"{slipped.name} with {acquisition.n_modes} modes"
+        return again(state, text, now_ns, slipped=True)
     if rtc.loop == "open":
         return again(state, "somebody opened the loop", now_ns)
     if record is None or rtc.cm_id != record.id or state.making_since_ns_utc is not None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service import events as ev
-from service.reactions.acquisition_plan import OUT_OF_HAND, left_open
+from service.reactions.acquisition_plan import left_open
+from service.reactions.alarms import Act, forbidding
 from service.reactions.journal import logged, with_alarm
 from service.reactions.loop import on_loop
 from service.reactions.matrices import Step
@@ -95,7 +96,7 @@ def again(state: TrackerState, reason: str, now_ns: int, *, slipped: bool = Fals
 def fail(state: TrackerState, reason: str, now_ns: int) -> Step:
     """Give up: the loop stays as it is, but one that is out of hand is opened."""
     closed = state.rtc is not None and state.rtc.loop != "open"
-    out_of_hand = any(alarm.name in OUT_OF_HAND for alarm in state.alarms)
+    out_of_hand = forbidding(state, Act.HOLD) is not None
     state, effects = without_dither(state)
     over = replace(state.acquisition, windows=state.windows_accepted)
     state = replace(state, registration=None, acquisition=over)

@@ -15,8 +15,8 @@ from service.control.continuation import (
     lines_of,
     modes_of,
 )
+from service.reactions.alarms import Act, forbidding, forbids
 from service.reactions.dither_choice import ACQUIRING_DITHER
-from service.reactions.journal import WRONG_RTC
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import (
     Acquisition,
@@ -36,9 +36,6 @@ DITHER_S = 6.0
 
 CLOSING_GAIN = 0.3
 """Of every mode of a loop that was found open: its status does not tell the gains."""
-
-OUT_OF_HAND = ("loop-diverging", "edge-slip")
-"""Alarms of a loop that does not hold."""
 
 OUT_OF_HAND_S = 2.0
 """For so long before the loop is opened by the service itself."""
@@ -89,7 +86,7 @@ def far_dither(
 def loop_found(state: TrackerState, rtc: RtcView, policy: Policy) -> LoopFound:
     """Return the loop as it is, and as it shall be closed again."""
     closed = rtc.loop != "open"
-    out_of_hand = any(alarm.name in OUT_OF_HAND for alarm in state.alarms)
+    out_of_hand = forbidding(state, Act.HOLD) is not None
     goal = rtc.n_controlled or min(policy.n_modes_target, rtc.n_modes)
     gains = rtc.gains if closed else (CLOSING_GAIN,) * goal
     return LoopFound(
@@ -146,11 +143,11 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
     if not policy.dither_enabled or state.dither_stopped or state.measuring is not None:
         return None
     failed = acquisition.stage is AcquisitionStage.FAILED
-    if failed or acquisition.held_off or _wrong_rtc(state):
+    if failed or acquisition.held_off or forbidding(state, Act.SEND_NEW) is not None:
         return None
     for alarm in state.alarms:
         lasted_ns = now_ns - alarm.since_ns_utc
-        if alarm.name in OUT_OF_HAND and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
+        if forbids(alarm, Act.HOLD) and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
     known = state.registration is not None and state.registration.usable
     if acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE):
@@ -174,16 +171,13 @@ def why_not_now(state: TrackerState, policy: Policy) -> str | None:
         return f"interaction matrix {state.measuring.id} is being measured"
     if not policy.dither_enabled:
         return "the settings forbid any dither"
-    if _wrong_rtc(state):
-        return "it may be the wrong RTC: see the alarms"
+    alarm = forbidding(state, Act.SEND_NEW)
+    if alarm is not None:
+        return f"{alarm.name}: {alarm.text}"
     if state.acquisition.under_way:
         return f"one is under way: {state.acquisition.text}"
     dither = far_dither(AcquisitionStage.COARSE, state.rtc, policy, 0)
     return dither if isinstance(dither, str) else None
-
-
-def _wrong_rtc(state: TrackerState) -> bool:
-    return any(alarm.name in WRONG_RTC for alarm in state.alarms)
 
 
 def sigma_of(acquisition: Acquisition) -> str:

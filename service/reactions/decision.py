@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.events import Effect, FetchMatrix
+from service.reactions.alarms import Act, forbidding
 from service.reactions.dither_schedule import choose_dither
 from service.reactions.dither_unwanted import without_unwanted
-from service.reactions.journal import PARALYSING, WRONG_RTC
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.update_choice import choose_update, judge_in_use
@@ -16,10 +16,9 @@ from service.state import RtcView, TrackerState
 
 def decide(state: TrackerState, policy: Policy, now_ns: int) -> Step:
     """Return what is to be done now, and the state that remembers having asked for it."""
-    alarms = {alarm.name for alarm in state.alarms}
-    if state.rtc is None or not alarms.isdisjoint(WRONG_RTC):
+    if state.rtc is None or forbidding(state, Act.ASK) is not None:
         return state, ()
-    if not alarms.isdisjoint(PARALYSING):
+    if forbidding(state, Act.DECIDE) is not None:
         return without_unwanted(state, state.rtc, policy, now_ns)
     effects: list[Effect] = []
     for choose in (_fetch, choose_dither, judge_in_use, choose_update):

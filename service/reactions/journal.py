@@ -8,15 +8,6 @@ from service.state import Alarm, Level, LogEntry, TrackerState
 
 LOG_LENGTH = 500
 
-WRONG_RTC = ("second-rtc", "basis-mismatch", "instrument-mismatch")
-"""Alarms while which nobody knows whose telemetry comes, or whom a reconstructor would reach."""
-
-PARALYSING = (*WRONG_RTC, "loop-diverging", "edge-slip")
-"""Alarms under which nothing is done by itself."""
-
-OFF_LOOP = "commands-off-loop"
-"""The alarm of a saturated mirror, or of an RTC whose account of its loop is wrong."""
-
 
 def logged(
     state: TrackerState, name: str, text: str, now_ns: int, level: Level = Level.INFO

@@ -7,7 +7,8 @@ from dataclasses import replace
 from service import events as ev
 from service.errors import CommandError
 from service.events import Effect
-from service.reactions.journal import PARALYSING, WRONG_RTC, logged, with_alarm, without_alarm
+from service.reactions.alarms import Act, forbidding
+from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.mode_ladder import with_limit
 from service.reactions.shelf import (
     known_record,
@@ -48,9 +49,9 @@ def on_matrix(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
         text = f"{record.id}: the mirror jumped while it was made"
         state = with_state(state, record.id, MatrixState.DISCARDED, text)
         return logged(state, "reconstructor.discarded", text, now_ns), ()
-    sendable = why_unsendable(state) is None and not _beyond_judging(state, record)
+    sendable = why_unsendable(state, record) is None and not _beyond_judging(state, record)
     if sendable and (wanted or _may_follow(state)):
-        return send_once_judged(state, record.id, now_ns)
+        return send_once_judged(state, record.id, now_ns, wanted=wanted)
     return state, ()
 
 
@@ -59,12 +60,22 @@ def _may_follow(state: TrackerState) -> bool:
     rtc, known = state.rtc, state.registration
     if state.mode is not Mode.AUTO or rtc is None or not rtc.in_loop:
         return False
-    if any(alarm.name in PARALYSING for alarm in state.alarms):
+    if forbidding(state, Act.DECIDE) is not None:
         return False
     return known is not None and settled(known)
 
 
-def send_once_judged(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
+def _why_not_by_itself(state: TrackerState) -> str:
+    """Return why nothing is sent that nobody asked for, where that is so."""
+    alarm = forbidding(state, Act.DECIDE)
+    if alarm is not None:
+        return f"{alarm.name}: {alarm.text}"
+    return "the mode, the loop or α has changed"
+
+
+def send_once_judged(
+    state: TrackerState, matrix_id: str, now_ns: int, *, wanted: bool = True
+) -> Step:
     """Send a reconstructor; where its verdict is not of the present loop and α, judge it first.
 
     Raises
@@ -73,7 +84,7 @@ def send_once_judged(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
         If it cannot be sent now, whatever the gate would say.
     """
     record, rtc = known_record(state, matrix_id), state.rtc
-    reason = why_unsendable(state)
+    reason = why_unsendable(state, record)
     if record.gate is not None and not record.gate.accepted:
         reason = record.gate.reason
     if rtc is None or reason is not None:
@@ -90,7 +101,7 @@ def send_once_judged(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
         gains = record.judged.gains
     text = f"{matrix_id} is judged again before it is sent: {stale}"
     state = logged(state, "reconstructor.judged-again", text, now_ns)
-    return state, (ev.JudgeProposal(id=matrix_id, gains=gains),)
+    return state, (ev.JudgeProposal(id=matrix_id, gains=gains, wanted=wanted),)
 
 
 def _beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
@@ -112,7 +123,9 @@ def on_proposal_judged(state: TrackerState, event: ev.ProposalJudged, now_ns: in
         text = f"{record.id}: {verdict.reason}"
         return logged(state, "reconstructor.refused", text, now_ns, Level.WARNING), ()
     state = with_changed(state, record)
-    reason = why_unsendable(state)
+    reason = why_unsendable(state, record)
+    if reason is None and not event.wanted and not _may_follow(state):
+        reason = _why_not_by_itself(state)
     if rtc is not None and reason is None:
         reason = why_stale(state, record.judged, commanded_gains(rtc, record.n_modes))
     if reason is None:
@@ -155,7 +168,7 @@ def send(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
         If no RTC is there, it may be the wrong one, or the gate's latest verdict is no.
     """
     record, rtc = known_record(state, matrix_id), state.rtc
-    reason = why_unsendable(state)
+    reason = why_unsendable(state, record)
     if record.gate is not None and not record.gate.accepted:
         reason = record.gate.reason
     if rtc is None or reason is not None:
@@ -177,13 +190,22 @@ def _why_unjudged(record: ReconstructorRecord) -> str:
     return record.reason if record.gate is None and record.state in on_its_way else ""
 
 
-def why_unsendable(state: TrackerState) -> str | None:
-    """Return why nothing may be published now, or None."""
+def why_unsendable(state: TrackerState, record: ReconstructorRecord) -> str | None:
+    """Return why a reconstructor may not be published now, whoever wants it, or None."""
     if state.rtc is None:
         return "no RTC is there"
     if state.registration is not None and state.registration.candidate is not None:
         return "a jump is suspected: the next window of telemetry decides"
-    return next((alarm.text for alarm in state.alarms if alarm.name in WRONG_RTC), None)
+    act = Act.SEND_KNOWN if _was_in_use(state, record) else Act.SEND_NEW
+    alarm = forbidding(state, act)
+    return None if alarm is None else alarm.text
+
+
+def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether the very numbers of this reconstructor have been in use before."""
+    used = {MatrixState.APPLIED, MatrixState.SUPERSEDED}
+    same = (r for r in state.reconstructors if r.sha256 == record.sha256 and r.state in used)
+    return bool(record.sha256) and any(same)
 
 
 def commanded_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:

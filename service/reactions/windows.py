@@ -12,9 +12,10 @@ from service.estimation.estimator import DitheredEstimate, model_error
 from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
 from service.estimation.noisymatrix import RandomEstimate
 from service.reactions.acquisition_plan import missed
+from service.reactions.alarms import RULES, Act, forbidding
 from service.reactions.dither import found_again
 from service.reactions.estimate import Measured
-from service.reactions.journal import OFF_LOOP, logged, with_alarm, without_alarm
+from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.modal_gain import followed_gains
 from service.reactions.policy import Policy
 from service.reactions.tracking import with_window
@@ -39,13 +40,6 @@ GAIN_GROUPS = 16
 
 MISFIT_WINDOWS = 10
 """So many tell the model error together: the misfit of a faint star's window is mostly chance."""
-
-OUT_OF_HAND = {
-    "loop-diverging": "the loop was diverging",
-    "edge-slip": "the edge had slipped",
-    OFF_LOOP: "the commands were off the loop equation",
-}
-"""Alarms under which no window and no look is believed."""
 
 
 def on_window(
@@ -130,8 +124,10 @@ def _why_useless(state: TrackerState, estimate: DitheredEstimate, policy: Policy
 
 def why_out_of_hand(state: TrackerState) -> str | None:
     """Return why nothing the loop does now measures anything, or None."""
-    reason = next((OUT_OF_HAND[a.name] for a in state.alarms if a.name in OUT_OF_HAND), None)
-    return None if reason is None else f"{reason}: its telemetry is no measurement"
+    alarm = forbidding(state, Act.MEASURE)
+    return (
+        None if alarm is None else f"{RULES[alarm.name].because}: its telemetry is no measurement"
+    )
 
 
 def refuse_window(state: TrackerState, reason: str, now_ns: int) -> TrackerState:

@@ -216,7 +216,9 @@ class Deeds:
         judged = judged_now(rtc, gains, registration)
         verdict = await self._verdict(matrix, gains, state, registration)
         if isinstance(effect, ev.JudgeProposal):
-            return ev.ProposalJudged(id=effect.id, verdict=verdict, judged=judged)
+            return ev.ProposalJudged(
+                id=effect.id, verdict=verdict, judged=judged, wanted=effect.wanted
+            )
         expected = await self._crew.call(
             Workbench.assess,
             matrix,

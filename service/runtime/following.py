@@ -10,8 +10,8 @@ from dataclasses import replace
 from service import events as ev
 from service.errors import ModelError
 from service.events import Event
+from service.reactions.alarms import Act, forbidding
 from service.reactions.dither import SILENT_S
-from service.reactions.journal import WRONG_RTC
 from service.reactions.policy import Policy
 from service.runtime.streams import Streams, shape_mismatch, troubles, with_dither, with_rtc
 from service.state import Level, TrackerState
@@ -24,7 +24,7 @@ def followed(
 
     Returns the streams, and what to put on record when the dither cannot be read.
     """
-    if any(alarm.name in WRONG_RTC for alarm in state.alarms):
+    if forbidding(state, Act.ASK) is not None:
         return with_rtc(streams, None), None
     streams = with_rtc(streams, state.rtc)
     dither = state.dither

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
+from service.reactions.alarms import Act, forbidding
 from service.reactions.gain_tables import table_of
-from service.reactions.windows import OUT_OF_HAND
 from service.state import Judged, Registration, RtcView, TrackerState
 
 GAIN_SAFETY = 1.1
@@ -47,7 +47,7 @@ def judged_now(rtc: RtcView, gains: tuple[float, ...], registration: Registratio
 def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None:
     """Return how many modes the loop holds with, if these are its gains; None: it does not."""
     rtc = state.rtc
-    if rtc is None or rtc.loop == "open" or any(a.name in OUT_OF_HAND for a in state.alarms):
+    if rtc is None or rtc.loop == "open" or forbidding(state, Act.MEASURE) is not None:
         return None
     n_modes = rtc.n_controlled
     return n_modes if gains[:n_modes] == rtc.gains[:n_modes] else None

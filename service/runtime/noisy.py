@@ -21,7 +21,7 @@ from service.fits.figures.noisy import WHAT, draw
 from service.fits.figures.sheet import check_plots
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
-from service.reactions.windows import OUT_OF_HAND
+from service.reactions.alarms import Act, forbidding
 from service.runtime.crew import Crew
 from service.runtime.errand import run_apart
 from service.state import NoisyFinding, NoisyRecord, NoisyState, TrackerState
@@ -62,7 +62,7 @@ class NoisyDesk:
         record, dither = state.gathering, state.dither
         if record is None or (dither is not None and dither.id != record.id):
             return
-        if window.plan.modes != record.modes or any(a.name in OUT_OF_HAND for a in state.alarms):
+        if window.plan.modes != record.modes or forbidding(state, Act.MEASURE) is not None:
             return
         total = self._total if self._id == record.id else None
         self._id = record.id

@@ -17,8 +17,8 @@ from service.estimation.loopcheck import LoopCheck, LoopTerms, Obedience
 from service.estimation.passive import Passive
 from service.estimation.randomdither import Correlated, RandomDither
 from service.estimation.vibration import Hearing, heard, hearing
+from service.reactions.alarms import OFF_LOOP
 from service.reactions.dither_choice import SETTLING_S, lock_in_plan
-from service.reactions.journal import OFF_LOOP
 from service.reactions.random_dither import random_plan
 from service.state import DitherKind, DitherView, RtcView
 from service.worker import Description

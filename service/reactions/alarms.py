@@ -1,0 +1,71 @@
+"""What each alarm forbids for as long as it lasts: the one table that every reaction asks.
+
+An alarm that is not in it is for the operator to see; it forbids nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from service.state import Alarm, TrackerState
+
+OFF_LOOP = "commands-off-loop"
+"""The alarm of a saturated mirror, or of an RTC whose account of its loop is wrong."""
+
+
+class Act(Enum):
+    """What an alarm may forbid."""
+
+    MEASURE = auto()
+    """Take a window, or a look at ordinary telemetry, for a measurement."""
+
+    DECIDE = auto()
+    """Make, send or dither without being asked: mode auto does nothing."""
+
+    HOLD = auto()
+    """Count on the loop as it is: after some seconds of this the service acquires by itself."""
+
+    SEND_NEW = auto()
+    """Send a matrix that was never in use, whoever approves of it; acquisitions need that."""
+
+    SEND_KNOWN = auto()
+    """Send one that has been in use before: a rollback."""
+
+    ASK = auto()
+    """Ask anything of the RTC, or follow its telemetry: nobody knows whose it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """What one alarm forbids."""
+
+    because: str
+    """What was the matter while it lasted, for the reason of a refusal."""
+
+    acts: frozenset[Act]
+
+
+_STRANGER = frozenset({Act.MEASURE, Act.DECIDE, Act.SEND_NEW, Act.SEND_KNOWN, Act.ASK})
+_OUT_OF_HAND = frozenset({Act.MEASURE, Act.DECIDE, Act.HOLD})
+
+RULES: dict[str, Rule] = {
+    "second-rtc": Rule("two RTCs were sending", _STRANGER),
+    "basis-mismatch": Rule("the RTC had another basis or configuration", _STRANGER),
+    "instrument-mismatch": Rule("the RTC was not of the instrument in the file", _STRANGER),
+    "loop-diverging": Rule("the loop was diverging", _OUT_OF_HAND),
+    "edge-slip": Rule("the edge had slipped", _OUT_OF_HAND),
+    OFF_LOOP: Rule("the commands were off the loop equation", frozenset({Act.MEASURE, Act.DECIDE})),
+}
+"""By the name of the alarm."""
+
+
+def forbidding(state: TrackerState, act: Act) -> Alarm | None:
+    """Return an alarm that forbids this now, or None."""
+    return next((alarm for alarm in state.alarms if forbids(alarm, act)), None)
+
+
+def forbids(alarm: Alarm, act: Act) -> bool:
+    """Return whether this alarm forbids this."""
+    rule = RULES.get(alarm.name)
+    return rule is not None and act in rule.acts

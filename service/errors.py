@@ -14,6 +14,7 @@
     │   └── BusyError        too much under way already: try again later
     ├── WorkerError          the worker process died; the job is lost, the service is not
     └── ArchiveError         a product that cannot be written, read, or fails its checksum
+        └── StorageError     the disk refuses: full, gone, or not to be written
 
 Expected outcomes (a rejected fit, a refused reconstructor, too few frames) are values, not
 exceptions: their text tells the operator what to do.
@@ -66,3 +67,7 @@ class WorkerError(PyrcalError):
 
 class ArchiveError(PyrcalError):
     """A product cannot be written or read, or its checksum does not match."""
+
+
+class StorageError(ArchiveError):
+    """The disk refuses to be written; the message names the path and what the system says."""

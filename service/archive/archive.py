@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Self
 
@@ -15,9 +16,12 @@ from service.archive.measured import MeasuredArchive
 from service.archive.noisy import NoisyArchive
 from service.archive.product import Provenance, read_matrix, read_product, write_product
 from service.archive.tracking import TrackingFile
-from service.errors import ArchiveError, UnknownIdError
+from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.state import ReconstructorRecord
 from service.wire import checked_id, checksum
+
+PROBE_BYTES = 1 << 20
+"""Least that must fit on the disk for it to be called writable."""
 
 
 class Archive:
@@ -45,6 +49,7 @@ class Archive:
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
         self._lock: IO[str] | None = None
+        self._largest_bytes = PROBE_BYTES
 
     def __enter__(self) -> Self:
         """Use an archive that is open; it is closed at the end."""
@@ -137,6 +142,7 @@ class Archive:
                 f"reconstructor {record.id}: found a matrix of checksum {sha256}, "
                 f"expected {record.sha256} of its record"
             )
+        self._largest_bytes = max(self._largest_bytes, matrix.nbytes)
         path = self._path(record.id)
         if path.exists():
             raise ArchiveError(f"reconstructor {record.id}: already stored, ids are never reused")
@@ -166,7 +172,7 @@ class Archive:
 
     def update(self, record: ReconstructorRecord) -> None:
         """Remember where a reconstructor is now, one that is not stored here (the RTC's) too."""
-        self._index.update(record)
+        self._index.record((record,), ())
 
     def records(self) -> tuple[ReconstructorRecord, ...]:
         """Return what is known of every reconstructor, oldest first."""
@@ -174,7 +180,36 @@ class Archive:
 
     def audit(self, t_ns_utc: int, who: str, name: str, text: str) -> None:
         """Add to the audit trail, which only ever grows."""
-        self._index.audit(AuditEntry(t_ns_utc=t_ns_utc, who=who, name=name, text=text))
+        self._index.record((), (AuditEntry(t_ns_utc=t_ns_utc, who=who, name=name, text=text),))
+
+    def record(self, records: Sequence[ReconstructorRecord], entries: Sequence[AuditEntry]) -> None:
+        """Remember where reconstructors are now and add to the audit trail: all or nothing.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses.
+        """
+        self._index.record(records, entries)
+
+    def probe(self) -> None:
+        """Write a file as large as the largest matrix so far, and remove it.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses.
+        """
+        path = self._products / "probe.part"
+        try:
+            with path.open("wb") as file:
+                file.write(bytes(self._largest_bytes))
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be written: {error}") from error
+        finally:
+            path.unlink(missing_ok=True)
 
     def audit_trail(self, limit: int = 100) -> tuple[AuditEntry, ...]:
         """Return the last ``limit`` entries of the audit trail, oldest first."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from service.archive.records import (
     record_from_json,
     record_to_json,
 )
-from service.errors import ArchiveError
+from service.errors import ArchiveError, StorageError
 from service.state import MeasurementRecord, ReconstructorRecord
 
 _Record = TypeVar("_Record")
@@ -143,14 +143,23 @@ class Index:
         if done.rowcount == 0:
             raise ArchiveError(f"reconstructor {record.id}: already stored, ids are never reused")
 
-    def update(self, record: ReconstructorRecord) -> None:
-        """Replace what is known of a reconstructor, or enter one that has no product here."""
+    def record(self, records: Sequence[ReconstructorRecord], entries: Sequence[AuditEntry]) -> None:
+        """Replace what is known of reconstructors and add to the audit trail: all or nothing.
+
+        A reconstructor that has no product here is entered.
+        """
         with self._use() as connection:
-            connection.execute(
+            connection.execute("BEGIN IMMEDIATE")
+            connection.executemany(
                 "INSERT INTO reconstructor VALUES (?, ?, ?, NULL)"
                 " ON CONFLICT (id) DO UPDATE SET record = excluded.record",
-                (record.id, record.created_ns_utc, record_to_json(record)),
+                [(r.id, r.created_ns_utc, record_to_json(r)) for r in records],
             )
+            connection.executemany(
+                "INSERT INTO audit VALUES (?, ?, ?, ?)",
+                [(e.t_ns_utc, e.who, e.name, _storable(e.text)) for e in entries],
+            )
+            connection.execute("COMMIT")
 
     def product_sha256(self, matrix_id: str) -> str | None:
         """Return the checksum of a stored reconstructor, None where none is stored."""
@@ -225,14 +234,6 @@ class Index:
             for name, text in rows
         )
 
-    def audit(self, entry: AuditEntry) -> None:
-        """Add an entry."""
-        with self._use() as connection:
-            connection.execute(
-                "INSERT INTO audit VALUES (?, ?, ?, ?)",
-                (entry.t_ns_utc, entry.who, entry.name, entry.text),
-            )
-
     def audit_trail(self, limit: int) -> tuple[AuditEntry, ...]:
         """Return the last ``limit`` entries, oldest first."""
         with self._use() as connection:
@@ -260,9 +261,18 @@ class Index:
             try:
                 yield self._connection
             except sqlite3.OperationalError as error:
-                raise ArchiveError(f"{self._path}: cannot be used: {error}") from error
+                text = f"{self._path}: cannot be used: {error} ({error.sqlite_errorname})"
+                raise StorageError(text) from error
             except sqlite3.DatabaseError as error:
                 raise ArchiveError(
                     f"{self._path}: damaged ({error}): move it away; the next start makes a new "
                     "one from the products, the audit trail stays in the old one"
                 ) from error
+            finally:
+                if self._connection.in_transaction:
+                    self._connection.rollback()
+
+
+def _storable(text: str) -> str:
+    """Return a text that UTF-8 can hold: half a surrogate pair would be refused for ever."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service import __version__
 from service.archive.records import record_from_json, record_to_json
-from service.errors import ArchiveError
+from service.errors import ArchiveError, StorageError
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.reactions.gain_tables import table_of
 from service.state import ReconstructorRecord
@@ -37,7 +37,7 @@ def write_product(
 
     Raises
     ------
-    ArchiveError
+    StorageError
         If the disk refuses.
     """
 
@@ -53,7 +53,7 @@ def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
 
     Raises
     ------
-    ArchiveError
+    StorageError
         If the disk refuses.
     """
     part = path.with_name(path.name + ".part")
@@ -66,7 +66,7 @@ def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
         _flush(path.parent)
     except (OSError, RuntimeError) as error:
         part.unlink(missing_ok=True)
-        raise ArchiveError(f"{path}: cannot be written: {error}") from error
+        raise StorageError(f"{path}: cannot be written: {error}") from error
 
 
 def read_matrix(path: Path) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import ArchiveError
+from service.errors import ArchiveError, StorageError
 from service.model.misregistration import Misregistration
 from service.state import (
     Acquisition,
@@ -68,7 +68,7 @@ class TrackingFile:
 
         Raises
         ------
-        ArchiveError
+        StorageError
             If the disk refuses.
         """
         part = self._path.with_suffix(".part")
@@ -79,7 +79,7 @@ class TrackingFile:
                 os.fsync(file.fileno())
                 part.replace(self._path)
         except OSError as error:
-            raise ArchiveError(f"{self._path}: cannot be written: {error}") from error
+            raise StorageError(f"{self._path}: cannot be written: {error}") from error
 
     def read(self) -> Saved | None:
         """Return what was saved; None: nothing was.

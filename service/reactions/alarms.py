@@ -13,6 +13,9 @@ from service.state import Alarm, TrackerState
 OFF_LOOP = "commands-off-loop"
 """The alarm of a saturated mirror, or of an RTC whose account of its loop is wrong."""
 
+ARCHIVE_FAILED = "archive-failed"
+"""The alarm of a disk that refuses: what cannot be recorded is not done."""
+
 
 class Act(Enum):
     """What an alarm may forbid."""
@@ -55,6 +58,7 @@ RULES: dict[str, Rule] = {
     "instrument-mismatch": Rule("the RTC was not of the instrument in the file", _STRANGER),
     "loop-diverging": Rule("the loop was diverging", _OUT_OF_HAND),
     "edge-slip": Rule("the edge had slipped", _OUT_OF_HAND),
+    ARCHIVE_FAILED: Rule("the disk refused to be written", frozenset({Act.DECIDE})),
     OFF_LOOP: Rule("the commands were off the loop equation", frozenset({Act.MEASURE, Act.DECIDE})),
 }
 """By the name of the alarm."""

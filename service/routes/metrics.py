@@ -61,6 +61,12 @@ class SnapshotCollector(Collector):
         yield _gauge("ready", "1 when the service can do its work", snapshot.ready)
         uptime_s = (snapshot.now_ns - snapshot.started_ns) / 1e9
         yield _gauge("uptime_seconds", "Since the service started", uptime_s)
+        refused = "Attempts to write that the disk has refused"
+        yield CounterMetricFamily(
+            "pyrcal_archive_failures", refused, value=snapshot.archive_failures
+        )
+        waiting = "Lines of the audit trail that are not on the disk yet"
+        yield _gauge("archive_waiting", waiting, snapshot.archive_waiting)
         yield from _of_link(snapshot.link)
         yield from _of_registration(snapshot)
         yield from _of_the_dither(snapshot.tracker)

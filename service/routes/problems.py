@@ -19,6 +19,7 @@ from service.errors import (
     LinkError,
     MatrixError,
     PyrcalError,
+    StorageError,
     TooLargeError,
     UnknownIdError,
 )
@@ -32,6 +33,7 @@ _OF_ERROR: dict[type[PyrcalError], tuple[HTTPStatus, str]] = {
     MatrixError: (HTTPStatus.UNPROCESSABLE_ENTITY, "unusable-matrix"),
     CommandError: (HTTPStatus.CONFLICT, "not-now"),
     LinkError: (HTTPStatus.GATEWAY_TIMEOUT, "rtc-silent"),
+    StorageError: (HTTPStatus.INSUFFICIENT_STORAGE, "archive-failed"),
     ArchiveError: (HTTPStatus.INTERNAL_SERVER_ERROR, "archive"),
     PyrcalError: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal"),
 }
@@ -74,6 +76,7 @@ UNKNOWN: Responses = {404: problem_response("No such thing")}
 COMMAND: Responses = {
     409: problem_response("Cannot be carried out in the present state"),
     504: problem_response("The RTC does not answer"),
+    507: problem_response("It cannot be recorded: the disk refuses; nothing has been done"),
 }
 
 

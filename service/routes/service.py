@@ -123,6 +123,12 @@ class Snapshot:
     simulated RTC runs slower than its timestamps.
     """
 
+    archive_failures: int = 0
+    """Attempts to write that the disk has refused."""
+
+    archive_waiting: int = 0
+    """Lines of the audit trail that are not on the disk yet."""
+
 
 class Service(Protocol):
     """The running service as the REST application sees it."""
@@ -139,6 +145,8 @@ class Service(Protocol):
             If it cannot be carried out in the present state.
         UnknownIdError
             If it names an unknown reconstructor.
+        StorageError
+            If it cannot be recorded; nothing has been done.
         """
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:

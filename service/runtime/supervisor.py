@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service import events as ev
 from service.archive import Archive
-from service.errors import PyrcalError, WorkerError
+from service.errors import PyrcalError, StorageError, WorkerError
 from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.randomdither import Correlated
 from service.events import Command, Effect, Event
@@ -28,7 +28,7 @@ from service.runtime.asking import why_not
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.runtime.following import followed, news, shape_news
-from service.runtime.resuming import SAVE_INTERVAL_S, has_news, is_urgent, leave
+from service.runtime.recording import Recorder
 from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.windows import fitted, watched
 from service.state import Level, LogEntry, MeasureState, TrackerState
@@ -69,10 +69,10 @@ class Supervisor:
         self._bridge = bridge
         self._crew = crew
         self._archive = archive
+        self._recorder = Recorder(archive, lambda: self._state, self._post)
         self._deeds = deeds
         self._streams: Streams | None = None
         self._windows: asyncio.Queue[Spectra | Correlated] = asyncio.Queue(WINDOWS_WAITING)
-        self._unrecorded = asyncio.Event()
         self._running: set[asyncio.Task[None]] = set()
         self._started_ns = time.time_ns()
         self._log = structlog.get_logger().bind(system=state.system)
@@ -88,23 +88,38 @@ class Supervisor:
             ready=ready,
             ready_reason="ready" if ready else "the optical model is being prepared",
             estimate_arrival_ns=known.arrived_ns_utc if known is not None else None,
+            archive_failures=self._recorder.failures,
+            archive_waiting=self._recorder.waiting,
         )
 
     async def submit(self, command: Command) -> str:
-        """Set an operator's command in motion; return one line that says what was."""
+        """Set an operator's command in motion; return one line that says what was.
+
+        It is on record before it is done, and so is why it is refused.
+        """
+        if isinstance(command, ev.SetPointing):  # told every second, and decides nothing
+            effects = self._post(command)
+        else:
+            await self._recorder.ordered(command)
+            try:
+                effects = await self._carried_out(command)
+            except PyrcalError as error:
+                self._recorder.refused(command, error)
+                raise
+        return f"{type(command).__name__}: {len(effects)} action(s) under way"
+
+    async def _carried_out(self, command: Command) -> tuple[Effect, ...]:
+        """Do what is asked; hear what the RTC says to it where that takes but a moment."""
         running = set(self._running)
         effects = self._post(command)
-        now_ns, name = time.time_ns(), type(command).__name__
-        if not isinstance(command, ev.SetPointing):  # told every second, and decides nothing
-            await asyncio.to_thread(self._archive.audit, now_ns, "operator", name, str(command))
         if isinstance(command, ev.Measure | ev.SetLoop | ev.Ramp):
             asked = self._running - running
-            if asked:  # a quick refusal may be here before the audit trail is written
+            if asked:
                 await asyncio.wait(asked)
             refusal = why_not(effects, self._state)
             if refusal is not None:
                 raise refusal
-        return f"{name}: {len(effects)} action(s) under way"
+        return effects
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)``."""
@@ -132,12 +147,12 @@ class Supervisor:
         try:
             await self._work()
         finally:
-            self._leave(self._state)
+            self._recorder.close()
 
     async def _work(self) -> None:
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._record())
-            group.create_task(self._save())
+            group.create_task(self._recorder.run())
+            group.create_task(self._recorder.save())
             description = await self._described()
             self._streams = Streams(description=description)
             self._policy = replace(
@@ -252,8 +267,6 @@ class Supervisor:
         before = self._state
         self._state, effects = step(before, event, self._policy, time.time_ns())
         self._tell(before)
-        if self._state.reconstructors != before.reconstructors or self._state.log != before.log:
-            self._unrecorded.set()
         self._follow()
         for effect in effects:
             self._start(self._do(effect, self._state))
@@ -287,7 +300,11 @@ class Supervisor:
 
     async def _do(self, effect: Effect, state: TrackerState) -> None:
         try:
+            await self._recorder.before(effect)
             event = await self._deeds.carry_out(effect, state)
+        except StorageError as error:
+            self._recorder.failed(error)
+            event = ev.JobFailed(effect=effect, text=str(error))
         except PyrcalError as error:
             event = ev.JobFailed(effect=effect, text=str(error))
         except Exception as error:  # noqa: BLE001 - a bug in one deed must not end the service
@@ -305,54 +322,21 @@ class Supervisor:
         try:
             self._post(await self._deeds.keep_measured(heard))
         except PyrcalError as error:
+            if isinstance(error, StorageError):
+                self._recorder.failed(error)
             self._note("measurement.not-kept", str(error), Level.WARNING)
 
     def _note(self, name: str, text: str, level: Level) -> None:
         self._post(ev.Noted(name=name, text=text, level=level))
 
     def _tell(self, before: TrackerState) -> None:
-        """Log what is new in the state's log, at its level."""
-        for entry in _new_entries(before, self._state):
+        """Log what is new in the state's log, at its level, and have it recorded."""
+        entries = _new_entries(before, self._state)
+        for entry in entries:
             getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text)
-
-    async def _record(self) -> None:
-        """Keep the archive in step with the state: reconstructors and the audit trail."""
-        recorded = replace(self._state, log=())
-        while True:
-            await self._unrecorded.wait()
-            self._unrecorded.clear()
-            before, recorded = recorded, self._state
-            try:
-                await asyncio.to_thread(_write, self._archive, before, recorded)
-            except PyrcalError as error:
-                self._log.error("archive.failed", text=str(error))
-
-    async def _save(self) -> None:
-        """Keep what the service after this one needs; seldom, but for what cannot wait."""
-        saved, next_s = self._state, time.monotonic()
-        while True:
-            await asyncio.sleep(SAVE_INTERVAL_S / 10)
-            due = is_urgent(saved, self._state) or time.monotonic() >= next_s
-            if due and has_news(saved, self._state):
-                saved, next_s = self._state, time.monotonic() + SAVE_INTERVAL_S
-                await asyncio.to_thread(self._leave, saved)
-
-    def _leave(self, state: TrackerState) -> None:
-        try:
-            leave(self._archive, state, time.time_ns())
-        except PyrcalError as error:
-            self._log.error("archive.failed", text=str(error))
+        self._recorder.changed(before, self._state, entries)
 
 
 def _new_entries(before: TrackerState, after: TrackerState) -> list[LogEntry]:
     known = set(before.log)
     return [entry for entry in after.log if entry not in known]
-
-
-def _write(archive: Archive, before: TrackerState, after: TrackerState) -> None:
-    old = {record.id: record for record in before.reconstructors}
-    for record in after.reconstructors:
-        if old.get(record.id) is not record:
-            archive.update(record)
-    for entry in _new_entries(before, after):
-        archive.audit(entry.t_ns_utc, "service", entry.name, entry.text)

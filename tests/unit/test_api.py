@@ -17,7 +17,14 @@ from prometheus_client.parser import text_string_to_metric_families
 from service import __version__
 from service.api import Snapshot, create_app
 from service.control.gate import GateVerdict
-from service.errors import ArchiveError, CommandError, LinkError, ModelError, UnknownIdError
+from service.errors import (
+    ArchiveError,
+    CommandError,
+    LinkError,
+    ModelError,
+    StorageError,
+    UnknownIdError,
+)
 from service.events import (
     Approve,
     Publish,
@@ -246,6 +253,8 @@ def service():
             started_ns=40 * SECOND,
             ready=True,
             ready_reason="telemetry flows",
+            archive_failures=3,
+            archive_waiting=2,
         )
     )
 
@@ -652,6 +661,7 @@ async def test_a_query_that_cannot_be_used_is_refused(client, path):
         (UnknownIdError("reconstructor cm-1: nobody has heard of it"), 404, "unknown-id"),
         (LinkError("the RTC did not answer within 1 s"), 504, "rtc-silent"),
         (ModelError("no such registration"), 500, "internal"),
+        (StorageError("index.sqlite: cannot be used: disk is full"), 507, "archive-failed"),
     ],
 )
 async def test_a_refused_command_is_a_problem_in_the_services_own_words(
@@ -739,6 +749,7 @@ async def test_metrics_show_what_the_service_knows(client):
     assert (found["alarms",], found["alarm", "rtc.silent"]) == (1, 1)
     assert (found["mode", "propose"], found["mode", "auto"]) == (1, 0)
     assert (found["ready",], found["uptime_seconds",]) == (1, 60.0)
+    assert (found["archive_failures_total",], found["archive_waiting",]) == (3, 2)
 
 
 MEASURING = MeasurementRecord(

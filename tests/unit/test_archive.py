@@ -401,7 +401,7 @@ DIE = "import os, signal\ndie = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\
     [
         ("import service.archive.product as p; p._flush = die\n", []),
         ("import service.archive.index as i; i.Index.add = die\n", ["cm-000000"]),
-        ("import service.archive.index as i; i.Index.audit = die\n", ["cm-000000"]),
+        ("import service.archive.index as i; i.Index.record = die\n", ["cm-000000"]),
     ],
     ids=["before the file has its name", "before the index", "before the audit trail"],
 )
@@ -429,6 +429,6 @@ def test_a_disk_that_refuses_leaves_nothing_behind(tmp_path):
     writer = start_writer(tmp_path, before=limit)
     assert writer.wait(timeout=20) == 1
     complaint = (tmp_path / "complaint.txt").read_text()
-    assert "ArchiveError" in complaint
+    assert "StorageError" in complaint
     assert "cm-000000.h5: cannot be written" in complaint
     assert assert_nothing_told_is_lost(tmp_path) == []

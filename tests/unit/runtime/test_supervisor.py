@@ -2,15 +2,17 @@
 
 import asyncio
 import contextlib
+import resource
 import socket
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from service import events as ev
 from service.archive import Archive
-from service.errors import CommandError
+from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds, Publishing
@@ -198,7 +200,7 @@ async def test_what_was_restored_is_on_record(supervisor, archive):
 async def test_it_is_saved_while_the_service_runs_and_not_only_at_its_end(
     supervisor, archive, monkeypatch
 ):
-    monkeypatch.setattr("service.runtime.supervisor.SAVE_INTERVAL_S", 0.01)
+    monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 0.01)
     async with running(supervisor):
         known = told(Story(Mode.HOLD).meet(), n_windows=1)
         supervisor._state = replace(supervisor._state, registration=known)
@@ -209,7 +211,7 @@ async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
     supervisor, archive, monkeypatch
 ):
     """Five seconds later is too late for a service that is killed."""
-    monkeypatch.setattr("service.runtime.supervisor.SAVE_INTERVAL_S", 1.0)
+    monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 1.0)
     story = Acquiring()
     story.see(n_windows=3)
     async with running(supervisor):
@@ -227,7 +229,7 @@ async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
 async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_forget_it(
     supervisor, archive, monkeypatch
 ):
-    monkeypatch.setattr("service.runtime.supervisor.SAVE_INTERVAL_S", 1.0)
+    monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 1.0)
     async with running(supervisor):
         known = told(Story(Mode.HOLD).meet(), n_windows=1)
         supervisor._state = replace(supervisor._state, registration=known)
@@ -243,3 +245,142 @@ async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_for
 def told(story, n_windows):
     story.see(n_windows=n_windows)
     return story.state.registration
+
+
+# --- a disk that refuses
+
+
+@contextlib.contextmanager
+def full_disk(archive):
+    """SQLite may grow no further, and no file may become longer than it is."""
+    connection = archive._index._connection
+    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    connection.execute("PRAGMA max_page_count = 1")
+    for length in (4000, 400, 40, 1, 1):
+        with contextlib.suppress(ArchiveError):
+            while True:
+                archive.audit(1, "somebody", "else", "x" * length)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        connection.execute("PRAGMA max_page_count = 1000000")
+
+
+def trail(archive, who):
+    entries = archive.audit_trail(100_000)
+    return [(entry.name, entry.text) for entry in entries if entry.who == who]
+
+
+def alarm_of(supervisor, name):
+    alarms = supervisor.snapshot().tracker.alarms
+    return next((alarm for alarm in alarms if alarm.name == name), None)
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr("service.runtime.recording.RETRY_S", 0.05)
+
+
+async def test_an_order_that_cannot_be_recorded_is_not_carried_out(supervisor, archive, impatient):
+    async with running(supervisor):
+        with full_disk(archive):
+            with pytest.raises(ArchiveError, match=r"index\.sqlite: .*full \(SQLITE_FULL\)"):
+                await supervisor.submit(ev.SetMode(mode=Mode.AUTO))
+            assert supervisor.snapshot().tracker.mode is Mode.HOLD
+            alarm = alarm_of(supervisor, "archive-failed")
+            assert "index.sqlite" in alarm.text
+            assert "free space" in alarm.text
+            assert supervisor.snapshot().archive_failures > 0
+            assert supervisor.snapshot().archive_waiting > 0
+        await until(lambda: alarm_of(supervisor, "archive-failed") is None)
+        await supervisor.submit(ev.SetMode(mode=Mode.PROPOSE))
+    names = [name for name, _ in trail(archive, "operator")]
+    assert names == ["SetMode", "SetMode.refused", "SetMode"]
+
+
+async def test_what_could_not_be_written_is_written_once_it_can_be_and_only_once(
+    supervisor, archive, impatient
+):
+    async with running(supervisor):
+        with full_disk(archive):
+            supervisor._post(ev.MatrixMade(record=record("cm-1"), wanted=False))
+            supervisor._post(ev.Noted(name="note", text="first"))
+            await until(lambda: alarm_of(supervisor, "archive-failed"))
+            supervisor._post(ev.Noted(name="note", text="second"))
+            await asyncio.sleep(0.2)
+            assert archive.records() == ()
+        await until(lambda: alarm_of(supervisor, "archive-failed") is None)
+    assert [kept.id for kept in archive.records()] == ["cm-1"]
+    told = [text for name, text in trail(archive, "service") if name == "note"]
+    assert told == ["first", "second"]
+
+
+async def test_a_service_that_ends_while_the_disk_refuses_still_writes_what_waits(
+    supervisor, archive
+):
+    async with running(supervisor):
+        with full_disk(archive):
+            supervisor._post(ev.Noted(name="note", text="last words"))
+            await until(lambda: alarm_of(supervisor, "archive-failed"))
+    assert ("note", "last words") in trail(archive, "service")
+
+
+async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
+    supervisor, archive, bridge, monkeypatch, impatient
+):
+    sent = []
+
+    async def publish(manifest, _matrix):
+        sent.append(manifest.id)
+
+    monkeypatch.setattr(bridge, "publish", publish)
+    matrix = np.zeros((3, 4), np.float32)
+    archive.store(record("cm-1", n_modes=3), matrix, None, {})
+    story = Story(Mode.HOLD).meet()
+    known = replace(story.state, reconstructors=(record("cm-1", n_modes=3),))
+    supervisor._state = known
+    effect = ev.SendMatrix(id="cm-1", n_modes=known.rtc.n_controlled, gains=None)
+    with full_disk(archive):
+        supervisor._post(ev.Noted(name="why", text="it is sent"))
+        await supervisor._do(effect, known)
+        assert sent == []
+    await supervisor._do(effect, known)
+    assert sent == ["cm-1"]
+
+
+async def test_a_refused_order_is_audited_with_the_reason(supervisor, archive):
+    async with running(supervisor):
+        with pytest.raises(CommandError):
+            await supervisor.submit(ev.Approve(id="cm-7"))
+        await until(lambda: len(trail(archive, "operator")) == 2)
+    (asked, _), (refused, why) = trail(archive, "operator")
+    assert (asked, refused) == ("Approve", "Approve.refused")
+    assert "cm-7" in why
+    assert "no reconstructor cm-7" in why
+
+
+async def test_what_the_rtc_refuses_is_audited_too(supervisor, archive):
+    async with running(supervisor):
+        supervisor._state = replace(supervisor._state, rtc=Story(Mode.HOLD).meet().state.rtc)
+        with pytest.raises(PyrcalError):
+            await supervisor.submit(ev.SetLoop(closed=False))
+        await until(lambda: len(trail(archive, "operator")) == 2)
+    assert trail(archive, "operator")[1][0] == "SetLoop.refused"
+
+
+async def test_alpha_that_could_not_be_saved_is_an_alarm_and_saved_later(
+    supervisor, archive, monkeypatch, impatient
+):
+    monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 0.01)
+    part = archive._directory / "tracking.part"
+    async with running(supervisor):
+        part.mkdir()
+        known = told(Story(Mode.HOLD).meet(), n_windows=1)
+        supervisor._state = replace(supervisor._state, registration=known)
+        await until(lambda: alarm_of(supervisor, "archive-failed"))
+        part.rmdir()
+        await until(lambda: archive.tracking.read() is not None)
+        await until(lambda: alarm_of(supervisor, "archive-failed") is None)

@@ -1,0 +1,214 @@
+"""Keeping the archive in step with the state: written before it counts, kept until it is."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+
+import structlog
+
+from service import events as ev
+from service.archive import Archive, AuditEntry
+from service.errors import ArchiveError, StorageError
+from service.events import Command, Effect
+from service.reactions.alarms import ARCHIVE_FAILED
+from service.runtime.resuming import SAVE_INTERVAL_S, has_news, is_urgent, leave
+from service.state import LogEntry, ReconstructorRecord, TrackerState
+
+RETRY_S = 2.0
+"""Between two attempts while the disk refuses."""
+
+MOST_WAITING = 10_000
+"""Lines of the audit trail that wait for a disk; newer ones are counted and dropped."""
+
+BEGINNINGS = (ev.SendMatrix, ev.AskDither, ev.AskMeasurement, ev.AskRamp)
+"""What is not done unless why it is done is on the disk. What ends something never waits."""
+
+
+class Recorder:
+    """Writes reconstructors' records, the audit trail and what the next service needs.
+
+    Belongs to the event loop; the disk is waited for in threads. What cannot be written waits and
+    is tried again; the alarm lasts until a file as large as a matrix can be written.
+
+    Parameters
+    ----------
+    archive
+        Open.
+    state
+        Returns what is known now.
+    post
+        Takes the alarm.
+    """
+
+    def __init__(
+        self,
+        archive: Archive,
+        state: Callable[[], TrackerState],
+        post: Callable[[ev.Trouble], object],
+    ) -> None:
+        self._archive = archive
+        self._state = state
+        self._post = post
+        self._records: dict[str, ReconstructorRecord] = {}
+        self._entries: list[AuditEntry] = []
+        self._lost = 0
+        self._guard = threading.Lock()
+        self._writing = threading.Lock()
+        self._news = asyncio.Event()
+        self._trouble = ""
+        self._log = structlog.get_logger()
+        self.failures = 0
+        """Attempts to write that the disk has refused."""
+
+    @property
+    def waiting(self) -> int:
+        """Lines of the audit trail that are not on the disk yet."""
+        return len(self._entries) + self._lost
+
+    def changed(self, before: TrackerState, after: TrackerState, news: Iterable[LogEntry]) -> None:
+        """Take what a step has changed, to be written soon."""
+        if after.reconstructors is not before.reconstructors:
+            old = {record.id: record for record in before.reconstructors}
+            new = {r.id: r for r in after.reconstructors if old.get(r.id) is not r}
+            with self._guard:
+                self._records |= new
+            if new:
+                self._news.set()
+        for entry in news:
+            self._add(
+                AuditEntry(t_ns_utc=entry.t_ns_utc, who="service", name=entry.name, text=entry.text)
+            )
+
+    async def ordered(self, command: Command) -> None:
+        """Write down what an operator asks for, before it is done.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses: it must not be done.
+        """
+        self._order(type(command).__name__, str(command))
+        try:
+            await self.flush()
+        except StorageError as error:
+            self.refused(command, error)
+            raise
+
+    def refused(self, command: Command, error: Exception) -> None:
+        """Take down why an operator does not get what was asked for."""
+        self._order(f"{type(command).__name__}.refused", f"{command}: {error}")
+
+    def _order(self, name: str, text: str) -> None:
+        self._add(AuditEntry(t_ns_utc=time.time_ns(), who="operator", name=name, text=text))
+
+    async def before(self, effect: Effect) -> None:
+        """Wait until what has led to an effect is on the disk.
+
+        Raises
+        ------
+        StorageError
+            If it cannot be: nothing is begun that cannot be recorded.
+        """
+        if isinstance(effect, BEGINNINGS):
+            await self.flush()
+
+    async def flush(self) -> None:
+        """Write what waits.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses; it goes on waiting.
+        """
+        try:
+            await asyncio.to_thread(self._write)
+        except StorageError as error:
+            self.failed(error)
+            raise
+
+    def failed(self, error: StorageError) -> None:
+        """Raise the alarm, until the disk can be written again."""
+        self.failures += 1
+        self._news.set()
+        if self._trouble != str(error):
+            self._trouble = str(error)
+            text = (
+                f"{error}: free space there or mend the disk; until it can be written orders are "
+                "refused, nothing is made or sent by itself, and the audit trail waits in memory"
+            )
+            self._post(ev.Trouble(name=ARCHIVE_FAILED, text=text))
+
+    async def run(self) -> None:
+        """Write whenever there is something to be written."""
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            try:
+                await asyncio.to_thread(self._write)
+                if self._trouble:
+                    await asyncio.to_thread(self._archive.probe)
+                    self._trouble = ""
+                    self._post(ev.Trouble(name=ARCHIVE_FAILED, text="", over=True))
+            except StorageError as error:
+                self.failed(error)
+                await asyncio.sleep(RETRY_S)
+
+    async def save(self) -> None:
+        """Keep what the service after this one needs; seldom, but for what cannot wait."""
+        saved, next_s = self._state(), time.monotonic()
+        while True:
+            await asyncio.sleep(SAVE_INTERVAL_S / 10)
+            state = self._state()
+            due = is_urgent(saved, state) or time.monotonic() >= next_s
+            if not (due and has_news(saved, state)):
+                continue
+            next_s = time.monotonic() + SAVE_INTERVAL_S
+            try:
+                await asyncio.to_thread(leave, self._archive, state, time.time_ns())
+                saved = state
+            except StorageError as error:
+                self.failed(error)
+                await asyncio.sleep(RETRY_S)
+            except ArchiveError as error:  # it has been put aside: the next attempt finds none
+                self._log.error("archive.failed", text=str(error))
+
+    def close(self) -> None:
+        """Write what still waits and what the next service needs; blocks."""
+        for write in (self._write, partial(leave, self._archive, self._state(), time.time_ns())):
+            try:
+                write()
+            except ArchiveError as error:
+                self._log.error("archive.failed", text=str(error))
+
+    def _add(self, entry: AuditEntry) -> None:
+        with self._guard:
+            if len(self._entries) < MOST_WAITING:
+                self._entries.append(entry)
+            else:
+                self._lost += 1
+        self._news.set()
+
+    def _write(self) -> None:
+        """Write all that waits as one; in a thread, one at a time."""
+        with self._writing:
+            with self._guard:
+                records, entries = dict(self._records), tuple(self._entries)
+                lost = self._lost
+            told = _told(lost) if lost else ()
+            if records or entries:
+                self._archive.record(tuple(records.values()), (*entries, *told))
+            with self._guard:
+                del self._entries[: len(entries)]
+                self._lost -= lost
+                for name, record in records.items():
+                    if self._records[name] is record:
+                        del self._records[name]
+
+
+def _told(lost: int) -> tuple[AuditEntry]:
+    text = f"{lost} lines came while the disk refused and {MOST_WAITING} waited already"
+    return (AuditEntry(t_ns_utc=time.time_ns(), who="service", name="archive.lost", text=text),)

@@ -8,7 +8,14 @@ from service.reactions.dither_choice import lock_in_plan, plan_dither
 from service.state import MatrixState, Mode
 from tests.unit.reactions.situations import N_MODES, POLICY, START_NS, Story, moved, of_kind, rtc
 
-PARALYSING = ["second-rtc", "basis-mismatch", "instrument-mismatch", "loop-diverging", "edge-slip"]
+PARALYSING = [
+    "second-rtc",
+    "basis-mismatch",
+    "instrument-mismatch",
+    "loop-diverging",
+    "edge-slip",
+    "archive-failed",
+]
 
 
 @pytest.fixture

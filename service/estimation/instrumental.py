@@ -23,6 +23,15 @@ Array = NDArray[Any]
 N_STEPS = 5
 """Gauss-Newton steps inside one linearisation: gains and α are multiplied with one another."""
 
+_MOST_TERMS = 40
+"""Of a series; one that needs more is given up, and the loop's equations are solved."""
+
+_GROWN = 10.0
+"""A term this much larger than the first is one of a series that does not end."""
+
+_ROUNDING = 1e-7
+"""Of single precision."""
+
 MAX_LAG_FRAMES = 0.2
 """A larger lag between slopes and commands: the columns are not aligned as the wire demands."""
 
@@ -93,11 +102,14 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> Wi
     ``r = S - γ D(α) C``. When ``step`` is not small the caller linearises anew at the estimate.
     """
     matrix = linearisation.matrix
+    coupling = loop.reconstructor @ matrix
     slopes = spectra.slopes[:, 0]
     seen = _images(linearisation, spectra.commands[:, 0])
-    known = _images(linearisation, _instrument(spectra, matrix, loop, np.ones(len(slopes))))
-    gains = np.array([_projected_gain(*line) for line in zip(slopes, seen, known, strict=True)])
-    known = _images(linearisation, _instrument(spectra, matrix, loop, gains))
+    known = _apply(matrix, _instrument(spectra, coupling, loop, np.ones(len(slopes))))
+    gains = np.array(
+        [_projected_gain(s, c[0], z) for s, c, z in zip(slopes, seen, known, strict=True)]
+    )
+    known = _images(linearisation, _instrument(spectra, coupling, loop, gains))
     step = np.zeros(4)
     for _ in range(N_STEPS):
         normal, score = _normal_equations(slopes, seen, known, gains, step)
@@ -134,26 +146,50 @@ def closed_loop_response(
 
     ``Z = [I + g R D γ e^{-iwd} / (1 - leak e^{-iw})]^{-1} U``, solved in the controlled modes.
     """
-    n = len(loop.reconstructor)
-    w = 2 * np.pi * frequency_hz / loop.frame_rate_hz
-    integrator = np.exp(-1j * w * loop.delay_frames) / (1.0 - loop.leak * np.exp(-1j * w))
-    feedback = (loop.gains[:n, None] * integrator * gain) * (loop.reconstructor @ matrix)
-    reply = np.linalg.solve(np.eye(n) + feedback[:, :n], -feedback @ dither)
-    total = dither.astype(complex)
-    total[:n] += reply
-    return np.asarray(total)
+    coupling = loop.reconstructor @ matrix
+    found = _responses(dither[None], coupling, loop, (frequency_hz,), np.array([gain]))
+    return np.asarray(found[0])
 
 
-def _instrument(spectra: Spectra, matrix: Array, loop: Loop, gains: Array) -> Array:
+def _instrument(spectra: Spectra, coupling: Array, loop: Loop, gains: Array) -> Array:
     """Return ``(n_lines, n_modes)`` the command each line's dither alone would cause."""
-    return np.array(
-        [
-            closed_loop_response(dither, matrix, loop, frequency, gain)
-            for dither, frequency, gain in zip(
-                spectra.dither, spectra.plan.frequencies_hz, gains, strict=True
-            )
-        ]
-    )
+    return _responses(spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains)
+
+
+def _responses(
+    dither: Array, coupling: Array, loop: Loop, frequencies_hz: tuple[float, ...], gains: Array
+) -> Array:
+    """Return ``closed_loop_response`` of every line from R D ``(n_controlled, n_modes)``.
+
+    The instrument need not be better known than D: single precision is enough, and so is the
+    series ``1 - F + F^2 - ...`` where it converges, as it does above a sixth of the frame rate.
+    """
+    n = len(coupling)
+    w = 2 * np.pi * np.array(frequencies_hz) / loop.frame_rate_hz
+    integrator = np.exp(-1j * w * loop.delay_frames) / (1.0 - loop.leak * np.exp(-1j * w))
+    answer = (np.outer(loop.gains[:n], integrator * gains)).astype(np.complex64)
+    own = np.ascontiguousarray(coupling[:, :n])
+    first = -answer * _apply(coupling, dither).T
+    reply = _summed(first, answer, own)
+    if reply is None:
+        around = answer.T[:, :, None] * own + np.eye(n, dtype=np.complex64)
+        reply = np.linalg.solve(around, first.T[:, :, None])[:, :, 0].T
+    total = dither.astype(complex)
+    total[:, :n] += reply.T
+    return total
+
+
+def _summed(first: Array, answer: Array, coupling: Array) -> Array | None:
+    """Return ``(1 + F)^-1 first`` as a series, ``F = answer * coupling``; None: not that way."""
+    reply = first
+    for _ in range(_MOST_TERMS):
+        before, reply = reply, first - answer * _apply(coupling, reply.T).T
+        change, size = np.abs(reply - before).max(), np.abs(reply).max()
+        if change <= _ROUNDING * size:  # zeros are settled, too
+            return np.asarray(reply)
+        if not change < _GROWN * np.abs(first).max():
+            return None
+    return None
 
 
 def _images(linearisation: Linearisation, vectors: Array) -> Array:
@@ -161,15 +197,15 @@ def _images(linearisation: Linearisation, vectors: Array) -> Array:
 
     Index 0 is D v, then the four derivatives of D applied to v.
     """
-    operators = np.concatenate([linearisation.matrix[None], linearisation.derivatives])
-    return np.moveaxis(_apply(operators, vectors), 0, 1)
+    operators = (linearisation.matrix, *linearisation.derivatives)
+    return np.stack([_apply(operator, vectors) for operator in operators], axis=1, dtype=complex)
 
 
 def _apply(operator: Array, vectors: Array) -> Array:
-    """Return ``operator @ v`` for complex rows v and a real operator, rows last but one."""
+    """Return ``operator @ v`` for complex rows v and a real operator, ``(n_vectors, n_slopes)``."""
     single = vectors.astype(np.complex64)
-    real = operator @ single.real.T
-    return np.asarray(np.swapaxes(real + 1j * (operator @ single.imag.T), -1, -2), complex)
+    both = operator @ np.concatenate([single.real, single.imag]).T
+    return np.asarray((both[:, : len(single)] + 1j * both[:, len(single) :]).T)
 
 
 def _modulus_sigma(gains: Array, covariance: Array) -> Array:
@@ -190,7 +226,7 @@ def _total_dither_m(spectra: Spectra) -> float:
 
 def _projected_gain(slopes: Array, seen: Array, known: Array) -> complex:
     """Return ``<D Z, S> / <D Z, D C>``: the first guess of the complex gain."""
-    return complex(np.vdot(known[0], slopes) / np.vdot(known[0], seen[0]))
+    return complex(np.vdot(known, slopes) / np.vdot(known, seen))
 
 
 def _regressors(images: Array, gain: complex, step: Array) -> Array:
@@ -235,9 +271,7 @@ def _side_bins(
     n = 4 + 2 * len(gains)
     spread = np.zeros((n, n))
     misfit = []
-    matrix = linearisation.matrix + np.tensordot(
-        step.astype(np.float32), linearisation.derivatives, axes=1
-    )
+    matrix = linearisation.matrix_by(step)
     for line, gain in enumerate(gains):
         explained = gain * _apply(matrix, spectra.commands[line, 1:])
         residual = spectra.slopes[line, 1:] - explained

@@ -49,8 +49,13 @@ class Linearisation:
 
     def matrix_at(self, alpha: Misregistration) -> NDArray[np.float32]:
         """Return D at a registration close by, to first order, ``(n_slopes, n_modes)``."""
-        step = (alpha.vector - self.alpha.vector).astype(np.float32)
-        return np.asarray(self.matrix + np.tensordot(step, self.derivatives, axes=1))
+        return self.matrix_by(alpha.vector - self.alpha.vector)
+
+    def matrix_by(self, step: Array) -> NDArray[np.float32]:
+        """Return D a short ``step`` ``(4,)`` away, numeric units, ``(n_slopes, n_modes)``."""
+        moved = np.tensordot(step.astype(np.float32), self.derivatives, axes=1)
+        moved += self.matrix
+        return np.asarray(moved)
 
 
 class InteractionModel:

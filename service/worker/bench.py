@@ -29,13 +29,16 @@ from service.model.workingpoint import Halo
 from service.registration.start import far_starts
 from service.worker.instruments import actuators_of, check_controllable, outer_of
 from service.worker.records import Compute, Description, Made
-from service.worker.sensor import SETTLED, Sensor
+from service.worker.sensor import FLAW, SETTLED, Sensor
 
 MAX_APPROACHES = 5
 """Steps of the coarse model; from the edge of the capture range three are enough."""
 
 REACH = 4.0
 """A step this long, in units of ``SETTLED``, ends well within one of them."""
+
+UNSEEN = 0.1
+"""Of an estimate's σ: a linearisation's error up to this is not worth another linearisation."""
 
 CONTRACTION = 0.5
 """A step longer than this share of the last one is not Newton's any more: the fit has failed."""
@@ -346,7 +349,10 @@ def _length(estimate: WindowEstimate | RandomEstimate) -> float:
 
 
 def _settled(estimate: WindowEstimate | RandomEstimate) -> bool:
-    return _length(estimate) <= 1.0
+    """Return whether the linearisation is near enough: its error is nothing beside the noise's."""
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    borne = float((UNSEEN * sigma / FLAW).min())
+    return _length(estimate) <= min(max(1.0, borne) ** 0.5, REACH)
 
 
 def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:

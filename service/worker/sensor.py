@@ -21,8 +21,13 @@ from service.model.workingpoint import Halo, working_point
 
 Array = NDArray[np.float64]
 
-SETTLED = np.array([0.01, 0.01, 5e-4, 1e-3])
-"""A step shorter than this (numeric units) leaves a linearisation error below 1e-4 of its unit."""
+SETTLED = np.array([0.03, 0.03, 1.5e-3, 3e-3])
+"""A step shorter than this (numeric units) leaves a linearisation error below ``FLAW``: D is all
+but straight, and another linearisation would cost more than it tells."""
+
+FLAW = np.array([2.5e-4, 2.5e-4, 1.5e-5, 3e-5])
+"""What such a step of all four leaves at most, on FLAO with any set of modes (numeric units); it
+grows as the square of the step. A fifteenth of the floor of a flat model."""
 
 FOLLOWED = 0.04
 """Gains that differ from the model's by more than this, as a logarithm, move the working point:

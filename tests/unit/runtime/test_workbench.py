@@ -105,6 +105,40 @@ def test_no_distance_from_the_last_linearisation_keeps_a_fit_from_settling(bench
     assert estimate.alpha.shift_x_subap == pytest.approx(there.shift_x_subap, abs=1e-3)
 
 
+@pytest.fixture
+def linearised(bench, monkeypatch):
+    """Where the fine model was linearised."""
+    model, taken = bench._sensor._model, []
+    linearise = model.linearise
+    monkeypatch.setattr(model, "linearise", lambda alpha: taken.append(alpha) or linearise(alpha))
+    return taken
+
+
+def test_a_mirror_that_stays_is_linearised_once_however_windows_scatter(bench, aligned, linearised):
+    starts = np.random.default_rng(4).normal(0.0, 0.005, (6, 2))
+    for seed, (x, y) in enumerate(starts):
+        start = replace(
+            ALPHA, shift_x_subap=ALPHA.shift_x_subap + x, shift_y_subap=ALPHA.shift_y_subap + y
+        )
+        window = dithered_window(bench, ALPHA, noise=0.3, seed=seed)
+        estimate = bench.fit(window, open_loop(aligned), start)
+        assert np.all(np.abs(estimate.alpha.vector - ALPHA.vector) < [0.1, 0.1, 0.02, 0.01])
+    assert len(linearised) <= 1
+
+
+def test_a_faint_star_does_not_ask_for_a_linearisation_finer_than_its_noise(
+    bench, aligned, linearised
+):
+    start = replace(ALPHA, shift_x_subap=ALPHA.shift_x_subap + 0.05)
+    bench._sensor.linearise(start)
+    estimate = bench.fit(dithered_window(bench, ALPHA, noise=3.0), open_loop(aligned), start)
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    assert sigma[0] > 0.02
+    assert len(linearised) == 1
+    error = estimate.alpha.vector - ALPHA.vector
+    assert np.all(np.abs(error) < 4 * sigma)
+
+
 def test_noise_without_a_signal_is_refused_in_words(bench, aligned):
     window = dithered_window(bench, ALPHA, gain=0.0, noise=1.0)
     outcome = bench.fit(window, open_loop(aligned), Misregistration())

@@ -13,6 +13,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,12 +105,15 @@ class Observatory:
         latencies: Latencies | None = None,
         pole_radius_bound: float = 0.95,
         with_poles: bool = True,
+        dome: Dome | None = None,
+        link: Callable[[Any], ShortLink] = ShortLink,
     ) -> None:
         """Take the simulator's command line, ``--plant linear --seed 1``, and the policy.
 
         ``with_poles`` finds the true poles of every swap, seconds on a diffractive telescope.
+        ``dome`` and ``link`` are another telescope and the way to it.
         """
-        self.dome = Dome(options)
+        self.dome = dome or Dome(options)
         description = workbench.describe()
         self.policy = replace(
             policy, mode_information=description.mode_information, start=description.start
@@ -123,7 +127,7 @@ class Observatory:
         self.events: list[tuple[float, Event]] = []
         """All that the tracker heard and when, status and ticks left out."""
 
-        self._link = ShortLink(self.dome)
+        self._link = link(self.dome)
         self._crew = OwnHands(workbench)
         self._deeds = Deeds(
             bridge=self._link,

@@ -110,9 +110,9 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     """Fit α and a free gain per mode to the noisy matrix; None when too few frames came.
 
     Variable projection (Kaufman 1975): ``g_j = D_j.Y_j / D_j.D_j``,
-    ``J_jk = g_j (I - P_j) dD_j/dα_k``, each mode weighted by its noise. The residual gives the
-    noise of the slopes; with it, ``Cov = A^-1 (J w) Q (J w)^T A^-1``, as the errors Q of the
-    columns are not independent.
+    ``J_jk = g_j (I - P_j) dD_j/dα_k``, each mode weighted by its noise. The errors of the columns
+    are not independent (Q), nor are those of the slopes (S): fast turbulence looks like modes. With
+    both, ``Cov = A^-1 (J w) (S x Q) (J w)^T A^-1``; the residual tells S.
     """
     found = noisy_matrix(state)
     if found is None:
@@ -137,8 +137,8 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     left = (residual - step @ flat).reshape(matrix.shape)
     freedom = (len(matrix) - 1) * (weight @ noise) - 4 * least
     variance = float(np.einsum("sm,sm,m->", left, left, weight) / freedom)
-    scores = heavy.reshape(-1, state.n_modes)
-    spread = (scores @ found.shape).reshape(4, -1) @ heavy.T
+    scores = _patterns(left, noise).T @ heavy.reshape(4, *matrix.shape)
+    spread = (scores @ found.shape).reshape(4, -1) @ scores.reshape(4, -1).T
     return PassiveEstimate(
         alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
         covariance=variance * normal @ spread @ normal,
@@ -146,6 +146,16 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
         misfit=variance / _slope_variance(state, found.matrix),
         step=step,
     )
+
+
+def _patterns(left: Array, noise: Array) -> Array:
+    """Return what is left of every mode's column as patterns P of the slopes' errors: S = P P^T.
+
+    Their trace is the number of slopes: errors without correlation would make the unit matrix.
+    """
+    moving = noise > 0.0
+    patterns = left[:, moving] / np.sqrt(noise[moving])
+    return np.asarray(patterns * np.sqrt(len(left) / np.sum(patterns**2)))
 
 
 def _slope_variance(state: Passive, matrix: Array) -> float:

@@ -352,7 +352,15 @@ class Observatory:
                 return self._worked(wait.judge_s)
             case ev.FetchMatrix():
                 return now_ns + round(wait.fetch_s * SECOND_NS)
-            case ev.SendMatrix() | ev.AskDither() | ev.AskNoDither() | ev.AskLoop() | ev.AskRamp():
+            case (
+                ev.SendMatrix()
+                | ev.AskDither()
+                | ev.AskNoDither()
+                | ev.AskLoop()
+                | ev.AskRamp()
+                | ev.AskMeasurement()
+                | ev.FinishNoisy()
+            ):
                 return now_ns + round(wait.command_s * SECOND_NS)
             case _:
                 raise TypeError(

@@ -10,7 +10,8 @@ from dataclasses import replace
 
 from service import events as ev
 from service.events import Command, Event
-from service.reactions.acquisition import acquire, on_acquire, refuse_meanwhile
+from service.reactions.acquisition import acquire, on_acquire
+from service.reactions.activity import refuse_if_occupied
 from service.reactions.decision import decide
 from service.reactions.dither import on_dither, on_silence, on_vibrations
 from service.reactions.dither_schedule import learnt
@@ -55,7 +56,7 @@ def step(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step
     UnknownIdError
         If it names a reconstructor nobody has heard of.
     """
-    refuse_meanwhile(state, event)
+    refuse_if_occupied(state, event, now_ns)
     before = state
     state, effects = _react(meanwhile(state, event, now_ns), event, policy, now_ns)
     state = declined(before, state, event, now_ns)

@@ -21,43 +21,17 @@ from service.reactions.acquisition_far import far_stage, on_far, on_missed
 from service.reactions.acquisition_over import forgotten
 from service.reactions.acquisition_plan import begun, why_needed, why_not_now
 from service.reactions.acquisition_restart import on_gap, taken_up
+from service.reactions.activity import ramping
 from service.reactions.alarms import Act, forbidding
 from service.reactions.journal import logged, without_alarm
 from service.reactions.matrices import Step
 from service.reactions.mode_ladder import half_of, limited
+from service.reactions.noisy import cut_off
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import Acquisition, AcquisitionStage, Mode, TrackerState
 
 PATIENCE_S = 180.0
 """In one stage: a simulated RTC may be ten times slower than its timestamps."""
-
-_LATER = (
-    ev.StartDither,
-    ev.Refit,
-    ev.Approve,
-    ev.Publish,
-    ev.Rollback,
-    ev.SetLoop,
-    ev.Ramp,
-    ev.Measure,
-    ev.MeasureNoisy,
-)
-"""What an operator cannot have while the loop is the acquisition's."""
-
-
-def refuse_meanwhile(state: TrackerState, event: Event) -> None:
-    """Refuse what would disturb an acquisition under way.
-
-    Raises
-    ------
-    CommandError
-        If that is what an operator asks for.
-    """
-    if state.acquisition.under_way and isinstance(event, _LATER):
-        raise CommandError(
-            f"{type(event).__name__}: an acquisition is under way ({state.acquisition.text}); "
-            "wait for it, or abort it"
-        )
 
 
 def on_acquire(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
@@ -96,7 +70,7 @@ def acquire(
             state = replace(state, acquisition=replace(acquisition, misses=0))
         state = forgotten(state, event, now_ns)
         why = why_needed(state, policy, now_ns)
-        if why is None:
+        if why is None or ramping(state, now_ns) is not None:
             return state, ()
         return _begin(state, policy, now_ns, why, commanded=False)
     if isinstance(event, ev.RtcVanished):
@@ -114,6 +88,7 @@ def _begin(state: TrackerState, policy: Policy, now_ns: int, why: str, *, comman
     if rtc is None:
         return state, ()
     state, effects = without_dither(without_alarm(state, "acquisition", now_ns))
+    state = cut_off(state, "an acquisition has begun", now_ns)
     lost = _own_loop_lost(state)
     state = begun(state, rtc, policy, now_ns, why=why, commanded=commanded)
     state = logged(state, "acquisition.begun", why, now_ns)

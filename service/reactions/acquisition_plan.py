@@ -167,15 +167,11 @@ def why_not_now(state: TrackerState, policy: Policy) -> str | None:
     """Return why an operator cannot have an acquisition now, or None."""
     if state.rtc is None:
         return "no RTC is there"
-    if state.measuring is not None:
-        return f"interaction matrix {state.measuring.id} is being measured"
     if not policy.dither_enabled:
         return "the settings forbid any dither"
     alarm = forbidding(state, Act.SEND_NEW)
     if alarm is not None:
         return f"{alarm.name}: {alarm.text}"
-    if state.acquisition.under_way:
-        return f"one is under way: {state.acquisition.text}"
     dither = far_dither(AcquisitionStage.COARSE, state.rtc, policy, 0)
     return dither if isinstance(dither, str) else None
 

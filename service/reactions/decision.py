@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.events import Effect, FetchMatrix
+from service.reactions.activity import ramping
 from service.reactions.alarms import Act, forbidding
 from service.reactions.dither_schedule import choose_dither
 from service.reactions.dither_unwanted import without_unwanted
@@ -18,7 +19,7 @@ def decide(state: TrackerState, policy: Policy, now_ns: int) -> Step:
     """Return what is to be done now, and the state that remembers having asked for it."""
     if state.rtc is None or forbidding(state, Act.ASK) is not None:
         return state, ()
-    if forbidding(state, Act.DECIDE) is not None:
+    if forbidding(state, Act.DECIDE) is not None or ramping(state, now_ns) is not None:
         return without_unwanted(state, state.rtc, policy, now_ns)
     effects: list[Effect] = []
     for choose in (_fetch, choose_dither, judge_in_use, choose_update):

@@ -36,6 +36,8 @@ ACQUIRING_DITHER = "acquire-"
 """How the id of a dither begins that the service has chosen, an operator, one that measures a
 noisy interaction matrix, and one that finds α from nothing."""
 
+OUR_DITHERS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
+
 _N_LINES = 4
 
 

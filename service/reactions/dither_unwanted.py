@@ -9,13 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.events import AskNoDither
-from service.reactions.dither_choice import (
-    ACQUIRING_DITHER,
-    ASKED_DITHER,
-    NOISY_DITHER,
-    OWN_DITHER,
-    total_m,
-)
+from service.reactions.activity import GONE_WITHIN_S
+from service.reactions.dither_choice import OUR_DITHERS, OWN_DITHER, total_m
 from service.reactions.dither_pace import budget_m
 from service.reactions.journal import with_alarm, without_alarm
 from service.reactions.matrices import Step
@@ -35,10 +30,6 @@ CALM_S = 60.0
 """After one that was too strong, before another is tried."""
 
 TELL_EVERY_S = 2.0
-GONE_WITHIN_S = 3.0
-"""For a stop to be answered, and for the next status to show it."""
-
-_OURS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
 
 
 def own_sine(dither: DitherView) -> bool:
@@ -139,7 +130,7 @@ def _too_strong(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None
 
 def _why_unwanted(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
     running = rtc.dither_id
-    if running is None or not running.startswith(_OURS):
+    if running is None or not running.startswith(OUR_DITHERS):
         return None
     wanted = state.dither is not None and state.dither.id == running
     if state.dither_stopped and not wanted:

@@ -191,12 +191,10 @@ def _ended(
     asked = state.loop_command
     text = command
     if asked is not None and asked.id == command:
-        state = replace(state, loop_command=replace(asked, state=outcome, reason=reason))
+        until_ns = now_ns + round(asked.lasts_s * SECOND_NS)
+        ended = replace(asked, state=outcome, reason=reason, until_ns_utc=until_ns)
+        state = replace(state, loop_command=ended)
         text = asked.text
-        if outcome is CommandState.ACCEPTED:
-            # while gains are only tried nothing is made or sent
-            until_ns = now_ns + round(asked.lasts_s * SECOND_NS)
-            state = replace(state, retry_ns_utc=max(state.retry_ns_utc, until_ns))
     level = Level.INFO if outcome is CommandState.ACCEPTED else Level.WARNING
     return logged(state, f"loop.{outcome}", f"{text}: {reason}" if reason else text, now_ns, level)
 

@@ -15,7 +15,6 @@ from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import (
     Level,
-    MatrixState,
     MeasurementRecord,
     MeasurePattern,
     MeasureState,
@@ -48,41 +47,20 @@ LONGEST_S = 3600.0
 
 MEASURING = "an interaction matrix is being measured: these frames are no ordinary telemetry"
 
-_SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
 _OVER = (
     MeasureState.REFUSED,
     MeasureState.FAILED,
     MeasureState.STORED,
     MeasureState.GIVEN_UP,
 )
-_WAIT_FOR_IT = (
-    ev.StartDither,
-    ev.Refit,
-    ev.Approve,
-    ev.Publish,
-    ev.Rollback,
-    ev.SetLoop,
-    ev.Ramp,
-)
 
 
 def meanwhile(state: TrackerState, event: Event, now_ns: int) -> TrackerState:
-    """Return the state as a measurement under way sees this event, before anybody else does.
-
-    Raises
-    ------
-    CommandError
-        If an operator asks for something that has to wait for the matrix.
-    """
+    """Return the state as a measurement under way sees this event, before anybody else does."""
     current = state.measuring
     if current is None:
         return state
     match event:
-        case _ if isinstance(event, _WAIT_FOR_IT):
-            raise CommandError(
-                f"{type(event).__name__}: interaction matrix {current.id} is being measured; "
-                "wait for it, or give it up"
-            )
         case ev.RtcVanished():
             return _failed(state, current, "the RTC vanished", now_ns)
         case ev.Tick():
@@ -118,9 +96,6 @@ def _ask(state: TrackerState, command: ev.Measure, policy: Policy, now_ns: int) 
     rtc = state.rtc
     if rtc is None:
         raise CommandError("measure: no RTC is there")
-    reason = _occupied(state)
-    if reason:
-        raise CommandError(f"measure: {reason}")
     if state.measurement(command.id) is not None:
         raise CommandError(f"measure: {command.id} was measured before; ids are never reused")
     record = _planned(command, rtc, policy, now_ns)
@@ -151,20 +126,6 @@ def _give_up(state: TrackerState, measurement_id: str, now_ns: int) -> Step:
     lasts_ns = round((record.duration_s or 0.0) * SECOND_NS)
     until_ns = (record.asked_ns_utc or now_ns) + lasts_ns
     return replace(state, retry_ns_utc=max(state.retry_ns_utc, until_ns)), ()
-
-
-def _occupied(state: TrackerState) -> str:
-    """Return what must end first; empty: nothing."""
-    if state.measuring is not None:
-        return f"{state.measuring.id} is being measured; wait for it"
-    if state.dither is not None:
-        return f"{state.dither.id} is running; stop it first"
-    if state.making_since_ns_utc is not None:
-        return "a reconstructor is being computed; wait for it"
-    sent = next((r.id for r in state.reconstructors if r.state in _SENT), None)
-    if sent is not None:
-        return f"reconstructor {sent} is on its way to the RTC; wait for it"
-    return ""
 
 
 def _planned(command: ev.Measure, rtc: RtcView, policy: Policy, now_ns: int) -> MeasurementRecord:

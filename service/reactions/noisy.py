@@ -10,7 +10,7 @@ from dataclasses import replace
 from service import events as ev
 from service.errors import CommandError, UnknownIdError
 from service.events import Event
-from service.reactions.dither_choice import OWN_DITHER, total_m
+from service.reactions.dither_choice import total_m
 from service.reactions.journal import logged
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
@@ -65,12 +65,20 @@ def gather(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> St
     if record is None:
         return state, ()
     match record.state:
+        case NoisyState.WAITING if isinstance(event, ev.StopDither):
+            return cut_off(state, "the operator stopped the dither", now_ns), ()
         case NoisyState.WAITING:
             return _waiting(state, record, policy, now_ns)
         case NoisyState.ASKED | NoisyState.RUNNING:
             return _playing(state, record, event, now_ns)
         case _:
             return _overdue(state, record, now_ns), ()
+
+
+def cut_off(state: TrackerState, why: str, now_ns: int) -> TrackerState:
+    """Return the state without the one under way, which has lost its dither."""
+    record = state.gathering
+    return state if record is None else _failed(state, record, why, now_ns)
 
 
 def awaits_its_dither(state: TrackerState) -> bool:
@@ -112,22 +120,12 @@ def _ask(state: TrackerState, command: ev.MeasureNoisy, policy: Policy, now_ns: 
 
 def _ready(state: TrackerState, command: ev.MeasureNoisy) -> RtcView:
     """Return the RTC, where it can play a dither now."""
-    rtc, dither = state.rtc, state.dither
+    rtc = state.rtc
     if rtc is None or rtc.loop == "open":
         raise CommandError("noisy matrix: it needs an RTC with its loop closed")
-    reason = ""
-    if state.gathering is not None:
-        reason = f"{state.gathering.id} is under way; wait for it, or give it up"
-    elif state.measuring is not None:
-        reason = f"interaction matrix {state.measuring.id} is being measured; wait for it"
-    elif state.acquisition.under_way:
-        reason = "an acquisition is under way; wait for it, or abort it"
-    elif dither is not None and not dither.id.startswith(OWN_DITHER):
-        reason = f"{dither.id} is running: stop it first"
-    elif state.noisy_matrix(command.id) is not None:
-        reason = f"{command.id} was measured before; ids are never reused"
-    if reason:
-        raise CommandError(f"noisy matrix: {reason}")
+    if state.noisy_matrix(command.id) is not None:
+        text = f"{command.id} was measured before; ids are never reused"
+        raise CommandError(f"noisy matrix: {text}")
     return rtc
 
 

@@ -88,8 +88,6 @@ def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, no
     rtc = state.rtc
     if rtc is None or rtc.loop == "open":
         raise CommandError("a dither needs an RTC with its loop closed")
-    if state.dither is not None:
-        raise CommandError(f"{state.dither.id} is running: stop it first")
     dither = _planned_dither(event, by_hand(state, rtc, policy), rtc, policy, now_ns)
     found_nm, budget_nm = 1e9 * total_m(dither), 1e9 * policy.dither_budget_m
     cost = f"{found_nm:.3g} nm RMS in all, budget {budget_nm:.3g} nm"
@@ -145,8 +143,6 @@ def _refit(state: TrackerState, n_modes: int | None, now_ns: int) -> Step:
         raise CommandError("refit: no RTC is there")
     if state.registration is None:
         raise CommandError("refit: α is not known yet; start a dither and wait for a window")
-    if state.making_since_ns_utc is not None:
-        raise CommandError("refit: a reconstructor is being computed; wait for it")
     wanted = n_modes or state.rtc.n_controlled
     if not 0 < wanted <= state.rtc.n_modes:
         raise CommandError(f"refit: found {wanted} modes; expected 1 to {state.rtc.n_modes}")
@@ -156,8 +152,6 @@ def _refit(state: TrackerState, n_modes: int | None, now_ns: int) -> Step:
 
 def _copy(state: TrackerState, source: str, why: str, now_ns: int) -> Step:
     """Offer an earlier matrix again; hold, or the service would replace it at once."""
-    if state.making_since_ns_utc is not None:
-        raise CommandError("a reconstructor is being computed; wait for it")
     if state.rtc is None:
         raise CommandError("no RTC is there")
     state = replace(with_mode(state, Mode.HOLD), making_since_ns_utc=now_ns)

@@ -141,6 +141,7 @@ def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerSta
         margin=None,
         assessment=None,
         judged_ns_utc=None,
+        loop_command=state.loop_command and replace(state.loop_command, lasts_s=0.0),
         retry_ns_utc=0,
         registration=registration and replace(registration, n_windows=0),
     )

@@ -141,5 +141,8 @@ class LoopCommand:
     lasts_s: float = 0.0
     """How long the RTC is busy with it, at its nominal rate; 0: it changes at once."""
 
+    until_ns_utc: int = 0
+    """Until when it is, once it has accepted; 0: not known."""
+
     reason: str = ""
     """Why it was refused, or has failed."""

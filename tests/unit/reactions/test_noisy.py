@@ -203,7 +203,7 @@ def test_one_at_a_time_and_never_the_same_id(story):
 
 def test_an_operators_dither_is_not_cut_short(story):
     story.tell(ev.StartDither(modes=(501,), amplitude_m=5e-9, frequency_hz=(250.0,)))
-    with pytest.raises(CommandError, match="is running: stop it first"):
+    with pytest.raises(CommandError, match="is running; stop it first"):
         story.tell(ASK)
 
 

@@ -203,7 +203,7 @@ class TestDither:
 
     def test_one_at_a_time(self):
         story = Story().meet()
-        refused(story, ev.StartDither(), "is running: stop it first")
+        refused(story, ev.StartDither(), "is running; stop it first")
 
     def test_it_needs_a_closed_loop(self):
         refused(Story(), ev.StartDither(), "needs an RTC with its loop closed")

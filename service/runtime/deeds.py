@@ -34,7 +34,7 @@ from service.state import (
     TrackerState,
 )
 from service.wire import LoopRequest, checksum, layout_of
-from service.worker import Workbench
+from service.worker import InUse, Workbench
 
 UNKNOWN_PARENT = "unknown"
 """Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""
@@ -214,24 +214,26 @@ class Deeds:
         matrix = await asyncio.to_thread(self.matrix, effect.id)
         gains = rtc.gains[: len(matrix)] if isinstance(effect, ev.JudgeMatrix) else effect.gains
         judged = judged_now(rtc, gains, registration)
-        verdict = await self._verdict(matrix, gains, state, registration)
         if isinstance(effect, ev.JudgeProposal):
-            return ev.ProposalJudged(
-                id=effect.id, verdict=verdict, judged=judged, wanted=effect.wanted
-            )
-        expected = await self._crew.call(
-            Workbench.assess,
-            matrix,
-            registration.alpha,
-            timing(rtc, len(matrix), registration),
-            rtc.magnitude,
+            verdict = await self._verdict(matrix, gains, state, registration)
+            return ev.ProposalJudged(id=effect.id, verdict=verdict, judged=judged)
+        n_holding = modes_that_hold(state, gains)
+        question = InUse(
+            matrix=matrix,
+            alpha=registration.alpha,
+            covariance=registration.total_covariance,
+            loop=loop_settings(rtc, gains, registration, n_holding=n_holding),
+            bound=self._publishing.pole_radius_bound,
+            timing=timing(rtc, len(matrix), registration),
+            magnitude=rtc.magnitude,
         )
+        margin = await self._crew.call(Workbench.margin, question)
         return ev.MarginJudged(
             id=effect.id,
-            verdict=verdict,
-            alpha=registration.alpha,
-            expected=expected,
-            judged=judged,
+            verdict=margin.verdict,
+            alpha=margin.alpha,
+            expected=margin.expected,
+            judged=replace(judged, alpha=margin.alpha, sigma=margin.sigma, gains=margin.gains),
         )
 
     async def _verdict(

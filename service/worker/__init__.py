@@ -5,6 +5,7 @@ alone. The executor is the seam: anything with ``submit`` may take its place.
 """
 
 from service.worker.bench import Workbench
+from service.worker.margin import InUse, Margin
 from service.worker.process import Done, be_polite, run_job, start_worker
 from service.worker.records import Compute, Description, Made
 
@@ -12,7 +13,9 @@ __all__ = [
     "Compute",
     "Description",
     "Done",
+    "InUse",
     "Made",
+    "Margin",
     "Workbench",
     "be_polite",
     "run_job",

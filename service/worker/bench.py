@@ -28,6 +28,7 @@ from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo
 from service.registration.start import far_starts
 from service.worker.instruments import actuators_of, check_controllable, outer_of
+from service.worker.margin import InUse, Margin
 from service.worker.records import Compute, Description, Made
 from service.worker.sensor import FLAW, SETTLED, Sensor
 
@@ -88,6 +89,7 @@ class Workbench:
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
         self._start = instrument.start
         self._compute = compute
+        self._margin: tuple[InUse, Margin] | None = None
         self._far: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
 
     def describe(self) -> Description:
@@ -117,6 +119,7 @@ class Workbench:
                 return _unsettled(spectra)
             found = self._against_flat(estimate)
             if self._sensor.follow(found.modes, found.optical_gain):
+                self._margin = None
                 estimate = self._settled_fit(spectra, loop, found.alpha)
         except np.linalg.LinAlgError as error:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
@@ -310,6 +313,22 @@ class Workbench:
         at_work = self._sensor.at_unit_gain(alpha)
         return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
 
+    def margin(self, question: InUse) -> Margin:
+        """Return verdict and worth of a matrix in use; the last ones while nothing has moved."""
+        if self._margin is None or not question.is_about(self._margin[0]):
+            alpha, matrix = question.alpha, question.matrix
+            found = Margin(
+                verdict=self.judge(
+                    matrix, alpha, question.covariance, question.loop, question.bound
+                ),
+                expected=self.assess(matrix, alpha, question.timing, question.magnitude),
+                alpha=alpha,
+                sigma=question.sigma,
+                gains=tuple(question.loop.gains.tolist()),
+            )
+            self._margin = question, found
+        return self._margin[1]
+
     def watch(
         self, state: passive.Passive, start: Misregistration | None
     ) -> passive.PassiveEstimate | None:
@@ -352,7 +371,7 @@ def _settled(estimate: WindowEstimate | RandomEstimate) -> bool:
     """Return whether the linearisation is near enough: its error is nothing beside the noise's."""
     sigma = np.sqrt(np.diag(estimate.covariance))
     borne = float((UNSEEN * sigma / FLAW).min())
-    return _length(estimate) <= min(max(1.0, borne) ** 0.5, REACH)
+    return _length(estimate) <= min(float(np.sqrt(max(1.0, borne))), REACH)
 
 
 def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:

@@ -5,24 +5,23 @@ from __future__ import annotations
 import asyncio
 from collections import defaultdict
 from collections.abc import Callable
-from concurrent.futures import Executor
-from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
-from service.errors import PyrcalError, WorkerError
-from service.worker import Workbench, run_job
+from service.errors import WorkerError
+from service.worker import Done, Workbench, Worker, run_job
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 class Crew:
-    """Hands jobs to an executor made by ``hire``; a dead worker costs one job, not the service."""
+    """Hands jobs to a worker made by ``hire``; a dead one costs one job, not the service."""
 
-    def __init__(self, hire: Callable[[], Executor]) -> None:
+    def __init__(self, hire: Callable[[], Worker]) -> None:
         self._hire = hire
-        self._executor: Executor | None = None
+        self._worker: Worker | None = None
+        self._turn = asyncio.Lock()
         self.n_lost = 0
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
         """Processor time of the worker by name of the job, seconds; a job that fails is not in."""
@@ -38,26 +37,29 @@ class Crew:
             If the worker process died, and a new one is there for the next job; or if the job
             failed in a way nobody foresaw, which must not end the service.
         """
-        if self._executor is None:
-            self._executor = self._hire()
-        work = partial(run_job, job, *args, **kwargs)
-        executor = self._executor
-        try:
-            done = await asyncio.get_running_loop().run_in_executor(executor, work)
-        except BrokenProcessPool as error:
-            if self._executor is executor:
-                self._executor = None
-                self.n_lost += 1
-            raise WorkerError(f"the worker process died during {job.__name__}") from error
-        except PyrcalError:
-            raise
-        except Exception as error:
-            raise WorkerError(f"{job.__name__} failed in the worker: {error!r}") from error
+        async with self._turn:
+            done = await self._done(job.__name__, partial(run_job, job, *args, **kwargs))
         self.cpu_s[job.__name__] += done.cpu_s
         return done.result
 
+    async def _done(self, name: str, work: Callable[[], Done[R]]) -> Done[R]:
+        if self._worker is None:
+            self._worker = self._hire()
+        worker = self._worker
+        try:
+            return await asyncio.to_thread(worker.run, work)
+        except EOFError as error:
+            self.n_lost += 1
+            self.dismiss()
+            raise WorkerError(f"the worker process died during {name}") from error
+        except WorkerError as error:
+            raise WorkerError(f"{name} {error}") from error
+        except asyncio.CancelledError:
+            self.dismiss()  # it would go on with what nobody waits for
+            raise
+
     def dismiss(self) -> None:
-        """End the worker; jobs that wait are dropped."""
-        executor, self._executor = self._executor, None
-        if executor is not None:
-            executor.shutdown(wait=False, cancel_futures=True)
+        """End the worker, whatever it is at; the next job finds a new one."""
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.kill()

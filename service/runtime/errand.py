@@ -7,14 +7,11 @@ process has nothing to do with the telescope: tracking never waits for it.
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
 from collections.abc import Callable
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
-from typing import TypeVar, cast
+from typing import TypeVar
 
-from service.errors import PyrcalError, WorkerError
-from service.worker import be_polite
+from service.errors import WorkerError
+from service.worker import Apart
 
 R = TypeVar("R")
 
@@ -29,43 +26,13 @@ async def run_apart(work: Callable[[], R], *, nice: int, limit_s: float) -> R:
     WorkerError
         If it raised anything else, the process died, or ``limit_s`` have passed.
     """
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_run, args=(theirs, work, nice), daemon=True)
-    await asyncio.to_thread(process.start)
-    theirs.close()  # else nobody would notice that the other end is gone
+    process = Apart(nice=nice)
     try:
         async with asyncio.timeout(limit_s):
-            answer = await asyncio.to_thread(_heard, ours)
+            return await asyncio.to_thread(process.do, work)
     except TimeoutError as error:
         raise WorkerError(f"took longer than {limit_s:g} s and was stopped") from error
+    except EOFError as error:
+        raise WorkerError("the process of the job died; out of memory?") from error
     finally:
         process.kill()
-        await asyncio.to_thread(_ended, process, ours)
-    if isinstance(answer, PyrcalError):
-        raise answer
-    return cast(R, answer)
-
-
-def _heard(ours: Connection) -> object:
-    try:
-        return ours.recv()
-    except (EOFError, OSError):
-        return WorkerError("the process of the job died; out of memory?")
-
-
-def _ended(process: BaseProcess, ours: Connection) -> None:
-    process.join()
-    ours.close()
-
-
-def _run(theirs: Connection, work: Callable[[], object], nice: int) -> None:
-    """Be the process: do the work and send what came of it."""
-    be_polite(nice)
-    try:
-        answer = work()
-    except PyrcalError as error:
-        answer = error
-    except Exception as error:  # noqa: BLE001 - sent home, where it is a failed job
-        answer = WorkerError(f"failed unforeseen: {error!r}")
-    theirs.send(answer)

@@ -147,6 +147,9 @@ class Supervisor:
         try:
             await self._work()
         finally:
+            for deed in self._running:
+                deed.cancel()
+            await asyncio.gather(*self._running, return_exceptions=True)
             self._recorder.close()
 
     async def _work(self) -> None:

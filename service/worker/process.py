@@ -1,4 +1,9 @@
-"""A process of its own for the workbench, nice'd and gone when its parent is gone."""
+"""Processes of their own for what takes long: nice'd, and ended at any moment.
+
+Whoever waits for one waits in a thread, on a pipe: a process that is killed, even one that is
+stopped, closes the pipe, and the wait is over. An executor of the standard library waits for its
+process to finish instead, and the service with it.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +11,26 @@ import contextlib
 import functools
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Concatenate, Generic, ParamSpec, TypeVar
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Concatenate, Generic, ParamSpec, TypeVar, cast
 
 from threadpoolctl import threadpool_limits
 
+from service.errors import PyrcalError, WorkerError
 from service.model.instrument import Instrument
 from service.worker.bench import Workbench
 from service.worker.records import Compute
 
 _open_workbench: Callable[[], Workbench] | None = None
-"""Of the worker process; an executor has no other place for what outlives a job."""
+"""Of the worker process: it outlives a job."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -37,14 +46,90 @@ class Done(Generic[R]):
     the making of the workbench."""
 
 
-def start_worker(instrument: Instrument, compute: Compute) -> ProcessPoolExecutor:
-    """Return an executor of one nice'd worker process; nothing runs before the first job."""
-    return ProcessPoolExecutor(
-        max_workers=1,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_enter,
-        initargs=(instrument, compute),
-    )
+class Apart:
+    """A process that does one piece of work after another; nothing runs before the first."""
+
+    def __init__(self, *, nice: int) -> None:
+        self._nice = nice
+        self._busy = threading.Lock()
+        self._process: BaseProcess | None = None
+        self._line: Connection | None = None
+        self._ended = threading.Event()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id; None: nothing has been asked of it yet."""
+        return None if self._process is None else self._process.pid
+
+    def do(self, work: Callable[[], R]) -> R:
+        """Have it done and return the result; ``work`` must be picklable, like what it returns.
+
+        Blocks until it is done or the process has ended, so call off the event loop.
+
+        Raises
+        ------
+        PyrcalError
+            What ``work`` has raised of this kind; WorkerError for anything else it raised.
+        EOFError
+            If the process died, or was killed meanwhile.
+        """
+        with self._busy:
+            try:
+                line = self._started()
+                line.send(work)
+                answer = line.recv()
+            except OSError as error:  # no process to be had, or a line that is cut
+                raise EOFError from error
+        if isinstance(answer, PyrcalError):
+            raise answer
+        return cast(R, answer)
+
+    def kill(self) -> None:
+        """End the process at once, whatever it is at; whoever waits for it waits no longer."""
+        self._ended.set()
+        process = self._process
+        if process is not None:
+            process.kill()
+            process.join()
+        with self._busy:
+            if self._line is not None:
+                self._line.close()
+
+    def _started(self) -> Connection:
+        if self._ended.is_set():
+            raise EOFError
+        if self._line is None:
+            context = multiprocessing.get_context("spawn")
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_work, args=(theirs, self._nice), daemon=True)
+            with _deaf_to_the_keyboard():
+                process.start()
+            self._process, self._line = process, ours
+            theirs.close()  # else nobody would notice that the other end is gone
+            if self._ended.is_set():  # killed while it was being born
+                process.kill()
+        return self._line
+
+
+class Worker(Apart):
+    """A process that keeps the workbench between jobs."""
+
+    def __init__(self, instrument: Instrument, compute: Compute) -> None:
+        super().__init__(nice=compute.nice)
+        self._entered = False
+        self._enter = functools.partial(_enter, instrument, compute)
+
+    def run(self, job: Callable[[], Done[R]]) -> Done[R]:
+        """Do a job on the workbench; see :meth:`Apart.do`."""
+        if not self._entered:
+            self.do(self._enter)
+            self._entered = True
+        return self.do(job)
+
+
+def start_worker(instrument: Instrument, compute: Compute) -> Worker:
+    """Return a nice'd worker process; nothing runs before the first job."""
+    return Worker(instrument, compute)
 
 
 def run_job(
@@ -61,9 +146,25 @@ def run_job(
 def _enter(instrument: Instrument, compute: Compute) -> None:
     """Prepare the worker process."""
     global _open_workbench
-    be_polite(compute.nice)
     # made by the first job, so that an impossible instrument fails that job and says why
     _open_workbench = functools.cache(lambda: Workbench(instrument, compute))
+
+
+def _work(line: Connection, nice: int) -> None:
+    """Be the process: do what comes and send what came of it, until the line is cut."""
+    be_polite(nice)
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            line.send(_answer(line.recv_bytes()))
+
+
+def _answer(work: bytes) -> object:
+    try:
+        return pickle.loads(work)()  # of this very program
+    except PyrcalError as error:
+        return error
+    except Exception as error:  # noqa: BLE001 - sent home, where it is a failed job
+        return WorkerError(f"failed unforeseen: {error!r}")
 
 
 def be_polite(nice: int) -> None:
@@ -72,6 +173,20 @@ def be_polite(nice: int) -> None:
     os.nice(nice)
     threading.Thread(target=_follow_parent, daemon=True).start()
     threadpool_limits(1)
+
+
+@contextlib.contextmanager
+def _deaf_to_the_keyboard() -> Iterator[None]:
+    """Start what is started here with SIGINT held back: it cannot ignore it before it has begun.
+
+    Ctrl-C in a terminal reaches every process there, also one that still imports.
+    """
+    resource_tracker.ensure_running()  # else the first process starts it, and it lets SIGINT in
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _follow_parent() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
@@ -18,7 +17,7 @@ from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.crew import Crew
 from service.state import ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
-from service.worker import Workbench
+from service.worker import Workbench, Worker
 from sim_rtc.reconstructors import Outcome, Staging, Verdict
 from studies.campaign.observatory_dome import Dome
 
@@ -145,5 +144,5 @@ class Shelf(Archive):
         return self._matrices[matrix_id]
 
 
-def _nobody() -> Executor:
+def _nobody() -> Worker:
     raise WorkerError("a simulated night has no worker process")

@@ -28,6 +28,10 @@ def interrupted(_bench: Workbench) -> str:
     return "still here"
 
 
+def asleep(_bench: Workbench) -> None:
+    time.sleep(60.0)
+
+
 def killed(_bench: Workbench) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -58,8 +62,6 @@ def crew(hired):
     crew = Crew(hire)
     yield crew
     crew.dismiss()
-    for executor in hired:
-        executor.shutdown(wait=True, cancel_futures=True)
 
 
 async def test_nobody_is_hired_before_there_is_work(crew, hired):
@@ -82,18 +84,18 @@ async def test_a_killed_worker_costs_one_job_and_the_next_one_works(crew, hired)
     assert (crew.n_lost, len(hired)) == (1, 2)
 
 
-async def test_jobs_that_waited_for_a_killed_worker_are_lost_together(crew, hired):
-    lost = await asyncio.gather(
+async def test_jobs_that_waited_for_a_killed_worker_are_done_by_the_next(crew, hired):
+    lost, first, second = await asyncio.gather(
         crew.call(killed), crew.call(process_id), crew.call(process_id), return_exceptions=True
     )
-    assert all(isinstance(outcome, WorkerError) for outcome in lost)
-    assert (crew.n_lost, len(hired)) == (1, 1)
-    assert await crew.call(process_id)
+    assert isinstance(lost, WorkerError)
+    assert first == second
+    assert (crew.n_lost, len(hired)) == (1, 2)
 
 
 async def test_a_job_that_raises_keeps_its_worker(crew, hired):
     before = await crew.call(process_id)
-    with pytest.raises(WorkerError, match=r"failing failed in the worker.*a bug in a job"):
+    with pytest.raises(WorkerError, match=r"failing failed unforeseen.*a bug in a job"):
         await crew.call(failing)
     assert await crew.call(process_id) == before
     assert crew.n_lost == 0
@@ -112,19 +114,34 @@ async def test_an_interrupt_from_the_keyboard_is_the_services_business(crew):
 
 
 async def test_the_worker_is_polite():
-    executor = start_worker(small_instrument(), type(COMPUTE)(threads=1, nice=5))
-    crew = Crew(lambda: executor)
+    crew = Crew(lambda: start_worker(small_instrument(), type(COMPUTE)(threads=1, nice=5)))
     try:
         assert await crew.call(niceness) == os.nice(0) + 5
     finally:
         crew.dismiss()
-        executor.shutdown(wait=True)
 
 
-async def test_dismissing_ends_the_worker(crew, hired):
+@pytest.mark.parametrize("number", [signal.SIGCONT, signal.SIGSTOP])
+async def test_dismissing_ends_the_worker_whatever_it_is_at(crew, hired, number):
     await crew.call(process_id)
+    waiting = asyncio.create_task(crew.call(asleep))
+    await asyncio.sleep(0.1)
+    os.kill(hired[0].pid, number)
+    began = time.monotonic()
     crew.dismiss()
-    for process in multiprocessing.active_children():
-        process.join(5.0)
     assert not multiprocessing.active_children()
+    with pytest.raises(WorkerError, match="died during asleep"):
+        await waiting
+    assert time.monotonic() - began < 1.0
     crew.dismiss()
+
+
+async def test_what_nobody_waits_for_any_more_is_not_finished(crew, hired):
+    await crew.call(process_id)
+    waiting = asyncio.create_task(crew.call(asleep))
+    await asyncio.sleep(0.1)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    assert not multiprocessing.active_children()
+    assert await crew.call(process_id) == hired[1].pid

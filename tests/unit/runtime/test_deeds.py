@@ -71,11 +71,9 @@ class Clock:
 
 @pytest.fixture(scope="module")
 def crew():
-    executor = start_worker(small_instrument(), COMPUTE)
-    crew = Crew(lambda: executor)
+    crew = Crew(lambda: start_worker(small_instrument(), COMPUTE))
     yield crew
     crew.dismiss()
-    executor.shutdown(wait=True)
 
 
 @pytest.fixture

@@ -60,8 +60,7 @@ def test_alpha_is_tracked_and_no_healthy_loop_is_opened(turned):
 @pytest.mark.timeout(60)
 async def test_the_running_service_has_it_from_the_instrument_file(turned, tmp_path):
     instrument = load_instrument(str(turned))
-    executor = start_worker(instrument, COMPUTE)
-    crew = Crew(lambda: executor)
+    crew = Crew(lambda: start_worker(instrument, COMPUTE))
     archive = Archive(tmp_path)
     archive.open()
     with archive, Bridge(Endpoint(system="small", listen=("tcp/127.0.0.1:0",))) as bridge:
@@ -88,5 +87,4 @@ async def test_the_running_service_has_it_from_the_instrument_file(turned, tmp_p
             supervisor._post(ev.WindowFitted(estimate=estimate(near)))
             known = supervisor.snapshot().tracker.registration
     crew.dismiss()
-    executor.shutdown(wait=True)
     assert known.alpha == near

@@ -1,0 +1,309 @@
+"""``pyrcal run``: the service, and the only place that wires its parts together."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import multiprocessing
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import structlog
+import uvicorn
+from threadpoolctl import threadpool_limits
+from typing_extensions import override
+
+from service.api import create_app
+from service.archive import Archive
+from service.config import Settings, load_instrument, load_settings
+from service.config.policy import policy_of
+from service.errors import ConfigurationError, PyrcalError
+from service.fits.upload import UploadFitter
+from service.model.instrument import Instrument
+from service.reactions.measurements import MEASUREMENTS_KEPT
+from service.reactions.noisy import NOISY_KEPT
+from service.reactions.shelf import restored
+from service.rtc_bridge import Bridge, Endpoint
+from service.runtime.crew import Crew
+from service.runtime.deeds import Deeds, Publishing
+from service.runtime.fitting import FitDesk, FitLimits
+from service.runtime.resuming import taken_up
+from service.runtime.supervisor import Supervisor
+from service.state import TrackerState
+from service.worker import Compute, start_worker
+
+_OPTIONS = {
+    "instrument": "service.instrument",
+    "mode": "service.mode",
+    "data_dir": "service.data_dir",
+    "listen": "zenoh.listen",
+    "connect": "zenoh.connect",
+    "host": "api.host",
+    "port": "api.port",
+}
+"""Command-line options that stand for a settings key."""
+
+REQUESTS_WITHIN_S = 2
+"""Requests under way when the service is asked to stop may take this long: an upload would take
+longer."""
+
+END_WITHIN_S = 4.5
+"""After this what holds the service up is named, and left behind: five seconds is what operators
+and process managers wait."""
+
+
+def add_run_arguments(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare ``pyrcal run``; ``commands`` is argparse's collection of sub-commands."""
+    run = commands.add_parser(
+        "run",
+        help="the service",
+        description="Run the service. Precedence: command line > environment "
+        "(PYRCAL_<SECTION>__<KEY>) > TOML file > defaults.",
+    )
+    run.add_argument("--config", type=Path, metavar="FILE", help="settings, TOML")
+    run.add_argument("--instrument", metavar="NAME|FILE", help="packaged name or TOML file")
+    run.add_argument("--mode", choices=["auto", "propose", "hold"], help="default: propose")
+    run.add_argument("--data-dir", metavar="DIR", help="products, index, audit trail; default var")
+    run.add_argument("--listen", metavar="ENDPOINT", help="zenoh, default tcp/127.0.0.1:7447")
+    run.add_argument("--connect", metavar="ENDPOINT", help="an observatory's own zenoh router")
+    run.add_argument("--host", help="of the REST API, default 127.0.0.1")
+    run.add_argument("--port", type=int, help="of the REST API, default 8080")
+
+
+def run_service(options: argparse.Namespace) -> int:
+    """Run the service until it is asked to stop; return the exit status."""
+    given = {
+        key: getattr(options, option)
+        for option, key in _OPTIONS.items()
+        if getattr(options, option) is not None
+    }
+    for key in ("zenoh.listen", "zenoh.connect"):
+        if key in given:
+            given[key] = [given[key]]
+    settings = load_settings(options.config, os.environ, given)
+    instrument = load_instrument(settings.service.instrument)
+    # the event loop's own products are small; a second BLAS thread would only fight the RTC link
+    threadpool_limits(1)
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
+        ],
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+    )
+    for remark in instrument.remarks:
+        structlog.get_logger().warning("instrument.remark", text=remark)
+    return asyncio.run(_serve(settings, instrument))
+
+
+async def _serve(settings: Settings, instrument: Instrument) -> int:
+    """Open everything, run until asked to stop or the service fails, close everything."""
+    listener = _listener(settings.api.host, settings.api.port)
+    archive = Archive(settings.service.data_dir)
+    damaged = archive.open()
+    log = structlog.get_logger()
+    for line in damaged:
+        log.warning("archive.damaged", text=line)
+    system = settings.service.system or instrument.name
+    crew = Crew(lambda: start_worker(instrument, _compute(settings)))
+    try:
+        with archive, Bridge(_endpoint(settings, system)) as bridge:
+            bridge.expect(instrument.basis_id, instrument.config_id)
+            supervisor = _supervisor(settings, instrument, system, bridge, crew, archive)
+            desk = _desk(settings, instrument)
+            return await _until_stopped(supervisor, desk, listener)
+    finally:
+        crew.dismiss()
+
+
+async def _until_stopped(supervisor: Supervisor, desk: FitDesk, listener: socket.socket) -> int:
+    desk.open()
+    config = uvicorn.Config(
+        create_app(supervisor, desk),
+        log_config=None,
+        access_log=False,
+        timeout_graceful_shutdown=REQUESTS_WITHIN_S,
+    )
+    server = _Server(config)
+    ending = _Ending()
+    host, port = listener.getsockname()[:2]
+    structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
+    work = asyncio.create_task(supervisor.run())
+    web = asyncio.create_task(server.serve(sockets=[listener]))
+    asked = asyncio.create_task(ending.asked.wait())
+    await asyncio.wait({work, web, asked}, return_when=asyncio.FIRST_COMPLETED)
+    failed = work.done() or web.done()
+    ending.begin()
+    server.should_exit = True
+    for task in (work, asked):
+        task.cancel()
+    outcomes = await asyncio.gather(work, web, return_exceptions=True)
+    await desk.close()
+    for outcome in outcomes:
+        _explain(outcome)
+    return 1 if failed else 0
+
+
+def _explain(outcome: BaseException | None) -> None:
+    """Log why the service failed; what it refused on purpose ends as one line.
+
+    Raises
+    ------
+    PyrcalError
+        The refusal itself.
+    """
+    while isinstance(outcome, BaseExceptionGroup):
+        outcome = outcome.exceptions[0]
+    if isinstance(outcome, PyrcalError):
+        raise outcome
+    if isinstance(outcome, Exception):
+        structlog.get_logger().error("service.failed", exc_info=outcome)
+
+
+class _Server(uvicorn.Server):
+    """A uvicorn that leaves signals alone: it would raise them again before all is closed."""
+
+    @override
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+class _Ending:
+    """Hears SIGINT and SIGTERM, once, and sees to it that the end comes."""
+
+    def __init__(self) -> None:
+        self.asked = asyncio.Event()
+        self._begun = False
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(self._ask))
+
+    def _ask(self) -> None:
+        self.begin()
+        self.asked.set()
+
+    def begin(self) -> None:
+        """Begin the end: it is not begun twice, and cannot be put off."""
+        if self._begun:
+            return
+        self._begun = True
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+        guard = threading.Timer(END_WITHIN_S, _leave_behind)
+        guard.daemon = True
+        guard.start()
+
+
+def _leave_behind() -> None:
+    """End the process with what still holds it up; what is on the disk is whole at any moment."""
+    held = [thread.name for thread in threading.enumerate() if not thread.daemon]
+    structlog.get_logger().error("service.ended-late", threads=held)
+    for child in multiprocessing.active_children():
+        child.kill()
+    os._exit(1)
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    """Bind the REST port first: a busy one must be said in one line before anything starts."""
+    try:
+        listener = socket.create_server((host, port))
+    except OSError as error:
+        raise ConfigurationError(
+            f"api.port: cannot listen on {host}:{port}: {error.strerror or error}; "
+            "choose another with --port"
+        ) from error
+    return listener
+
+
+def _supervisor(
+    settings: Settings,
+    instrument: Instrument,
+    system: str,
+    bridge: Bridge,
+    crew: Crew,
+    archive: Archive,
+) -> Supervisor:
+    deeds = Deeds(
+        bridge=bridge,
+        crew=crew,
+        archive=archive,
+        instrument=instrument,
+        publishing=Publishing(
+            system=system,
+            chunk_bytes=settings.zenoh.chunk_bytes,
+            pole_radius_bound=settings.control.pole_radius_bound,
+        ),
+        clock_ns=time.time_ns,
+    )
+    policy = policy_of(settings)
+    state = TrackerState(
+        system=system,
+        mode=settings.service.mode,
+        reconstructors=restored(archive.records()),
+        measurements=archive.measured.records()[-MEASUREMENTS_KEPT:],
+        noisy=archive.noisy.records()[-NOISY_KEPT:],
+        basis_id=instrument.basis_id,
+        config_id=instrument.config_id,
+    )
+    return Supervisor(
+        state=taken_up(archive, state, policy, time.time_ns()),
+        policy=policy,
+        bridge=bridge,
+        crew=crew,
+        archive=archive,
+        deeds=deeds,
+    )
+
+
+def _desk(settings: Settings, instrument: Instrument) -> FitDesk:
+    """Return the desk for fits of uploads; an uploaded instrument is read like any other."""
+    most_bytes = settings.fits.upload_limit_mb * 1_000_000
+    return FitDesk(
+        folder=settings.service.data_dir / "uploads",
+        fit=UploadFitter(
+            own=instrument,
+            load_instrument=load_instrument,
+            most_bytes=most_bytes,
+            threads=settings.compute.threads,
+        ),
+        limits=FitLimits(
+            most_bytes=most_bytes,
+            waiting=settings.fits.waiting,
+            seconds=settings.fits.time_limit_s,
+            nice=settings.compute.nice,
+        ),
+        clock_ns=time.time_ns,
+    )
+
+
+def _endpoint(settings: Settings, system: str) -> Endpoint:
+    return Endpoint(
+        system=system,
+        listen=settings.zenoh.listen,
+        connect=settings.zenoh.connect,
+        chunk_bytes=settings.zenoh.chunk_bytes,
+    )
+
+
+def _compute(settings: Settings) -> Compute:
+    table = settings.compute
+    return Compute(
+        threads=table.threads,
+        nice=table.nice,
+        pupil_sampling=table.pupil_sampling,
+        detector_nodes=table.detector_nodes,
+        working_point_modes=table.working_point_modes,
+        method=settings.control.method,
+        max_condition=settings.control.max_condition,
+        slope_noise=settings.control.slope_noise,
+        wind_m_s=settings.control.wind_m_s,
+    )

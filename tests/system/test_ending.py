@@ -1,0 +1,185 @@
+"""Whatever the service is at, it ends within five seconds of being asked to, and leaves nothing."""
+
+import os
+import signal
+import socket
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.system.night import INSTRUMENT, a_night, session_members, wait_for
+from tests.system.stranger import Stranger, small_telescope
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
+
+BOTH = [signal.SIGINT, signal.SIGTERM]
+
+
+@pytest.fixture
+def night(tmp_path):
+    with a_night(tmp_path) as night:
+        yield night
+
+
+def check_end(night, service, number, *, group=False):
+    """Ask the service to end; it does in good order, whatever it was at."""
+    began = time.monotonic()
+    if group:
+        os.killpg(service.popen.pid, number)
+    else:
+        service.send(number)
+    status = service.popen.wait(60.0)
+    took_s = time.monotonic() - began
+    assert took_s < 5.0, (took_s, service.log)
+    assert status == 0, service.log
+    assert "Traceback" not in service.log, service.log
+    assert "service.ended-late" not in service.log, service.log
+    wait_for(lambda: not session_members(service.popen.pid), 1.0, "no child process left")
+    assert not list(night.directory.rglob("*.part"))
+
+
+def stranger(night):
+    return Stranger(night.zenoh, *small_telescope(0.1, -0.05, 0.3, 1.003))
+
+
+def maps_of(service):
+    """Return which files the process has mapped: how far its imports are."""
+    try:
+        return Path(f"/proc/{service.popen.pid}/maps").read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+def workers_of(service):
+    """Return the processes of the service that have numpy: the worker and not its tracker."""
+    found = []
+    for member in session_members(service.popen.pid):
+        maps = Path(f"/proc/{member}/maps").read_text(encoding="utf-8")
+        if member != service.popen.pid and "_multiarray_umath" in maps:
+            found.append(member)
+    return found
+
+
+@pytest.mark.parametrize("number", BOTH)
+@pytest.mark.parametrize("library", ["_struct", "_multiarray_umath", "pydantic_core", "zenoh"])
+def test_while_it_imports(night, number, library):
+    service = night.service(wait=False)
+    wait_for(lambda: library in maps_of(service), 20.0, f"{library} is imported")
+    check_end(night, service, number)
+
+
+@pytest.mark.parametrize("number", BOTH)
+@pytest.mark.parametrize("after_s", [0.0, 0.4, 1.5])
+def test_while_the_model_is_prepared(night, number, after_s):
+    service = night.service(instrument="flao-lbt", wait=False)
+    wait_for(lambda: "api.listening" in service.log, 20.0, "the first line")
+    time.sleep(after_s)
+    check_end(night, service, number)
+
+
+def test_ctrl_c_in_a_terminal_while_the_worker_still_imports(night):
+    service = night.service(instrument="flao-lbt", wait=False)
+    wait_for(lambda: len(session_members(service.popen.pid)) > 2, 20.0, "the worker is started")
+    check_end(night, service, signal.SIGINT, group=True)
+
+
+@pytest.mark.parametrize("number", BOTH)
+def test_while_it_tracks(night, number):
+    service = night.service("auto")
+    with stranger(night):
+        wait_for(lambda: night.state["windows_accepted"] > 1, 40.0, "it tracks")
+        check_end(night, service, number)
+
+
+def test_while_its_worker_is_stopped(night):
+    service = night.service("auto")
+    with stranger(night):
+        wait_for(lambda: night.state["windows_accepted"] > 0, 40.0, "it tracks")
+        (worker,) = workers_of(service)
+        os.kill(worker, signal.SIGSTOP)
+        time.sleep(3.0)  # a window waits for it by now
+        check_end(night, service, signal.SIGTERM)
+
+
+def test_while_its_worker_is_stopped_before_it_has_begun(night):
+    service = night.service("auto", wait=False)
+    (worker,) = wait_for(lambda: workers_of(service), 20.0, "a worker")
+    os.kill(worker, signal.SIGSTOP)
+    time.sleep(0.5)
+    check_end(night, service, signal.SIGINT)
+
+
+def test_while_an_upload_dribbles_in(night):
+    service = night.service("hold")
+    with closing(socket.create_connection(("127.0.0.1", night.port))) as line:
+        line.sendall(b"POST /v1/fits HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 100000\r\n\r\n")
+        line.sendall(b"\x89HDF\r\n\x1a\n")
+        wait_for(lambda: list(night.directory.rglob("upload*")), 10.0, "the upload has begun")
+        check_end(night, service, signal.SIGTERM)
+
+
+def test_while_an_upload_is_fitted(night):
+    matrix = Path(__file__).parents[1] / "data" / "tiny" / "tiny.h5"
+    service = night.service("hold", wait=True)
+    answer = night.client.post("/v1/fits", content=matrix.read_bytes())
+    assert answer.is_success, answer.text
+    time.sleep(0.5)
+    check_end(night, service, signal.SIGINT)
+
+
+def test_while_somebody_reads_a_matrix_slowly(night):
+    service = night.service("auto")
+    with stranger(night):
+        wait_for(lambda: night.state["in_use"], 40.0, "a matrix in use")
+        path = f"/v1/reconstructors/{night.state['in_use']}/matrix"
+        with closing(socket.create_connection(("127.0.0.1", night.port))) as line:
+            line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+            line.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+            assert line.recv(12).startswith(b"HTTP/1.1 200")
+            check_end(night, service, signal.SIGTERM)
+
+
+def test_while_the_rtc_answers_nothing(night):
+    """A question is under way that nobody answers, and its thread waits."""
+    service = night.service("auto")
+    with stranger(night) as rtc:
+        rtc.on_command = lambda *_: time.sleep(20.0)
+        wait_for(lambda: rtc.commands, 40.0, "a question")
+        check_end(night, service, signal.SIGINT)
+        rtc.on_command = None
+
+
+def test_asked_again_and_again(night):
+    """An impatient hand on the keyboard makes it neither later nor louder."""
+    service = night.service("hold")
+    stop = threading.Event()
+
+    def insist():
+        while not stop.wait(0.02):
+            try:
+                os.killpg(service.popen.pid, signal.SIGINT)
+            except ProcessLookupError:
+                return
+
+    hand = threading.Thread(target=insist)
+    hand.start()
+    try:
+        check_end(night, service, signal.SIGINT)
+    finally:
+        stop.set()
+        hand.join()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_a_hundred_times_at_any_moment(night):
+    """From the first milliseconds to tracking, each time a little later."""
+    with stranger(night):
+        for k in range(100):
+            service = night.service("auto", INSTRUMENT, wait=False)
+            wait_for(lambda service=service: "_struct" in maps_of(service), 20.0, "it imports")
+            time.sleep(0.08 * k)
+            check_end(night, service, BOTH[k % 2])

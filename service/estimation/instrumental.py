@@ -181,13 +181,13 @@ def _responses(
 
 def _summed(first: Array, answer: Array, coupling: Array) -> Array | None:
     """Return ``(1 + F)^-1 first`` as a series, ``F = answer * coupling``; None: not that way."""
-    reply = first
+    reply, largest = first, np.abs(first).max(initial=0.0)
     for _ in range(_MOST_TERMS):
         before, reply = reply, first - answer * _apply(coupling, reply.T).T
-        change, size = np.abs(reply - before).max(), np.abs(reply).max()
+        change, size = (np.abs(x).max(initial=0.0) for x in (reply - before, reply))
         if change <= _ROUNDING * size:  # zeros are settled, too
             return np.asarray(reply)
-        if not change < _GROWN * np.abs(first).max():
+        if not change < _GROWN * largest:
             return None
     return None
 

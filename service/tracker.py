@@ -116,7 +116,7 @@ def _react(  # noqa: C901 - one line for each event
             after = on_window(state, estimate, policy, now_ns)
             return learnt(state, after, estimate), ()
         case ev.WindowLost(refused=refused):
-            return refuse_window(state, refused.reason, now_ns), ()
+            return refuse_window(state, refused.reason, now_ns, mistold=refused.mistold), ()
         case ev.Vibrations():
             return on_vibrations(state, event, now_ns), ()
         case ev.Watched():

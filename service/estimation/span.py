@@ -34,6 +34,9 @@ class WindowRefused:
     t_ns_utc: int
     """When it was given up."""
 
+    mistold: bool = False
+    """Whether it shows that slopes or commands are not what the instrument file says."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Span:

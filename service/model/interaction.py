@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -267,12 +268,23 @@ def lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
     The flux is the pupil's light on each subaperture, so that the mask depends neither on the
     sampling nor on the light diffracted out of the images.
     """
-    fine = instrument_pupil(instrument, 8).amplitude
     n = instrument.wfs.n_subapertures
+    flux = _light_per_subaperture(n, instrument.wfs.pupil_diameter, instrument.obscuration_ratio)
+    return np.asarray(flux >= instrument.wfs.flux_threshold)
+
+
+@lru_cache(maxsize=8)
+def _light_per_subaperture(n: int, diameter_subap: float, obscuration_ratio: float) -> Array:
+    """Return the share of each subaperture ``(n, n)`` that the pupil lights."""
+    fine = annular_pupil(
+        n_subapertures=n,
+        diameter_subap=diameter_subap,
+        obscuration_ratio=obscuration_ratio,
+        sampling=8,
+    ).amplitude
     margin = (len(fine) - 8 * n) // 2
     inner = fine[margin : margin + 8 * n, margin : margin + 8 * n]
-    flux = inner.reshape(n, 8, n, 8).mean(axis=(1, 3))
-    return np.asarray(flux >= instrument.wfs.flux_threshold)
+    return np.asarray(inner.reshape(n, 8, n, 8).mean(axis=(1, 3)))
 
 
 def reference_slopes(

@@ -13,6 +13,12 @@ from service.state import Alarm, TrackerState
 OFF_LOOP = "commands-off-loop"
 """The alarm of a saturated mirror, or of an RTC whose account of its loop is wrong."""
 
+WRONG_MATRIX = "matrix-mismatch"
+"""The alarm of an RTC whose own matrix is of other slopes or commands than the file tells."""
+
+WRONG_ANSWER = "response-mismatch"
+"""The alarm of slopes that answer a dither otherwise than the file tells."""
+
 ARCHIVE_FAILED = "archive-failed"
 """The alarm of a disk that refuses: what cannot be recorded is not done."""
 
@@ -50,6 +56,7 @@ class Rule:
 
 
 _STRANGER = frozenset({Act.MEASURE, Act.DECIDE, Act.SEND_NEW, Act.SEND_KNOWN, Act.ASK})
+_MISTOLD = frozenset({Act.MEASURE, Act.SEND_NEW, Act.SEND_KNOWN})
 _OUT_OF_HAND = frozenset({Act.MEASURE, Act.DECIDE, Act.HOLD})
 
 RULES: dict[str, Rule] = {
@@ -58,6 +65,9 @@ RULES: dict[str, Rule] = {
     "instrument-mismatch": Rule("the RTC was not of the instrument in the file", _STRANGER),
     "loop-diverging": Rule("the loop was diverging", _OUT_OF_HAND),
     "edge-slip": Rule("the edge had slipped", _OUT_OF_HAND),
+    WRONG_MATRIX: Rule("the RTC's matrix was of other slopes or commands", _MISTOLD),
+    # windows go on: one that is as it should be ends it
+    WRONG_ANSWER: Rule("slopes answered otherwise than told", _MISTOLD - {Act.MEASURE}),
     ARCHIVE_FAILED: Rule("the disk refused to be written", frozenset({Act.DECIDE})),
     OFF_LOOP: Rule("the commands were off the loop equation", frozenset({Act.MEASURE, Act.DECIDE})),
 }

@@ -10,6 +10,7 @@ from service.control.precision import forgetting_mean, measured_ratio
 from service.estimation.instrumental import WindowEstimate
 from service.estimation.noisymatrix import RandomEstimate
 from service.events import AskDither, AskNoDither
+from service.reactions.alarms import Act, forbidding
 from service.reactions.dither_choice import (
     NOISY_DITHER,
     OWN_DITHER,
@@ -161,7 +162,8 @@ def _why_none(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
         return rtc.why_open
     if state.in_use is None and state.dither is None and rtc.dither is None:
         return "the reconstructor in use is not known yet"
-    return None
+    alarm = forbidding(state, Act.MEASURE)
+    return None if alarm is None else f"nothing would be measured under {alarm.name}"
 
 
 def _running(state: TrackerState, dither: DitherView, wish: Wish, now_ns: int) -> Step:

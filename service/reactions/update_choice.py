@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from service.events import JudgeMatrix, MakeMatrix
+from service.reactions.alarms import Act, forbidding
 from service.reactions.matrices import Step
 from service.reactions.mode_ladder import fewer_than, more_to_try
 from service.reactions.policy import SECOND_NS, Policy
@@ -62,6 +63,8 @@ def choose_update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
     if state.mode is Mode.HOLD or known is None or not settled(known):
         return state, ()
     if not rtc.in_loop or state.making_since_ns_utc is not None:
+        return state, ()
+    if forbidding(state, Act.SEND_NEW) is not None:
         return state, ()
     if _busy(state) or now_ns < max(_next_attempt_ns(state, rtc, policy), state.retry_ns_utc):
         return state, ()

@@ -12,7 +12,7 @@ from service.estimation.estimator import DitheredEstimate, model_error
 from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
 from service.estimation.noisymatrix import RandomEstimate
 from service.reactions.acquisition_plan import missed
-from service.reactions.alarms import RULES, Act, forbidding
+from service.reactions.alarms import RULES, WRONG_ANSWER, Act, forbidding
 from service.reactions.dither import found_again
 from service.reactions.estimate import Measured
 from service.reactions.journal import logged, with_alarm, without_alarm
@@ -50,6 +50,8 @@ def on_window(
     if reason is not None:
         return refuse_window(state, reason, now_ns)
     state = without_alarm(found_again(state, now_ns), "columns-misaligned", now_ns)
+    if not isinstance(estimate, RandomEstimate):
+        state = without_alarm(state, WRONG_ANSWER, now_ns)
     known, random = state.registration, isinstance(estimate, RandomEstimate)
     modes, gains, gain_sigma = _gains_of(estimate)
     measured = Measured(
@@ -130,10 +132,17 @@ def why_out_of_hand(state: TrackerState) -> str | None:
     )
 
 
-def refuse_window(state: TrackerState, reason: str, now_ns: int) -> TrackerState:
-    """Count a window that gave nothing, and say why."""
+def refuse_window(
+    state: TrackerState, reason: str, now_ns: int, *, mistold: bool = False
+) -> TrackerState:
+    """Count a window that gave nothing, and say why.
+
+    ``mistold``: because slopes or commands are not what the instrument file says.
+    """
     state = missed(replace(state, windows_refused=state.windows_refused + 1), reason)
     if reason.startswith("columns misaligned"):
         state = with_alarm(state, "columns-misaligned", reason, now_ns)
+    if mistold:
+        state = with_alarm(state, WRONG_ANSWER, reason, now_ns)
     level = Level.INFO if reason.startswith(EXPECTED) else Level.WARNING
     return logged(state, "window.refused", reason, now_ns, level)

@@ -12,7 +12,7 @@ the orientation with the fewest flips, and the least rotation among those.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -30,6 +30,7 @@ from service.registration.reference import Reference
 from service.registration.target import Target, oriented, target_of
 
 Array = NDArray[np.float64]
+Setting = tuple[SlopeOrder, Orientation]
 
 SAMPLING = 1
 """Pupil points per subaperture: enough for shapes this smooth."""
@@ -111,23 +112,35 @@ def find_orientation(
     ``basis`` holds the columns of ``reference``. Shift and magnification are taken as nominal:
     the lowest orders hardly feel them.
     """
-    turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper)
     stated = instrument.slopes
     if stated.orientation is None:
         settings = list(_settings(stated.order))
     else:
         settings = [(stated.order, stated.orientation)]
+    poses = poses_of(instrument, reference, basis, settings, mapper=mapper)
+    return _judged(poses, instrument.mirror.nominal_rotation_rad)
+
+
+def poses_of(
+    instrument: Instrument,
+    reference: Reference,
+    basis: Basis,
+    settings: Sequence[Setting],
+    *,
+    mapper: Mapper = map,
+) -> list[Pose]:
+    """Return how well each of these orders and orientations explains the lowest orders."""
+    turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper)
     low = replace(
         reference,
         matrix=turned.lowest.measured(reference.matrix),
         modes=None,
         noise=None,
     )
-    poses = [
+    return [
         turned.pose(target_of(low, oriented(instrument, order, orientation)), order, orientation)
         for order, orientation in settings
     ]
-    return _judged(poses, instrument.mirror.nominal_rotation_rad)
 
 
 def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> InteractionModel:
@@ -145,10 +158,15 @@ def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> Inte
     )
 
 
-def _settings(order: SlopeOrder) -> Iterator[tuple[SlopeOrder, Orientation]]:
+def _settings(order: SlopeOrder) -> Iterator[Setting]:
     """Yield every orientation, and the components exchanged where the order can say that."""
     exchanged = {SlopeOrder.XY: SlopeOrder.YX, SlopeOrder.YX: SlopeOrder.XY}
     orders = [order] if order not in exchanged else [order, exchanged[order]]
+    yield from settings_of(orders)
+
+
+def settings_of(orders: Iterable[SlopeOrder] = tuple(SlopeOrder)) -> Iterator[Setting]:
+    """Yield every orientation and pair of signs in each of these orders."""
     flags = (False, True)
     for listed, swap, flip_x, flip_y, sign_x, sign_y in product(
         orders, flags, flags, flags, (1, -1), (1, -1)

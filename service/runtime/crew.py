@@ -22,6 +22,9 @@ class Crew:
         self._hire = hire
         self._worker: Worker | None = None
         self._turn = asyncio.Lock()
+        self.first: Callable[[], Done[None]] | None = None
+        """What every new worker does before anything else; None: nothing."""
+
         self.n_lost = 0
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
         """Processor time of the worker by name of the job, seconds; a job that fails is not in."""
@@ -43,10 +46,11 @@ class Crew:
         return done.result
 
     async def _done(self, name: str, work: Callable[[], Done[R]]) -> Done[R]:
-        if self._worker is None:
-            self._worker = self._hire()
-        worker = self._worker
+        hired = self._worker is None
+        worker = self._worker = self._worker or self._hire()
         try:
+            if hired and self.first is not None:
+                await asyncio.to_thread(worker.run, self.first)
             return await asyncio.to_thread(worker.run, work)
         except EOFError as error:
             self.n_lost += 1

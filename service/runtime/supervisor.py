@@ -30,7 +30,7 @@ from service.runtime.deeds import Deeds
 from service.runtime.following import followed, news, shape_news
 from service.runtime.recording import Recorder
 from service.runtime.streams import Streams, Window, fed, taken, with_matrix
-from service.runtime.windows import fitted, watched
+from service.runtime.windows import fitted, listened, watched
 from service.state import Level, LogEntry, MeasureState, TrackerState
 from service.tracker import step
 from service.wire import AlarmMessage
@@ -290,8 +290,18 @@ class Supervisor:
             if in_use is not None and self._streams is not None:
                 matrix = await asyncio.to_thread(self._deeds.matrix, in_use)
                 self._streams = with_matrix(self._streams, in_use, matrix)
+                await self._hear_out(in_use, matrix)
         except PyrcalError as error:
             self._note("reconstructor.not-offered", str(error), Level.WARNING)
+
+    async def _hear_out(self, in_use: str, matrix: NDArray[np.float32]) -> None:
+        """Learn from the matrix in use how the RTC lists its slopes and counts its commands."""
+        record = self._state.reconstructor(in_use)
+        if record is None:
+            return
+        for event in await listened(record, matrix, self._state, self._crew):
+            if self._state.in_use == in_use:
+                self._post(event)
 
     def _follow(self) -> None:
         """Keep the streaming estimators in step with the RTC and the dither."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service import events as ev
 from service.errors import PyrcalError
@@ -14,11 +16,13 @@ from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.passive import Passive
 from service.estimation.randomdither import Correlated
 from service.events import Event
+from service.reactions.alarms import WRONG_MATRIX
 from service.reactions.watchdog import fit_begins_at
+from service.registration.dialect import setting_written
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
-from service.state import Level, TrackerState
-from service.worker import Workbench
+from service.state import Level, ReconstructorRecord, TrackerState
+from service.worker import Workbench, run_job
 
 
 async def fitted(
@@ -101,6 +105,32 @@ async def watched(
         return None
     loop = () if state.rtc is None else state.rtc.loop_numbers
     return ev.Watched(estimate=estimate, t_ns_utc=end_ns, loop=loop)
+
+
+async def listened(
+    record: ReconstructorRecord, matrix: NDArray[np.float32], state: TrackerState, crew: Crew
+) -> list[Event]:
+    """Return what a matrix that the RTC brought tells of its slopes and commands.
+
+    One that the service has made and judged says nothing that it did not know.
+    """
+    if record.judged is not None:
+        return []
+    known = state.registration
+    try:
+        dialect = await crew.call(Workbench.listen, matrix, None if known is None else known.alpha)
+    except PyrcalError as error:
+        return [ev.Noted(name="slopes.unknown", text=str(error), level=Level.WARNING)]
+    events: list[Event] = []
+    if dialect.found is not None and dialect.adopted:
+        crew.first = partial(run_job, Workbench.adopt, dialect.found)
+        text = f'orientation "auto": found {setting_written(dialect.found)} by {record.id}'
+        events.append(ev.Noted(name="slopes.adopted", text=text))
+    raised = any(alarm.name == WRONG_MATRIX for alarm in state.alarms)
+    if dialect.wrong or raised:
+        text = f"{record.id}: {dialect.wrong}" if dialect.wrong else f"{record.id} is as told"
+        events.append(ev.Trouble(name=WRONG_MATRIX, text=text, over=not dialect.wrong))
+    return events
 
 
 def lost(window: Window, reason: str) -> Event:

@@ -26,7 +26,10 @@ from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo
+from service.registration.dialect import LIKELY, Dialect, of_answer, of_reconstructor
+from service.registration.orientation import Setting
 from service.registration.start import far_starts
+from service.registration.target import oriented
 from service.worker.instruments import actuators_of, check_controllable, outer_of
 from service.worker.margin import InUse, Margin
 from service.worker.records import Compute, Description, Made
@@ -65,8 +68,14 @@ class Workbench:
 
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
         check_controllable(instrument)
-        basis = modal_basis(instrument)
+        self._basis = modal_basis(instrument)
         self._threads = ThreadPoolExecutor(compute.threads)
+        self._compute = compute
+        self._equip(instrument)
+
+    def _equip(self, instrument: Instrument) -> None:
+        """Make the models of an instrument, all but its modes."""
+        basis, compute = self._basis, self._compute
 
         def model(sampling: int, nodes: int, halo: Halo | None) -> RtcInteractionModel:
             return RtcInteractionModel(
@@ -88,7 +97,6 @@ class Workbench:
         self._model = self._sensor.flat
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
         self._start = instrument.start
-        self._compute = compute
         self._margin: tuple[InUse, Margin] | None = None
         self._far: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
 
@@ -111,10 +119,28 @@ class Workbench:
 
         Where the linearisation at hand is too far away, the coarse model leads to within reach of
         one new, fine linearisation. A working point that does not give the optical gains that were
-        measured is followed first.
+        measured is followed first. Slopes that cannot be those of the instrument file are refused
+        with what they look like.
         """
+        begun = start or self._start
+        outcome = self._fitted(spectra, loop, begun)
+        if isinstance(outcome, WindowEstimate):
+            gains = outcome.optical_gain
+            if gains.real.min() > LIKELY[0] and np.abs(gains).max() < LIKELY[1]:
+                return outcome
+            begun = outcome.alpha
+        seen = spectra.commands[:, 0] @ self._sensor.near(begun).matrix.T
+        turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / spectra.plan.frame_rate_hz
+        answer = of_answer(spectra.slopes[:, 0], seen, turns, self._model.instrument)
+        if not answer.wrong:
+            return outcome
+        return WindowRefused(reason=answer.wrong, t_ns_utc=spectra.t_end_ns_utc, mistold=True)
+
+    def _fitted(
+        self, spectra: Spectra, loop: Loop, start: Misregistration
+    ) -> WindowEstimate | WindowRefused:
         try:
-            estimate = self._settled_fit(spectra, loop, start or self._start)
+            estimate = self._settled_fit(spectra, loop, start)
             if estimate is None:
                 return _unsettled(spectra)
             found = self._against_flat(estimate)
@@ -124,6 +150,31 @@ class Workbench:
         except np.linalg.LinAlgError as error:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
         return _unsettled(spectra) if estimate is None else self._against_flat(estimate)
+
+    def listen(self, in_use: NDArray[np.float32], near: Misregistration | None) -> Dialect:
+        """Return whether the RTC's own matrix is of the slopes that the instrument file tells.
+
+        Where the file leaves the orientation open, what is found is taken over.
+        """
+        at, instrument = near or self._start, self._model.instrument
+        dialect = of_reconstructor(
+            in_use,
+            instrument,
+            self._basis,
+            near=at,
+            response=self._sensor.at_unit_gain(at).matrix,
+            mapper=self._threads.map,
+        )
+        if instrument.slopes.orientation is not None or dialect.found is None or dialect.wrong:
+            return dialect
+        self.adopt(dialect.found)
+        return replace(dialect, adopted=True)
+
+    def adopt(self, setting: Setting) -> None:
+        """List slopes in this order and orientation from now on."""
+        recipe = self._model.instrument.slopes
+        if (recipe.order, recipe.assumed_orientation) != setting:
+            self._equip(oriented(self._model.instrument, *setting))
 
     def _settled_fit(
         self, spectra: Spectra, loop: Loop, start: Misregistration

@@ -29,7 +29,7 @@ from service.runtime.deeds import Deeds, Publishing
 from service.runtime.following import followed, news, shape_news
 from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.supervisor import WATCH_INTERVAL_S
-from service.runtime.windows import fitted, lost, watched
+from service.runtime.windows import fitted, listened, lost, watched
 from service.state import Mode, TrackerState
 from service.tracker import step
 from service.wire import CHUNK_LIMIT, Manifest
@@ -57,6 +57,9 @@ class Latencies:
     """Until a matrix is staged; the RTC swaps with its next frames."""
 
     fetch_s: float = 0.3
+    listen_s: float = 0.5
+    """Until a matrix of the RTC's own has been compared with the instrument file."""
+
     status_s: float = 0.2
     """Between two status messages of the RTC."""
 
@@ -321,7 +324,15 @@ class Observatory:
             self._do(effect, self.state)
         in_use = self.state.in_use
         if in_use is not None and in_use != before.in_use:
-            self.streams = with_matrix(self.streams, in_use, self._deeds.matrix(in_use))
+            self._hear_out(in_use)
+
+    def _hear_out(self, in_use: str) -> None:
+        """Watch what the matrix in use does, and learn from it how the RTC speaks."""
+        matrix, record = self._deeds.matrix(in_use), self.state.reconstructor(in_use)
+        self.streams = with_matrix(self.streams, in_use, matrix)
+        if record is not None:
+            for event in asyncio.run(listened(record, matrix, self.state, self._crew)):
+                self._in(self.latencies.listen_s, partial(self._post, event))
 
     def _do(self, effect: Effect, state: TrackerState) -> None:
         """Carry an effect out; what comes of it is heard when it would be."""

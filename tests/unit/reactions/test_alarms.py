@@ -6,12 +6,15 @@ import pytest
 
 from service import events as ev
 from service.errors import CommandError
+from service.estimation.lockin import WindowRefused
 from service.reactions.alarms import RULES, Act, Rule
 from service.state import MatrixState, Mode
 from tests.unit.reactions.situations import Story, judged, of_kind, record
 
 STRANGERS = ["second-rtc", "basis-mismatch", "instrument-mismatch"]
 OUT_OF_HAND = ["loop-diverging", "edge-slip", "commands-off-loop"]
+
+MISTOLD = ["matrix-mismatch", "response-mismatch"]
 
 FORBIDDING = pytest.mark.parametrize("name", [*STRANGERS, *OUT_OF_HAND])
 
@@ -98,3 +101,31 @@ def test_where_only_new_matrices_are_forbidden_one_that_was_in_use_may_come_back
 def test_a_name_that_is_in_no_table_forbids_nothing():
     story = settled("margin")
     assert of_kind(story.tell(ev.MatrixMade(record=made(story), wanted=False)), ev.SendMatrix)
+
+
+@pytest.mark.parametrize("name", MISTOLD)
+def test_while_slopes_are_not_as_told_nothing_is_made_or_sent_whoever_wants_it(name):
+    story = settled(name)
+    story.wait(6)
+    story.tell(ev.MatrixMade(record=made(story), wanted=False))
+    story.tell(ev.MatrixMade(record=made(story, "cm-2"), wanted=True))
+    with pytest.raises(CommandError, match="cm-2 cannot be sent: found"):
+        story.tell(ev.Approve(id="cm-2"))
+    story.wait(6)
+    assert not of_kind(story.effects, ev.SendMatrix | ev.MakeMatrix)
+
+
+def test_no_dither_is_played_that_nothing_would_be_measured_with():
+    story = settled("matrix-mismatch")
+    story.wait(30)
+    assert not of_kind(story.effects, ev.AskDither)
+
+
+def test_a_window_that_is_as_it_should_be_ends_the_alarm_of_one_that_was_not():
+    story = Story(Mode.AUTO).meet()
+    story.see(n_windows=3)
+    wrong = WindowRefused(reason="slopes have the other sign", t_ns_utc=story.now_ns, mistold=True)
+    story.tell(ev.WindowLost(refused=wrong))
+    assert "response-mismatch" in story.alarms
+    story.see(n_windows=1)
+    assert "response-mismatch" not in story.alarms

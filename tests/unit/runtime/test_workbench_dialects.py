@@ -85,3 +85,112 @@ def test_what_can_only_be_fitted_offline_is_refused(instrument):
         Workbench(unknown, COMPUTE)
     with pytest.raises(ModelError, match=r"found wfs\.input = frames"):
         Workbench(replace(instrument, frames=FrameWindows()), COMPUTE)
+
+
+class Mistold:
+    """A workbench whose instrument file tells another listing of the slopes than the RTC's."""
+
+    def __init__(self, order="xy", **axes):
+        self.setting = SlopeOrder(order), Orientation(**axes)
+        small = small_instrument()
+        told = replace(small, slopes=SlopeRecipe(orientation=Orientation()))
+        self.told = Workbench(told, COMPUTE)
+        self.auto = Workbench(small, COMPUTE)
+        model = InteractionModel(small, modal_basis(small))
+        mask = rtc_valid_subapertures(small)
+        self.seen = to_rtc(model.interaction_matrix(ALPHA_SMALL), *self.setting, mask)
+        at_rest = to_rtc(model.interaction_matrix(Misregistration()), *self.setting, mask)
+        self.own = np.linalg.pinv(at_rest[:, :N_CONTROLLED]).astype(np.float32)
+
+
+ALPHA_SMALL = replace(ALPHA, rotation_rad=0.004)
+
+
+@pytest.mark.parametrize(
+    ("axes", "named"),
+    [
+        ({"sign_x": -1, "sign_y": -1}, "orientation.sign = -1"),
+        ({"sign_y": -1}, "orientation.sign = [1, -1]"),
+        ({"order": "yx"}, 'slopes.order = "yx"'),
+        ({"order": "interleaved"}, 'slopes.order = "interleaved"'),
+        ({"flip_x": True}, "orientation.flip_x = true"),
+        ({"swap_xy": True, "flip_y": True}, "orientation.swap_xy = true, orientation.flip_y"),
+    ],
+)
+def test_another_listing_of_the_slopes_than_told_is_named_by_the_rtcs_own_matrix(axes, named):
+    rtc = Mistold(**axes)
+    dialect = rtc.told.listen(rtc.own, None)
+    assert named in dialect.wrong
+    assert dialect.found == rtc.setting
+    assert not dialect.adopted
+
+
+def test_slopes_of_the_other_sign_are_named_by_the_answer_to_the_dither():
+    rtc = Mistold(sign_x=-1, sign_y=-1)
+    window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
+    refused = rtc.told.fit(window, open_loop(rtc.own), None)
+    assert refused.mistold
+    assert "slopes have the other sign" in refused.reason
+    assert "orientation.sign = -1" in refused.reason
+
+
+def test_slopes_in_another_order_are_named_by_the_answer_to_the_dither():
+    rtc = Mistold(order="interleaved")
+    window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
+    refused = rtc.told.fit(window, open_loop(rtc.own), None)
+    assert refused.mistold
+    assert 'slopes.order = "interleaved"' in refused.reason
+
+
+def test_slopes_two_frames_late_are_not_taken_for_slopes_of_the_other_sign():
+    rtc = Mistold()
+    window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
+    turns = 2 * np.pi * np.array(window.plan.bins_hz) / window.plan.frame_rate_hz
+    late = window.slopes * np.exp(-2j * turns)[:, :, None]
+    outcome = rtc.told.fit(replace(window, slopes=late), open_loop(rtc.own), None)
+    assert not getattr(outcome, "mistold", False)
+
+
+def test_an_orientation_left_open_is_found_in_the_rtcs_own_matrix_and_taken_over():
+    rtc = Mistold(order="yx", flip_y=True, sign_x=-1)
+    dialect = rtc.auto.listen(rtc.own, None)
+    assert dialect.adopted
+    assert dialect.found == rtc.setting
+    made = rtc.auto.make(ALPHA_SMALL, np.diag(SIGMA**2), loop_settings(), 0.95)
+    product = made.matrix @ rtc.seen[:, :N_CONTROLLED]
+    np.testing.assert_allclose(product, np.eye(N_CONTROLLED), atol=1e-3)
+
+
+def test_a_matrix_that_no_orientation_explains_leaves_nothing_to_take_over():
+    rtc = Mistold()
+    noise = np.random.default_rng(1).normal(size=rtc.own.shape).astype(np.float32)
+    dialect = rtc.auto.listen(noise * np.abs(rtc.own).mean(), None)
+    assert "no orientation explains" in dialect.wrong
+    assert dialect.found is None
+
+
+@pytest.mark.parametrize(
+    ("metres", "named"),
+    [(1e-9, "nanometres"), (1e-6, "micrometres"), (1e-3, "millimetres"), (2.0, "surface")],
+)
+def test_commands_in_another_unit_are_named_by_the_rtcs_own_matrix(metres, named):
+    rtc = Mistold()
+    dialect = rtc.told.listen((rtc.own / metres).astype(np.float32), None)
+    assert named in dialect.wrong
+
+
+def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():
+    rtc = Mistold()
+    window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
+    in_nm = replace(window, commands=window.commands * 1e9, dither=window.dither * 1e9)
+    refused = rtc.told.fit(in_nm, open_loop(rtc.own), None)
+    assert refused.mistold
+    assert "nanometres" in refused.reason
+
+
+def test_what_is_as_told_is_not_complained_of():
+    rtc = Mistold()
+    for bench in (rtc.told, rtc.auto):
+        assert not bench.listen(rtc.own, None).wrong
+        found = bench.fit(dithered_window(Sensor(rtc.seen), ALPHA_SMALL), open_loop(rtc.own), None)
+        assert np.all(np.abs(found.alpha.vector - ALPHA_SMALL.vector) < 0.01)

@@ -1,0 +1,52 @@
+"""An RTC that tells something wrong of its slopes, commands or loop gets no matrix, and is told."""
+
+import numpy as np
+import pytest
+
+from tests.system.night import ALPHA, INSTRUMENT, a_night, wait_for
+from tests.system.stranger import Stranger, small_telescope
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+
+
+@pytest.fixture
+def night(tmp_path):
+    with a_night(tmp_path) as night:
+        yield night
+
+
+def wrong(night):
+    """Texts of the alarms that speak of an RTC that is not as it is told."""
+    names = {"matrix-mismatch", "response-mismatch", "loop-law", "command-unit"}
+    return {a["name"]: a["text"] for a in night.state["alarms"] if a["name"] in names}
+
+
+def pinned(night, orientation):
+    path = night.directory / "pinned.toml"
+    text = INSTRUMENT.read_text(encoding="utf-8")
+    path.write_text(f"{text}\n[slopes]\norientation = {orientation}\n", encoding="utf-8")
+    return path
+
+
+def test_slopes_of_the_other_sign_are_named_and_no_matrix_is_sent(night):
+    night.service("auto", pinned(night, "{ sign = 1 }"))
+    response, variance_m2 = small_telescope(**ALPHA)
+    assumed, _ = small_telescope()
+    with Stranger(night.zenoh, -response, variance_m2, assumed=-assumed) as rtc:
+        wait_for(lambda: wrong(night) or rtc.applied, 40.0, "an alarm")
+
+        assert not rtc.applied
+        assert "sign" in "".join(wrong(night).values())
+
+
+def test_an_orientation_left_open_is_found_adopted_and_the_matrix_sent_holds(night):
+    night.service("auto")
+    response, variance_m2 = small_telescope(**ALPHA)
+    assumed, _ = small_telescope()
+    order = np.arange(len(response)).reshape(2, -1).T.ravel()
+    with Stranger(night.zenoh, -response[order], variance_m2, assumed=-assumed[order]) as rtc:
+        wait_for(lambda: rtc.applied, 40.0, f"a matrix applied; {night.state['alarms']}")
+        n_batches = len(rtc.residuals)
+        wait_for(lambda: len(rtc.residuals) > n_batches + 100, 10.0, "two seconds more")
+        after = np.median([value for _, value in rtc.residuals[n_batches:]])
+        assert after < 1.1 * np.median([value for _, value in rtc.residuals[:n_batches]])

@@ -3,12 +3,13 @@ import multiprocessing
 import os
 import signal
 import time
+from functools import partial
 
 import pytest
 
 from service.errors import WorkerError
 from service.runtime.crew import Crew
-from service.worker import Workbench, start_worker
+from service.worker import Workbench, run_job, start_worker
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 pytestmark = pytest.mark.timeout(60)
@@ -145,3 +146,22 @@ async def test_what_nobody_waits_for_any_more_is_not_finished(crew, hired):
         await waiting
     assert not multiprocessing.active_children()
     assert await crew.call(process_id) == hired[1].pid
+
+
+def remembering(bench: Workbench) -> None:
+    bench.told = "first"
+
+
+def remembered(bench: Workbench) -> str | None:
+    return getattr(bench, "told", None)
+
+
+def test_what_every_worker_must_be_told_is_told_to_one_that_takes_a_dead_ones_place(crew):
+    async def jobs():
+        await crew.call(process_id)
+        crew.first = partial(run_job, remembering)
+        with pytest.raises(WorkerError):
+            await crew.call(killed)
+        return await crew.call(remembered)
+
+    assert asyncio.run(jobs()) == "first"

@@ -1,0 +1,75 @@
+"""The container image: what the build is let see is what the Dockerfile copies and pip needs."""
+
+import re
+import shlex
+import tomllib
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+from service.__main__ import _OTHER_PROGRAMS
+
+ROOT = Path(__file__).parents[2]
+
+
+def as_regex(pattern: str) -> re.Pattern[str]:
+    """Docker's patterns: ``*`` within a name, ``**`` over any number of folders."""
+    pieces = re.split(r"(\*\*/|\*\*|\*|\?)", pattern.strip("/"))
+    meanings = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+    return re.compile("".join(meanings.get(piece, re.escape(piece)) for piece in pieces))
+
+
+def let_through(path: str, ignore: str) -> bool:
+    """As Docker decides: the last line that matches the path, or a folder above it, counts."""
+    above = [str(p) for p in PurePosixPath(path).parents][:-1]
+    ignored = False
+    for line in ignore.split():
+        keeps, pattern = line.startswith("!"), as_regex(line.lstrip("!"))
+        if any(pattern.fullmatch(name) for name in (path, *above)):
+            ignored = not keeps
+    return not ignored
+
+
+def copied() -> list[str]:
+    """Return the sources of every COPY."""
+    lines = (ROOT / "Dockerfile").read_text().replace("\\\n", " ").splitlines()
+    words = [shlex.split(line)[1:] for line in lines if line.startswith("COPY ")]
+    return [source for line in words for source in line[:-1] if not source.startswith("--")]
+
+
+IGNORE = (ROOT / ".dockerignore").read_text()
+
+
+@pytest.mark.parametrize("source", copied())
+def test_what_the_dockerfile_copies_is_let_into_the_build(source):
+    assert (ROOT / source).exists()
+    assert let_through(source, IGNORE), f".dockerignore leaves out {source}"
+
+
+def test_every_file_of_the_packages_is_copied():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    packages = project["tool"]["setuptools"]["packages"]["find"]["include"]
+    files = [
+        path.relative_to(ROOT).as_posix()
+        for package in packages
+        for path in (ROOT / package.rstrip("*")).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    ]
+    assert len(files) > 200
+    assert [name for name in files if not let_through(name, IGNORE)] == []
+    assert {name.split("/")[0] for name in files} <= set(copied())
+
+
+def test_what_pip_reads_besides_is_copied():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert {"pyproject.toml", project["readme"], *project["license-files"]} <= set(copied())
+
+
+@pytest.mark.parametrize("module", _OTHER_PROGRAMS.values())
+def test_every_program_that_pyrcal_can_become_is_in_the_image(module):
+    assert module.split(".")[0] in copied()
+
+
+@pytest.mark.parametrize("path", [".git/config", "var/index.sqlite", "service/__pycache__/a.pyc"])
+def test_nothing_else_is_sent_to_the_build(path):
+    assert not let_through(path, IGNORE)

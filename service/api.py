@@ -20,6 +20,7 @@ from service.routes import (
     reading,
 )
 from service.routes import fits as fits_of_uploads
+from service.routes.admission import Admission, Hosts
 from service.routes.fits import Fits
 from service.routes.service import Link, Service, Snapshot
 
@@ -34,8 +35,12 @@ finite is `null`. Errors are `application/problem+json` (RFC 9457).
 """
 
 
-def create_app(service: Service, fits: Fits | None = None) -> FastAPI:
+def create_app(
+    service: Service, fits: Fits | None = None, *, hosts: Hosts | None = None
+) -> FastAPI:
     """Return the REST application of a service, and of a desk for fits where there is one.
+
+    It answers to ``hosts``, loopback alone where they are not given, and to no other name.
 
     Swagger and ReDoc pages are left out: they load their scripts from the internet, which an
     observatory's network need not reach. ``/openapi.json`` is there.
@@ -47,7 +52,9 @@ def create_app(service: Service, fits: Fits | None = None) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         generate_unique_id_function=_operation_id,
+        responses=problems.EVERYWHERE,
     )
+    app.add_middleware(Admission, hosts=hosts or Hosts())
     app.state.service = service
     problems.install(app)
     for routes in (

@@ -10,7 +10,8 @@
     ├── LinkError            the zenoh session cannot be opened or an RTC does not answer
     ├── CommandError         an operator's request that cannot be carried out now
     │   ├── UnknownIdError   a reconstructor, session or product nobody has heard of
-    │   ├── TooLargeError    an upload beyond the limit
+    │   ├── TooLargeError    a request or an upload beyond the limit
+    │   ├── TooSlowError     a request or an upload that does not come in time
     │   └── BusyError        too much under way already: try again later
     ├── WorkerError          the worker process died; the job is lost, the service is not
     └── ArchiveError         a product that cannot be written, read, or fails its checksum
@@ -54,7 +55,11 @@ class UnknownIdError(CommandError):
 
 
 class TooLargeError(CommandError):
-    """An upload is larger than this service takes."""
+    """A request or an upload is larger than this service takes."""
+
+
+class TooSlowError(CommandError):
+    """A request or an upload does not come in time."""
 
 
 class BusyError(CommandError):

@@ -22,7 +22,7 @@ from typing_extensions import override
 
 from service.api import create_app
 from service.archive import Archive
-from service.config import Settings, load_instrument, load_settings
+from service.config import Settings, load_instrument, load_settings, packaged_instrument
 from service.config.policy import policy_of
 from service.errors import ConfigurationError, PyrcalError
 from service.fits.upload import UploadFitter
@@ -30,6 +30,7 @@ from service.model.instrument import Instrument
 from service.reactions.measurements import MEASUREMENTS_KEPT
 from service.reactions.noisy import NOISY_KEPT
 from service.reactions.shelf import restored
+from service.routes.admission import Hosts, server_config
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds, Publishing
@@ -119,19 +120,18 @@ async def _serve(settings: Settings, instrument: Instrument) -> int:
             bridge.expect(instrument.basis_id, instrument.config_id)
             supervisor = _supervisor(settings, instrument, system, bridge, crew, archive)
             desk = _desk(settings, instrument)
-            return await _until_stopped(supervisor, desk, listener)
+            hosts = Hosts(bound=settings.api.host, allowed=settings.api.allowed_hosts)
+            return await _until_stopped(supervisor, desk, listener, hosts)
     finally:
         crew.dismiss()
 
 
-async def _until_stopped(supervisor: Supervisor, desk: FitDesk, listener: socket.socket) -> int:
+async def _until_stopped(
+    supervisor: Supervisor, desk: FitDesk, listener: socket.socket, hosts: Hosts
+) -> int:
     desk.open()
-    config = uvicorn.Config(
-        create_app(supervisor, desk),
-        log_config=None,
-        access_log=False,
-        timeout_graceful_shutdown=REQUESTS_WITHIN_S,
-    )
+    app = create_app(supervisor, desk, hosts=hosts)
+    config = server_config(app, timeout_graceful_shutdown=REQUESTS_WITHIN_S)
     server = _Server(config)
     ending = _Ending()
     host, port = listener.getsockname()[:2]
@@ -272,6 +272,7 @@ def _desk(settings: Settings, instrument: Instrument) -> FitDesk:
         fit=UploadFitter(
             own=instrument,
             load_instrument=load_instrument,
+            packaged_instrument=packaged_instrument,
             most_bytes=most_bytes,
             threads=settings.compute.threads,
         ),
@@ -280,6 +281,7 @@ def _desk(settings: Settings, instrument: Instrument) -> FitDesk:
             waiting=settings.fits.waiting,
             seconds=settings.fits.time_limit_s,
             nice=settings.compute.nice,
+            memory_mb=settings.fits.memory_limit_mb,
         ),
         clock_ns=time.time_ns,
     )

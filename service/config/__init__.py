@@ -4,7 +4,7 @@ Both are TOML, read strictly: an unknown key, a wrong type or a number out of ra
 ``ConfigurationError`` of one line that names the file and the key.
 """
 
-from service.config.instrument import load_instrument
+from service.config.instrument import load_instrument, packaged_instrument
 from service.config.settings import Settings, load_settings
 
-__all__ = ["Settings", "load_instrument", "load_settings"]
+__all__ = ["Settings", "load_instrument", "load_settings", "packaged_instrument"]

@@ -61,15 +61,25 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     path = Path(name_or_path)
     if path.suffix == ".toml" or path.name != str(name_or_path):
         return _read(path)
+    return packaged_instrument(str(name_or_path))
+
+
+def packaged_instrument(name: str) -> Instrument:
+    """Return the instrument of a packaged name.
+
+    Raises
+    ------
+    ConfigurationError
+        If none has this name.
+    """
     packaged = resources.files("service") / "instruments"
-    resource = packaged / f"{name_or_path}.toml"
-    if not resource.is_file():
-        names = sorted(Path(r.name).stem for r in packaged.iterdir() if r.name.endswith(".toml"))
+    known = {Path(r.name).stem: r for r in packaged.iterdir() if r.name.endswith(".toml")}
+    if name not in known:
         raise ConfigurationError(
-            f"instrument {name_or_path}: neither a packaged name ({', '.join(names)}) "
+            f"instrument {name}: neither a packaged name ({', '.join(sorted(known))}) "
             "nor the path of a .toml file"
         )
-    with resources.as_file(resource) as path:
+    with resources.as_file(known[name]) as path:
         return _read(path)
 
 

@@ -61,6 +61,10 @@ class ApiTable(Table):
     port: int = Field(default=8080, ge=0, le=65535)
     """TCP port; 0: any free one."""
 
+    allowed_hosts: Tuple[str] = ()
+    """Names under which it may be asked for besides loopback and ``host``, without a port: that of
+    the machine where ``host`` is all of its interfaces, or of a proxy before it."""
+
 
 class DitherTable(Table):
     """``[dither]``: the small signal that tells the truth."""
@@ -253,6 +257,9 @@ class FitsTable(Table):
 
     time_limit_s: Positive = 600.0
     """A fit that takes longer is stopped."""
+
+    memory_limit_mb: int = Field(default=4000, ge=500, le=1_000_000)
+    """A fit whose process needs more is stopped, megabytes."""
 
 
 class Settings(Table):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +20,12 @@ from service.errors import MatrixError
 MOST_BYTES = 4 << 30
 """Largest array that is read: a cube of 400 full frames of 512 x 512 is a tenth of it."""
 
+ROOMY_BYTES = 64 << 20
+"""An array that takes no more in memory is read, however few bytes the file has of it."""
+
+MOST_SWELLING = 1000
+"""Bytes in memory for each in the file, of larger ones: gzip does not compress noise any better."""
+
 _FITS_BEGINS = (b"SIMPLE  =", b"\x1f\x8b")
 """First bytes of a FITS file, and of anything compressed with gzip, which FITS files often are."""
 
@@ -35,8 +42,14 @@ class StoredArray:
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    read: Callable[[], NDArray[Any]]
-    """Returns it as the file has it."""
+    stored_bytes: int
+    """What the file holds of it, compressed."""
+
+    load: Callable[[], NDArray[Any]]
+    """Returns it as the file has it, unchecked."""
+
+    at_once: tuple[int, ...] = ()
+    """Shape of what is unpacked at once, which may exceed ``shape``; empty: all of it."""
 
     def numbers(self) -> NDArray[np.float64]:
         """Return it as native float64, whatever its byte order.
@@ -48,14 +61,25 @@ class StoredArray:
         """
         if self.dtype.kind not in "iuf":
             raise MatrixError(f"{self.where}: found type {self.dtype}, expected real numbers")
-        size = int(np.prod(self.shape, dtype=np.int64)) * max(self.dtype.itemsize, 8)
-        if size > MOST_BYTES:
+        return np.asarray(self.read(), dtype=np.float64)
+
+    def read(self) -> NDArray[Any]:
+        """Return it as the file has it, unless it could not be that large.
+
+        Raises
+        ------
+        MatrixError
+            If it is too large, claims more than the file can hold, or the file is damaged there.
+        """
+        n_bytes = max(math.prod(self.shape), math.prod(self.at_once)) * max(self.dtype.itemsize, 8)
+        most = min(MOST_BYTES, max(ROOMY_BYTES, MOST_SWELLING * self.stored_bytes))
+        if n_bytes > most:
             raise MatrixError(
-                f"{self.where}: found shape {self.shape}, {size / 1e9:.1f} GB in memory; "
-                f"expected at most {MOST_BYTES / 1e9:.1f} GB"
+                f"{self.where}: found shape {self.shape}, {n_bytes / 1e9:.1f} GB in memory, of "
+                f"{self.stored_bytes} bytes in the file; expected at most {most / 1e9:.2g} GB"
             )
         try:
-            return np.asarray(self.read(), dtype=np.float64)
+            return self.load()
         except (OSError, RuntimeError, TypeError, ValueError) as error:
             raise MatrixError(f"{self.where}: damaged: {error}") from error
 
@@ -139,8 +163,11 @@ def _hdf5(path: Path) -> Iterator[Container]:
     arrays: dict[str, StoredArray] = {}
 
     def find(name: str) -> StoredArray | None:
-        item = file.get(name.strip("/") or "/")
-        return _dataset(item, f"{path}:/{name.strip('/')}")
+        where = f"{path}:/{name.strip('/')}"
+        try:
+            return _dataset(file.get(name.strip("/") or "/"), where)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise MatrixError(f"{where}: a link that leads nowhere: {error}") from error
 
     def visit(name: str, item: object) -> None:
         array = _dataset(item, f"{path}:/{name}")
@@ -160,8 +187,64 @@ def _dataset(item: object, where: str) -> StoredArray | None:
     if not isinstance(item, h5py.Dataset) or item.shape is None:
         return None
     return StoredArray(
-        where=where, shape=item.shape, dtype=item.dtype, read=partial(item.__getitem__, ())
+        where=where,
+        shape=item.shape,
+        dtype=item.dtype,
+        stored_bytes=item.id.get_storage_size(),
+        load=partial(item.__getitem__, ()),
+        at_once=item.chunks or (),
     )
+
+
+def check_sealed(path: Path) -> None:
+    """Refuse an HDF5 file that reaches beyond itself; any other file has no way to.
+
+    Raises
+    ------
+    MatrixError
+        If it holds a link to another file, a virtual dataset, or one whose data lie outside; or is
+        damaged.
+    """
+    if not h5py.is_hdf5(path):
+        return
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            seen = {h5py.h5o.get_info(file.id).addr}
+            groups = [file["/"]]
+            while groups:
+                groups += _sealed(groups.pop(), path, seen)
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error
+
+
+def _sealed(group: h5py.Group, path: Path, seen: set[int]) -> list[h5py.Group]:
+    """Check what is in a group, following no link; return the groups not ``seen`` yet."""
+    found = []
+    for name in group:
+        link = group.get(name, getlink=True)
+        item = group[name] if isinstance(link, h5py.HardLink) else link
+        beyond = _beyond(item)
+        if beyond is not None:
+            where = f"{path}:{group.name.rstrip('/')}/{name}"
+            raise MatrixError(f"{where}: found {beyond}, expected all data in the file itself")
+        if isinstance(item, h5py.Group):
+            address = h5py.h5o.get_info(item.id).addr
+            if address not in seen:
+                seen.add(address)
+                found.append(item)
+    return found
+
+
+def _beyond(item: object) -> str | None:
+    """Return how an object, or a link, reaches beyond its file; None: it does not."""
+    if isinstance(item, h5py.ExternalLink):
+        return f"a link to another file, {item.filename}"
+    if isinstance(item, h5py.Dataset) and item.is_virtual:
+        files = sorted({source.file_name for source in item.virtual_sources()})
+        return f"a virtual dataset of other files, {', '.join(files)}"
+    if isinstance(item, h5py.Dataset) and item.external:
+        return f"data outside, in {item.external[0][0]}"
+    return None
 
 
 @contextmanager
@@ -185,7 +268,7 @@ def _fits(path: Path) -> Iterator[Container]:
         for number, hdu in enumerate(file):
             if hdu.is_image and hdu.shape:
                 name = str(hdu.header.get("EXTNAME", number))
-                array = _image(hdu, f"{path}[{name}]")
+                array = _image(hdu, f"{path}[{name}]", path.stat().st_size)
                 arrays[str(number) if name in arrays else name] = array
                 known.setdefault(name.lower(), array)
                 known[str(number)] = array
@@ -198,10 +281,11 @@ def _fits(path: Path) -> Iterator[Container]:
         )
 
 
-def _image(hdu: _ImageHdu, where: str) -> StoredArray:
+def _image(hdu: _ImageHdu, where: str, file_bytes: int) -> StoredArray:
     return StoredArray(
         where=where,
         shape=hdu.shape,
         dtype=np.dtype(f"f{8 if abs(hdu.header['BITPIX']) > 32 else 4}"),
-        read=lambda: hdu.data,
+        stored_bytes=file_bytes,
+        load=lambda: hdu.data,
     )

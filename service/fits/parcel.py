@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from service.errors import ConfigurationError, MatrixError
+from service.fits.container import check_sealed
 
 MOST_FILES = 32
 
@@ -49,17 +50,21 @@ def opened_parcel(upload: Path, folder: Path, reference: str | None, most_bytes:
     ------
     MatrixError, ConfigurationError
         If an archive is damaged, too large, has other folders than one, or leaves open which file
-        is what; or if its instrument file refers to files that are not in it.
+        is what; if its instrument file refers to files that are not in it; or if an HDF5 file
+        reaches beyond itself.
     """
     with upload.open("rb") as file:
         packed = file.read(4) == _ZIP_BEGINS
     if not packed:
+        check_sealed(upload)
         return Parcel(reference=upload, instrument=None)
     try:
         with zipfile.ZipFile(upload) as archive:
             names = _unpack(archive, folder, most_bytes)
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
         raise MatrixError(f"upload: damaged zip archive: {error}") from error
+    for name in names:
+        check_sealed(folder / name)
     instrument = folder / _only_toml(names)
     referred = set(_referred(instrument))
     for name in sorted(referred - set(names)):
@@ -118,8 +123,16 @@ def _referred(instrument: Path) -> Iterator[str]:
         tables = tomllib.loads(instrument.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError):
         return  # whoever loads it says what is wrong
-    for table in tables.values():
-        for value in table.values() if isinstance(table, dict) else ():
-            match = _REFERENCE.fullmatch(value) if isinstance(value, str) else None
-            if match is not None:
-                yield match[1] or match[2]
+    for text in _texts(tables):
+        match = _REFERENCE.fullmatch(text)
+        if match is not None:
+            yield match[1] or match[2]
+
+
+def _texts(value: object) -> Iterator[str]:
+    """Yield every text in a TOML file's values, however deep."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _texts(part)

@@ -22,8 +22,11 @@ class UploadFitter:
     own: Instrument
     """The service's own instrument."""
 
-    load_instrument: Callable[[str | Path], Instrument]
-    """Reads another one: packaged, or a file."""
+    load_instrument: Callable[[Path], Instrument]
+    """Reads that of an upload."""
+
+    packaged_instrument: Callable[[str], Instrument]
+    """Reads a packaged one; a name is never a file of this machine."""
 
     most_bytes: int
     """Of the files of an archive together."""
@@ -44,7 +47,7 @@ class UploadFitter:
         try:
             parcel = opened_parcel(folder / UPLOAD, unpacked, asked.reference, self.most_bytes)
             if asked.instrument is not None:
-                instrument = self.load_instrument(asked.instrument)
+                instrument = self.packaged_instrument(asked.instrument)
             elif parcel.instrument is not None:
                 instrument = self.load_instrument(parcel.instrument)
             else:

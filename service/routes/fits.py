@@ -40,6 +40,8 @@ class Fits(Protocol):
         ------
         TooLargeError
             If it is beyond the limit; before it is read where its length ``n_bytes`` is told.
+        TooSlowError
+            If it stands still, or trickles.
         BusyError
             If too many wait already.
         MatrixError
@@ -98,6 +100,15 @@ class FitParameters(BaseModel):
 
     measurement: str | None = Field(default=None, min_length=1, max_length=_TEXT)
     """Id of a matrix the RTC has measured for this service; there is no body then."""
+
+    @field_validator("instrument")
+    @classmethod
+    def _instrument_is_packaged(cls, name: str | None) -> str | None:
+        if name is not None and name.endswith(".toml"):
+            raise ValueError(
+                f"found {name!r}, expected a packaged name; a file of your own goes into the upload"
+            )
+        return name
 
     @field_validator("modes")
     @classmethod
@@ -223,8 +234,8 @@ _UPLOAD: dict[str, Any] = {
     openapi_extra=_UPLOAD,
     responses={
         **UNKNOWN,
-        413: problem_response("The upload is larger than this service takes"),
         503: problem_response("Too many fits wait already"),
+        507: problem_response("The disk refuses"),
     },
 )
 async def fit(

@@ -21,6 +21,7 @@ from service.errors import (
     PyrcalError,
     StorageError,
     TooLargeError,
+    TooSlowError,
     UnknownIdError,
 )
 
@@ -29,6 +30,7 @@ MEDIA_TYPE = "application/problem+json"
 _OF_ERROR: dict[type[PyrcalError], tuple[HTTPStatus, str]] = {
     UnknownIdError: (HTTPStatus.NOT_FOUND, "unknown-id"),
     TooLargeError: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large"),
+    TooSlowError: (HTTPStatus.REQUEST_TIMEOUT, "too-slow"),
     BusyError: (HTTPStatus.SERVICE_UNAVAILABLE, "busy"),
     MatrixError: (HTTPStatus.UNPROCESSABLE_ENTITY, "unusable-matrix"),
     CommandError: (HTTPStatus.CONFLICT, "not-now"),
@@ -37,6 +39,9 @@ _OF_ERROR: dict[type[PyrcalError], tuple[HTTPStatus, str]] = {
     ArchiveError: (HTTPStatus.INTERNAL_SERVER_ERROR, "archive"),
     PyrcalError: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal"),
 }
+
+RETRY_S = 30
+"""When to come again where too much is under way, seconds: a fit takes that long."""
 
 
 class Problem(BaseModel):
@@ -59,6 +64,17 @@ class Problem(BaseModel):
     instance: str
     """Path of the request."""
 
+    @classmethod
+    def of(cls, status: HTTPStatus, kind: str, detail: str, instance: str) -> Problem:
+        """Return a problem of this ``kind``."""
+        return cls(
+            type=f"urn:pyrcal:problem:{kind}",
+            title=status.phrase,
+            status=status,
+            detail=detail,
+            instance=instance,
+        )
+
 
 def problem_response(description: str) -> dict[str, Any]:
     """Return the OpenAPI description of an error response."""
@@ -72,6 +88,12 @@ Responses = dict[int | str, dict[str, Any]]
 """OpenAPI descriptions by HTTP status."""
 
 INVALID: Responses = {422: problem_response("A parameter or a field of the body cannot be used")}
+EVERYWHERE: Responses = {
+    403: problem_response("Sent by a page from elsewhere: its Origin is not the Host it asks"),
+    408: problem_response("The request did not come in time"),
+    413: problem_response("The body is larger than this service takes"),
+    421: problem_response("Asked for under a name this service does not know"),
+}
 UNKNOWN: Responses = {404: problem_response("No such thing")}
 COMMAND: Responses = {
     409: problem_response("Cannot be carried out in the present state"),
@@ -88,13 +110,7 @@ def problem(
     headers: Mapping[str, str] | None = None,
 ) -> JSONResponse:
     """Return a problem of this ``kind``."""
-    body = Problem(
-        type=f"urn:pyrcal:problem:{kind}",
-        title=status.phrase,
-        status=status,
-        detail=detail,
-        instance=request.url.path,
-    )
+    body = Problem.of(status, kind, detail, request.url.path)
     return JSONResponse(
         body.model_dump(), status_code=status, headers=headers, media_type=MEDIA_TYPE
     )
@@ -108,9 +124,15 @@ def install(app: FastAPI) -> None:
     app.exception_handler(Exception)(_fault)
 
 
-async def _known(request: Request, error: PyrcalError) -> JSONResponse:
+def known_problem(request: Request, error: PyrcalError) -> JSONResponse:
+    """Return the problem that an error of this service is."""
     status, kind = next(_OF_ERROR[cls] for cls in type(error).__mro__ if cls in _OF_ERROR)
-    return problem(request, status, kind, str(error))
+    later = {"Retry-After": str(RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else None
+    return problem(request, status, kind, str(error), later)
+
+
+async def _known(request: Request, error: PyrcalError) -> JSONResponse:
+    return known_problem(request, error)
 
 
 async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:

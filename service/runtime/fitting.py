@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import itertools
 import shutil
+import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,9 @@ from service.errors import (
     BusyError,
     MatrixError,
     PyrcalError,
+    StorageError,
     TooLargeError,
+    TooSlowError,
     UnknownIdError,
 )
 from service.fits.jobs import UNFINISHED, UPLOAD, FitAsked, FitJob, FitState
@@ -32,6 +35,12 @@ FITS_KEPT = 50
 
 STALL_S = 30.0
 """Longest time an upload may stand still."""
+
+PATIENCE_S = 30.0
+"""How far an upload may lag behind the slowest pace, seconds."""
+
+SLOWEST_BYTES_S = 200_000
+"""Least pace of an upload, bytes a second: one that trickles would hold a place for ever."""
 
 _BLOCK = 1 << 20
 """Bytes written to the disk at once."""
@@ -55,6 +64,9 @@ class FitLimits:
 
     nice: int
     """Of its process: the telescope goes first."""
+
+    memory_mb: int
+    """That its process may allocate."""
 
 
 class FitDesk:
@@ -133,7 +145,7 @@ class FitDesk:
                 await self._receive(job.id, file, body)
         except OSError as error:
             await self._forget(job.id)
-            raise ArchiveError(f"fit: the upload cannot be kept: {error.strerror}") from error
+            raise StorageError(f"fit: the upload cannot be kept: {error.strerror}") from error
         except BaseException:
             await self._forget(job.id)
             raise
@@ -173,7 +185,7 @@ class FitDesk:
             digest.update(written)
             await asyncio.to_thread(file.write, written)
 
-        async for chunk in _unstalled(body):
+        async for chunk in _in_time(body):
             if n_bytes == 0 and chunk:
                 _check_kind(chunk)
             n_bytes += len(chunk)
@@ -193,7 +205,10 @@ class FitDesk:
         try:
             async with self._turn:
                 self._put(replace(self._jobs[fit_id], state=FitState.RUNNING))
-                found = await run_apart(work, nice=self._limits.nice, limit_s=self._limits.seconds)
+                limits = self._limits
+                found = await run_apart(
+                    work, nice=limits.nice, limit_s=limits.seconds, memory_mb=limits.memory_mb
+                )
             self._put(replace(self._jobs[fit_id], state=FitState.DONE, document=found))
             self._log.info("fit.done", id=fit_id, verdict=found["verdict"])
         except PyrcalError as error:
@@ -215,16 +230,24 @@ class FitDesk:
         await asyncio.to_thread(shutil.rmtree, self._folder / fit_id, ignore_errors=True)
 
 
-async def _unstalled(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
-    """Yield the chunks of a body for as long as they keep coming."""
+async def _in_time(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """Yield the chunks of a body for as long as they keep coming, and fast enough."""
+    began_s, n_bytes = time.monotonic(), 0
     while True:
+        left_s = PATIENCE_S + n_bytes / SLOWEST_BYTES_S - (time.monotonic() - began_s)
         try:
-            async with asyncio.timeout(STALL_S):
+            async with asyncio.timeout(min(left_s, STALL_S)):
                 chunk = await anext(body)
         except StopAsyncIteration:
             return
         except TimeoutError as error:
-            raise MatrixError(f"upload: nothing came for {STALL_S:.0f} s") from error
+            if left_s > STALL_S:
+                raise TooSlowError(f"upload: nothing came for {STALL_S:g} s") from error
+            raise TooSlowError(
+                f"upload: found {n_bytes} bytes in {time.monotonic() - began_s:.0f} s, expected at "
+                f"least {SLOWEST_BYTES_S / 1e6:g} MB a second"
+            ) from error
+        n_bytes += len(chunk)
         yield chunk
 
 

@@ -59,7 +59,7 @@ class FakeService:
 @pytest.fixture
 async def client(desk):
     transport = httpx.ASGITransport(create_app(FakeService(), desk), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
         yield client
 
 
@@ -114,6 +114,7 @@ async def test_without_parameters_the_defaults_of_the_command_hold(client, desk)
         {"start": "1,2,3"},
         {"instrument": "/etc/passwd"},
         {"instrument": "a/b.toml"},
+        {"instrument": "b.toml"},
         {"datset": "D"},
     ],
 )
@@ -201,5 +202,5 @@ async def test_the_document_is_described(client):
 
 async def test_without_a_desk_there_are_no_fits():
     transport = httpx.ASGITransport(create_app(object()))
-    async with httpx.AsyncClient(transport=transport, base_url="http://pyrcal") as client:
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
         assert (await client.get("/v1/fits")).status_code == 404

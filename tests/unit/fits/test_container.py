@@ -7,7 +7,7 @@ import pytest
 
 from service.errors import MatrixError
 from service.fits import container
-from service.fits.container import opened
+from service.fits.container import check_sealed, opened
 
 VALUES = np.arange(6.0).reshape(2, 3)
 
@@ -140,3 +140,111 @@ def test_a_truncated_fits_file_is_damaged(fits_file, tmp_path):
 def test_without_astropy_it_says_what_to_install(fits_file, monkeypatch):
     monkeypatch.setitem(sys.modules, "astropy.io", None)
     assert "extra 'fits'" in refused(fits_file, "0")
+
+
+# --- files made to deceive
+
+
+def test_a_link_to_itself_is_named(tmp_path):
+    path = tmp_path / "loop.h5"
+    with h5py.File(path, "w") as file:
+        file["interaction_matrix"] = h5py.SoftLink("/interaction_matrix")
+        file["to"] = h5py.SoftLink("/fro")
+        file["fro"] = h5py.SoftLink("/to")
+    for name in ("interaction_matrix", "to"):
+        assert f"/{name}: a link that leads nowhere" in refused(path, name)
+
+
+@pytest.mark.parametrize("kind", ["never written", "compressed", "one chunk"])
+def test_a_small_file_that_claims_a_large_array_is_refused_before_it_is_read(tmp_path, kind):
+    path = tmp_path / "claim.h5"
+    with h5py.File(path, "w") as file:
+        if kind == "never written":
+            file.create_dataset("D", (22_000, 24_000), "f8", chunks=(22, 24_000))
+        elif kind == "compressed":
+            made = file.create_dataset(
+                "D", (40_000, 1_000), "f8", chunks=(40_000, 100), compression=9
+            )
+            made[:, :100] = 0.0
+        else:
+            made = file.create_dataset(
+                "D", (2, 3), "f8", chunks=(20_000, 20_000), maxshape=(None, None), compression=1
+            )
+    assert path.stat().st_size < 100_000
+    text = refused(path, "D")
+    assert "bytes in the file" in text
+    assert "GB in memory" in text or "MB in memory" in text
+
+
+def test_a_fits_file_that_claims_more_than_it_holds_is_refused(tmp_path):
+    fits = pytest.importorskip("astropy.io.fits")
+    path = tmp_path / "claim.fits"
+    fits.writeto(path, np.zeros((10, 10), np.float32))
+    content = path.read_bytes()
+    for axis in (1, 2):
+        old = f"NAXIS{axis}  =                   10".encode()
+        content = content.replace(old, f"NAXIS{axis}  =                22000".encode())
+    packed = tmp_path / "claim.fits.gz"
+    packed.write_bytes(gzip.compress(content))
+    path.write_bytes(content)
+    for claim in (path, packed):
+        with pytest.raises(MatrixError, match=r"damaged|bytes in the file"), opened(claim) as file:
+            file.find("0").numbers()
+
+
+def test_compressed_measurements_are_read_as_before(tmp_path):
+    path = tmp_path / "real.h5"
+    values = np.random.default_rng(1).normal(size=(300, 400))
+    values[:, 100:] = 0.0
+    with h5py.File(path, "w") as file:
+        file.create_dataset("D", data=values, chunks=True, compression=9, shuffle=True)
+    assert np.array_equal(numbers(path, "D"), values)
+
+
+SECRET = "/srv/secret.h5"
+
+
+def made_to_reach_out(file, kind):
+    if kind == "external link":
+        file["deep/inside"] = h5py.ExternalLink(SECRET, "/D")
+    elif kind == "data outside":
+        file.create_dataset("deep/inside", (2, 3), "f8", external=[("/etc/hostname", 0, 48)])
+    elif kind == "virtual":
+        layout = h5py.VirtualLayout((2, 3), "f8")
+        layout[:] = h5py.VirtualSource(SECRET, "D", (2, 3))
+        file.create_virtual_dataset("deep/inside", layout)
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("external link", f"a link to another file, {SECRET}"),
+        ("data outside", "data outside, in /etc/hostname"),
+        ("virtual", f"a virtual dataset of other files, {SECRET}"),
+    ],
+)
+def test_a_file_that_reaches_beyond_itself_is_named(tmp_path, kind, said):
+    path = tmp_path / "reaching.h5"
+    with h5py.File(path, "w") as file:
+        file["D"] = VALUES
+        made_to_reach_out(file, kind)
+    with pytest.raises(MatrixError) as error:
+        check_sealed(path)
+    assert "/deep/inside: found " + said in str(error.value)
+    assert "expected all data in the file itself" in str(error.value)
+
+
+def test_links_within_a_file_and_groups_that_hold_themselves_reach_nowhere(tmp_path):
+    path = tmp_path / "sealed.h5"
+    with h5py.File(path, "w") as file:
+        file["measured/D"] = VALUES
+        file["again"] = h5py.SoftLink("/measured/D")
+        file["measured/up"] = file["/"]
+        file["self"] = h5py.SoftLink("/self")
+    check_sealed(path)
+
+
+def test_what_is_no_hdf5_file_has_no_links(tmp_path):
+    path = tmp_path / "some.fits"
+    path.write_bytes(b"SIMPLE  = nothing more")
+    check_sealed(path)

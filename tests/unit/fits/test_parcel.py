@@ -1,6 +1,7 @@
 import io
 import zipfile
 
+import h5py
 import pytest
 
 from service.errors import ConfigurationError, MatrixError
@@ -33,7 +34,8 @@ def refused(path, folder, reference=None, most=1_000_000):
 
 def test_a_file_alone_is_the_measured_one(tmp_path, unpacked):
     path = tmp_path / "upload"
-    path.write_bytes(b"\x89HDF\r\n\x1a\n")
+    with h5py.File(path, "w") as file:
+        file["D"] = [1.0]
     parcel = opened_parcel(path, unpacked, None, 100)
     assert parcel.reference == path
     assert parcel.instrument is None
@@ -107,3 +109,35 @@ def test_a_locked_archive_is_refused(tmp_path, unpacked):
     path = tmp_path / "upload"
     path.write_bytes(bytes(content))
     assert "encrypted" in refused(path, unpacked)
+
+
+def reaching(path):
+    with h5py.File(path, "w") as file:
+        file["mask"] = h5py.ExternalLink("/srv/secret.h5", "/mask")
+    return path.read_bytes()
+
+
+def test_a_matrix_that_is_a_link_to_the_servers_own_files_is_refused(tmp_path, unpacked):
+    path = tmp_path / "upload"
+    reaching(path)
+    assert "/mask: found a link to another file, /srv/secret.h5" in refused(path, unpacked)
+
+
+def test_so_is_a_mask_of_an_archive(tmp_path, unpacked):
+    mask = reaching(tmp_path / "made.h5")
+    path = zipped(tmp_path, my_dot_toml=TOML, mask_dot_h5=mask, modes_dot_fits="c", im_dot_h5="m")
+    text = refused(path, unpacked)
+    assert "mask.h5:/mask: found a link to another file" in text
+
+
+@pytest.mark.parametrize(
+    "toml",
+    [
+        '[mirror]\nmodes = ["/srv/secret.h5:/modes"]\n',
+        '[mirror.more]\nmodes = "/srv/secret.h5:/modes"\n',
+        'modes = "../../secret.h5:/modes"\n',
+    ],
+)
+def test_a_reference_is_found_wherever_it_stands_in_the_instrument_file(tmp_path, unpacked, toml):
+    path = zipped(tmp_path, a_dot_toml=toml, b_dot_h5="b")
+    assert "secret.h5" in refused(path, unpacked)

@@ -2,11 +2,12 @@
 
 import pickle
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from service.config import load_instrument
+from service.config import load_instrument, packaged_instrument
 from service.errors import MatrixError
 from service.fits.jobs import UPLOAD, FitAsked
 from service.fits.upload import UploadFitter
@@ -18,7 +19,13 @@ ASKED = FitAsked(options=FitOptions(modes=np.arange(15)))
 
 
 def fitter(own):
-    made = UploadFitter(own=own, load_instrument=load_instrument, most_bytes=1_000_000, threads=1)
+    made = UploadFitter(
+        own=own,
+        load_instrument=load_instrument,
+        packaged_instrument=packaged_instrument,
+        most_bytes=1_000_000,
+        threads=1,
+    )
     return pickle.loads(pickle.dumps(made))
 
 
@@ -57,3 +64,12 @@ def test_refusals_do_not_tell_where_the_service_keeps_its_files(tmp_path):
     with pytest.raises(MatrixError) as error:
         fitter(small_instrument())(folder, ASKED)
     assert str(error.value).startswith("other.h5: found something else")
+
+
+def test_a_file_of_the_server_is_no_packaged_instrument(tmp_path, monkeypatch):
+    monkeypatch.chdir(HERE)
+    asked = replace(ASKED, instrument="tiny.toml")
+    with pytest.raises(
+        MatrixError, match=r"instrument tiny\.toml: neither a packaged name .*flao-lbt"
+    ):
+        fitter(small_instrument())(uploaded(tmp_path, HERE / "tiny.h5"), asked)

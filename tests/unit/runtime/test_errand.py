@@ -4,6 +4,7 @@ import signal
 import time
 from functools import partial
 
+import numpy as np
 import pytest
 
 from service.errors import MatrixError, WorkerError
@@ -82,3 +83,20 @@ async def test_a_job_nobody_waits_for_is_stopped(tmp_path):
     with pytest.raises(asyncio.CancelledError):
         await waiting
     await gone(tmp_path)
+
+
+def hungry():
+    return len(np.ones(400_000_000))
+
+
+def modest():
+    return float(np.ones(1_000_000).sum())
+
+
+async def test_a_job_that_needs_more_memory_than_it_may_have_is_told_how_much_that_is():
+    with pytest.raises(WorkerError, match="needs more memory than 1500 MB"):
+        await run_apart(hungry, nice=0, limit_s=30.0, memory_mb=1500)
+
+
+async def test_a_job_within_its_memory_is_done():
+    assert await run_apart(modest, nice=0, limit_s=30.0, memory_mb=1500) == 1e6

@@ -7,7 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
+from service.errors import (
+    BusyError,
+    MatrixError,
+    StorageError,
+    TooLargeError,
+    TooSlowError,
+    UnknownIdError,
+)
 from service.fits.jobs import FitAsked, FitState
 from service.registration.options import FitOptions
 from service.runtime import fitting
@@ -15,7 +22,7 @@ from service.runtime.fitting import FitDesk, FitLimits
 
 pytestmark = pytest.mark.timeout(60)
 
-LIMITS = FitLimits(most_bytes=10_000_000, waiting=2, seconds=30.0, nice=0)
+LIMITS = FitLimits(most_bytes=10_000_000, waiting=2, seconds=30.0, nice=0, memory_mb=4000)
 ASKED = FitAsked(options=FitOptions())
 HDF5 = b"\x89HDF\r\n\x1a\n" + b"\x00" * 5_000_000
 
@@ -150,9 +157,34 @@ async def test_an_upload_that_stops_is_given_up(opened, tmp_path, monkeypatch):
         await asyncio.sleep(30.0)
 
     desk = opened()
-    with pytest.raises(MatrixError, match="nothing came"):
+    with pytest.raises(TooSlowError, match="nothing came"):
         await desk.take(ASKED, stalled(), None)
     assert not list((tmp_path / "uploads").iterdir())
+
+
+async def test_an_upload_that_trickles_does_not_hold_its_place(opened, tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "PATIENCE_S", 0.3)
+
+    async def trickling():
+        yield HDF5[:1000]
+        for _ in range(300):
+            await asyncio.sleep(0.1)
+            yield b"x"
+
+    desk = opened(waiting=1)
+    begun = time.monotonic()
+    with pytest.raises(TooSlowError, match=r"expected at least 0\.2 MB a second"):
+        await desk.take(ASKED, trickling(), None)
+    assert time.monotonic() - begun < 5.0
+    assert (await taken(desk)).state is FitState.WAITING
+
+
+async def test_a_disk_that_is_full_is_said_as_such(opened, monkeypatch):
+    desk = opened()
+    monkeypatch.setattr(fitting, "UPLOAD", "/dev/full")
+    with pytest.raises(StorageError, match="No space left on device"):
+        await taken(desk)
+    assert not desk.jobs()
 
 
 async def test_a_fit_that_takes_too_long_is_stopped(opened, tmp_path):

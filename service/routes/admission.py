@@ -1,0 +1,283 @@
+"""Who may ask over HTTP, and how much of the service's time and memory one request may take.
+
+A page in an operator's browser can send requests to this service: from another origin, or under a
+name of its own that it has had resolved to this address. Programs send no ``Origin``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import time
+from dataclasses import dataclass
+from http import HTTPStatus
+from ipaddress import ip_address
+from typing import Any
+
+import structlog
+import uvicorn
+from fastapi import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from typing_extensions import override
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from service.errors import PyrcalError, TooLargeError, TooSlowError
+from service.routes.problems import Problem, known_problem, problem
+
+MOST_BODY_BYTES = 1_000_000
+"""Of a request; uploads to be fitted have a limit of their own."""
+
+BODY_S = 20.0
+"""Longest time the body of a request may take to come, seconds."""
+
+HALF_OPEN_S = 10.0
+"""Longest time a request's head may take, seconds; also for what still comes after the answer."""
+
+MOST_CONNECTIONS = 100
+"""Beyond it the one that has waited longest, with no request at work, gives way."""
+
+RETRY_S = 5
+"""When a client that finds no place should come again, seconds."""
+
+STREAMED = ("POST", "/v1/fits")
+"""The route that reads its body itself: it goes to the disk, with its own limits."""
+
+QUIET_S = 60.0
+"""Between two lines in the log on strangers, seconds."""
+
+_HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:\d{1,5})?", re.IGNORECASE)
+
+_PORTS = {"http": ":80", "https": ":443"}
+"""What need not be written in an origin."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hosts:
+    """Names and addresses under which this service is asked for; loopback is always one."""
+
+    bound: str = "127.0.0.1"
+    """Address it listens on. With that of all interfaces any address will do, for a page that was
+    loaded from an address cannot have had it resolved to another."""
+
+    allowed: tuple[str, ...] = ()
+    """Further names, without a port."""
+
+    def know(self, host: str) -> bool:
+        """Return whether the value of a ``Host`` header is one of them."""
+        match = _HOST.fullmatch(host)
+        if match is None:
+            return False
+        name = match[1].strip("[]").rstrip(".").lower()
+        if name in {"localhost", self.bound.lower(), *(n.lower() for n in self.allowed)}:
+            return True
+        try:
+            return ip_address(name).is_loopback or ip_address(self.bound).is_unspecified
+        except ValueError:
+            return False
+
+
+class Admission:
+    """Lets requests through to the application that may be made, each with its whole body.
+
+    Parameters
+    ----------
+    app
+        The application.
+    hosts
+        Under which it is asked for.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: Hosts) -> None:
+        self._app = app
+        self._hosts = hosts
+        self._quiet_until_s = 0.0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request that may not be made; hand on every other."""
+        if scope["type"] != "http":
+            return await self._app(scope, receive, send)
+        request = Request(scope)
+        stranger = self._stranger(request)
+        if stranger is not None:
+            status, kind, detail = stranger
+            self._tell(request, kind, detail)
+            return await problem(request, status, kind, detail)(scope, receive, send)
+        if (request.method, request.url.path) != STREAMED:
+            try:
+                receive = _again(await _whole(request, receive), receive)
+            except PyrcalError as error:
+                return await known_problem(request, error)(scope, receive, send)
+        return await self._app(scope, receive, send)
+
+    def _stranger(self, request: Request) -> tuple[HTTPStatus, str, str] | None:
+        """Return why a request is not for this service, or not of its own page; None: it is."""
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        if not self._hosts.know(host):
+            detail = (
+                f"found Host {host!r:.100}, expected localhost or the address this service listens "
+                "on; name others in the settings, api.allowed_hosts"
+            )
+            return HTTPStatus.MISDIRECTED_REQUEST, "foreign-host", detail
+        if origin is not None and not _same(origin.lower(), host.lower()):
+            detail = (
+                f"found Origin {origin!r:.100}, expected none or http://{host}: a page from "
+                "elsewhere cannot use this service"
+            )
+            return HTTPStatus.FORBIDDEN, "foreign-origin", detail
+        return None
+
+    def _tell(self, request: Request, kind: str, detail: str) -> None:
+        now_s = time.monotonic()
+        if now_s >= self._quiet_until_s:
+            self._quiet_until_s = now_s + QUIET_S
+            client = None if request.client is None else request.client.host
+            structlog.get_logger().warning(
+                "api.stranger", kind=kind, client=client, path=request.url.path, text=detail
+            )
+
+
+def _same(origin: str, host: str) -> bool:
+    scheme, _, authority = origin.partition("://")
+    port = _PORTS.get(scheme)
+    return port is not None and authority.removesuffix(port) == host.removesuffix(port)
+
+
+async def _whole(request: Request, receive: Receive) -> bytes:
+    """Return the body of a request.
+
+    Raises
+    ------
+    TooLargeError, TooSlowError
+        If it is beyond the limit, or has not come in time.
+    """
+    told = request.headers.get("content-length", "")
+    if told.isdecimal() and int(told) > MOST_BODY_BYTES:
+        raise _too_large(f"{int(told) / 1e6:.1f} MB")
+    body = bytearray()
+    try:
+        async with asyncio.timeout(BODY_S):
+            while True:
+                message = await receive()
+                body += message.get("body", b"")
+                if len(body) > MOST_BODY_BYTES:
+                    raise _too_large("more")
+                if not message.get("more_body", False):
+                    return bytes(body)
+    except TimeoutError as error:
+        raise TooSlowError(f"body: {len(body)} bytes came within {BODY_S:g} s, not all") from error
+
+
+def _too_large(found: str) -> TooLargeError:
+    return TooLargeError(f"body: found {found}, expected at most {MOST_BODY_BYTES / 1e6:.1f} MB")
+
+
+def _again(body: bytes, receive: Receive) -> Receive:
+    """Return a ``receive`` that begins with this body."""
+    first = True
+
+    async def replayed() -> Message:
+        nonlocal first
+        if not first:
+            return await receive()
+        first = False
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return replayed
+
+
+def server_config(app: ASGIApp, **options: Any) -> uvicorn.Config:  # noqa: ANN401 - uvicorn's own
+    """Return how the application is served: with limits, and nothing logged for each request."""
+    return uvicorn.Config(
+        app, http=_Connection, ws="none", log_config=None, access_log=False, **options
+    )
+
+
+async def _busy(scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer instead of the application."""
+    detail = f"{MOST_CONNECTIONS} requests are at work, the most there may be: try later"
+    headers = {"Retry-After": str(RETRY_S), "Connection": "close"}
+    status = HTTPStatus.SERVICE_UNAVAILABLE
+    answer = problem(Request(scope), status, "busy", detail, headers)
+    await answer(scope, receive, send)
+
+
+class _Connection(H11Protocol):
+    """A connection that does not wait for ever, and gives way to others while it does.
+
+    uvicorn limits the time between two requests, not that of a request's head.
+    """
+
+    _since_s = 0.0
+    _ending: asyncio.TimerHandle | None = None
+
+    @override
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._since_s = self.loop.time()
+        others = [c for c in self.connections if isinstance(c, _Connection) and c is not self]
+        if len(others) >= MOST_CONNECTIONS:
+            resting = [c for c in others if c.rests]
+            if resting:
+                min(resting, key=lambda c: c._since_s).transport.abort()  # noqa: SLF001 - its own
+            else:
+                self.app = _busy
+        self._watch()
+
+    @override
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        self._watch()
+
+    @override
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._since_s = self.loop.time()
+        self._watch()
+
+    @override
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._unwatch()
+
+    @override
+    def send_400_response(self, msg: str) -> None:
+        self._answer(HTTPStatus.BAD_REQUEST, "http", msg)
+
+    @property
+    def rests(self) -> bool:
+        """Whether no request is at work."""
+        begun = self.cycle is not None  # though its type says that it always is
+        return not begun or self.cycle.response_complete
+
+    def _watch(self) -> None:
+        """Start the clock when something is awaited that no request needs, else stop it."""
+        if not self.rests or self.transport.is_closing():
+            self._unwatch()
+        elif self._ending is None:
+            self._ending = self.loop.call_later(HALF_OPEN_S, self._end)
+
+    def _unwatch(self) -> None:
+        if self._ending is not None:
+            self._ending.cancel()
+            self._ending = None
+
+    def _end(self) -> None:
+        head_came_half = self.conn.trailing_data[0] and self.cycle is None
+        if head_came_half:
+            detail = f"the head of the request did not come within {HALF_OPEN_S:g} s"
+            self._answer(HTTPStatus.REQUEST_TIMEOUT, "too-slow", detail)
+        else:
+            self.transport.abort()
+
+    def _answer(self, status: HTTPStatus, kind: str, detail: str) -> None:
+        """Answer without the application, which has not heard of a request, and close."""
+        if self.rests:
+            told = Problem.of(status, kind, detail, instance="")
+            body = json.dumps(told.model_dump()).encode()
+            head = (
+                f"HTTP/1.1 {status} {status.phrase}\r\nContent-Type: application/problem+json\r\n"
+                f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+            )
+            self.transport.write(head.encode() + body)
+        self.transport.close()

@@ -1,0 +1,277 @@
+"""Who may ask over HTTP, and how much: foreign pages, endless bodies, half-open connections."""
+
+import asyncio
+import contextlib
+import json
+import socket
+
+import httpx
+import pytest
+import uvicorn
+
+from service.api import create_app
+from service.routes import admission
+from service.routes.admission import Hosts, server_config
+from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
+
+pytestmark = pytest.mark.timeout(60)
+
+
+@pytest.fixture
+def service():
+    return FakeService(
+        Snapshot(
+            tracker=STATE, link=LINK, now_ns=100, started_ns=40, ready=True, ready_reason="ready"
+        )
+    )
+
+
+def client_of(service, hosts=None, host="127.0.0.1:8080"):
+    app = create_app(service, hosts=hosts or Hosts())
+    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+    return httpx.AsyncClient(transport=transport, base_url=f"http://{host}")
+
+
+# --- a page in the operator's browser
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "http://evil.example",
+        "http://localhost:3000",
+        "https://127.0.0.1",
+        "http://127.0.0.1:8080.evil.example",
+        "null",
+        "file://",
+        "",
+    ],
+)
+async def test_a_page_from_elsewhere_cannot_act(service, origin):
+    async with client_of(service) as client:
+        headers = {"Origin": origin, "Content-Type": "text/plain"}
+        response = await client.post("/v1/rollback", headers=headers)
+    assert_problem(response, 403, "foreign-origin", "expected none or http://127.0.0.1:8080")
+    assert service.commands == []
+
+
+@pytest.mark.parametrize("origin", ["http://127.0.0.1:8080", "HTTP://127.0.0.1:8080", None])
+async def test_its_own_page_and_programs_that_are_no_browser_can(service, origin):
+    headers = {} if origin is None else {"Origin": origin}
+    async with client_of(service) as client:
+        assert (await client.post("/v1/rollback", headers=headers)).status_code == 202
+    assert len(service.commands) == 1
+
+
+async def test_the_port_a_scheme_stands_for_need_not_be_written(service):
+    hosts = Hosts(allowed=("pyrcal.observatory.org",))
+    async with client_of(service, hosts, "pyrcal.observatory.org") as client:
+        headers = {"Origin": "https://pyrcal.observatory.org:443"}
+        assert (await client.post("/v1/rollback", headers=headers)).status_code == 202
+
+
+@pytest.mark.parametrize("method", ["GET", "POST", "OPTIONS"])
+async def test_a_name_that_was_bound_to_this_address_by_a_stranger_is_refused(service, method):
+    async with client_of(service, host="evil.example:8080") as client:
+        response = await client.request(method, "/v1/rollback")
+    assert_problem(response, 421, "foreign-host", "evil.example:8080", "api.allowed_hosts")
+    assert service.commands == []
+
+
+@pytest.mark.parametrize(
+    ("bound", "allowed", "host", "known"),
+    [
+        ("127.0.0.1", (), "localhost", True),
+        ("127.0.0.1", (), "LOCALHOST.:8080", True),
+        ("127.0.0.1", (), "127.0.0.1:1", True),
+        ("127.0.0.1", (), "[::1]:8080", True),
+        ("127.0.0.1", (), "10.0.0.5:8080", False),
+        ("127.0.0.1", (), "127.0.0.1.evil.example", False),
+        ("127.0.0.1", (), "evil@127.0.0.1", False),
+        ("127.0.0.1", (), "", False),
+        ("10.0.0.5", (), "10.0.0.5:8080", True),
+        ("10.0.0.5", (), "10.0.0.6:8080", False),
+        ("rtc-host", (), "rtc-host:8080", True),
+        ("0.0.0.0", (), "10.0.0.5:8080", True),
+        ("::", (), "[fe80::1]:8080", True),
+        ("0.0.0.0", (), "rtc-host:8080", False),
+        ("0.0.0.0", ("RTC-host",), "rtc-host:8080", True),
+        ("0.0.0.0", ("rtc-host",), "other:8080", False),
+    ],
+)
+async def test_hosts_are_loopback_the_bound_address_and_those_of_the_settings(
+    service, bound, allowed, host, known
+):
+    hosts = Hosts(bound=bound, allowed=allowed)
+    async with client_of(service, hosts) as client:
+        response = await client.get("/v1/state", headers={"Host": host})
+    assert response.status_code == (200 if known else 421)
+
+
+# --- bodies
+
+
+async def test_a_body_beyond_the_limit_is_refused_before_it_is_read(service):
+    read = 0
+
+    async def endless():
+        nonlocal read
+        while True:
+            read += 1 << 16
+            yield b" " * (1 << 16)
+
+    async with client_of(service) as client:
+        told = await client.post("/v1/refit", content=b" " * 2_000_000)
+        assert_problem(told, 413, "too-large", "2.0 MB", "at most 1.0 MB")
+        response = await client.post("/v1/refit", content=endless())
+    assert_problem(response, 413, "too-large", "at most 1.0 MB")
+    assert read < 1_300_000
+
+
+async def test_a_body_within_the_limit_reaches_the_service(service):
+    body = json.dumps({"mode": "auto"}) + " " * 900_000
+    async with client_of(service) as client:
+        headers = {"Content-Type": "application/json"}
+        assert (await client.put("/v1/mode", content=body, headers=headers)).status_code == 202
+
+
+# --- connections, over real sockets
+
+
+@contextlib.asynccontextmanager
+async def serving(service):
+    listener = socket.create_server(("127.0.0.1", 0))
+    server = uvicorn.Server(server_config(create_app(service)))
+    server.capture_signals = contextlib.nullcontext
+    task = asyncio.create_task(server.serve(sockets=[listener]))
+    while not server.started:  # noqa: ASYNC110 - uvicorn has no event for it
+        await asyncio.sleep(0.01)
+    try:
+        yield listener.getsockname()[1]
+    finally:
+        server.should_exit = True
+        await task
+
+
+async def connected(port, sent=b""):
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(sent)
+    await writer.drain()
+    return reader, writer
+
+
+def parts(answer):
+    head, _, body = answer.partition(b"\r\n\r\n")
+    return int(head.split()[1]), head.lower(), json.loads(body)
+
+
+async def state_of(port):
+    async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{port}") as client:
+        return await client.get("/v1/state")
+
+
+async def test_a_request_whose_head_does_not_come_is_ended(service, monkeypatch):
+    """Also one that sends a byte now and then."""
+    monkeypatch.setattr(admission, "HALF_OPEN_S", 0.5)
+    async with serving(service) as port:
+        silent, never = await connected(port)
+        slow, dripping = await connected(port, b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\n")
+        began = asyncio.get_running_loop().time()
+
+        async def drip():
+            with contextlib.suppress(ConnectionError):
+                while True:
+                    await asyncio.sleep(0.1)
+                    dripping.write(b"a: b\r\n")
+
+        task = asyncio.create_task(drip())
+        status, head, problem = parts(await slow.read())
+        assert await silent.read() == b""
+        assert asyncio.get_running_loop().time() - began < 2.0
+        task.cancel()
+        assert (status, problem["type"]) == (408, "urn:pyrcal:problem:too-slow")
+        assert b"application/problem+json" in head
+        for writer in (never, dripping):
+            writer.close()
+
+
+async def test_a_connection_may_rest_between_requests_as_before(service, monkeypatch):
+    monkeypatch.setattr(admission, "HALF_OPEN_S", 0.3)
+    async with serving(service) as port:
+        request = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        reader, writer = await connected(port, request)
+        for _ in range(3):
+            assert b"200 OK" in await reader.readuntil(b"\r\n\r\n")
+            await reader.readuntil(b"}")
+            await asyncio.sleep(0.2)
+            writer.write(request)
+        writer.close()
+
+
+async def test_a_body_that_does_not_come_is_ended_with_408(service, monkeypatch):
+    monkeypatch.setattr(admission, "BODY_S", 0.5)
+    monkeypatch.setattr(admission, "HALF_OPEN_S", 0.5)
+    async with serving(service) as port:
+        head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
+        reader, writer = await connected(port, head)
+        status, _, problem = parts(await asyncio.wait_for(reader.read(), 5.0))
+        assert (status, problem["status"]) == (408, 408)
+        assert "0.5 s" in problem["detail"]
+        writer.close()
+    assert service.commands == []
+
+
+async def test_a_client_that_goes_on_sending_after_its_refusal_is_let_go(service, monkeypatch):
+    monkeypatch.setattr(admission, "HALF_OPEN_S", 0.5)
+    async with serving(service) as port:
+        head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99999999\r\n\r\n"
+        reader, writer = await connected(port, head)
+        answer = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), 5.0)
+        assert b"413" in answer
+
+        async def go_on():
+            for _ in range(100):
+                writer.write(b" " * 1000)
+                await writer.drain()
+                await asyncio.sleep(0.05)
+
+        with pytest.raises(ConnectionError):
+            await go_on()
+
+
+async def test_half_open_connections_give_way_to_the_operator(service, monkeypatch):
+    monkeypatch.setattr(admission, "MOST_CONNECTIONS", 20)
+    async with serving(service) as port:
+        held = [await connected(port, b"GET / HTTP/1.1\r\n") for _ in range(60)]
+        assert (await asyncio.wait_for(state_of(port), 5.0)).status_code == 200
+        await asyncio.sleep(0.1)
+        ended = [reader for reader, _ in held if reader.at_eof() or reader.exception()]
+        assert len(ended) >= 40
+        for _, writer in held:
+            writer.close()
+
+
+async def test_too_many_requests_at_work_are_answered_503_with_when_to_come_again(
+    service, monkeypatch
+):
+    monkeypatch.setattr(admission, "MOST_CONNECTIONS", 3)
+    head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
+    async with serving(service) as port:
+        held = [await connected(port, head) for _ in range(3)]
+        await asyncio.sleep(0.2)
+        response = await asyncio.wait_for(state_of(port), 5.0)
+        assert_problem(response, 503, "busy", "3 requests")
+        assert int(response.headers["retry-after"]) > 0
+        for _, writer in held:
+            writer.close()
+        await asyncio.sleep(0.2)
+        assert (await state_of(port)).status_code == 200
+
+
+async def test_what_is_no_http_is_a_problem_document_too(service):
+    async with serving(service) as port:
+        reader, writer = await connected(port, b"\x16\x03\x01 nonsense\r\n\r\n")
+        status, head, problem = parts(await asyncio.wait_for(reader.read(), 5.0))
+        assert (status, problem["status"]) == (400, 400)
+        assert b"application/problem+json" in head
+        writer.close()

@@ -125,7 +125,7 @@ def test_the_service_fits_what_is_uploaded_and_keeps_nothing(night):
 def check_two_gigabytes_are_refused_unread(night):
     with socket.create_connection(("127.0.0.1", night.port), timeout=10.0) as raw:
         raw.sendall(
-            b"POST /v1/fits HTTP/1.1\r\nHost: pyrcal\r\nContent-Length: 2000000000\r\n\r\n"
+            b"POST /v1/fits HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2000000000\r\n\r\n"
             + b"\x89HDF\r\n\x1a\n"
         )
         answer = b""

@@ -62,7 +62,7 @@ class Linearisation:
 class InteractionModel:
     """Noise-free interaction matrices of one instrument at any registration.
 
-    Keeps what does not depend on α, and the last sensor Jacobian and the last rendered modes, so
+    Keeps what does not depend on α, and the sensor's last response and the last rendered modes, so
     that a new rotation costs no optics and a new shift no rendering.
     """
 
@@ -96,7 +96,6 @@ class InteractionModel:
         self._map = mapper
         self._dtype = dtype
         self._response: _Last[Response] = _Last()
-        self._jacobian: _Last[Array] = _Last()
         self._modes: _Last[Array] = _Last()
 
     @property
@@ -111,7 +110,7 @@ class InteractionModel:
         ----------
         Heritier et al. 2018, equation 6: D = M_WFS M_DM.
         """
-        return self._product(self.sensor_jacobian(alpha), self._rendered(alpha))
+        return self._seen(alpha, self._rendered(alpha))
 
     def derivatives(self, alpha: Misregistration) -> Array:
         """Return dD/dα ``(4, n_slopes, n_modes)``: per subaperture, radian, magnification."""
@@ -123,11 +122,11 @@ class InteractionModel:
         Per unit of stretch along x, and as much shrinking along y; the second along 45 deg and
         135 deg. The size stays, so that neither is a magnification.
         """
-        jacobian, points = self.sensor_jacobian(alpha), self._mirror_points(alpha)
+        points = self._mirror_points(alpha)
         turn = rotation(alpha.rotation_rad)
         on_sensor = points @ turn.T
         directions = (on_sensor * [-1.0, 1.0] @ turn, -on_sensor[:, ::-1] @ turn)
-        return np.stack([self._product(jacobian, self._moved(points, way)) for way in directions])
+        return np.stack([self._seen(alpha, self._moved(points, way)) for way in directions])
 
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return D(α) and its derivatives together."""
@@ -139,11 +138,8 @@ class InteractionModel:
 
     def sensor_jacobian(self, alpha: Misregistration) -> Array:
         """Return K, slopes against pupil OPD, ``(n_slopes, n_points)``, slope per metre."""
-        shift = self._image_shift(alpha)
-        return self._jacobian.get(
-            shift,
-            lambda: self._per_metre(normalised_jacobian(self._at_rest(shift), self.valid)),
-        )
+        response = self._at_rest(self._image_shift(alpha))
+        return self._per_metre(normalised_jacobian(response, self.valid))
 
     def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
         """Return which slopes lie within one subaperture of unknown surface, ``(n_slopes,)``.
@@ -187,34 +183,41 @@ class InteractionModel:
             tuple(moved), lambda: self._by_rows(self.basis.render, points).astype(self._dtype)
         )
 
+    def _seen(self, alpha: Misregistration, shapes: Array) -> Array:
+        """Return the slopes ``(n_slopes, n_shapes)`` of shapes ``(n_points, n_shapes)``, metres."""
+        response = self._at_rest(self._image_shift(alpha)).to(shapes, self._product)
+        return self._per_metre(normalised_jacobian(response, self.valid))
+
     def _shape_derivatives(self, alpha: Misregistration) -> tuple[Array, Array]:
-        jacobian, points = self.sensor_jacobian(alpha), self._mirror_points(alpha)
+        points = self._mirror_points(alpha)
         turned = np.column_stack([points[:, 1], -points[:, 0]])
         return (
-            self._product(jacobian, self._moved(points, turned)),
-            self._product(jacobian, self._moved(points, -points / alpha.magnification)),
+            self._seen(alpha, self._moved(points, turned)),
+            self._seen(alpha, self._moved(points, -points / alpha.magnification)),
         )
 
     def _shift_derivatives(self, alpha: Misregistration) -> tuple[Array, Array]:
         if self.instrument.stop is Stop.TELESCOPE:
-            jacobian, points = self.sensor_jacobian(alpha), self._mirror_points(alpha)
+            points = self._mirror_points(alpha)
             steps = -rotation(alpha.rotation_rad) / alpha.magnification
             along_x, along_y = (np.broadcast_to(step, points.shape) for step in steps)
             return (
-                self._product(jacobian, self._moved(points, along_x)),
-                self._product(jacobian, self._moved(points, along_y)),
+                self._seen(alpha, self._moved(points, along_x)),
+                self._seen(alpha, self._moved(points, along_y)),
             )
         shift, modes = self._image_shift(alpha), self._rendered(alpha)
-        at_rest = self._at_rest(shift)
-        by_axis = (
-            self.optics.response(self.valid, shift, nodes_x=Nodes.edges(), mapper=self._map),
-            self.optics.response(self.valid, shift, nodes_y=Nodes.edges(), mapper=self._map),
-        )
+        at_rest = self._at_rest(shift).to(modes, self._product)
         along_x, along_y = (
-            self._product(
-                self._per_metre(normalised_derivative(at_rest, moving, self.valid)), modes
+            self._per_metre(
+                normalised_derivative(
+                    at_rest,
+                    self.optics.response(self.valid, shift, mapper=self._map, **edges).to(
+                        modes, self._product
+                    ),
+                    self.valid,
+                )
             )
-            for moving in by_axis
+            for edges in ({"nodes_x": Nodes.edges()}, {"nodes_y": Nodes.edges()})
         )
         return along_x, along_y
 
@@ -233,8 +236,10 @@ class InteractionModel:
             list(self._map(lambda start: function(rows[start : start + _ROW_CHUNK]), starts))
         )
 
-    def _product(self, jacobian: Array, modes: Array) -> Array:
-        return self._by_rows(lambda rows: rows @ modes, jacobian)
+    def _product(self, gradient: Array, shapes: Array) -> Array:
+        if gradient.ndim == 1:
+            return np.asarray(gradient @ shapes)
+        return self._by_rows(lambda rows: rows @ shapes, gradient)
 
 
 def instrument_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
@@ -316,7 +321,10 @@ def _light(
 
 
 def normalised_jacobian(response: Response, valid: NDArray[np.bool_]) -> Array:
-    """Return the gradient of the normalised slopes, ``(n_slopes, n_points)`` per radian."""
+    """Return the gradient of the normalised slopes, ``(n_slopes, n_points)`` per radian.
+
+    Of a response to shapes: their slopes, ``(n_slopes, n_shapes)``.
+    """
     differences, flux = _light(response.images, valid, response.normalisation)
     jacobian = response.gradient - _times(differences / flux, response.flux_gradient)
     jacobian /= flux[:, None].astype(jacobian.dtype)

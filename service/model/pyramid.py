@@ -7,7 +7,7 @@ the modulated pupil field and W the one-dimensional "roof" operator. Unit of len
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -67,6 +67,18 @@ class Response:
 
     normalisation: Normalisation = Normalisation.GLOBAL
     """What normalises the differences."""
+
+    def to(self, shapes: Array, product: Callable[[Array, Array], Array]) -> Response:
+        """Return the response to combinations of points, ``shapes`` ``(n_points, n_shapes)``.
+
+        What is linear in the phase may be done to a few hundred shapes as well as to thousands of
+        points, and costs less. ``product`` multiplies two matrices.
+        """
+        return replace(
+            self,
+            gradient=product(self.gradient, shapes),
+            flux_gradient=product(self.flux_gradient, shapes),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

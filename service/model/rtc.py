@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.slopes import to_rtc
+from service.model.slopes import rtc_mask, to_rtc
 
 Array = NDArray[Any]
 
@@ -40,5 +40,5 @@ class RtcInteractionModel(InteractionModel):
 
     def _listed(self, rows: Array) -> Array:
         recipe = self.instrument.slopes
-        mask = rtc_valid_subapertures(self.instrument)
+        mask = rtc_mask(self.valid, recipe.assumed_orientation)
         return to_rtc(rows, recipe.order, recipe.assumed_orientation, mask)

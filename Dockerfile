@@ -13,7 +13,8 @@ RUN pip install --no-cache-dir -c constraints.txt . \
 ENV PYRCAL_API__HOST=0.0.0.0 \
     PYRCAL_API__PORT=8080 \
     PYRCAL_ZENOH__LISTEN='["tcp/0.0.0.0:7447"]' \
-    PYRCAL_SERVICE__DATA_DIR=/var/lib/pyrcal
+    PYRCAL_SERVICE__DATA_DIR=/var/lib/pyrcal \
+    PYRCAL_SERVICE__CACHE_DIR=/var/lib/pyrcal/cache
 
 USER pyrcal
 WORKDIR /var/lib/pyrcal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
-from service.model.modes import analytic_basis
+from service.model.modes import ModalBasis, analytic_basis
+from service.prepared import Prepared, usual_folder
 from sim_rtc.beforehand import identity_of, initial_reconstructor
 from sim_rtc.computer import RealTimeComputer
 from sim_rtc.detector import Detector
@@ -77,6 +79,12 @@ class Telescope:
         )
 
 
+def _modes(instrument: Instrument) -> ModalBasis:
+    """Return the modes of an analytic mirror, from the folder that the service keeps its own in."""
+    kept = Prepared(usual_folder(os.environ)).basis(instrument)
+    return kept if isinstance(kept, ModalBasis) else analytic_basis(instrument)
+
+
 def build_telescope(
     options: Options, instrument: Instrument, executor: Executor | None = None
 ) -> Telescope:
@@ -98,7 +106,7 @@ def build_telescope(
         )
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
     binning = options.devices.binning
-    basis = binned_basis(instrument, analytic_basis(instrument), binning)
+    basis = binned_basis(instrument, _modes(instrument), binning)
     instrument = binned(instrument, binning)
     plant = build_plant(options, instrument, basis, plant_rng)
     optics = MovingOptics(

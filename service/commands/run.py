@@ -27,6 +27,7 @@ from service.config.policy import policy_of
 from service.errors import ConfigurationError, PyrcalError
 from service.fits.upload import UploadFitter
 from service.model.instrument import Instrument
+from service.prepared import usual_folder
 from service.reactions.measurements import MEASUREMENTS_KEPT
 from service.reactions.noisy import NOISY_KEPT
 from service.reactions.shelf import restored
@@ -308,4 +309,5 @@ def _compute(settings: Settings) -> Compute:
         max_condition=settings.control.max_condition,
         slope_noise=settings.control.slope_noise,
         wind_m_s=settings.control.wind_m_s,
+        cache=settings.service.cache_dir or usual_folder(os.environ),
     )

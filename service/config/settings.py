@@ -38,6 +38,10 @@ class ServiceTable(Table):
     data_dir: Path = Field(default=Path("var"), strict=False)
     """Where products, index and audit trail live; relative to the working directory."""
 
+    cache_dir: Path | None = Field(default=None, strict=False)
+    """Where what takes long to compute and is always the same is kept; it may be deleted at any
+    time. None: ``pyrcal`` in the user's cache folder."""
+
 
 class ZenohTable(Table):
     """``[zenoh]``: the way to the RTC."""

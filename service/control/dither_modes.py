@@ -26,12 +26,20 @@ def information(linearisation: Linearisation) -> Array:
     The Fisher information of white slope noise, a free gain of the mode taken out:
     ``J^T J`` with ``J_k = (I - P) dD/dα_k``, P the projection on the mode's own response.
     """
-    response = linearisation.matrix.astype(np.float64)
-    derivatives = linearisation.derivatives.astype(np.float64)
-    norm = np.einsum("sm,sm->m", response, response)
-    along = np.einsum("sm,ksm->km", response, derivatives)
-    full = np.einsum("ksm,lsm->mkl", derivatives, derivatives, optimize=True)
+    response, derivatives = linearisation.matrix, linearisation.derivatives
+    n_modes = response.shape[1]
+    norm = _sums(response, response)
+    along = np.array([_sums(response, derivative) for derivative in derivatives])
+    full = np.empty((n_modes, len(derivatives), len(derivatives)))
+    for k, one in enumerate(derivatives):
+        for j, other in enumerate(derivatives[: k + 1]):
+            full[:, k, j] = full[:, j, k] = _sums(one, other)
     return np.asarray(full - np.einsum("km,lm->mkl", along, along) / norm[:, None, None])
+
+
+def _sums(one: NDArray[np.float32], other: NDArray[np.float32]) -> Array:
+    """Return the products of every two columns, ``(n_modes,)``."""
+    return np.asarray(np.einsum("sm,sm->m", one, other), dtype=np.float64)
 
 
 def most_telling(information: Array, candidates: range, n: int, wanted: Array) -> tuple[int, ...]:

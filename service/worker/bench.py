@@ -22,10 +22,11 @@ from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.noisymatrix import RandomEstimate, fit_random
 from service.estimation.randomdither import Correlated
 from service.model.instrument import Instrument
+from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from service.model.modes import modal_basis
 from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo
+from service.prepared import Prepared
 from service.registration.dialect import LIKELY, Dialect, of_answer, of_reconstructor
 from service.registration.orientation import Setting
 from service.registration.start import far_starts
@@ -68,7 +69,8 @@ class Workbench:
 
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
         check_controllable(instrument)
-        self._basis = modal_basis(instrument)
+        self._prepared = Prepared(compute.cache)
+        self._basis = self._prepared.basis(instrument)
         self._threads = ThreadPoolExecutor(compute.threads)
         self._compute = compute
         self._equip(instrument)
@@ -102,7 +104,8 @@ class Workbench:
 
     def describe(self) -> Description:
         """Return what telemetry must look like, and prepare for the first fit."""
-        linearisation = self._sensor.near(self._start)
+        linearisation = self._first()
+        self._sensor.keep(linearisation)
         return Description(
             n_slopes=self._model.n_slopes,
             n_modes=self._model.basis.n_modes,
@@ -111,6 +114,20 @@ class Workbench:
             mode_information=information(linearisation),
             start=self._start,
         )
+
+    def _first(self) -> Linearisation:
+        """Return the linearisation about the nominal registration, prepared once for all."""
+        compute, start = self._compute, self._start
+
+        def computed() -> dict[str, NDArray[np.float32]]:
+            found = self._sensor.linearise(start)
+            return {"matrix": found.matrix, "derivatives": found.derivatives}
+
+        what = (compute.pupil_sampling, compute.detector_nodes, compute.working_point_modes)
+        kept = self._prepared.arrays(
+            self._model.instrument, ("linearisation", *what, start.vector.tolist()), computed
+        )
+        return Linearisation(alpha=start, **kept)
 
     def fit(
         self, spectra: Spectra, loop: Loop, start: Misregistration | None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,9 @@ class Compute:
 
     wind_m_s: float = 15.0
     """At which the expected loss of a reconstructor is computed."""
+
+    cache: Path | None = None
+    """Folder of what is prepared once; None: it is computed every time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

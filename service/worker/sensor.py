@@ -79,9 +79,12 @@ class Sensor:
 
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return a new linearisation about ``alpha``, and keep it."""
-        self._linearisation = self._model.linearise(alpha)
-        self._ratio = None
-        return self._linearisation
+        self.keep(self._model.linearise(alpha))
+        return self.near(alpha)
+
+    def keep(self, linearisation: Linearisation) -> None:
+        """Take a linearisation of this very sensor, wherever it comes from, as the one at hand."""
+        self._linearisation, self._ratio = linearisation, None
 
     def ratio(self) -> Array:
         """Return ``(n_modes,)`` how much of the flat response is left of each mode at work.

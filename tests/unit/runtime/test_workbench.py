@@ -10,6 +10,7 @@ from service.estimation.frames import FrameBlock
 from service.estimation.instrumental import Loop
 from service.estimation.lockin import LockIn, LockInPlan, Spectra, WindowRefused, accumulate
 from service.model.misregistration import Misregistration
+from service.model.rtc import RtcInteractionModel
 from service.worker import Workbench, run_job
 from tests.unit.runtime.small import (
     COMPUTE,
@@ -103,6 +104,20 @@ def test_no_distance_from_the_last_linearisation_keeps_a_fit_from_settling(bench
     estimate = bench.fit(dithered_window(bench, there, noise=1e-6), open_loop(aligned), ALPHA)
     assert not isinstance(estimate, WindowRefused)
     assert estimate.alpha.shift_x_subap == pytest.approx(there.shift_x_subap, abs=1e-3)
+
+
+def test_a_second_workbench_finds_the_first_linearisation_prepared(tmp_path, monkeypatch):
+    compute = replace(COMPUTE, cache=tmp_path)
+    first = Workbench(small_instrument(), compute)
+    described = first.describe()
+    monkeypatch.setattr(RtcInteractionModel, "linearise", lambda *_: pytest.fail("again"))
+    second = Workbench(small_instrument(), compute)
+    again = second.describe()
+    np.testing.assert_array_equal(again.mode_information, described.mode_information)
+    np.testing.assert_array_equal(
+        second._sensor.near(Misregistration()).derivatives,
+        first._sensor.near(Misregistration()).derivatives,
+    )
 
 
 @pytest.fixture

@@ -1,0 +1,158 @@
+"""What takes seconds to compute and is always the same, kept on disk: modes, a linearisation.
+
+A file is found by a digest of all that its numbers depend on, the code of the model included, so
+that none is ever out of date; one that is damaged is made again. Several processes may share the
+folder, and it may be deleted at any time. Where it cannot be written nothing is kept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from service.fits.fingerprint import instrument_sha256
+from service.model import instrument as model_code
+from service.model.instrument import BasisKind, Instrument, Mirror
+from service.model.mirror import mirror_surface
+from service.model.modes import Basis, ModalBasis, modal_basis
+
+Arrays = Mapping[str, NDArray[Any]]
+
+MOST_BYTES = 1_000_000_000
+"""All files together; the ones used least recently go first."""
+
+VARIABLE = "PYRCAL_SERVICE__CACHE_DIR"
+"""Of the environment; the service's setting ``service.cache_dir`` has the same name there."""
+
+_SUFFIX = ".npz"
+_ABANDONED_S = 3600.0
+"""A file that has been under way for so long belongs to a process that died."""
+
+
+def usual_folder(environment: Mapping[str, str]) -> Path:
+    """Return where things are kept unless somebody says otherwise."""
+    told = environment.get(VARIABLE)
+    if told:
+        return Path(told)
+    home = environment.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(home) / "pyrcal"
+
+
+class Prepared:
+    """A folder of results; without one everything is computed."""
+
+    def __init__(self, folder: Path | None, *, most_bytes: int = MOST_BYTES) -> None:
+        self._folder = folder
+        self._most_bytes = most_bytes
+
+    def basis(self, instrument: Instrument) -> Basis:
+        """Return the modes of this instrument, as ``modal_basis`` does.
+
+        Only Karhunen-Loeve modes are kept: others are a matter of milliseconds.
+        """
+        mirror = instrument.mirror
+        if (
+            not isinstance(mirror, Mirror)
+            or mirror.mode_to_actuator is not None
+            or mirror.basis is not BasisKind.KARHUNEN_LOEVE
+        ):
+            return modal_basis(instrument)
+
+        def computed() -> Arrays:
+            basis = modal_basis(instrument)
+            if not isinstance(basis, ModalBasis):
+                raise TypeError(f"found {type(basis).__name__} for an analytic mirror")
+            return {
+                "mode_to_actuator": basis.mode_to_actuator,
+                "coefficients": basis.coefficients,
+                "variance_m2": basis.variance_m2,
+            }
+
+        kept = self.arrays(instrument, ("modes",), computed)
+        return ModalBasis(
+            surface=mirror_surface(mirror, instrument.subaperture_m),
+            y_sign=mirror.y_sign,
+            **kept,
+        )
+
+    def arrays(
+        self, instrument: Instrument, what: tuple[object, ...], compute: Callable[[], Arrays]
+    ) -> Arrays:
+        """Return named arrays of an instrument, from disk or from ``compute``.
+
+        ``what`` tells everything else that they depend on; it is known by its ``repr``.
+        """
+        if self._folder is None:
+            return compute()
+        facts = (instrument_sha256(instrument), _code_sha256(), np.__version__, scipy.__version__)
+        digest = hashlib.sha256(repr((facts, what)).encode()).hexdigest()
+        path = self._folder / f"{instrument.name}-{what[0]}-{digest[:32]}{_SUFFIX}"
+        found = _read(path)
+        if found is None:
+            found = compute()
+            # a full disk or a folder of somebody else's only costs the time once more
+            with contextlib.suppress(OSError):
+                self._write(path, found)
+        return found
+
+    def _write(self, path: Path, arrays: Arrays) -> None:
+        if sum(array.nbytes for array in arrays.values()) > self._most_bytes:
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        number, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=_SUFFIX)
+        try:
+            with os.fdopen(number, "wb") as file:
+                np.savez(file, allow_pickle=False, **arrays)
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+        self._tidy(path)
+
+    def _tidy(self, newest: Path) -> None:
+        """Remove the oldest until all fit, and what dead processes have left."""
+        files = []
+        for path in newest.parent.glob(f"*{_SUFFIX}"):
+            with contextlib.suppress(OSError):  # another process tidies, too
+                status = path.stat()
+                files.append((status.st_mtime, status.st_size, path))
+        room = self._most_bytes
+        for modified_s, n_bytes, path in sorted(files, reverse=True):
+            waiting = path.name.startswith(".")
+            room -= n_bytes
+            old = time.time() - modified_s > _ABANDONED_S if waiting else room < 0
+            if old and path != newest:
+                path.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> Arrays | None:
+    """Return what a file holds, and mark it as used; None: there is none, or it is damaged."""
+    try:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}  # read whole: the sums are checked
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    return arrays
+
+
+@cache
+def _code_sha256() -> str:
+    """Return a digest of the model's own code: another version computes other numbers."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(model_code.__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

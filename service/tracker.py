@@ -15,7 +15,8 @@ from service.reactions.activity import refuse_if_occupied
 from service.reactions.decision import decide
 from service.reactions.dither import on_dither, on_silence, on_vibrations
 from service.reactions.dither_schedule import learnt
-from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.evidence import over as ended
+from service.reactions.journal import logged, with_alarm
 from service.reactions.loop import close_again, on_loop
 from service.reactions.matrices import (
     Step,
@@ -88,7 +89,7 @@ def _react(  # noqa: C901 - one line for each event
             return on_vanished(state, now_ns), ()
         case ev.Trouble(name=name, text=text, over=over):
             if over:
-                return without_alarm(state, name, now_ns), ()
+                return ended(state, name, now_ns, event.t_ns_utc), ()
             return with_alarm(state, name, text, now_ns), ()
         case ev.Noted(name=name, text=text, level=level):
             return logged(state, name, text, now_ns, level), ()
@@ -113,7 +114,7 @@ def _react(  # noqa: C901 - one line for each event
         case ev.WindowFitted() if state.measuring is not None:
             return refuse_window(state, MEASURING, now_ns), ()
         case ev.WindowFitted(estimate=estimate):
-            after = on_window(state, estimate, policy, now_ns)
+            after = on_window(state, event, policy, now_ns)
             return learnt(state, after, estimate), ()
         case ev.WindowLost(refused=refused):
             return refuse_window(state, refused.reason, now_ns, mistold=refused.mistold), ()

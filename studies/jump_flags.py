@@ -20,6 +20,7 @@ from service.config.policy import policy_of
 from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.reactions.estimate import Measured
+from service.reactions.evidence import taken
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.tracking import with_window
 from service.state import Source, TrackerState
@@ -129,12 +130,13 @@ def _flags(night: Night, rng: np.random.Generator, policy: Policy) -> list[tuple
 def _measured(night: Night, end_s: float, rng: np.random.Generator, policy: Policy) -> Measured:
     read = night.mean(end_s) + night.sigma * rng.normal(size=4)
     said = night.sigma * np.sqrt(rng.chisquare(DEGREES) / DEGREES) / BOUNDARY_SCALE
+    began_s = end_s - WINDOW_S
     return Measured(
         alpha=Misregistration.from_vector(Misregistration().vector + read / BOUNDARY_SCALE),
         covariance=np.diag(said**2),
         floor=policy.floor,
         misfit=1.0,
-        t_ns_utc=START_NS + round(end_s * SECOND_NS),
+        when=taken(*(START_NS + round(s * SECOND_NS) for s in (began_s, end_s))),
         source=Source.LOCK_IN,
         optical_gain=0.6,
         optical_gains=(),

@@ -75,6 +75,14 @@ class Passive:
     begun: bool = False
     """Whether frames of this run have been multiplied."""
 
+    since_ns_utc: int = 0
+    """No frame in the sums is older, by the RTC's clock; 0: not known."""
+
+    @property
+    def n_waiting(self) -> int:
+        """Frames that are not multiplied yet."""
+        return sum(rows.n for rows in self.waiting)
+
     @property
     def why_unusable(self) -> str | None:
         """Return why this loop's telemetry says nothing, or None."""

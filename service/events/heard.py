@@ -58,6 +58,9 @@ class Trouble:
     over: bool = False
     """The condition has ended."""
 
+    t_ns_utc: int = 0
+    """End of the telemetry that told, the RTC's clock; 0: it was not telemetry."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noted:
@@ -73,6 +76,8 @@ class WindowFitted:
     """The worker estimated α from one window."""
 
     estimate: WindowEstimate | RandomEstimate
+    began_ns_utc: int = 0
+    """Begin of the window, the RTC's clock; 0: not told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,6 +85,8 @@ class FarFitted:
     """The worker found α from afar, in a window with the loop open."""
 
     found: FarEstimate
+    began_ns_utc: int = 0
+    """Begin of the window, the RTC's clock; 0: not told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,6 +103,9 @@ class Watched:
     estimate: PassiveEstimate
     t_ns_utc: int
     """End of the telemetry it is of."""
+
+    began_ns_utc: int = 0
+    """Begin of it, the RTC's clock; 0: not told."""
 
     loop: tuple[float, ...] = ()
     """``RtcView.loop_numbers`` of the loop it is of; empty: not known."""

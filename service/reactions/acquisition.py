@@ -147,8 +147,8 @@ def _late(acquisition: Acquisition, now_ns: int) -> bool:
 
 def _heard(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
     match event:
-        case ev.FarFitted(found=found):
-            return on_far(state, found, policy, now_ns)
+        case ev.FarFitted():
+            return on_far(state, event, policy, now_ns)
         case ev.WindowLost(refused=refused) if refused.reason.startswith(NOT_FOUND):
             return on_missed(state, refused.reason, now_ns)
         case ev.DitherAnswered(accepted=False, reason=reason):

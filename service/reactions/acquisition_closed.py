@@ -15,7 +15,7 @@ from service.reactions.matrices import Step, send, why_unsendable
 from service.reactions.mode_ladder import fewer_than
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.shelf import with_state
-from service.reactions.verdicts import why_stale
+from service.reactions.verdicts import why_worthless
 from service.reactions.worth import moved
 from service.state import (
     Acquisition,
@@ -63,15 +63,17 @@ def on_made(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
         return state, ()
     if record.state is MatrixState.REFUSED:
         return _refused(state, record, now_ns)
-    reason = why_unsendable(state, record)
     found = acquisition.found
-    if rtc is None or found is None or reason is not None:
-        return again(state, f"{record.id} cannot be sent: {reason}", now_ns)
+    if rtc is None or found is None:
+        return again(state, f"{record.id} cannot be sent: no RTC is there", now_ns)
     gains = gains_for(found, record.n_modes, rtc.n_modes)
-    stale = why_stale(state, record.judged, gains[: record.n_modes])
+    stale = why_worthless(state, record.judged, gains[: record.n_modes])
     if stale is not None:
         state = with_state(state, record.id, MatrixState.DISCARDED, f"while it was made, {stale}")
         return logged(state, "reconstructor.discarded", f"{record.id}: {stale}", now_ns), ()
+    reason = why_unsendable(state, record)
+    if reason is not None:
+        return again(state, f"{record.id} cannot be sent: {reason}", now_ns)
     state, _ = send(state, record.id, now_ns)
     acquisition = replace(
         acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None
@@ -111,7 +113,9 @@ def _widened(
         return again(state, text, now_ns, slipped=True)
     if rtc.loop == "open":
         return again(state, "somebody opened the loop", now_ns)
-    if record is None or rtc.cm_id != record.id or state.making_since_ns_utc is not None:
+    doubted = state.registration is not None and bool(state.registration.doubt)
+    waiting = doubted or state.making_since_ns_utc is not None
+    if record is None or rtc.cm_id != record.id or waiting:
         return choose_dither(state, rtc, policy, now_ns)
     if record.applied_frame_seq is not None and acquisition.applied != record.id:
         acquisition = replace(acquisition, applied=record.id, windows=state.windows_accepted)

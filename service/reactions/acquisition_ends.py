@@ -7,6 +7,7 @@ from dataclasses import replace
 from service import events as ev
 from service.reactions.acquisition_plan import left_open
 from service.reactions.alarms import Act, forbidding
+from service.reactions.evidence import voided
 from service.reactions.journal import logged, with_alarm
 from service.reactions.loop import on_loop
 from service.reactions.matrices import Step
@@ -72,7 +73,7 @@ def again(state: TrackerState, reason: str, now_ns: int, *, slipped: bool = Fals
         most = half_of(acquisition.n_modes)
         state = limited(state, most, reason, now_ns)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    state, effects = without_dither(state)
+    state, effects = without_dither(voided(state, "the acquisition had not begun anew"))
     state = replace(
         state,
         registration=None,

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from service import events as ev
-from service.estimation.faraway import FarEstimate
 from service.model.misregistration import Misregistration
 from service.reactions.acquisition_ends import again, entered, fail, told, without_dither
 from service.reactions.acquisition_plan import far_dither, reach_of, sigma_of
+from service.reactions.evidence import taken, why_void
 from service.reactions.matrices import Step
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import AcquisitionStage, Registration, RtcView, TrackerState
@@ -40,9 +40,11 @@ def far_stage(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) ->
     return _dithered(state, rtc, policy, now_ns)
 
 
-def on_far(state: TrackerState, found: FarEstimate, policy: Policy, now_ns: int) -> Step:
+def on_far(state: TrackerState, event: ev.FarFitted, policy: Policy, now_ns: int) -> Step:
     """Take over where a window puts the mirror, or hold it against where another one did."""
-    rtc, acquisition, estimate = state.rtc, state.acquisition, found.estimate
+    rtc, acquisition, estimate = state.rtc, state.acquisition, event.found.estimate
+    if why_void(state, taken(event.began_ns_utc, estimate.t_ns_utc)) is not None:
+        return state, ()
     if acquisition.stage not in {AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING}:
         return state, ()
     if (

@@ -17,6 +17,7 @@ from service.control.continuation import (
 )
 from service.reactions.alarms import Act, forbidding, forbids
 from service.reactions.dither_choice import ACQUIRING_DITHER
+from service.reactions.evidence import voided
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import (
     Acquisition,
@@ -132,6 +133,7 @@ def begun(
         n_modes=first_closed(found.n_controlled),
         sent=left is not None and left.sent,
     )
+    state = voided(state, "the acquisition had not begun")
     return replace(state, acquisition=acquisition, registration=None, margin=None)
 
 

@@ -24,7 +24,7 @@ _ON_ITS_WAY_S = 2.0
 
 _SAME_LINE_HZ = 2.5
 
-_ALARM = "dither-lost"
+DITHER_LOST = "dither-lost"
 
 
 def on_dither(state: TrackerState, event: ev.DitherAnswered, now_ns: int) -> TrackerState:
@@ -69,7 +69,7 @@ def follow_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerStat
     if told_to_stop or played_s >= dither.duration_s - SILENT_S:
         dithering = replace(state.dithering, ended_ns_utc=now_ns)
         state = replace(state, dither=None, dithering=dithering)
-        state = without_alarm(state, _ALARM, now_ns)
+        state = without_alarm(state, DITHER_LOST, now_ns)
         return logged(state, "dither.ended", f"{dither.id} has ended", now_ns)
     text = f"the RTC's status shows no {dither.id} although it was accepted: it is asked for again"
     wait_s = 0.0 if state.dither_losses == 0 else _patience_s(state)
@@ -91,7 +91,7 @@ def on_silence(state: TrackerState, event: ev.DitherSilent, now_ns: int) -> Trac
         "of it: α is not measured"
     )
     if event.silent_s < _patience_s(state):
-        return with_alarm(state, _ALARM, text, now_ns)
+        return with_alarm(state, DITHER_LOST, text, now_ns)
     return _lost(state, dither, text, now_ns)
 
 
@@ -118,7 +118,7 @@ def _corrected(
 
 
 def _lost(state: TrackerState, dither: DitherView, text: str, now_ns: int) -> TrackerState:
-    state = with_alarm(state, _ALARM, text, now_ns)
+    state = with_alarm(state, DITHER_LOST, text, now_ns)
     state = logged(state, "dither.lost", text, now_ns, Level.WARNING)
     return replace(state, dither=None, dither_lost=dither.id, dither_losses=state.dither_losses + 1)
 
@@ -130,4 +130,4 @@ def _patience_s(state: TrackerState) -> float:
 def found_again(state: TrackerState, now_ns: int) -> TrackerState:
     """Return the state after a window that held the dither, or when none is wanted any more."""
     state = replace(state, dither_lost=None, dither_losses=0)
-    return without_alarm(state, _ALARM, now_ns)
+    return without_alarm(state, DITHER_LOST, now_ns)

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from service.estimation.wind import Drift, Joint, begin_joint, predicted
 from service.model.misregistration import Misregistration
+from service.reactions.evidence import CLOCK_SET_BACK_S, Taken, pointing_at, precedes
 from service.reactions.journal import without_alarm
 from service.reactions.policy import SECOND_NS, Policy
-from service.reactions.surprise import CLOCK_SET_BACK_S, last_of
+from service.reactions.surprise import last_of
 from service.reactions.validity import aged, flexure, slewed_deg, without_dither_due
 from service.state import (
     Earlier,
@@ -43,9 +44,7 @@ class Measured:
     covariance: Array
     """``(4, 4)`` numeric units, from its own data."""
 
-    t_ns_utc: int
-    """End of the window, the RTC's clock."""
-
+    when: Taken
     source: Source
     optical_gain: float
     """Mean modulus of the gains of the dithered modes."""
@@ -58,6 +57,16 @@ class Measured:
 
     misfit: float
     """Residual power over what noise explains; 1: the model explains the window."""
+
+    @property
+    def t_ns_utc(self) -> int:
+        """End of the window, the RTC's clock."""
+        return self.when.ended_ns_utc
+
+    @property
+    def seen(self) -> Seen:
+        """Return what was measured, whatever the filter makes of it."""
+        return Seen(alpha=self.alpha, covariance=self.covariance, t_ns_utc=self.t_ns_utc)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -135,18 +144,20 @@ def accepted(
     state: TrackerState, folded: Folded, measured: Measured, policy: Policy, now_ns: int
 ) -> TrackerState:
     """Return the state whose registration is what the filter says after a window."""
-    joint = folded.joint
+    joint, when = folded.joint, measured.when
     known = state.registration
     bias = None if known is None else known.bias
+    doubted = _still_doubted(state, folded, when)
     anew = folded.jumped or (known is not None and known.candidate is not None)
     registration = Registration(
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
         floor=measured.floor,
-        t_ns_utc=measured.t_ns_utc,
+        t_ns_utc=when.ended_ns_utc,
         arrived_ns_utc=now_ns,
         n_windows=folded.n_windows,
         window_ns_utc=now_ns,
+        window_began_ns_utc=when.began_ns_utc,
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
         bias=bias_of(
@@ -158,17 +169,34 @@ def accepted(
         passive_after_ns_utc=known.passive_after_ns_utc if known is not None else 0,
         earlier=None if anew else _earlier(known, folded, measured),
         jumped_ns_utc=_jumped_ns_utc(known, folded, now_ns),
-        pointing=state.pointing,
-        window_pointing=state.pointing,
+        doubt=known.doubt if known is not None and doubted else "",
+        doubted_ns_utc=known.doubted_ns_utc if known is not None and doubted else 0,
+        pointing=pointing_at(state, when.ended_ns_utc),
+        window_pointing=pointing_at(state, when.began_ns_utc),
         restored_ns_utc=known.restored_ns_utc if known is not None else None,
         basis_id=state.basis_id,
         config_id=state.config_id,
     )
     state = replace(state, registration=registration, windows_accepted=state.windows_accepted + 1)
-    state = without_alarm(without_dither_due(state), SUSPECTED, now_ns)
-    state = without_alarm(state, DISAGREES, now_ns)
+    if not doubted:
+        state = without_alarm(without_dither_due(state), SUSPECTED, now_ns)
+        state = without_alarm(state, DISAGREES, now_ns)
     state = remembered(state, entry_of(measured, registration, folded.innovation))
     return aged(state, policy, now_ns)
+
+
+def _still_doubted(state: TrackerState, folded: Folded, when: Taken) -> bool:
+    """Return whether α stays in doubt: the window is of before.
+
+    One that confirms where the mirror has jumped to need not have begun since, for it tells no
+    other place than the window before it.
+    """
+    known = state.registration
+    if known is None or not known.doubt:
+        return False
+    if folded.jumped:
+        when = replace(when, began_ns_utc=when.ended_ns_utc)
+    return precedes(state, when, known.doubted_ns_utc)
 
 
 def _jumped_ns_utc(known: Registration | None, folded: Folded, now_ns: int) -> int | None:
@@ -184,7 +212,7 @@ def _earlier(known: Registration | None, folded: Folded, measured: Measured) -> 
     before = known.earlier
     return replace(
         last_of(known),
-        then=Seen(alpha=measured.alpha, covariance=measured.covariance, t_ns_utc=measured.t_ns_utc),
+        then=measured.seen,
         earlier=None if before is None else replace(before, then=None, earlier=None),
     )
 

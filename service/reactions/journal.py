@@ -22,12 +22,15 @@ def logged(
 
 def with_alarm(state: TrackerState, name: str, text: str, now_ns: int) -> TrackerState:
     """Return the state with this alarm raised; one already raised keeps its beginning."""
-    raised = next((a for a in state.alarms if a.name == name), None)
-    since_ns = raised.since_ns_utc if raised is not None else now_ns
-    alarm = Alarm(name=name, since_ns_utc=since_ns, text=text, seen_ns_utc=now_ns)
+    before = next((a for a in state.alarms if a.name == name), None)
+    raised = before
+    if raised is None:
+        t_ns = 0 if state.rtc is None else state.rtc.t_ns_utc
+        raised = Alarm(name=name, since_ns_utc=now_ns, text=text, t_ns_utc=t_ns)
+    alarm = replace(raised, text=text, seen_ns_utc=now_ns)
     others = tuple(a for a in state.alarms if a.name != name)
     state = replace(state, alarms=(*others, alarm))
-    return state if raised is not None else logged(state, name, text, now_ns, Level.ALARM)
+    return state if before is not None else logged(state, name, text, now_ns, Level.ALARM)
 
 
 def without_alarm(state: TrackerState, name: str, now_ns: int) -> TrackerState:

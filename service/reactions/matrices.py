@@ -17,7 +17,7 @@ from service.reactions.shelf import (
     with_record,
     with_state,
 )
-from service.reactions.verdicts import settled, why_of_another_loop, why_stale
+from service.reactions.verdicts import settled, why_stale, why_worthless
 from service.reactions.worth import outdated
 from service.state import (
     Assessment,
@@ -196,7 +196,10 @@ def why_unsendable(state: TrackerState, record: ReconstructorRecord) -> str | No
         return "no RTC is there"
     if state.registration is not None and state.registration.candidate is not None:
         return "a jump is suspected: the next window of telemetry decides"
-    act = Act.SEND_KNOWN if _was_in_use(state, record) else Act.SEND_NEW
+    known = _was_in_use(state, record)
+    if state.registration is not None and state.registration.doubt and not known:
+        return f"α is invalid ({state.registration.doubt})"
+    act = Act.SEND_KNOWN if known else Act.SEND_NEW
     alarm = forbidding(state, act)
     return None if alarm is None else alarm.text
 
@@ -235,11 +238,11 @@ def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int)
         state = without_alarm(state, "no-acknowledgement", now_ns)
         state = without_alarm(state, "margin", now_ns)
         gains = () if state.rtc is None else commanded_gains(state.rtc, record.n_modes)
-        other = why_of_another_loop(state, record.judged, gains)
+        of_other = why_worthless(state, record.judged, gains)
         state = replace(
             state,
-            margin=None if other else record.gate,
-            judged_ns_utc=None if other else now_ns,
+            margin=None if of_other else record.gate,
+            judged_ns_utc=None if of_other else now_ns,
         )
         text = f"{event.id} applied from frame {event.frame_seq}"
         return logged(state, "reconstructor.applied", text, now_ns)
@@ -278,7 +281,7 @@ def on_margin(state: TrackerState, judged: ev.MarginJudged, now_ns: int) -> Trac
         return state
     gains = () if state.rtc is None else state.rtc.gains[: record.n_modes]
     of = judged.judged
-    if of is not None and why_of_another_loop(state, of, gains) is not None:
+    if of is not None and why_worthless(state, of, gains) is not None:
         return replace(state, judged_ns_utc=None) if matrix_id == state.in_use else state
     state = with_changed(state, replace(record, gate=verdict, judged=of))
     if matrix_id != state.in_use:

@@ -17,6 +17,7 @@ from service.reactions.dither_choice import (
 )
 from service.reactions.dither_pace import by_hand
 from service.reactions.dither_unwanted import told_to_stop
+from service.reactions.evidence import pointed
 from service.reactions.journal import logged
 from service.reactions.matrices import Step, send_once_judged
 from service.reactions.orders import with_mode
@@ -49,7 +50,7 @@ def on_command(  # noqa: C901 - one line for each command
         case ev.SetMode(mode=mode):
             return logged(with_mode(state, mode), "mode", f"mode is {mode}", now_ns), ()
         case ev.SetPointing(pointing=pointing):
-            return replace(state, pointing=pointing), ()
+            return pointed(state, pointing), ()
         case ev.StopDither():
             state = found_again(replace(state, dither=None, dither_stopped=True), now_ns)
             state = told_to_stop(state, now_ns)

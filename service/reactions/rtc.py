@@ -8,6 +8,7 @@ from service import events as ev
 from service.events import Effect
 from service.reactions.dither import follow_status, found_again
 from service.reactions.dither_unwanted import gone
+from service.reactions.evidence import over, pointed, voided
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS
 from service.reactions.shelf import known_record, with_in_use, with_state
@@ -41,7 +42,7 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
     for alarm in state.alarms:
         silent_ns = now_ns - alarm.seen_ns_utc
         if alarm.name in _RENEWED and silent_ns > FORGOTTEN_AFTER_S * SECOND_NS:
-            state = without_alarm(state, alarm.name, now_ns)
+            state = over(state, alarm.name, now_ns)
     since_ns = state.making_since_ns_utc
     if since_ns is not None and now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
         state = replace(state, making_since_ns_utc=None)
@@ -62,8 +63,8 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
         rtc=rtc,
         basis_id=state.basis_id or rtc.basis_id,
         config_id=state.config_id or rtc.config_id,
-        pointing=rtc.pointing or state.pointing,
     )
+    state = pointed(state, rtc.pointing)
     state = _of_this_basis(state, now_ns)
     state = _told_of_gains(before, state, rtc, now_ns)
     if rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None:
@@ -133,6 +134,7 @@ def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerSta
         if record.state in {MatrixState.PUBLISHED, MatrixState.STAGED}:
             state = with_state(state, record.id, MatrixState.FAILED, "the RTC restarted")
     registration = state.registration
+    state = voided(state, "the RTC was in another session")
     state = replace(
         state,
         rtc=None,

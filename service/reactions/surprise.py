@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from service.estimation.passive import BIAS_FLOOR
 from service.estimation.wind import JUMP_THRESHOLD, Joint
 from service.model.misregistration import Misregistration
+from service.reactions.evidence import CLOCK_SET_BACK_S
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.validity import flexure
 from service.state import Earlier, Pointing, Registration, Seen
@@ -24,9 +25,6 @@ STEADY_S = 60.0
 VARYING = 0.3
 """Share of the model error that differs from window to window: bright stars scatter by 0.1 % of a
 subaperture and 6 mdeg, twice what their own data say (docs/results/night.md)."""
-
-CLOCK_SET_BACK_S = 60.0
-"""Telemetry never waits so long for the worker: the RTC's clock has gone back."""
 
 ROTATION_LIMIT = 15.1
 """What the normalised square of one parameter exceeds once in 10 000, ``JUMP_THRESHOLD`` that of

@@ -29,6 +29,7 @@ from service.reactions.estimate import (
     entry_of,
     remembered,
 )
+from service.reactions.evidence import pointing_at, precedes
 from service.reactions.journal import logged, with_alarm
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.surprise import (
@@ -41,6 +42,11 @@ from service.reactions.surprise import (
 )
 from service.reactions.validity import aged, with_dither_due
 from service.state import Candidate, Level, Registration, Seen, TrackerState
+
+TOO_EARLY = (
+    "it began before α came into doubt and agrees with what was known then: only one taken since "
+    "can tell"
+)
 
 
 def with_window(
@@ -57,6 +63,9 @@ def with_window(
     if first is not None and pair_surprise(known, reading, policy).far:
         return _jumped(state, first, measured, policy, now_ns)
     far = window_surprise(known, reading, policy)
+    if known.doubt and not far.far and precedes(state, measured.when, known.doubted_ns_utc):
+        state = replace(state, windows_refused=state.windows_refused + 1)
+        return logged(state, "window.refused", TOO_EARLY, now_ns)
     if known.candidate is not None:
         state = _outlier(state, known.candidate, measured, now_ns)
     if far.far:
@@ -87,7 +96,10 @@ def _held(
         held_ns_utc=now_ns,
         innovation=innovation,
     )
-    doubted = replace(known, candidate=candidate, doubt="a jump is suspected")
+    since_ns = max(known.doubted_ns_utc if known.doubt else 0, measured.t_ns_utc)
+    doubted = replace(
+        known, candidate=candidate, doubt="a jump is suspected", doubted_ns_utc=since_ns
+    )
     state = remembered(
         replace(state, registration=doubted), entry_of(measured, known, innovation, entered=False)
     )
@@ -148,7 +160,7 @@ def _reading(measured: Measured, state: TrackerState) -> Reading:
         value=measured.alpha.vector,
         noise=measured.covariance,
         t_ns_utc=measured.t_ns_utc,
-        pointing=state.pointing,
+        pointing=pointing_at(state, measured.t_ns_utc),
     )
 
 

@@ -56,6 +56,19 @@ def why_stale(state: TrackerState, judged: Judged | None, gains: tuple[float, ..
     return why_of_another_loop(state, judged, gains)
 
 
+def why_worthless(
+    state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
+) -> str | None:
+    """Return the same where it need not be sent: while α is in doubt no verdict is of where it is.
+
+    A reconstructor that somebody wants back is sent all the same.
+    """
+    known = state.registration
+    if known is not None and known.doubt:
+        return known.doubt
+    return why_stale(state, judged, gains)
+
+
 def why_of_another_loop(
     state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
 ) -> str | None:

@@ -22,11 +22,12 @@ from service.estimation.wind import (
 )
 from service.model.misregistration import Misregistration
 from service.reactions.estimate import DISAGREES, bias_of, brought_forward, joint_of, remembered
+from service.reactions.evidence import pointing_at, precedes, taken
 from service.reactions.journal import logged, with_alarm
 from service.reactions.policy import Policy
 from service.reactions.surprise import Reading, look_surprise, sum_of
 from service.reactions.validity import aged, with_dither_due
-from service.reactions.windows import CAPTURE_RANGE, why_out_of_hand
+from service.reactions.windows import CAPTURE_RANGE, why_no_measurement
 from service.state import (
     HistoryEntry,
     Level,
@@ -43,7 +44,7 @@ def on_watchdog(
     state: TrackerState, event: ev.Watched, policy: Policy, now_ns: int
 ) -> TrackerState:
     """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
-    reason = _why_useless(state, event)
+    reason = _why_useless(state, event) or _why_known_already(state, event)
     if reason is not None:
         return replace(state, unwatched=f"a look was not used: {reason}")
     known = state.registration
@@ -62,7 +63,7 @@ def on_watchdog(
         value=measured,
         noise=event.estimate.covariance,
         t_ns_utc=event.t_ns_utc,
-        pointing=state.pointing,
+        pointing=pointing_at(state, event.t_ns_utc),
     )
     far = look_surprise(known, joint_of(known), reading, policy)
     if far > JUMP_THRESHOLD:
@@ -98,7 +99,18 @@ def _why_useless(state: TrackerState, event: ev.Watched) -> str | None:
     """Return why a look says nothing of the telescope as it is, or None."""
     if event.loop and state.rtc is not None and event.loop != state.rtc.loop_numbers:
         return "the loop has changed since"
-    return why_out_of_hand(state)
+    return why_no_measurement(state, taken(event.began_ns_utc, event.t_ns_utc))
+
+
+def _why_known_already(state: TrackerState, event: ev.Watched) -> str | None:
+    """Return which later telemetry has told more than a look that was long under way, or None."""
+    known = state.registration
+    if known is None or not known.window_began_ns_utc:
+        return None
+    since = taken(known.window_began_ns_utc, known.window_began_ns_utc)
+    if precedes(state, since, event.t_ns_utc):
+        return None
+    return "a dithered window taken since has been fitted before it"
 
 
 def _alone(state: TrackerState, event: ev.Watched, policy: Policy) -> TrackerState:
@@ -161,7 +173,8 @@ def _barking(
     gone = forgotten(prior, event.estimate.bias_excess)
     registration = _after(state, known, gone, event, now_ns)
     bias = bias_of(gone, event.t_ns_utc, _loop(state, known))
-    registration = replace(registration, doubt=text, bias=bias)
+    since_ns = max(known.doubted_ns_utc if known.doubt else 0, event.t_ns_utc)
+    registration = replace(registration, doubt=text, doubted_ns_utc=since_ns, bias=bias)
     state = replace(state, registration=registration)
     detail = f"{text} (innovation {far:.0f}, expected 4)"
     state = logged(state, "registration.passive-jump", detail, now_ns, Level.WARNING)
@@ -181,7 +194,7 @@ def _after(
         t_ns_utc=max(event.t_ns_utc, known.t_ns_utc),
         arrived_ns_utc=now_ns,
         bias=bias_of(joint, event.t_ns_utc, _loop(state, known), sum_of(known, joint_of(known))),
-        pointing=state.pointing,
+        pointing=pointing_at(state, event.t_ns_utc),
     )
 
 

@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation.estimator import DitheredEstimate, model_error
-from service.estimation.instrumental import MAX_LAG_FRAMES, WindowEstimate
+from service.estimation.instrumental import MAX_LAG_FRAMES
 from service.estimation.noisymatrix import RandomEstimate
+from service.events import WindowFitted
 from service.reactions.acquisition_plan import missed
 from service.reactions.alarms import RULES, WRONG_ANSWER, Act, forbidding
-from service.reactions.dither import found_again
+from service.reactions.dither import DITHER_LOST, found_again
 from service.reactions.estimate import Measured
+from service.reactions.evidence import Taken, taken, tells_of, why_void
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.modal_gain import followed_gains
 from service.reactions.policy import Policy
@@ -43,21 +45,26 @@ MISFIT_WINDOWS = 10
 
 
 def on_window(
-    state: TrackerState, estimate: WindowEstimate | RandomEstimate, policy: Policy, now_ns: int
+    state: TrackerState, event: WindowFitted, policy: Policy, now_ns: int
 ) -> TrackerState:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
-    reason = _why_useless(state, estimate, policy)
+    estimate = event.estimate
+    when = taken(event.began_ns_utc, estimate.t_ns_utc)
+    reason = _why_useless(state, estimate, when, policy)
     if reason is not None:
         return refuse_window(state, reason, now_ns)
-    state = without_alarm(found_again(state, now_ns), "columns-misaligned", now_ns)
-    if not isinstance(estimate, RandomEstimate):
-        state = without_alarm(state, WRONG_ANSWER, now_ns)
+    if tells_of(state, DITHER_LOST, when):
+        state = found_again(state, now_ns)
+    told = () if isinstance(estimate, RandomEstimate) else (WRONG_ANSWER,)
+    for name in ("columns-misaligned", *told):
+        if tells_of(state, name, when):
+            state = without_alarm(state, name, now_ns)
     known, random = state.registration, isinstance(estimate, RandomEstimate)
     modes, gains, gain_sigma = _gains_of(estimate)
     measured = Measured(
         alpha=estimate.alpha,
         covariance=estimate.covariance,
-        t_ns_utc=estimate.t_ns_utc,
+        when=when,
         source=Source.RANDOM if random else Source.LOCK_IN,
         optical_gain=float(gains.mean()),
         optical_gains=followed_gains(
@@ -94,11 +101,13 @@ def _gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
     return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
 
 
-def _why_useless(state: TrackerState, estimate: DitheredEstimate, policy: Policy) -> str | None:
+def _why_useless(
+    state: TrackerState, estimate: DitheredEstimate, when: Taken, policy: Policy
+) -> str | None:
     """Return why a window's estimate must not be used, or None."""
     if state.rtc is None or estimate.session != state.rtc.session:
         return "the RTC has restarted since"
-    reason = why_out_of_hand(state)
+    reason = why_no_measurement(state, when)
     if reason is not None:
         return reason
     lag = float(np.median(estimate.lag_frames))
@@ -124,12 +133,12 @@ def _why_useless(state: TrackerState, estimate: DitheredEstimate, policy: Policy
     return None
 
 
-def why_out_of_hand(state: TrackerState) -> str | None:
-    """Return why nothing the loop does now measures anything, or None."""
+def why_no_measurement(state: TrackerState, when: Taken) -> str | None:
+    """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
     alarm = forbidding(state, Act.MEASURE)
-    return (
-        None if alarm is None else f"{RULES[alarm.name].because}: its telemetry is no measurement"
-    )
+    if alarm is None:
+        return why_void(state, when)
+    return f"{RULES[alarm.name].because}: its telemetry is no measurement"
 
 
 def refuse_window(

@@ -53,7 +53,8 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
     for name, trouble, over in troubles(streams):
         known = any(alarm.name == name for alarm in state.alarms)
         if (trouble is not None) is not known:
-            found.append(ev.Trouble(name=name, text=trouble or over, over=known))
+            text, t_ns = trouble or over, streams.heard_ns_utc
+            found.append(ev.Trouble(name=name, text=text, over=known, t_ns_utc=t_ns))
     return found
 
 

@@ -42,6 +42,9 @@ class Streams:
     rtc: RtcView | None = None
     """The loop the frames come from."""
 
+    heard_ns_utc: int = 0
+    """End of the last frame that came, the RTC's clock; 0: none has."""
+
     in_loop: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     """Modes it moves by itself; empty: it is open."""
 
@@ -109,6 +112,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
         n_modes=rtc.n_controlled,
         memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz,
         delay_frames=rtc.delay_frames,
+        since_ns_utc=streams.heard_ns_utc,
     )
     if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
         ears = hearing(rtc.n_slopes)
@@ -224,6 +228,8 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     rtc = streams.rtc
     if rtc is None or block.session != rtc.session or not _fits(rtc, block):
         return streams, []
+    end_ns = block.t0_ns_utc + (block.n_frames - 1) * block.dt_ns
+    streams = replace(streams, heard_ns_utc=end_ns)
     terms = _terms(streams, block.cm_id)
     if terms is not None:
         streams = replace(streams, check=loopcheck.observe(streams.check, block, terms))
@@ -294,7 +300,15 @@ def taken(streams: Streams) -> tuple[Streams, Passive | str]:
             f"no passive estimate yet: {sums.n_effective:.0f} frames in runs without gaps, "
             f"{least} are needed for {sums.n_modes} modes"
         )
-    begun = replace(sums, cross=None, moved=None, power=None, n_effective=0.0)
+    waiting_ns = round(sums.n_waiting * 1e9 / rtc.frame_rate_hz)
+    begun = replace(
+        sums,
+        cross=None,
+        moved=None,
+        power=None,
+        n_effective=0.0,
+        since_ns_utc=streams.heard_ns_utc - waiting_ns,
+    )
     return replace(streams, passive=begun), sums
 
 

@@ -21,7 +21,7 @@ from service.reactions.watchdog import fit_begins_at
 from service.registration.dialect import setting_written
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
-from service.state import Level, ReconstructorRecord, TrackerState
+from service.state import Level, ReconstructorRecord, RtcView, TrackerState
 from service.worker import Workbench, run_job
 
 
@@ -44,7 +44,7 @@ async def _correlated(window: Correlated, state: TrackerState, crew: Crew) -> Ev
         return lost(window, str(error))
     if isinstance(outcome, WindowRefused):
         return ev.WindowLost(refused=outcome)
-    return ev.WindowFitted(estimate=outcome)
+    return ev.WindowFitted(estimate=outcome, began_ns_utc=_began_ns(window, state.rtc))
 
 
 async def _demodulated(spectra: Spectra, state: TrackerState, crew: Crew, deeds: Deeds) -> Event:
@@ -69,7 +69,7 @@ async def _demodulated(spectra: Spectra, state: TrackerState, crew: Crew, deeds:
         return lost(spectra, str(error))
     if isinstance(outcome, WindowRefused):
         return ev.WindowLost(refused=outcome)
-    return ev.WindowFitted(estimate=outcome)
+    return ev.WindowFitted(estimate=outcome, began_ns_utc=_began_ns(spectra, rtc))
 
 
 async def _found(spectra: Spectra, state: TrackerState, crew: Crew) -> Event:
@@ -81,7 +81,7 @@ async def _found(spectra: Spectra, state: TrackerState, crew: Crew) -> Event:
         return lost(spectra, str(error))
     if isinstance(outcome, WindowRefused):
         return ev.WindowLost(refused=outcome)
-    return ev.FarFitted(found=outcome)
+    return ev.FarFitted(found=outcome, began_ns_utc=_began_ns(spectra, state.rtc))
 
 
 async def watched(
@@ -104,7 +104,14 @@ async def watched(
     if estimate is None:
         return None
     loop = () if state.rtc is None else state.rtc.loop_numbers
-    return ev.Watched(estimate=estimate, t_ns_utc=end_ns, loop=loop)
+    return ev.Watched(estimate=estimate, t_ns_utc=end_ns, began_ns_utc=sums.since_ns_utc, loop=loop)
+
+
+def _began_ns(window: Spectra | Correlated, rtc: RtcView | None) -> int:
+    """Return when a window began, by the RTC's clock; 0: no RTC tells how long it was."""
+    if rtc is None:
+        return 0
+    return window.t_end_ns_utc - round(window.plan.n_frames * 1e9 / rtc.frame_rate_hz)
 
 
 async def listened(

@@ -26,6 +26,10 @@ class Alarm:
     seen_ns_utc: int = 0
     """When it was last found to be so."""
 
+    t_ns_utc: int = 0
+    """When it was raised, by the RTC's clock: telemetry from before does not tell that it is over.
+    0: not known."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogEntry:

@@ -185,6 +185,9 @@ class Registration:
     window_ns_utc: int = 0
     """When the last dithered window arrived, by the service's clock; 0: not known."""
 
+    window_began_ns_utc: int = 0
+    """When that window began, by the RTC's clock; 0: not known."""
+
     grown: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` variance that drift and flexure have added since ``t_ns_utc``, numeric units."""
 
@@ -218,6 +221,10 @@ class Registration:
 
     doubt: str = ""
     """Why α may be somewhere else, until a dithered window decides; empty: no doubt."""
+
+    doubted_ns_utc: int = 0
+    """End of the telemetry that cast the doubt, the RTC's clock: a window that began before it
+    cannot end it."""
 
     standing: Standing = Standing()
     """How much it is worth now."""

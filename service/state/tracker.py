@@ -123,6 +123,15 @@ class TrackerState:
     pointing: Pointing | None = None
     """Of the telescope, from the RTC's status or the observatory; None: nobody has told."""
 
+    pointings: tuple[tuple[int, Pointing], ...] = ()
+    """Where it looked, and from when on by the RTC's clock: oldest first, bounded."""
+
+    void_before_ns_utc: int = 0
+    """Telemetry that began before this time of the RTC's clock measures nothing."""
+
+    void_because: str = ""
+    """What was the matter with it."""
+
     watchdog: Watchdog | None = None
     unwatched: str = ""
     """Why ordinary telemetry says nothing of α now; empty: it does, or was not looked at yet."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Self
 
@@ -14,10 +16,19 @@ from numpy.typing import NDArray
 from service.archive.index import AuditEntry, Index
 from service.archive.measured import MeasuredArchive
 from service.archive.noisy import NoisyArchive
-from service.archive.product import Provenance, read_matrix, read_product, write_product
+from service.archive.product import (
+    Provenance,
+    check_whole,
+    read_fate,
+    read_matrix,
+    read_product,
+    swept,
+    write_fate,
+    write_product,
+)
 from service.archive.tracking import TrackingFile
 from service.errors import ArchiveError, StorageError, UnknownIdError
-from service.state import ReconstructorRecord
+from service.state import MatrixState, ReconstructorRecord
 from service.wire import checked_id, checksum
 
 PROBE_BYTES = 1 << 20
@@ -50,6 +61,10 @@ class Archive:
         """What is known of the registration, for the service after this one."""
         self._lock: IO[str] | None = None
         self._largest_bytes = PROBE_BYTES
+        self._unsound: dict[str, str] = {}
+        self._stand_ins: dict[str, ReconstructorRecord] = {}
+        self.wrong: tuple[str, ...] = ()
+        """What :meth:`open` has found wrong, a line for each."""
 
     def __enter__(self) -> Self:
         """Use an archive that is open; it is closed at the end."""
@@ -63,11 +78,13 @@ class Archive:
         """Make the directory, open the index and bring it up to date with the products.
 
         A product that was complete but not yet in the index when the service was killed is taken
-        in now; what was half-written is removed.
+        in now; what was half-written is removed. An index that is not there is made of the products
+        and of what lies beside each on what became of it.
 
         Returns
         -------
-        One line for each damaged product; the others are not affected.
+        One line for each thing that is wrong: a product missing or damaged, a record that is not
+        understood, what cannot be removed, a lost index. The others are not affected.
 
         Raises
         ------
@@ -78,19 +95,18 @@ class Archive:
         try:
             self._products.mkdir(parents=True, exist_ok=True)
             self._lock = _locked(self._directory / "lock")
-            for leftover in self._products.glob("*.part"):
-                leftover.unlink()
-            self.measured.prepare()
-            self.noisy.prepare()
+            told = [*swept(self._products), *self.measured.prepare(), *self.noisy.prepare()]
         except OSError as error:
             self.close()
             raise ArchiveError(f"{self._directory}: cannot be used: {error}") from error
         try:
-            self._index.open()
-            return (*self._adopt(), *self.measured.adopt(), *self.noisy.adopt())
+            anew = self._index.open()
+            told += [*self._adopt(anew), *self._doubted()]
+            self.wrong = (*told, *self.measured.adopt(), *self.noisy.adopt())
         except ArchiveError:
             self.close()
             raise
+        return self.wrong
 
     def close(self) -> None:
         """Close the index and let another service use the directory."""
@@ -172,11 +188,17 @@ class Archive:
 
     def update(self, record: ReconstructorRecord) -> None:
         """Remember where a reconstructor is now, one that is not stored here (the RTC's) too."""
-        self._index.record((record,), ())
+        self.record((record,), ())
 
     def records(self) -> tuple[ReconstructorRecord, ...]:
-        """Return what is known of every reconstructor, oldest first."""
-        return self._index.records()
+        """Return what is known of every reconstructor, oldest first.
+
+        One whose product was missing or damaged at the start has failed, with the reason.
+        """
+        understood, wrong = self._index.records()
+        known = [*understood, *(r for name, r in self._stand_ins.items() if name in wrong)]
+        known.sort(key=lambda record: record.created_ns_utc)
+        return tuple(self._judged(record) for record in known)
 
     def audit(self, t_ns_utc: int, who: str, name: str, text: str) -> None:
         """Add to the audit trail, which only ever grows."""
@@ -190,6 +212,10 @@ class Archive:
         StorageError
             If the disk refuses.
         """
+        for record in records:
+            path = self._path(record.id)
+            if path.exists():
+                write_fate(path, record)
         self._index.record(records, entries)
 
     def probe(self) -> None:
@@ -218,19 +244,54 @@ class Archive:
     def _path(self, matrix_id: str) -> Path:
         return self._products / f"{matrix_id}.h5"
 
-    def _adopt(self) -> tuple[str, ...]:
+    def _adopt(self, anew: bool) -> list[str]:
+        """Take in the products that the index, made ``anew`` or not, does not know."""
         known = self._index.stored_ids()
-        damaged = []
+        told, taken = [], 0
         for path in sorted(self._products.glob("*.h5")):
             if path.stem in known:
                 continue
             try:
                 record, matrix = read_product(path)
             except ArchiveError as error:
-                damaged.append(str(error))
+                told.append(str(error))
                 continue
-            self._index.add(record, checksum(matrix))
-        return tuple(damaged)
+            fate = read_fate(path)
+            if fate is None and anew:
+                reason = "what became of it was lost with the index"
+                fate = replace(record, state=MatrixState.DISCARDED, reason=reason)
+            self._index.add(fate or record, checksum(matrix))
+            taken += 1
+        if anew and taken:
+            lost = self._directory / "index.sqlite"
+            text = f"was not there: made anew of {taken} products; the audit trail begins here"
+            told.append(f"{lost}: {text}")
+        return told
+
+    def _doubted(self) -> list[str]:
+        """Look at every product, and at every record that is not understood."""
+        self._unsound.clear()
+        self._stand_ins.clear()
+        told = []
+        for name in sorted(self._index.stored_ids()):
+            try:
+                check_whole(self._path(name), "reconstructor")
+            except ArchiveError as error:
+                self._unsound[name] = str(error)
+                told.append(str(error))
+        for name, text in self._index.records()[1].items():
+            told.append(text)
+            with contextlib.suppress(ArchiveError):
+                path = self._path(name)
+                self._stand_ins[name] = read_fate(path) or read_product(path)[0]
+        return told
+
+    def _judged(self, record: ReconstructorRecord) -> ReconstructorRecord:
+        wrong = self._unsound.get(record.id)
+        if wrong is None:
+            return record
+        reason = f"it was {record.state}; {wrong}"
+        return replace(record, state=MatrixState.FAILED, reason=reason)
 
 
 def _locked(path: Path) -> IO[str]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from service.archive.records import (
     measurement_from_json,
@@ -91,8 +91,8 @@ class Index:
         self._lock = threading.Lock()
         self._connection: sqlite3.Connection | None = None
 
-    def open(self) -> None:
-        """Open the file, or make it.
+    def open(self) -> bool:
+        """Open the file, or make it; return whether it had to be made.
 
         Raises
         ------
@@ -115,6 +115,7 @@ class Index:
                     raise ArchiveError(
                         f"{self._path}: found version {version}, expected {_SCHEMA_VERSION}"
                     )
+                return bool(version == 0)
         except sqlite3.OperationalError as error:
             raise ArchiveError(f"{self._path}: cannot be opened: {error}") from error
 
@@ -177,21 +178,12 @@ class Index:
             ).fetchall()
         return frozenset(row[0] for row in rows)
 
-    def records(self) -> tuple[ReconstructorRecord, ...]:
-        """Return every reconstructor, oldest first.
+    def records(self) -> tuple[list[ReconstructorRecord], dict[str, str]]:
+        """Return every reconstructor, oldest first, and by id what is wrong with the others.
 
-        Raises
-        ------
-        ArchiveError
-            If one was written by a version that this one does not understand.
+        A record that another version has written may not be understood.
         """
-        with self._use() as connection:
-            rows = connection.execute(
-                "SELECT id, record FROM reconstructor ORDER BY created_ns_utc, rowid"
-            ).fetchall()
-        return tuple(
-            self._understood(record_from_json, f"reconstructor {name}", text) for name, text in rows
-        )
+        return self._understood("reconstructor", record_from_json)
 
     def add_measurement(self, record: MeasurementRecord, sha256: str) -> None:
         """Enter a measured interaction matrix whose product is on the disk.
@@ -217,22 +209,9 @@ class Index:
             ).fetchone()
         return None if row is None else row[0]
 
-    def measurements(self) -> tuple[MeasurementRecord, ...]:
-        """Return every measured interaction matrix, oldest first.
-
-        Raises
-        ------
-        ArchiveError
-            If one was written by a version that this one does not understand.
-        """
-        with self._use() as connection:
-            rows = connection.execute(
-                "SELECT id, record FROM measurement ORDER BY created_ns_utc, rowid"
-            ).fetchall()
-        return tuple(
-            self._understood(measurement_from_json, f"measurement {name}", text)
-            for name, text in rows
-        )
+    def measurements(self) -> tuple[list[MeasurementRecord], dict[str, str]]:
+        """Return every measured interaction matrix, as :meth:`records`."""
+        return self._understood("measurement", measurement_from_json)
 
     def audit_trail(self, limit: int) -> tuple[AuditEntry, ...]:
         """Return the last ``limit`` entries, oldest first."""
@@ -245,13 +224,20 @@ class Index:
             for t, who, name, text in reversed(rows)
         )
 
-    def _understood(self, read: Callable[[str], _Record], name: str, text: str) -> _Record:
-        try:
-            return read(text)
-        except (ValueError, KeyError, TypeError) as error:
-            raise ArchiveError(
-                f"{self._path}: record of {name} not understood: {error!r}"
-            ) from error
+    def _understood(
+        self, table: Literal["reconstructor", "measurement"], read: Callable[[str], _Record]
+    ) -> tuple[list[_Record], dict[str, str]]:
+        with self._use() as connection:
+            rows = connection.execute(
+                f"SELECT id, record FROM {table} ORDER BY created_ns_utc, rowid"
+            ).fetchall()
+        understood, wrong = [], {}
+        for name, text in rows:
+            try:
+                understood.append(read(text))
+            except (ValueError, KeyError, TypeError) as error:
+                wrong[name] = f"{self._path}: record of {table} {name} not understood: {error!r}"
+        return understood, wrong
 
     @contextmanager
     def _use(self) -> Iterator[sqlite3.Connection]:

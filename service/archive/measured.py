@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service import __version__
 from service.archive.index import Index
-from service.archive.product import DAMAGE, Provenance, write_whole
+from service.archive.product import Provenance, check_whole, opened, swept, write_whole
 from service.archive.records import measurement_from_json, measurement_to_json
 from service.errors import ArchiveError, UnknownIdError
 from service.state import MeasurementRecord
@@ -29,16 +29,23 @@ class MeasuredArchive:
         self._directory = directory
         self._index = index
 
-    def prepare(self) -> None:
-        """Make the directory and remove what was half-written; the index is not needed yet."""
-        self._directory.mkdir(parents=True, exist_ok=True)
-        for leftover in self._directory.glob("*.part"):
-            leftover.unlink()
+    def prepare(self) -> tuple[str, ...]:
+        """Make the directory and remove what was half-written; return a line for what will not go.
+
+        The index is not needed yet.
+        """
+        return swept(self._directory)
 
     def adopt(self) -> tuple[str, ...]:
-        """Enter complete files the index does not know; return a line for each damaged one."""
-        known = {record.id for record in self._index.measurements()}
-        damaged = []
+        """Enter complete files the index does not know; return a line for all that is wrong."""
+        understood, wrong = self._index.measurements()
+        damaged = list(wrong.values())
+        for record in understood:
+            try:
+                check_whole(self._path(record.id), "interaction_matrix")
+            except ArchiveError as error:
+                damaged.append(str(error))
+        known = {record.id for record in understood} | wrong.keys()
         for path in sorted(self._directory.glob("*.h5")):
             if path.stem in known:
                 continue
@@ -96,7 +103,7 @@ class MeasuredArchive:
 
     def records(self) -> tuple[MeasurementRecord, ...]:
         """Return what is known of every measured matrix, oldest first."""
-        return self._index.measurements()
+        return tuple(self._index.measurements()[0])
 
     def matrix(self, measurement_id: str) -> NDArray[np.float32]:
         """Return a measured matrix, ``(n_slopes, n_modes)``, its checksum verified.
@@ -137,14 +144,9 @@ class MeasuredArchive:
 
 
 def _read(path: Path) -> tuple[MeasurementRecord, NDArray[np.float32]]:
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            record = measurement_from_json(file.attrs["record"])
-            matrix = np.asarray(file["interaction_matrix"][()], np.float32)
-    except FileNotFoundError as error:
-        raise ArchiveError(f"{path}: missing, although it was stored") from error
-    except DAMAGE as error:
-        raise ArchiveError(f"{path}: damaged: {error}") from error
+    with opened(path) as file:
+        record = measurement_from_json(file.attrs["record"])
+        matrix = np.asarray(file["interaction_matrix"][()], np.float32)
     if record.id != path.stem:
         raise ArchiveError(f"{path}: found measurement {record.id} in it, expected {path.stem}")
     if checksum(matrix) != record.sha256:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import __version__
-from service.archive.product import DAMAGE, Provenance, write_whole
+from service.archive.product import DAMAGE, Provenance, swept, write_whole
 from service.errors import ArchiveError, UnknownIdError
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.state import NoisyFinding, NoisyRecord, NoisyState
@@ -57,11 +57,9 @@ class NoisyArchive:
         self._directory = directory
         self._records: dict[str, NoisyRecord] = {}
 
-    def prepare(self) -> None:
-        """Make the directory and remove what was half-written."""
-        self._directory.mkdir(parents=True, exist_ok=True)
-        for leftover in self._directory.glob("*.part"):
-            leftover.unlink()
+    def prepare(self) -> tuple[str, ...]:
+        """Make the directory, remove what was half-written; return a line for what will not go."""
+        return swept(self._directory)
 
     def adopt(self) -> tuple[str, ...]:
         """Learn what is there; return a line for each damaged file."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +70,27 @@ def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
         raise StorageError(f"{path}: cannot be written: {error}") from error
 
 
-def read_matrix(path: Path) -> NDArray[np.float32]:
-    """Return the reconstructor of a file, ``(n_modes, n_slopes)``.
+def swept(directory: Path) -> tuple[str, ...]:
+    """Make a directory and remove what was half-written; return a line for what will not go.
+
+    Raises
+    ------
+    OSError
+        If the directory cannot be made.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    told = []
+    for leftover in sorted(directory.glob("*.part")):
+        try:
+            leftover.unlink()
+        except OSError as error:
+            told.append(f"{leftover}: cannot be removed and is left alone: {error.strerror}")
+    return tuple(told)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """Open a product to read it.
 
     Raises
     ------
@@ -79,11 +99,60 @@ def read_matrix(path: Path) -> NDArray[np.float32]:
     """
     try:
         with h5py.File(path, "r", locking=False) as file:
-            return _matrix(file)
+            yield file
     except FileNotFoundError as error:
         raise ArchiveError(f"{path}: missing, although it was stored") from error
     except DAMAGE as error:
         raise ArchiveError(f"{path}: damaged: {error}") from error
+
+
+def check_whole(path: Path, dataset: str) -> None:
+    """Look whether a product is there and not cut, without reading its numbers.
+
+    Raises
+    ------
+    ArchiveError
+        If it is missing or damaged.
+    """
+    with opened(path) as file:
+        len(file[dataset])
+
+
+def read_matrix(path: Path) -> NDArray[np.float32]:
+    """Return the reconstructor of a file, ``(n_modes, n_slopes)``.
+
+    Raises
+    ------
+    ArchiveError
+        If the file is missing or damaged.
+    """
+    with opened(path) as file:
+        return _matrix(file)
+
+
+def write_fate(path: Path, record: ReconstructorRecord) -> None:
+    """Write beside a product what has become of it, for the day when the index is lost.
+
+    Raises
+    ------
+    StorageError
+        If the disk refuses.
+    """
+    part = path.with_suffix(".json.part")
+    try:
+        part.write_text(record_to_json(record), encoding="utf-8")
+        part.replace(path.with_suffix(".json"))
+    except OSError as error:
+        raise StorageError(f"{part}: cannot be written: {error}") from error
+
+
+def read_fate(path: Path) -> ReconstructorRecord | None:
+    """Return what has become of a product; None: nothing is known of it."""
+    try:
+        record = record_from_json(path.with_suffix(".json").read_text(encoding="utf-8"))
+    except DAMAGE:
+        return None
+    return record if record.id == path.stem else None
 
 
 def read_product(path: Path) -> tuple[ReconstructorRecord, NDArray[np.float32]]:
@@ -94,13 +163,10 @@ def read_product(path: Path) -> tuple[ReconstructorRecord, NDArray[np.float32]]:
     ArchiveError
         If the file is damaged or holds another product than its name says.
     """
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            record = record_from_json(file.attrs["record"])
-            matrix = _matrix(file)
-            sha256 = file.attrs["sha256"]
-    except DAMAGE as error:
-        raise ArchiveError(f"{path}: damaged: {error}") from error
+    with opened(path) as file:
+        record = record_from_json(file.attrs["record"])
+        matrix = _matrix(file)
+        sha256 = file.attrs["sha256"]
     if record.id != path.stem:
         raise ArchiveError(f"{path}: found reconstructor {record.id} in it, expected {path.stem}")
     if checksum(matrix) != sha256:

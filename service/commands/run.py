@@ -110,10 +110,7 @@ async def _serve(settings: Settings, instrument: Instrument) -> int:
     """Open everything, run until asked to stop or the service fails, close everything."""
     listener = _listener(settings.api.host, settings.api.port)
     archive = Archive(settings.service.data_dir)
-    damaged = archive.open()
-    log = structlog.get_logger()
-    for line in damaged:
-        log.warning("archive.damaged", text=line)
+    archive.open()
     system = settings.service.system or instrument.name
     crew = Crew(lambda: start_worker(instrument, _compute(settings)))
     try:

@@ -17,8 +17,10 @@ SAVE_INTERVAL_S = 5.0
 def taken_up(archive: Archive, state: TrackerState, policy: Policy, now_ns: int) -> TrackerState:
     """Return the state with the registration that was saved, if there is one and it fits.
 
-    A damaged file costs the α in it and nothing else.
+    A damaged file costs the α in it and nothing else. What else is wrong in the archive is told.
     """
+    for text in archive.wrong:
+        state = logged(state, "archive.damaged", text, now_ns, Level.WARNING)
     try:
         saved = archive.tracking.read()
     except ArchiveError as error:

@@ -187,6 +187,16 @@ async def test_a_damaged_file_costs_alpha_and_not_the_start(archive, tmp_path):
     assert (tmp_path / "tracking.damaged").exists()
 
 
+async def test_what_is_wrong_in_the_archive_is_on_record_from_the_start(archive):
+    (archive._directory / "reconstructors" / "old.h5").mkdir()
+    archive.close()
+    archive.open()
+    state = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
+    (entry,) = [entry for entry in state.log if entry.name == "archive.damaged"]
+    assert "old.h5" in entry.text
+    assert entry.level is Level.WARNING
+
+
 async def test_what_was_restored_is_on_record(supervisor, archive):
     supervisor._state = replace(
         supervisor._state, log=(LogEntry(t_ns_utc=1, level=Level.INFO, name="old", text="news"),)

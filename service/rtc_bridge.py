@@ -75,6 +75,7 @@ class Bridge:
         self._outbox = Outbox(endpoint.offer_s)
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
+        self._held: list[object] = []
 
     def __enter__(self) -> Self:
         """Open the link."""
@@ -115,6 +116,7 @@ class Bridge:
         """Leave the network; the process can exit. Closing twice does nothing."""
         session, self._session = self._session, None
         self._publishers.clear()
+        self._held.clear()
         self._intake.set_wakeup(None)
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
@@ -227,13 +229,16 @@ class Bridge:
         keys = self._keys
         for key in (keys.state, keys.alarm):
             self._publishers[key] = link.last_value(session, key)
-        link.serve(session, keys.all_matrices, self._answer)
-        link.announce(session, keys.alive(Role.SERVICE))
-        link.subscribe(session, keys.acknowledgement, self._guarded("ack", self._on_ack))
-        link.subscribe(session, keys.status, self._guarded("status", self._on_status))
-        link.subscribe(session, keys.all_measured, self._guarded("im", self._on_measured))
-        link.watch(session, keys.alive(Role.RTC), self._guarded("alive", self._on_alive))
-        link.subscribe_frames(session, keys.frames, self._guarded("frames", self._on_frames))
+        # zenoh takes back what nobody holds: a token within microseconds
+        self._held += [
+            link.serve(session, keys.all_matrices, self._answer),
+            link.announce(session, keys.alive(Role.SERVICE)),
+            link.subscribe(session, keys.acknowledgement, self._guarded("ack", self._on_ack)),
+            link.subscribe(session, keys.status, self._guarded("status", self._on_status)),
+            link.subscribe(session, keys.all_measured, self._guarded("im", self._on_measured)),
+            link.watch(session, keys.alive(Role.RTC), self._guarded("alive", self._on_alive)),
+            link.subscribe_frames(session, keys.frames, self._guarded("frames", self._on_frames)),
+        ]
 
     def _guarded(self, kind: str, take: Callable[[_T], None]) -> Callable[[_T], None]:
         """Return a callback that lets nothing escape into zenoh's thread unseen."""

@@ -97,7 +97,7 @@ def serve(session: zenoh.Session, key: str, callback: Callable[[zenoh.Query], No
 
 
 def announce(session: zenoh.Session, key: str) -> object:
-    """Hold a liveliness token until the session closes."""
+    """Return a liveliness token, there for as long as it is held and the session is open."""
     return session.liveliness().declare_token(key)
 
 

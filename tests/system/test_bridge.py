@@ -33,11 +33,13 @@ from service.wire import (
     DitherAction,
     DitherKind,
     DitherRequest,
+    Keys,
     LoopRequest,
     Manifest,
     MeasuredManifest,
     Pattern,
     Reply,
+    Role,
     StateMessage,
     decode_alarm,
     decode_state,
@@ -428,6 +430,27 @@ def test_a_status_is_reported_and_a_bad_one_counted(bridge, rtc):
     assert seen.first(StatusReceived).status == rtc.status(seq=42, magnitude=None)
     assert bridge.statistics().messages_malformed == {"status": 2}
     assert "missing: key 'v'" in seen.first(MalformedMessage).text
+
+
+def tokens(session, key):
+    return [str(reply.ok.key_expr) for reply in session.liveliness().get(key, timeout=1.0)]
+
+
+def test_the_services_token_is_there_for_others_for_as_long_as_the_link_is_open(endpoint, rtc):
+    key = rtc.keys.alive(Role.SERVICE)
+    time.sleep(0.2)
+    assert tokens(rtc.zenoh, key) == [key]
+
+
+def test_the_services_token_goes_with_the_service(endpoint):
+    other = Endpoint(system=SYSTEM, connect=endpoint.listen)
+    key = Keys(SYSTEM).alive(Role.SERVICE)
+    with Bridge(replace(endpoint, system="router")), client_session(endpoint.listen[0]) as outside:
+        with Bridge(other):
+            wait_until(lambda: tokens(outside, key) == [key], 3.0)
+            time.sleep(0.2)
+            assert tokens(outside, key) == [key]
+        wait_until(lambda: tokens(outside, key) == [], 3.0)
 
 
 # ---------------------------------------------------------------- reconstructors

@@ -32,6 +32,7 @@ from service.wire import (
     BATCH_LIMIT,
     CHUNK_LIMIT,
     MESSAGE_LIMIT,
+    STATUS_LIMIT,
     AckState,
     AlarmMessage,
     Command,
@@ -269,7 +270,7 @@ class Bridge:
         )
 
     def _on_status(self, sample: zenoh.Sample) -> None:
-        self._intake.status(link.bytes_of(sample.payload, MESSAGE_LIMIT, "a status"))
+        self._intake.status(link.bytes_of(sample.payload, STATUS_LIMIT, "a status"))
 
     def _on_ack(self, sample: zenoh.Sample) -> None:
         data = link.bytes_of(sample.payload, MESSAGE_LIMIT, "an acknowledgement")

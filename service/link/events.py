@@ -82,16 +82,6 @@ class BasisMismatch:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WrongShape:
-    """Frames have other sizes than the status says; one event for a burst of them."""
-
-    expected: tuple[int, int]
-    """Slopes and modes, by the status."""
-
-    found: tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class MalformedMessage:
     """A message that broke the contract and was not used; one event for a burst of them."""
 
@@ -120,7 +110,6 @@ LinkEvent = (
     | SecondRtc
     | IdsAdopted
     | BasisMismatch
-    | WrongShape
     | MalformedMessage
     | MeasuredMatrix
 )

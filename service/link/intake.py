@@ -26,11 +26,10 @@ from service.link.events import (
     SecondRtc,
     SessionChanged,
     StatusReceived,
-    WrongShape,
 )
-from service.link.ring import FrameCounts, FrameRing
+from service.link.ring import LEAP, FrameCounts, FrameRing
 from service.link.sessions import SessionWatch
-from service.link.statistics import LinkStatistics
+from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
 from service.link.wakeup import Wakeup
 from service.wire import (
     FRAMES_PER_BATCH,
@@ -39,6 +38,7 @@ from service.wire import (
     FrameHeader,
     decode_frames,
     decode_status,
+    essentials,
 )
 
 LATENCIES: Final = 1024
@@ -46,6 +46,22 @@ LATENCIES: Final = 1024
 
 TAKE_FRAMES: Final = 256
 """Frames copied under one hold of the lock, so that ingest never waits for long."""
+
+STATUS_INTERVAL_S: Final = 0.1
+"""Between two statuses that say the same: of more, the latest is taken when it is over."""
+
+CHANGES: Final = 10
+"""Statuses that say something else each, which are taken within that time all the same."""
+
+SPARED: Final = "spared"
+"""What became of a status that a later one made superfluous."""
+
+PLACED: Final = {
+    "duplicate": "they had come before",
+    "late": "their place in the sequence had been passed",
+    "nonfinite": "a slope or a command is not finite",
+}
+"""What becomes of frames in the sequence besides being used, and what is then wrong with them."""
 
 
 class Intake:
@@ -74,11 +90,15 @@ class Intake:
         self._config_id: str | None = None
         self._shape: tuple[int, int] | None = None
         self._counts = FrameCounts()
-        self._tally: Counter[str] = Counter()
-        self._refused: Counter[str] = Counter()
-        self._malformed: Counter[str] = Counter()
+        self._counted: Counter[str] = Counter()
+        self._tally = Tally()
         self._rtc_alive = False
+        self._begun_s = clock()
         self._last_frame_s: float | None = None
+        self._last_status_s: float | None = None
+        self._essentials: tuple[object, ...] = ()
+        self._changes = 0
+        self._spared: bytes | None = None
         self._latency_s: deque[float] = deque(maxlen=LATENCIES)
 
     def expect(self, basis_id: str | None, config_id: str | None) -> None:
@@ -127,48 +147,80 @@ class Intake:
         self._wakeup.ring()
 
     def status(self, data: bytes) -> None:
-        """Take the RTC's account of its loop.
+        """Take the RTC's account of its loop; of a flood of them as many as are of use.
 
         Raises
         ------
         WireError
             If it breaks the contract.
         """
+        found = essentials(data)
+        now_s = self._clock()
+        with self._lock:
+            if self._superfluous(found, now_s):
+                self._spared = data
+                self._tally.add("status", SPARED, 1, now_s)
+                return
+            self._spared = None
+        self._take_status(data, found)
+        self._wakeup.ring()
+
+    def _superfluous(self, found: tuple[object, ...], now_s: float) -> bool:
+        """Return whether a status may give way to the next one."""
+        last_s = self._last_status_s
+        if last_s is None or now_s - last_s >= STATUS_INTERVAL_S:
+            self._changes = 0
+            return False
+        if found == self._essentials:
+            return True
+        self._changes += 1
+        return self._changes > CHANGES
+
+    def _take_status(self, data: bytes, found: tuple[object, ...]) -> None:
         status = decode_status(data)
         now_s = self._clock()
         with self._lock:
-            self._tally["statuses"] += 1
-            if self._admit(status.session, now_s):
-                self._expected(status.basis_id, status.config_id, now_s)
-                self._shape = (status.n_slopes, status.n_modes)
-                self._queue.put(StatusReceived(status=status))
-        self._wakeup.ring()
+            if not self._admit("status", status.session, 1, now_s):
+                return
+            self._tally.add("status", USED, 1, now_s)
+            self._essentials = found
+            self._last_status_s = now_s
+            self._expected(status.basis_id, status.config_id, now_s)
+            self._shape = (status.n_slopes, status.n_modes)
+            self._queue.put(StatusReceived(status=status))
 
     def acknowledgement(self, acknowledgement: Acknowledgement, *, known: bool) -> None:
         """Take the RTC's word on a reconstructor."""
+        now_s = self._clock()
         with self._lock:
-            self._tally["acknowledgements"] += 1
-            self._tally["unknown"] += not known
-        self.event(AcknowledgementReceived(acknowledgement=acknowledgement, known=known))
+            self._counted["unknown"] += not known
+            if self._admit("ack", acknowledgement.session, 1, now_s):
+                self._tally.add("ack", USED, 1, now_s)
+                event = AcknowledgementReceived(acknowledgement=acknowledgement, known=known)
+                self._queue.put(event)
+        self._wakeup.ring()
 
     def liveliness(self, *, alive: bool) -> None:
         """Take the appearance or disappearance of the RTC's token."""
         with self._lock:
             self._rtc_alive = alive
+            if not alive:
+                self._sessions.leave()
         self.event(RtcAppeared() if alive else RtcVanished())
 
     def malformed(self, kind: str, error: WireError) -> None:
         """Count a message that was not used, and report the first of a burst."""
+        now_s = self._clock()
         with self._lock:
-            self._malformed[kind] += 1
-            due = self._bursts.opens(f"malformed {kind}", self._clock())
+            self._tally.add(kind, MALFORMED, 1, now_s, str(error))
+            due = self._bursts.opens(f"malformed {kind}", now_s)
         if due:
             self.event(MalformedMessage(kind=kind, text=str(error)))
 
     def failed(self, kind: str) -> bool:
         """Count a fault of the service itself; return whether it is the first of a burst."""
         with self._lock:
-            self._tally["failed"] += 1
+            self._counted["failed"] += 1
             return self._bursts.opens(f"failed {kind}", self._clock())
 
     def event(self, event: LinkEvent) -> None:
@@ -193,85 +245,129 @@ class Intake:
     def events(self) -> list[LinkEvent]:
         """Return what has happened since the last call, oldest first."""
         self._wakeup.answer()
+        self._take_spared()
         return self._queue.take()
+
+    def _take_spared(self) -> None:
+        """Take the last of a flood of statuses in, once it is due."""
+        with self._lock:
+            data, last_s = self._spared, self._last_status_s
+            if data is None or (last_s or 0.0) + STATUS_INTERVAL_S > self._clock():
+                return
+            self._spared, self._changes = None, 0
+        try:
+            self._take_status(data, essentials(data))
+        except WireError as error:
+            self.malformed("status", error)
 
     def statistics(self) -> LinkStatistics:
         """Return all counters as they are now."""
         with self._lock:
-            latency, tally = list(self._latency_s), self._tally
-            last, counts = self._last_frame_s, asdict(self._counts)
+            now_s, tally = self._clock(), self._tally
+            malformed = {k: n for (k, fate), n in tally.totals.items() if fate == MALFORMED}
             return LinkStatistics(
                 rtc_alive=self._rtc_alive,
                 session=self._sessions.current,
                 basis_id=self._basis_id,
                 config_id=self._config_id,
-                batches_received=tally["batches"],
-                **{f"frames_{name}": value for name, value in counts.items()},
-                frames_refused=dict(self._refused),
-                messages_malformed=dict(self._malformed),
-                statuses_received=tally["statuses"],
-                acknowledgements_received=tally["acknowledgements"],
-                acknowledgements_unknown=tally["unknown"],
+                batches_received=self._counted["batches"],
+                **{f"frames_{name}": n for name, n in asdict(self._counts).items()},
+                frames_refused=tally.of("frames", but=(USED, MALFORMED, *PLACED)),
+                messages_malformed=malformed,
+                statuses_received=sum(tally.of("status", but=(MALFORMED,)).values()),
+                acknowledgements_received=sum(tally.of("ack", but=(MALFORMED,)).values()),
+                acknowledgements_unknown=self._counted["unknown"],
                 events_dropped=self._queue.dropped,
-                callback_errors=tally["failed"],
-                frame_age_s=None if last is None else self._clock() - last,
-                latency_p50_s=median(latency) if latency else None,
+                callback_errors=self._counted["failed"],
+                frame_age_s=_age_s(self._last_frame_s, now_s),
+                fates=tally.fates(now_s),
+                status_age_s=_age_s(self._last_status_s, now_s),
+                session_age_s=now_s - self._begun_s,
+                session_waiting=self._sessions.waiting(now_s),
+                latency_p50_s=median(self._latency_s) if self._latency_s else None,
             )
 
     def _belongs(self, header: FrameHeader, now_s: float) -> bool:
         """Return whether frames are of the session, basis, configuration and shape that count."""
-        if not self._admit(header.session, now_s):
-            self._refused["session"] += header.n
+        if not self._admit("frames", header.session, header.n, now_s):
             return False
-        wrong = self._expected(header.basis_id, header.config_id, now_s)
-        wrong = wrong or self._misshapen(header, now_s)
+        wrong = self._expected(header.basis_id, header.config_id, now_s) or self._misshapen(header)
         if wrong:
-            self._refused[wrong] += header.n
+            reason, text = wrong
+            self._tally.add("frames", reason, header.n, now_s, text)
         return not wrong
 
-    def _misshapen(self, header: FrameHeader, now_s: float) -> str:
-        """Return "shape" for frames of other sizes than the status says, else an empty string."""
-        found = (header.n_slopes, header.n_modes)
-        if self._shape is None or found == self._shape:
-            return ""
-        if self._bursts.opens("shape", now_s):
-            self._queue.put(WrongShape(expected=self._shape, found=found))
-        return "shape"
+    def _misshapen(self, header: FrameHeader) -> tuple[str, str] | None:
+        """Return why frames are not of the sizes that the status says; None: they are."""
+        found, expected = (header.n_slopes, header.n_modes), self._shape
+        if expected is None or found == expected:
+            return None
+        return "shape", (
+            f"{found[0]} slopes and {found[1]} modes, expected {expected[0]} and {expected[1]} as "
+            "the RTC's status says"
+        )
 
     def _store(self, batch: FrameBatch, now_s: float) -> None:
         header = batch.header
-        self._tally["batches"] += 1
+        self._counted["batches"] += 1
         self._last_frame_s = now_s
         if self._ring is None or not self._ring.fits(header):
             if self._ring is not None:
                 self._counts.overwritten += self._ring.undelivered
             self._ring = FrameRing(header, self._capacity(header), self._counts)
-        self._ring.store(batch, now_s)
+        batches, wrong = [batch], self._ring.why_not(header)
+        if wrong is not None:
+            reason, text = wrong
+            batches = self._ring.leapt(batch) if reason == LEAP else []
+            if not batches:
+                self._tally.add("frames", reason, header.n, now_s, text)
+        for each in batches:
+            self._place(self._ring, each, now_s)
+
+    def _place(self, ring: FrameRing, batch: FrameBatch, now_s: float) -> None:
+        """Put frames in their places, and count what became of them."""
+        before = asdict(self._counts)
+        ring.store(batch, now_s)
+        after = asdict(self._counts)
+        self._tally.add("frames", USED, after["received"] - before["received"], now_s)
+        for name, text in PLACED.items():
+            self._tally.add("frames", name, after[name] - before[name], now_s, text)
 
     def _capacity(self, header: FrameHeader) -> int:
         row_bytes = 4 * (header.n_slopes + 2 * header.n_modes)
         wanted = int(self._endpoint.ring_seconds * 1e9 / header.dt_ns)
         return max(2 * FRAMES_PER_BATCH, min(wanted, self._endpoint.ring_bytes // row_bytes))
 
-    def _admit(self, session: str, now_s: float) -> bool:
+    def _admit(self, kind: str, session: str, n: int, now_s: float) -> bool:
+        """Return whether ``n`` of a kind are of the session that counts, or count them."""
         current = self._sessions.current
         admission = self._sessions.admit(session, now_s)
         if admission.changed:
-            self._shape = None
+            self._shape, self._begun_s = None, now_s
+            self._last_status_s, self._essentials = None, ()
             self._queue.put(SessionChanged(old=admission.previous, new=session))
-        if admission.second and current and self._bursts.opens("second", now_s):
-            self._queue.put(SecondRtc(current=current, other=session))
+        if not admission.accepted:
+            text = f"session {session}, while session {current} sends"
+            self._tally.add(kind, "session", n, now_s, text)
+        rival = admission.rival
+        if rival is not None and current and self._bursts.opens("second", now_s):
+            self._queue.put(SecondRtc(current=current, other=rival))
         return admission.accepted
 
-    def _expected(self, basis_id: str, config_id: str, now_s: float) -> str:
-        """Return which id is not the expected one, or an empty string; adopt where none is."""
+    def _expected(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
+        """Return which id is not the expected one, None: both are; adopt where none is."""
         if self._basis_id is None or self._config_id is None:
             self._basis_id = self._basis_id or basis_id
             self._config_id = self._config_id or config_id
             self._queue.put(IdsAdopted(basis_id=self._basis_id, config_id=self._config_id))
-        expected = (self._basis_id, self._config_id)
-        if (basis_id, config_id) == expected:
-            return ""
+        expected, found = (self._basis_id, self._config_id), (basis_id, config_id)
+        if found == expected:
+            return None
         if self._bursts.opens("ids", now_s):
-            self._queue.put(BasisMismatch(expected=expected, found=(basis_id, config_id)))
-        return "basis" if basis_id != self._basis_id else "config"
+            self._queue.put(BasisMismatch(expected=expected, found=found))
+        which = "basis" if basis_id != self._basis_id else "config"
+        return which, f"{' and '.join(found)}, expected {' and '.join(expected)}"
+
+
+def _age_s(then_s: float | None, now_s: float) -> float | None:
+    return None if then_s is None else now_s - then_s

@@ -16,6 +16,15 @@ MISSING: Final = 0
 HELD: Final = 1
 VOID: Final = 2
 
+LEAP: Final = "leap"
+"""In a word, why frames are kept until more have come."""
+
+LEAP_S: Final = 10.0
+"""Of frames: a longer leap of the sequence is believed only when more batches confirm it."""
+
+CONFIRMATIONS: Final = 2
+"""Batches that must go on where a leap has led."""
+
 
 @dataclass(slots=True)
 class FrameCounts:
@@ -75,6 +84,8 @@ class FrameRing:
         self._has_dither = np.zeros(capacity, np.bool_)
         self._cm_id = np.full(capacity, None, object)
         self._noticed_s = np.zeros(capacity)
+        self._newest_ns = header.t0_ns
+        self._leapt: list[FrameBatch] = []
 
     def fits(self, header: FrameHeader) -> bool:
         """Return whether these frames belong here."""
@@ -87,6 +98,39 @@ class FrameRing:
         slots = np.arange(self._cursor, self._head) % self._capacity
         return int(np.count_nonzero(self._state[slots] == HELD))
 
+    def why_not(self, header: FrameHeader) -> tuple[str, str] | None:
+        """Return why frames have no place in this sequence, as a word and a text; None: they have.
+
+        A number that was there before on a frame of a later time is no frame come late.
+        """
+        ahead = header.seq0 - self._head
+        far = min(round(LEAP_S * 1e9 / header.dt_ns), self._capacity)
+        if ahead > far:
+            return LEAP, (
+                f"seq0 leaps from {self._head} to {header.seq0} in session {self.session}: it is "
+                f"believed when {CONFIRMATIONS} more batches confirm it"
+            )
+        old = header.seq0 + header.n <= self._head
+        again = old and header.t0_ns > self._newest_ns
+        if again or (-ahead - header.n) * header.dt_ns > LEAP_S * 1e9:
+            return "sequence", (
+                f"seq0 goes back from {self._head} to {header.seq0} in session {self.session}: the "
+                "RTC must begin a new session when its sequence starts over; restart it"
+            )
+        return None
+
+    def leapt(self, batch: FrameBatch) -> list[FrameBatch]:
+        """Return the batches of a leap that enough of them confirm, else none; keep this one."""
+        before = self._leapt[-1].header if self._leapt else None
+        header = batch.header
+        if before is None or not 0 <= header.seq0 - before.seq0 - before.n <= self._capacity:
+            self._leapt = []
+        self._leapt.append(batch)
+        if len(self._leapt) <= CONFIRMATIONS:
+            return []
+        found, self._leapt = self._leapt, []
+        return found
+
     def store(self, batch: FrameBatch, now_s: float) -> None:
         """Put the frames of a batch in their places.
 
@@ -94,8 +138,11 @@ class FrameRing:
         place that nothing will fill.
         """
         header, counts = batch.header, self._counts
+        self._leapt = []
         seq = np.arange(header.seq0, header.seq0 + header.n)
         older = int(np.count_nonzero(seq < self._head))
+        if header.seq0 + header.n > self._head:
+            self._newest_ns = header.t0_ns + (header.n - 1) * header.dt_ns
         self._advance(header.seq0 + header.n, now_s)
         slots = seq % self._capacity
         here = self._seq[slots] == seq

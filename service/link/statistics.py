@@ -1,9 +1,82 @@
-"""Counters of the link, as one record for REST and metrics."""
+"""Counters of the link, as one record for REST and metrics, and what came in the last seconds."""
 
 from __future__ import annotations
 
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
+
+RECENT_S: Final = 2.0
+"""What came within this time says how the telemetry is now."""
+
+BIN_S: Final = 0.25
+"""What came within this time is summed."""
+
+USED: Final = "used"
+"""What became of a message, or a frame, that was taken in."""
+
+MALFORMED: Final = "malformed"
+"""What became of one that broke the contract."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fate:
+    """What has become of messages of one kind, or of frames, in the last seconds."""
+
+    kind: str
+    """frames, status, ack, im, reply."""
+
+    outcome: str
+    """``used``, or in a word why not."""
+
+    n: int
+    """Frames, or messages, in the last ``RECENT_S``."""
+
+    age_s: float
+    """Since the last one."""
+
+    text: str
+    """Of the last one: what was found and what was expected; empty: nothing was wrong."""
+
+
+class Tally:
+    """Counts what has become of everything that came; not thread-safe."""
+
+    __slots__ = ("_bins", "_last", "totals")
+
+    def __init__(self) -> None:
+        self.totals: Counter[tuple[str, str]] = Counter()
+        self._bins: deque[tuple[float, Counter[tuple[str, str]]]] = deque(
+            maxlen=round(RECENT_S / BIN_S) + 1
+        )
+        self._last: dict[tuple[str, str], tuple[float, str]] = {}
+
+    def add(self, kind: str, outcome: str, n: int, now_s: float, text: str = "") -> None:
+        """Count ``n`` of a kind that met the same fate."""
+        if not n:
+            return
+        self.totals[kind, outcome] += n
+        if not self._bins or now_s - self._bins[-1][0] >= BIN_S:
+            self._bins.append((now_s, Counter()))
+        self._bins[-1][1][kind, outcome] += n
+        self._last[kind, outcome] = (now_s, text)
+
+    def of(self, kind: str, *, but: tuple[str, ...] = ()) -> dict[str, int]:
+        """Return the totals of one kind since the start, by outcome."""
+        return {o: n for (k, o), n in self.totals.items() if k == kind and o not in but}
+
+    def fates(self, now_s: float) -> tuple[Fate, ...]:
+        """Return what has become of everything, the most frequent first."""
+        recent: Counter[tuple[str, str]] = Counter()
+        for start_s, counts in self._bins:
+            if now_s - start_s <= RECENT_S:
+                recent.update(counts)
+        fates = (
+            Fate(kind=kind, outcome=outcome, n=recent[kind, outcome], age_s=now_s - s, text=text)
+            for (kind, outcome), (s, text) in self._last.items()
+        )
+        return tuple(sorted(fates, key=lambda fate: -fate.n))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +118,7 @@ class LinkStatistics:
     """Frames nobody drained in time, or that a new session made void."""
 
     frames_refused: Mapping[str, int]
-    """Frames of batches not used, by reason: session, basis, config, shape."""
+    """Frames of batches not used, by reason: session, basis, config, shape, leap, sequence."""
 
     messages_malformed: Mapping[str, int]
     """Messages that broke the contract, by kind: frames, status, ack, im, reply."""
@@ -63,6 +136,18 @@ class LinkStatistics:
 
     frame_age_s: float | None
     """Seconds since the last frame arrived, by arrival; None: none has."""
+
+    fates: tuple[Fate, ...] = ()
+    """What has become of frames and messages, by kind and outcome, the most frequent first."""
+
+    status_age_s: float | None = None
+    """Seconds since the last status of this session was taken in; None: none has been."""
+
+    session_age_s: float = 0.0
+    """Seconds since the first message of the session that counts."""
+
+    session_waiting: str | None = None
+    """The session that will count if the present one stays silent; None: there is none."""
 
     latency_p50_s: float | None
     """Median of put-to-callback over the last batches; None unless the RTC's session stamps its

@@ -60,12 +60,6 @@ def _trouble(event: heard.LinkEvent) -> ev.Event | None:
                 f"{expected[0]} and {expected[1]}: no estimate, no publication until they agree"
             )
             return ev.Trouble(name="basis-mismatch", text=text)
-        case heard.WrongShape(expected=expected, found=found):
-            text = (
-                f"frames of {found[0]} slopes and {found[1]} modes, expected {expected[0]} and "
-                f"{expected[1]} as the RTC's status says: they are not used"
-            )
-            return ev.Trouble(name="frames-shape", text=text)
         case heard.IdsAdopted(basis_id=basis_id, config_id=config_id):
             text = f"basis {basis_id}, configuration {config_id}"
             return ev.Noted(name="ids.adopted", text=text)
@@ -96,7 +90,7 @@ def rtc_view(status: Status) -> RtcView:
         dither_id=status.dither.request.id if status.dither is not None else None,
         dither=None if status.dither is None else _running(status.dither),
         t_ns_utc=status.t_ns,
-        seq=status.seq,
+        seq=-1 if status.seq is None else status.seq,
         pointing=_pointing(status.pointing),
         flux=status.flux,
     )

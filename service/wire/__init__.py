@@ -53,6 +53,7 @@ from service.wire.manifests import (
     encode_measured_manifest,
 )
 from service.wire.status import (
+    STATUS_LIMIT,
     Acknowledgement,
     AckState,
     AlarmMessage,
@@ -68,6 +69,7 @@ from service.wire.status import (
     encode_alarm,
     encode_state,
     encode_status,
+    essentials,
 )
 
 __all__ = [
@@ -76,6 +78,7 @@ __all__ = [
     "CHUNK_LIMIT",
     "FRAMES_PER_BATCH",
     "MESSAGE_LIMIT",
+    "STATUS_LIMIT",
     "VERSION",
     "AckState",
     "Acknowledgement",
@@ -127,6 +130,7 @@ __all__ = [
     "encode_reply",
     "encode_state",
     "encode_status",
+    "essentials",
     "layout_of",
     "split",
 ]

@@ -11,9 +11,26 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import WireError
 from service.model.misregistration import PARAMETERS
 from service.wire.commands import DitherRequest, Loop, read_dither
-from service.wire.fields import Fields, pack
+from service.wire.fields import MESSAGE_LIMIT, Fields, pack
+
+STATUS_LIMIT: Final = MESSAGE_LIMIT + 16 * 512**2
+"""Bytes: a longer status is refused unread; its images come on top of what a message may have."""
+
+ESSENTIAL: Final = (
+    "session",
+    "loop",
+    "cm_id",
+    "dither",
+    "n_controlled",
+    "n_slopes",
+    "n_modes",
+    "basis_id",
+    "config_id",
+)
+"""What of a status must not be missed, however soon the next one comes."""
 
 RATE_LIMIT_HZ: Final = 1e6
 DELAY_LIMIT_FRAMES: Final = 100.0
@@ -46,8 +63,8 @@ class Status:
     """The RTC's own account of its loop, a few times a second."""
 
     session: str
-    seq: int
-    """The last frame processed."""
+    seq: int | None
+    """The last frame processed; None: there has been none yet."""
 
     t_ns: int
     """Nanoseconds since the Unix epoch, UTC."""
@@ -109,9 +126,11 @@ class Acknowledgement:
     """The RTC's word on one reconstructor."""
 
     session: str
-    id: str
-    sha256: str
-    """Of the matrix meant, 64 lower-case hex digits."""
+    id: str | None
+    """None: the commit that is rejected could not be read."""
+
+    sha256: str | None
+    """Of the matrix meant, 64 lower-case hex digits; None where ``id`` is."""
 
     state: AckState
     reason: str
@@ -191,14 +210,14 @@ def decode_status(data: bytes) -> Status:
     WireError
         If a key is missing or out of range, or the message is too long.
     """
-    message = Fields.unpack(data, "a status").of_this_version()
+    message = _checked(data).of_this_version()
     n_modes = message.integer("n_modes", 1)
     gains = message.numbers("gains", low=0.0)
     if len(gains) != n_modes:
         raise message.refusal("gains", list(gains), f"one for each of {n_modes} modes")
     return Status(
         session=message.opaque("session"),
-        seq=message.integer("seq"),
+        seq=message.optional("seq", message.integer),
         t_ns=message.integer("t_ns"),
         loop=message.choice("loop", Loop),
         frame_rate_hz=message.number("frame_rate_hz", above=0.0, high=RATE_LIMIT_HZ),
@@ -218,6 +237,31 @@ def decode_status(data: bytes) -> Status:
         flux=message.optional("flux", lambda key: _flux(message, key)),
         pointing=message.extension("pointing", lambda key: _pointing(message.child(key))),
     )
+
+
+def essentials(data: bytes) -> tuple[object, ...]:
+    """Return what of a status must not be missed, unchecked; two that differ in it both count.
+
+    Raises
+    ------
+    WireError
+        If the message is no map, or too long.
+    """
+    message = _checked(data)
+    return tuple(message.extension(key, message.get) for key in ESSENTIAL)
+
+
+def _checked(data: bytes) -> Fields:
+    """Return the map of a status that is no longer than its limit, its images left aside."""
+    message = Fields.unpack(data, "a status", STATUS_LIMIT)
+    flux = message.extension("flux", message.get)
+    n_bytes = len(data) - (len(flux) if isinstance(flux, bytes) else 0)
+    if n_bytes > MESSAGE_LIMIT:
+        raise WireError(
+            f"range: a status has {n_bytes} bytes besides its flux, expected at most "
+            f"{MESSAGE_LIMIT}"
+        )
+    return message
 
 
 def _pointing(message: Fields) -> PointingStatus:
@@ -264,10 +308,14 @@ def decode_acknowledgement(data: bytes) -> Acknowledgement:
     frame_seq = message.optional("frame_seq", message.integer)
     if (frame_seq is not None) != (state is AckState.APPLIED):
         raise message.refusal("frame_seq", frame_seq, "a number if and only if applied")
+    matrix_id = message.optional("id", message.identifier)
+    sha256 = message.optional("sha256", message.sha256)
+    if state is not AckState.REJECTED and (matrix_id is None or sha256 is None):
+        raise message.refusal("id, sha256", (matrix_id, sha256), "both, unless rejected")
     return Acknowledgement(
         session=message.opaque("session"),
-        id=message.identifier("id"),
-        sha256=message.sha256("sha256"),
+        id=matrix_id,
+        sha256=sha256,
         state=state,
         reason=message.optional("reason", message.text) or "",
         frame_seq=frame_seq,

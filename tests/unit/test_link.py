@@ -6,18 +6,21 @@ import pytest
 from service.errors import UnknownIdError, WireError
 from service.link.endpoint import Endpoint
 from service.link.events import (
+    AcknowledgementReceived,
     EventQueue,
     MalformedMessage,
     RtcAppeared,
     SecondRtc,
     SessionChanged,
-    WrongShape,
+    StatusReceived,
 )
 from service.link.intake import Intake
 from service.link.measured import MeasuredIntake
 from service.link.outbox import OFFERS, Offer, Outbox
 from service.link.sessions import SessionWatch
 from service.wire import (
+    Acknowledgement,
+    AckState,
     FrameHeader,
     Keys,
     Loop,
@@ -73,52 +76,77 @@ def spans(blocks):
 # ---------------------------------------------------------------- sessions
 
 
-def test_the_newest_session_replaces_the_one_before():
+def test_a_session_is_replaced_once_it_has_been_silent():
     watch = SessionWatch()
     first = watch.admit("a", 0.0)
     assert (first.accepted, first.changed, first.previous) == (True, True, None)
-    second = watch.admit("b", 1.0)
+    assert not watch.admit("b", 1.0).accepted
+    assert watch.waiting(1.0) == "b"
+    second = watch.admit("b", 2.0)
     assert (second.accepted, second.changed, second.previous) == (True, True, "a")
-    assert not watch.admit("b", 2.0).changed
+    assert not watch.admit("b", 3.0).changed
+
+
+def test_one_message_of_an_unknown_session_takes_nothing_over_and_is_named():
+    watch = SessionWatch()
+    watch.admit("a", 0.0)
+    assert not watch.admit("stray", 0.1).accepted
+    named = [watch.admit("a", 0.1 * k).rival for k in range(2, 30)]
+    assert watch.current == "a"
+    assert [rival for rival in named if rival] == ["stray"]
 
 
 def test_the_last_words_of_a_replaced_session_are_refused_but_no_second_rtc():
     watch = SessionWatch()
     watch.admit("a", 0.0)
-    watch.admit("b", 1.0)
-    echo = watch.admit("a", 1.5)
-    assert (echo.accepted, echo.second) == (False, False)
+    watch.admit("b", 2.0)
+    assert not watch.admit("a", 2.5).accepted
+    assert watch.admit("b", 4.0).rival is None
 
 
-def test_a_replaced_session_that_goes_on_beside_the_new_one_is_a_second_rtc():
+def test_a_straggler_of_the_old_session_does_not_make_the_new_one_a_second_rtc():
     watch = SessionWatch()
     watch.admit("a", 0.0)
-    watch.admit("b", 1.0)
-    watch.admit("b", 2.4)
-    assert watch.admit("a", 2.5).second
+    watch.admit("b", 0.1)
+    assert watch.admit("a", 0.6).rival is None
+    assert watch.admit("b", 2.7).changed
 
 
-def test_a_replaced_session_takes_over_when_the_new_one_has_fallen_silent():
+def test_a_session_that_goes_on_beside_the_one_that_counts_is_a_second_rtc():
     watch = SessionWatch()
     watch.admit("a", 0.0)
-    watch.admit("b", 1.0)
-    back = watch.admit("a", 3.5)
-    assert (back.accepted, back.changed, back.previous) == (True, True, "b")
+    named = []
+    for k in range(1, 40):
+        watch.admit("b", 0.1 * k)
+        named.append(watch.admit("a", 0.1 * k + 0.05).rival)
+    assert watch.current == "a"
+    assert "b" in named
 
 
-def test_endless_restarts_are_remembered_within_bounds():
+def test_after_a_goodbye_nothing_is_waited_for_unless_the_session_speaks_again():
     watch = SessionWatch()
+    watch.admit("a", 0.0)
+    watch.leave()
+    watch.admit("a", 0.1)
+    assert not watch.admit("b", 0.2).accepted
+    watch.leave()
+    assert watch.admit("b", 0.3).previous == "a"
+
+
+def test_endless_strangers_are_remembered_within_bounds():
+    watch = SessionWatch()
+    watch.admit("a", 0.0)
     for k in range(100):
-        watch.admit(f"s{k}", float(k))
-    assert not watch.admit("s98", 99.5).accepted
-    assert watch.admit("s3", 99.5).accepted
+        watch.admit(f"s{k}", 0.01 * k)
+    assert len(watch._rivals) <= 16
 
 
 # ---------------------------------------------------------------- intake
 
 
-def test_what_a_new_session_leaves_behind_is_void_and_counted(intake):
+def test_what_a_new_session_leaves_behind_is_void_and_counted(intake, clock):
     send(intake, 500)
+    clock.now_s += 2.0
     send(intake, 0, session="s2")
     assert spans(intake.drain()) == [("s2", 0, 10)]
     statistics = intake.statistics()
@@ -165,27 +193,29 @@ def test_frames_of_another_shape_than_the_status_says_cost_themselves_only(intak
     send(intake, 10, n_slopes=2)
     send(intake, 20)
     send(intake, 30, n_slopes=2)
-    assert [e for e in intake.events() if isinstance(e, WrongShape)] == [
-        WrongShape(expected=(3, 2), found=(2, 2))
-    ]
+    fate = next(f for f in intake.statistics().fates if f.outcome == "shape")
+    assert (fate.kind, fate.n) == ("frames", 20)
+    assert fate.text.startswith("2 slopes and 2 modes, expected 3 and 2")
     assert intake.statistics().frames_refused == {"shape": 20}
     assert intake.statistics().frames_overwritten == 0
     assert spans(intake.drain()) == [("s1", 0, 10)]
 
 
-def test_a_status_of_another_shape_brings_frames_of_that_shape(intake):
+def test_a_status_of_another_shape_brings_frames_of_that_shape(intake, clock):
     say(intake)
     send(intake, 0)
     say(intake, n_slopes=4)
     send(intake, 10, n_slopes=4)
     assert spans(intake.drain()) == [("s1", 10, 10)]
+    clock.now_s += 2.0
     say(intake, session="s2", n_slopes=4)
     send(intake, 0, session="s2", n_slopes=4)
     assert intake.statistics().frames_refused == {}
 
 
-def test_a_new_session_need_not_have_the_shape_of_the_one_before(intake):
+def test_a_new_session_need_not_have_the_shape_of_the_one_before(intake, clock):
     say(intake)
+    clock.now_s += 2.0
     send(intake, 0, session="s2", n_slopes=4)
     assert intake.statistics().frames_refused == {}
 
@@ -200,12 +230,57 @@ def test_frames_behind_a_hole_are_held_back_until_patience_ends(intake, clock):
     assert spans(intake.drain()) == [("s1", 20, 10)]
 
 
-def test_a_sequence_that_leaps_further_than_the_ring_is_long_costs_no_memory(intake):
+def fate(intake, outcome, kind="frames"):
+    """Return what the link says of frames, or messages, that met this fate."""
+    fates = intake.statistics().fates
+    return next((f for f in fates if (f.kind, f.outcome) == (kind, outcome)), None)
+
+
+@pytest.mark.parametrize("leap", [2_000, 20_000, 2**61])
+def test_one_frame_with_a_leap_of_its_number_costs_itself_only(intake, leap):
     send(intake, 0)
-    send(intake, 2**50, t0_ns=0)
-    statistics = intake.statistics()
-    assert statistics.frames_lost == 2**50 - 10
-    assert statistics.frames_overwritten == 10
+    send(intake, leap, n=1, t0_ns=10**18 + 10_000_000)
+    for k in range(1, 5):
+        send(intake, 10 * k)
+    assert sum(b.n_frames for b in intake.drain()) == 50
+    assert (fate(intake, "leap").n, fate(intake, "late")) == (1, None)
+    assert "leaps from 10 to" in fate(intake, "leap").text
+
+
+def test_a_leap_that_the_next_batches_confirm_is_believed_and_costs_no_memory(intake, clock):
+    send(intake, 0)
+    intake.drain()
+    for k in range(4):
+        send(intake, 2**50 + 10 * k, t0_ns=10**18 + 10_000_000 * (k + 1))
+    clock.now_s += 0.6
+    assert spans(intake.drain()) == [("s1", 2**50, 40)]
+    assert intake.statistics().frames_lost == 2**50 - 10
+
+
+def test_leaps_that_lead_nowhere_are_never_believed(intake):
+    for k in range(10):
+        send(intake, 10 * k)
+        send(intake, 2**50 + 10_000 * k, t0_ns=10**18)
+    assert sum(b.n_frames for b in intake.drain()) == 100
+
+
+@pytest.mark.parametrize("n_batches", [20, 2000])
+def test_a_sequence_that_starts_over_in_its_session_is_named_at_once(intake, n_batches):
+    for k in range(n_batches):
+        send(intake, 10 * k)
+    newest_ns = 10**18 + n_batches * 10_000_000
+    send(intake, 0, t0_ns=newest_ns)
+    assert fate(intake, "sequence").n == 10
+    assert f"goes back from {10 * n_batches} to 0" in fate(intake, "sequence").text
+
+
+def test_frames_that_come_late_or_again_are_no_fault_of_the_sequence(intake):
+    send(intake, 0)
+    send(intake, 20)
+    send(intake, 10)
+    send(intake, 10)
+    assert fate(intake, "sequence") is None
+    assert (fate(intake, "used").n, fate(intake, "duplicate").n) == (30, 10)
 
 
 def test_more_frames_than_one_hold_of_the_lock_copies_are_all_drained(intake):
@@ -225,13 +300,74 @@ def test_drained_frames_are_copies(intake):
 
 def test_two_interleaved_sessions_are_reported_once_per_burst(intake, clock):
     send(intake, 0)
-    send(intake, 0, session="s2")
     for k in range(1, 30):
         clock.now_s += 0.3
-        send(intake, 10 * k, session="s2")
         send(intake, 10 * k)
-    assert intake.events().count(SecondRtc(current="s2", other="s1")) == 1
+        send(intake, 10 * k, session="s2")
+    assert intake.events().count(SecondRtc(current="s1", other="s2")) == 1
     assert intake.statistics().frames_refused == {"session": 290}
+
+
+@pytest.mark.parametrize("kind", ["frames", "status", "ack"])
+def test_no_message_of_an_unknown_session_takes_over_from_one_that_sends(intake, clock, kind):
+    send(intake, 0)
+    say(intake)
+    if kind == "frames":
+        send(intake, 0, session="other")
+    elif kind == "status":
+        say(intake, session="other")
+    else:
+        intake.acknowledgement(
+            Acknowledgement(
+                session="other",
+                id="cm-1",
+                sha256="0" * 64,
+                state=AckState.APPLIED,
+                reason="",
+                frame_seq=5,
+            ),
+            known=True,
+        )
+    events = intake.events()
+    assert intake.statistics().session == "s1"
+    assert not [e for e in events if isinstance(e, SessionChanged) and e.new == "other"]
+    assert not [e for e in events if isinstance(e, AcknowledgementReceived)]
+    assert fate(intake, "session", kind) is not None
+
+
+def flood(intake, clock, n, **changes):
+    for k in range(n):
+        clock.now_s += 0.002
+        say(intake, seq=k, **changes)
+
+
+def test_of_a_flood_of_statuses_ten_a_second_are_taken_and_the_latest_is_not_lost(intake, clock):
+    taken = []
+    for k in range(1000):
+        clock.now_s += 0.002
+        say(intake, seq=k)
+        taken += [e.status.seq for e in intake.events() if isinstance(e, StatusReceived)]
+    clock.now_s += 0.2
+    taken += [e.status.seq for e in intake.events() if isinstance(e, StatusReceived)]
+    assert 15 <= len(taken) <= 25
+    assert taken == sorted(taken)
+    assert taken[-1] == 999
+    assert intake.statistics().statuses_received == 1000 + 1
+
+
+@pytest.mark.parametrize(
+    "change", [{"loop": Loop.OPEN}, {"cm_id": "other"}, {"n_controlled": 1}, {"n_slopes": 4}]
+)
+def test_what_matters_in_a_flood_of_statuses_is_taken_at_once(intake, clock, change):
+    flood(intake, clock, 20)
+    intake.events()
+    clock.now_s += 0.002
+    say(intake, **change)
+    flood(intake, clock, 20)
+    taken = [e.status for e in intake.events() if isinstance(e, StatusReceived)]
+    (key, value) = next(iter(change.items()))
+    assert [getattr(status, key) for status in taken[:2]] == [value, getattr(taken[1], key)]
+    assert getattr(taken[1], key) != value
 
 
 def test_a_complaint_is_reported_again_after_a_while_and_always_counted(intake, clock):

@@ -140,12 +140,6 @@ def test_another_basis_is_trouble_that_says_what_was_expected():
     assert "kl and b, expected kl and a" in event.text
 
 
-def test_frames_of_another_shape_than_the_status_says_are_trouble_with_both():
-    event = translate.event_of(heard.WrongShape(expected=(1384, 594), found=(1383, 594)))
-    assert event.name == "frames-shape"
-    assert "frames of 1383 slopes and 594 modes, expected 1384 and 594" in event.text
-
-
 def test_a_malformed_message_is_a_warning_on_record():
     event = translate.event_of(heard.MalformedMessage(kind="status", text="v: found 2"))
     assert (event.name, event.level) == ("message.malformed", Level.WARNING)

@@ -275,9 +275,10 @@ class Bridge:
     def _on_ack(self, sample: zenoh.Sample) -> None:
         data = link.bytes_of(sample.payload, MESSAGE_LIMIT, "an acknowledgement")
         acknowledgement = decode_acknowledgement(data)
-        known = self._outbox.knows(acknowledgement.id)
-        if acknowledgement.state is AckState.APPLIED:
-            self._outbox.adopt(acknowledgement.id)
+        matrix_id = acknowledgement.id
+        known = matrix_id is None or self._outbox.knows(matrix_id)
+        if matrix_id is not None and acknowledgement.state is AckState.APPLIED:
+            self._outbox.adopt(matrix_id, acknowledgement.sha256)
         self._intake.acknowledgement(acknowledgement, known=known)
 
     def _on_measured(self, sample: zenoh.Sample) -> None:

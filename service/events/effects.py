@@ -61,7 +61,8 @@ class SendMatrix:
 class FetchMatrix:
     """Ask the RTC for the matrix it uses."""
 
-    id: str
+    id: str | None
+    """By its status; None: its status does not say."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

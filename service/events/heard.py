@@ -172,7 +172,12 @@ class ProposalJudged:
 class Acknowledged:
     """The RTC answered to a reconstructor."""
 
-    id: str
+    id: str | None
+    """None: it could not read which one it rejects."""
+
+    sha256: str | None = None
+    """Of the matrix it means; None: not told."""
+
     session: str | None = None
     """Of the RTC that answers; None: not known."""
 

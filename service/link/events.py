@@ -128,6 +128,7 @@ class Bursts:
         last = self._last.get(kind)
         if last is not None and now_s - last < BURST_S:
             return False
+        self._last = {k: s for k, s in self._last.items() if now_s - s < BURST_S}
         self._last[kind] = now_s
         return True
 

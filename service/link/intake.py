@@ -345,12 +345,13 @@ class Intake:
         if admission.changed:
             self._shape, self._begun_s = None, now_s
             self._last_status_s, self._essentials = None, ()
+            self._tally.begin()
             self._queue.put(SessionChanged(old=admission.previous, new=session))
         if not admission.accepted:
             text = f"session {session}, while session {current} sends"
             self._tally.add(kind, "session", n, now_s, text)
         rival = admission.rival
-        if rival is not None and current and self._bursts.opens("second", now_s):
+        if rival is not None and current and self._bursts.opens(f"second {rival}", now_s):
             self._queue.put(SecondRtc(current=current, other=rival))
         return admission.accepted
 

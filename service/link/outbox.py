@@ -77,10 +77,10 @@ class Outbox:
                 raise UnknownIdError(f"reconstructor {matrix_id} is not on offer")
             self._current = matrix_id
 
-    def adopt(self, matrix_id: str) -> None:
-        """Make an offer the current one if it is still there."""
+    def adopt(self, matrix_id: str, sha256: str | None) -> None:
+        """Make an offer the current one if it is still there, and of this sum."""
         with self._lock:
-            if matrix_id in self._offers:
+            if matrix_id in self._offers and self._sums.get(matrix_id) == sha256:
                 self._current = matrix_id
 
     def current_commit(self) -> bytes:

@@ -14,12 +14,15 @@ from service.link.session import ask
 from service.wire import (
     ChunkAssembler,
     Command,
+    CommandKind,
     Encodings,
     Keys,
     Manifest,
+    Reply,
     command_kind,
     decode_manifest,
     encode_command,
+    encode_reply,
 )
 
 if TYPE_CHECKING:
@@ -27,6 +30,9 @@ if TYPE_CHECKING:
 
 ABSENT_PAUSE_S: Final = 0.3
 """Before a command is repeated: an RTC that is not there makes a query end at once."""
+
+OPTIONAL: Final = (CommandKind.RAMP,)
+"""Commands that an RTC need not know."""
 
 MATRIX_TIMEOUT_S: Final = 2.0
 """For the RTC to answer with a manifest or a part of its matrix."""
@@ -47,10 +53,14 @@ def send_command(session: zenoh.Session, endpoint: Endpoint, command: Command) -
     for attempt in range(endpoint.command_attempts):
         if attempt:
             time.sleep(ABSENT_PAUSE_S)
-        timeout_s = endpoint.command_timeout_s
+        timeout_s, began_s = endpoint.command_timeout_s, time.monotonic()
         answer = ask(session, selector, timeout_s, payload, Encodings.COMMAND)
         if answer is not None:
             return answer
+        # zenoh ends a query at once that nobody serves
+        if kind in OPTIONAL and time.monotonic() - began_s < timeout_s / 2:
+            reason = f"unsupported: the RTC offers no {kind}"
+            return encode_reply(Reply(id=command.id, accepted=False, reason=reason, start_seq=None))
     raise LinkError(
         f"no answer from the RTC to {kind} command {command.id} after "
         f"{endpoint.command_attempts} attempts: whether it was carried out is unknown"

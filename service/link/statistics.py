@@ -62,6 +62,11 @@ class Tally:
         self._bins[-1][1][kind, outcome] += n
         self._last[kind, outcome] = (now_s, text)
 
+    def begin(self) -> None:
+        """Forget what came of late, and no total: what sends now is another."""
+        self._bins.clear()
+        self._last.clear()
+
     def of(self, kind: str, *, but: tuple[str, ...] = ()) -> dict[str, int]:
         """Return the totals of one kind since the start, by outcome."""
         return {o: n for (k, o), n in self.totals.items() if k == kind and o not in but}

@@ -22,6 +22,12 @@ WRONG_ANSWER = "response-mismatch"
 ARCHIVE_FAILED = "archive-failed"
 """The alarm of a disk that refuses: what cannot be recorded is not done."""
 
+OTHER_SUM = "wrong-matrix"
+"""The alarm of an RTC that acknowledges, or holds, other numbers than were sent."""
+
+STANDING_BY = "standing-by"
+"""The alarm of a service that leaves the RTC to another one."""
+
 
 class Act(Enum):
     """What an alarm may forbid."""
@@ -69,6 +75,11 @@ RULES: dict[str, Rule] = {
     # windows go on: one that is as it should be ends it
     WRONG_ANSWER: Rule("slopes answered otherwise than told", _MISTOLD - {Act.MEASURE}),
     ARCHIVE_FAILED: Rule("the disk refused to be written", frozenset({Act.DECIDE})),
+    OTHER_SUM: Rule(
+        "the RTC held another matrix than was sent",
+        frozenset({Act.DECIDE, Act.SEND_NEW, Act.SEND_KNOWN}),
+    ),
+    STANDING_BY: Rule("another service was driving the RTC", _STRANGER),
     OFF_LOOP: Rule("the commands were off the loop equation", frozenset({Act.MEASURE, Act.DECIDE})),
 }
 """By the name of the alarm."""

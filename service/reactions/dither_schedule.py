@@ -160,7 +160,8 @@ def _why_none(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
         return f"the settings forbid it{left}"
     if not rtc.in_loop:
         return rtc.why_open
-    if state.in_use is None and state.dither is None and rtc.dither is None:
+    unnamed = rtc.cm_id is None or state.unfetched
+    if state.in_use is None and not unnamed and state.dither is None and rtc.dither is None:
         return "the reconstructor in use is not known yet"
     alarm = forbidding(state, Act.MEASURE)
     return None if alarm is None else f"nothing would be measured under {alarm.name}"

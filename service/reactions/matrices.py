@@ -7,7 +7,7 @@ from dataclasses import replace
 from service import events as ev
 from service.errors import CommandError
 from service.events import Effect
-from service.reactions.alarms import Act, forbidding
+from service.reactions.alarms import OTHER_SUM, Act, forbidding
 from service.reactions.journal import logged, with_alarm, without_alarm
 from service.reactions.mode_ladder import with_limit
 from service.reactions.shelf import (
@@ -225,16 +225,20 @@ def extended_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:
 
 def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int) -> TrackerState:
     """Fold the RTC's answer to a reconstructor back in; a late one is accepted."""
-    record = state.reconstructor(event.id)
+    record = _meant(state, event)
     if record is None:
         text = f"an acknowledgement for {event.id}, which this service never sent"
         return logged(state, "acknowledgement.unknown", text, now_ns, Level.WARNING)
+    event = replace(event, id=record.id)
     if _is_old(state, record, event):
         return state
+    if record.sha256 and event.sha256 not in {None, record.sha256}:
+        return _wrong(state, record, event, now_ns)
     if event.state is MatrixState.APPLIED:
+        state = _right(state, record.id, now_ns)
         reason = event.reason or _why_unjudged(record)
         record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
-        state = with_in_use(with_changed(state, record), event.id)
+        state = with_in_use(with_changed(state, record), record.id)
         state = without_alarm(state, "no-acknowledgement", now_ns)
         state = without_alarm(state, "margin", now_ns)
         gains = () if state.rtc is None else commanded_gains(state.rtc, record.n_modes)
@@ -249,11 +253,44 @@ def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int)
     reason = event.reason
     if event.state is MatrixState.STAGED:
         reason = reason or _why_unjudged(record)
-    state = with_state(state, event.id, event.state, reason)
+    state = with_state(state, record.id, event.state, reason)
     if event.state is MatrixState.REJECTED:
         text = f"the RTC rejected {event.id}: {event.reason}"
         return logged(state, "reconstructor.rejected", text, now_ns, Level.WARNING)
     return state
+
+
+def _meant(state: TrackerState, event: ev.Acknowledged) -> ReconstructorRecord | None:
+    """Return which reconstructor is acknowledged: a commit nobody could read was the last one."""
+    if event.id is not None:
+        return state.reconstructor(event.id)
+    sent = {MatrixState.PUBLISHED, MatrixState.STAGED}
+    return next((r for r in reversed(state.reconstructors) if r.state in sent), None)
+
+
+def _wrong(
+    state: TrackerState, record: ReconstructorRecord, event: ev.Acknowledged, now_ns: int
+) -> TrackerState:
+    """Believe that the RTC holds other numbers than were sent: nothing more goes out."""
+    text = (
+        f"the RTC has {event.state} other numbers as {record.id}: sha256 {event.sha256}, sent were "
+        f"{record.sha256}; nothing is published until it holds what was sent (rtc/cm/applied) or "
+        "begins a new session: open the loop if it suffers, look at the RTC's log"
+    )
+    state = with_state(state, record.id, MatrixState.FAILED, text)
+    if event.state is MatrixState.APPLIED:
+        state = replace(state, in_use=None, margin=None, assessment=None)
+    state = replace(state, wrong_matrix=record.id, applied_asked_ns_utc=now_ns)
+    return with_alarm(state, OTHER_SUM, text, now_ns)
+
+
+def _right(state: TrackerState, matrix_id: str, now_ns: int) -> TrackerState:
+    """Return the state once the RTC holds the numbers that it should."""
+    if state.wrong_matrix is None:
+        return state
+    text = f"the RTC holds {matrix_id} as it was sent"
+    state = logged(replace(state, wrong_matrix=None), "reconstructor.right", text, now_ns)
+    return without_alarm(state, OTHER_SUM, now_ns)
 
 
 def _is_old(state: TrackerState, record: ReconstructorRecord, event: ev.Acknowledged) -> bool:
@@ -267,8 +304,23 @@ def _is_old(state: TrackerState, record: ReconstructorRecord, event: ev.Acknowle
 
 
 def on_fetched(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> TrackerState:
-    """Shelve the matrix the RTC uses, which the service did not make."""
-    state = replace(with_in_use(with_record(state, record), record.id), retry_ns_utc=0)
+    """Shelve the matrix the RTC uses, which the service did not make, or find its own again."""
+    state = replace(state, unfetched="")
+    known = state.reconstructor(record.id)
+    if known is not None and known.sha256 not in {"", record.sha256}:
+        event = ev.Acknowledged(
+            id=record.id,
+            sha256=record.sha256,
+            state=MatrixState.APPLIED,
+            reason="",
+            frame_seq=known.applied_frame_seq,
+        )
+        return _wrong(state, known, event, now_ns)
+    state = _right(state, record.id, now_ns)
+    if known is not None and state.in_use == record.id:
+        return state
+    state = state if known is not None else with_record(state, record)
+    state = replace(with_in_use(state, record.id), retry_ns_utc=0)
     text = f"the RTC uses {record.id}, {record.n_modes} modes"
     return logged(state, "reconstructor.adopted", text, now_ns)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from service import events as ev
 from service.events import Effect
+from service.reactions.alarms import OTHER_SUM
 from service.reactions.dither import follow_status, found_again
 from service.reactions.dither_unwanted import gone
 from service.reactions.evidence import over, pointed, voided
@@ -21,7 +22,7 @@ ACKNOWLEDGE_WITHIN_S = 3.0
 FORGOTTEN_AFTER_S = 15.0
 """An alarm the link repeats while it lasts is over after this much silence."""
 
-_RENEWED = ("second-rtc", "basis-mismatch", "frames-shape")
+_RENEWED = ("second-rtc", "basis-mismatch")
 
 COMPUTE_WITHIN_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
@@ -67,7 +68,8 @@ def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     state = pointed(state, rtc.pointing)
     state = _of_this_basis(state, now_ns)
     state = _told_of_gains(before, state, rtc, now_ns)
-    if rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None:
+    known = rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None
+    if rtc.cm_id is not None and known and rtc.cm_id != state.wrong_matrix:
         state = _used_by_status(state, rtc.cm_id, now_ns)
     measuring = state.measuring
     opened = state.acquisition.under_way or (measuring is not None and measuring.opens_loop)
@@ -140,6 +142,9 @@ def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerSta
         rtc=None,
         dither=None,
         in_use=None,
+        wrong_matrix=None,
+        applied_asked_ns_utc=0,
+        unfetched="",
         margin=None,
         assessment=None,
         judged_ns_utc=None,
@@ -147,7 +152,7 @@ def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerSta
         retry_ns_utc=0,
         registration=registration and replace(registration, n_windows=0),
     )
-    state = gone(found_again(state, now_ns), now_ns)
+    state = without_alarm(gone(found_again(state, now_ns), now_ns), OTHER_SUM, now_ns)
     return logged(state, "rtc.session", f"the RTC started session {session}", now_ns)
 
 
@@ -161,6 +166,8 @@ def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> T
             state = replace(state, dither=None, retry_ns_utc=later)
         case ev.AskNoDither():
             pass  # it is asked again while it must be; nothing else has to wait for that
+        case ev.FetchMatrix():
+            state = replace(state, unfetched=text)
         case ev.SendMatrix(id=matrix_id):
             state = with_state(state, matrix_id, MatrixState.FAILED, text)
         case _:

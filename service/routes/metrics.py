@@ -74,6 +74,9 @@ class SnapshotCollector(Collector):
         yield from _of_measurement(snapshot)
         alarms = {alarm.name: 1 for alarm in snapshot.tracker.alarms}
         yield _gauge("alarms", "Alarms that last", len(alarms))
+        waits = {wait.name: wait.hinders + 1 for wait in snapshot.waiting_for}
+        expected = "1 for what is waited for, 2 where nothing can be done meanwhile"
+        yield _labelled_gauge("waiting_for", expected, "name", waits)
         yield _labelled_gauge("alarm", "1 for each alarm that lasts", "name", alarms)
 
 

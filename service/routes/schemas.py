@@ -14,7 +14,7 @@ from service.routes.rtc_views import (
 )
 from service.routes.service import Snapshot
 from service.routes.views import FourView, Number, View
-from service.state import Level, MatrixState, Mode
+from service.state import Level, MatrixState, Mode, Party
 
 
 class VerdictView(View):
@@ -121,6 +121,22 @@ class EventsView(View):
     alarms: tuple[AlarmView, ...]
     log: tuple[LogEntryView, ...]
     """Oldest first."""
+
+
+class WaitingView(View):
+    """Something the service waits for."""
+
+    name: str
+    """Machine-readable."""
+
+    party: Party
+    """Who can end it: "rtc", "operator", "worker" (the service's own) or "service" (another)."""
+
+    text: str
+    """What is missing, and what to do."""
+
+    hinders: bool
+    """Whether the service can do nothing of its work meanwhile: then it is not ready."""
 
 
 class LinkView(View):
@@ -258,6 +274,9 @@ class StateView(View):
     """Why ordinary telemetry says nothing of α now, and what it would need; empty: it does, or was
     not looked at yet."""
 
+    waiting_for: tuple[WaitingView, ...]
+    """Whom the service waits for and what they should do, what hinders most first."""
+
     alarms: tuple[AlarmView, ...]
     windows_accepted: int
     windows_refused: int
@@ -281,6 +300,7 @@ class StateView(View):
             | {
                 "ready": snapshot.ready,
                 "ready_reason": snapshot.ready_reason,
+                "waiting_for": snapshot.waiting_for,
                 "now_ns": snapshot.now_ns,
                 "uptime_s": (snapshot.now_ns - snapshot.started_ns) / 1e9,
                 "registration": registration and AlphaView.of(registration, snapshot),

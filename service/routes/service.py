@@ -11,7 +11,7 @@ from fastapi import Depends, Request
 from numpy.typing import NDArray
 
 from service.events import Command
-from service.state import TrackerState
+from service.state import TrackerState, Waiting
 
 
 class Link(Protocol):
@@ -115,6 +115,9 @@ class Snapshot:
 
     ready_reason: str
     """What it waits for, or that it waits for nothing."""
+
+    waiting_for: tuple[Waiting, ...] = ()
+    """Whom the service waits for and what they should do, what hinders most first."""
 
     estimate_arrival_ns: int | None = None
     """When the last window that entered the estimate arrived, on the service's clock.

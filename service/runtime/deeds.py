@@ -264,13 +264,14 @@ class Deeds:
             return ev.LoopAnswered(id=effect.id, accepted=False, reason=verdict.reason)
         return await self._ask(effect)
 
-    async def _fetch(self, matrix_id: str) -> Event:
+    async def _fetch(self, matrix_id: str | None) -> Event:
         manifest, matrix = await self._bridge.fetch_applied()
-        if manifest.id != matrix_id:
+        if matrix_id not in {None, manifest.id}:
             raise LinkError(f"the RTC offers {manifest.id}, its status says it uses {matrix_id}")
         record = translate.record_of(manifest)
-        self._remember(record.id, matrix)
+        # first: the archive refuses other numbers under an id it knows
         await asyncio.to_thread(self._store_foreign, record, matrix)
+        self._remember(record.id, matrix)
         return ev.MatrixFetched(record=record)
 
     async def _send(self, effect: ev.SendMatrix, state: TrackerState) -> Event | None:

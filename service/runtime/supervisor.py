@@ -30,10 +30,11 @@ from service.runtime.deeds import Deeds
 from service.runtime.following import followed, news, shape_news
 from service.runtime.recording import Recorder
 from service.runtime.streams import Streams, Window, fed, taken, with_matrix
+from service.runtime.waiting import Facts, Told, news_of_link, waiting_for
 from service.runtime.windows import fitted, listened, watched
-from service.state import Level, LogEntry, MeasureState, TrackerState
+from service.state import Level, LogEntry, MeasureState, TrackerState, Waiting
 from service.tracker import step
-from service.wire import AlarmMessage
+from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, Workbench
 
 POLL_S = 0.05
@@ -79,18 +80,28 @@ class Supervisor:
 
     def snapshot(self) -> Snapshot:
         """Return what is known now."""
-        ready, known = self._streams is not None, self._state.registration
+        known, waiting = self._state.registration, self._waiting()
         return Snapshot(
             tracker=self._state,
             link=self._bridge.statistics(),
             now_ns=time.time_ns(),
             started_ns=self._started_ns,
-            ready=ready,
-            ready_reason="ready" if ready else "the optical model is being prepared",
+            ready=not any(wait.hinders for wait in waiting),
+            ready_reason="; ".join(f"{wait.party}: {wait.text}" for wait in waiting) or "ready",
+            waiting_for=waiting,
             estimate_arrival_ns=known.arrived_ns_utc if known is not None else None,
             archive_failures=self._recorder.failures,
             archive_waiting=self._recorder.waiting,
         )
+
+    def _waiting(self) -> tuple[Waiting, ...]:
+        """Return whom the service waits for now."""
+        facts = Facts(
+            state=self._state,
+            link=self._bridge.statistics(),
+            preparing=self._streams is None,
+        )
+        return waiting_for(facts)
 
     async def submit(self, command: Command) -> str:
         """Set an operator's command in motion; return one line that says what was.
@@ -225,10 +236,16 @@ class Supervisor:
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
+        told = Told()
         while True:
             self._post(ev.Tick())
             now_ns = time.time_ns()
-            self._bridge.publish_state(translate.state_message(self._state, now_ns))
+            for event in news_of_link(self._bridge.statistics(), self._state, now_ns):
+                self._post(event)
+            waiting = self._waiting()
+            for text in told.news(waiting, self._state.alarms, now_ns):
+                self._note("waiting", text, Level.INFO)
+            self._bridge.publish_state(translate.state_message(self._state, now_ns, waiting))
             raised = frozenset((a.name, a.text) for a in self._state.alarms)
             for name, text in raised ^ alarms:
                 self._bridge.publish_alarm(
@@ -237,7 +254,7 @@ class Supervisor:
                         t_ns=now_ns,
                         name=name,
                         active=(name, text) in raised,
-                        text=text,
+                        text=text[:TEXT_LIMIT],
                     )
                 )
             alarms = raised

@@ -17,8 +17,10 @@ from service.state import (
     ReconstructorRecord,
     RtcView,
     TrackerState,
+    Waiting,
 )
 from service.wire import (
+    TEXT_LIMIT,
     Acknowledgement,
     DitherStatus,
     Manifest,
@@ -123,6 +125,7 @@ def _running(status: DitherStatus) -> DitherView | None:
 def _acknowledged(acknowledgement: Acknowledgement) -> ev.Acknowledged:
     return ev.Acknowledged(
         id=acknowledgement.id,
+        sha256=acknowledgement.sha256,
         session=acknowledgement.session,
         state=MatrixState(acknowledgement.state.value),
         reason=acknowledgement.reason,
@@ -199,7 +202,9 @@ def measurement_of(manifest: MeasuredManifest) -> MeasurementRecord:
     )
 
 
-def state_message(state: TrackerState, now_ns: int) -> StateMessage:
+def state_message(
+    state: TrackerState, now_ns: int, waiting: tuple[Waiting, ...] = ()
+) -> StateMessage:
     """Return the short account of the state for whoever listens on the network."""
     known = state.registration
     sigma = None if known is None else known.sigma * BOUNDARY_SCALE
@@ -212,4 +217,5 @@ def state_message(state: TrackerState, now_ns: int) -> StateMessage:
         sigma=None if sigma is None else dict(zip(PARAMETERS, sigma.tolist(), strict=True)),
         in_use=state.in_use,
         validity=None if known is None else known.standing.validity.value,
+        waiting_for=tuple(f"{w.party}: {w.text}"[:TEXT_LIMIT] for w in waiting),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import events as ev
-from service.errors import PyrcalError
+from service.errors import PyrcalError, UnknownIdError
 from service.estimation.estimator import Window
 from service.estimation.instrumental import Loop
 from service.estimation.lockin import Spectra, WindowRefused
@@ -52,10 +52,10 @@ async def _demodulated(spectra: Spectra, state: TrackerState, crew: Crew, deeds:
     rtc, known = state.rtc, state.registration
     if state.acquisition.looks_afar:
         return await _found(spectra, state, crew)
-    if rtc is None or spectra.cm_id is None:
-        return lost(spectra, "the RTC or its reconstructor is not known")
+    if rtc is None:
+        return lost(spectra, "the RTC is not known")
     try:
-        matrix = await asyncio.to_thread(deeds.matrix, spectra.cm_id)
+        matrix = await asyncio.to_thread(_reconstructor, spectra, state, deeds)
         loop = Loop(
             reconstructor=matrix,
             gains=np.array(rtc.gains),
@@ -70,6 +70,20 @@ async def _demodulated(spectra: Spectra, state: TrackerState, crew: Crew, deeds:
     if isinstance(outcome, WindowRefused):
         return ev.WindowLost(refused=outcome)
     return ev.WindowFitted(estimate=outcome, began_ns_utc=_began_ns(spectra, rtc))
+
+
+def _reconstructor(spectra: Spectra, state: TrackerState, deeds: Deeds) -> NDArray[np.float32]:
+    """Return the matrix that made the commands; one that nobody has tells nothing of the loop.
+
+    The fit takes the dither alone for its instrument then, which costs precision and no truth.
+    """
+    unknown = np.zeros((0, spectra.slopes.shape[-1]), np.float32)
+    if spectra.cm_id is None and state.in_use is None:
+        return unknown
+    try:
+        return deeds.matrix(spectra.cm_id or state.in_use or "")
+    except UnknownIdError:
+        return unknown
 
 
 async def _found(spectra: Spectra, state: TrackerState, crew: Crew) -> Event:

@@ -2,7 +2,7 @@
 
 from service.state.acquisition import Acquisition, AcquisitionStage, Interruption, LoopFound
 from service.state.dithering import Dithering, DitherPhase, DitherPlan, Precision
-from service.state.journal import Alarm, Level, LogEntry
+from service.state.journal import Alarm, Level, LogEntry, Party, Waiting
 from service.state.measurements import MeasurementRecord, MeasurePattern, MeasureState
 from service.state.noisy import ModeSet, NoisyFinding, NoisyRecord, NoisyState
 from service.state.pointing import Pointing
@@ -57,6 +57,7 @@ __all__ = [
     "NoisyRecord",
     "NoisyState",
     "Orders",
+    "Party",
     "PassiveBias",
     "Pointing",
     "Precision",
@@ -69,5 +70,6 @@ __all__ = [
     "Standing",
     "TrackerState",
     "Validity",
+    "Waiting",
     "Watchdog",
 ]

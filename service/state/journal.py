@@ -31,6 +31,35 @@ class Alarm:
     0: not known."""
 
 
+class Party(StrEnum):
+    """Whom the service waits for."""
+
+    RTC = "rtc"
+    OPERATOR = "operator"
+    WORKER = "worker"
+    """The service's own, which computes."""
+
+    SERVICE = "service"
+    """Another one, of the same system."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Waiting:
+    """Something the service waits for."""
+
+    name: str
+    """Machine-readable."""
+
+    party: Party
+    """Who can end it."""
+
+    text: str
+    """What is missing, and what to do."""
+
+    hinders: bool = False
+    """Whether the service can do nothing of its work meanwhile."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogEntry:
     """One thing that happened."""

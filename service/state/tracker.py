@@ -60,6 +60,15 @@ class TrackerState:
     in_use: str | None = None
     """Id of the matrix the RTC multiplies with; None: unknown."""
 
+    wrong_matrix: str | None = None
+    """Id under which the RTC holds other numbers than were sent; None: it holds what it should."""
+
+    applied_asked_ns_utc: int = 0
+    """When the RTC was last asked for the matrix it uses."""
+
+    unfetched: str = ""
+    """Why it could not be had; empty: it could, or was not asked for."""
+
     margin: GateVerdict | None = None
     """The gate's verdict on the matrix in use at the current α ± 3σ; None: not known yet."""
 

@@ -33,7 +33,7 @@ from service.wire.commands import (
     encode_command,
     encode_reply,
 )
-from service.wire.fields import MESSAGE_LIMIT, VERSION
+from service.wire.fields import MESSAGE_LIMIT, TEXT_LIMIT, VERSION
 from service.wire.frames import (
     ATTACHMENT_LIMIT,
     BATCH_LIMIT,
@@ -79,6 +79,7 @@ __all__ = [
     "FRAMES_PER_BATCH",
     "MESSAGE_LIMIT",
     "STATUS_LIMIT",
+    "TEXT_LIMIT",
     "VERSION",
     "AckState",
     "Acknowledgement",

@@ -148,6 +148,14 @@ class Fields:
             raise self.refusal(key, value, f"a text of {low} to {limit} characters")
         return value
 
+    def texts(self, key: str) -> tuple[str, ...]:
+        """Return a list of texts."""
+        found = self._list(key)
+        for value in found:
+            if not isinstance(value, str) or len(value) > TEXT_LIMIT:
+                raise self.refusal(key, value, f"texts of at most {TEXT_LIMIT} characters")
+        return tuple(found)
+
     def opaque(self, key: str) -> str:
         """Return a string that is only ever compared (session, basis, configuration)."""
         value = self.get(key)

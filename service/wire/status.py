@@ -164,6 +164,9 @@ class StateMessage:
     """Whether ``alpha`` may be relied on: fresh, ageing, stale or invalid; None: nothing is known,
     or a service of before this key said it."""
 
+    waiting_for: tuple[str, ...] = ()
+    """Whom the service waits for and what they should do."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmMessage:
@@ -344,6 +347,7 @@ def decode_state(data: bytes) -> StateMessage:
         sigma=message.optional("sigma", lambda key: message.named_numbers(key, PARAMETERS)),
         in_use=message.optional("in_use", message.identifier),
         validity=message.extension("validity", message.text),
+        waiting_for=message.extension("waiting_for", message.texts) or (),
     )
 
 

@@ -37,12 +37,6 @@ def test_a_matrix_fetched_twice_is_on_the_shelf_once(story):
     assert [record.id for record in story.state.reconstructors] == ["initial"]
 
 
-def test_an_rtc_without_a_matrix_is_asked_for_none():
-    story = Story()
-    story.tell(ev.SessionStarted(session="s1"))
-    assert not story.tell(ev.StatusSeen(rtc=rtc(cm_id=None)))
-
-
 def test_an_open_loop_is_an_alarm_until_it_is_closed(story):
     story.tell(ev.StatusSeen(rtc=rtc(loop="open")))
     assert "loop-open" in story.alarms

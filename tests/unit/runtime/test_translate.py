@@ -112,7 +112,7 @@ def test_an_acknowledgement_keeps_its_word(state, expected):
         heard.AcknowledgementReceived(acknowledgement=acknowledgement, known=True)
     )
     assert event == ev.Acknowledged(
-        id="cm-1", session="s1", state=expected, reason="why", frame_seq=9
+        id="cm-1", sha256="0" * 64, session="s1", state=expected, reason="why", frame_seq=9
     )
 
 

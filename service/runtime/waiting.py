@@ -1,0 +1,328 @@
+"""What the link complains of and what the service waits for: derived from what is, never set."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from service import events as ev
+from service.link.intake import SPARED
+from service.link.statistics import MALFORMED, RECENT_S, USED, Fate, LinkStatistics
+from service.reactions.alarms import Act, forbids
+from service.reactions.policy import SECOND_NS
+from service.state import (
+    AcquisitionStage,
+    Alarm,
+    MatrixState,
+    Mode,
+    Party,
+    TrackerState,
+    Waiting,
+)
+
+SILENT_S: Final = 3.0
+"""What has not come for so long is waited for."""
+
+FAULT_S: Final = 10.0
+"""A message that broke the contract is complained of for so long."""
+
+UNUSED_SHARE: Final = 0.1
+"""Of the frames that come: more of them lost to their own faults are an alarm."""
+
+MOST_STATUSES_HZ: Final = 25.0
+"""More than twice what the contract allows is a flood."""
+
+OVER_NS: Final = 3 * SECOND_NS
+"""A complaint that has not been made for so long is over."""
+
+FAULTS: Final = ("leap", "sequence", "shape", MALFORMED)
+"""What becomes of frames only where the RTC breaks the contract, be it once."""
+
+NAMED_ELSEWHERE: Final = ("basis", "config")
+"""What becomes of frames under an alarm of its own."""
+
+TOLD_AFTER_NS: Final = 2 * SECOND_NS
+"""What is waited for no longer than this need not be put on record."""
+
+TOLD_EVERY_NS: Final = 60 * SECOND_NS
+"""Least time between two records of the same."""
+
+COMPLAINTS: Final = ("frames-unused", "messages-refused", "status-flood")
+"""Names of the alarms that are made here."""
+
+
+_NUMBER: Final = re.compile(r"[0-9]+")
+
+
+def complaints(link: LinkStatistics) -> dict[str, str]:
+    """Return the alarms of what came in the last seconds, by name."""
+    made = {
+        "frames-unused": _unused(link),
+        "messages-refused": _refused(link),
+        "status-flood": _flood(link),
+    }
+    return {name: text for name, text in made.items() if text}
+
+
+def _unused(link: LinkStatistics) -> str:
+    """Return which frames come and are not used, and why; empty: all is well."""
+    frames = [fate for fate in link.fates if fate.kind == "frames"]
+    came, used = sum(f.n for f in frames), sum(f.n for f in frames if f.outcome == USED)
+    lost = [f for f in frames if f.outcome not in NAMED_ELSEWHERE and _is_lost(f, link, used)]
+    faults = [f for f in lost if f.outcome in FAULTS and f.age_s < FAULT_S]
+    if sum(f.n for f in lost) <= UNUSED_SHARE * came:
+        lost = faults
+    lost = [f for f in lost if f.n or f in faults]
+    if not lost:
+        return ""
+    reasons = ", ".join(sorted(f.outcome for f in lost))
+    details = "; ".join(f"{f.n} {f.outcome} ({f.text})" for f in lost[:3])
+    return (
+        f"the RTC's frames are not used ({reasons}): {details}; of {came} in the last "
+        f"{RECENT_S:.0f} s {used} were used: look at the RTC's telemetry"
+    )
+
+
+def _is_lost(fate: Fate, link: LinkStatistics, used: int) -> bool:
+    """Return whether frames that met this fate are missed."""
+    match fate.outcome:
+        case "used":
+            return False
+        case "duplicate":
+            return not used
+        case "session":  # while the one that counts is silent, another may be taking over
+            return link.session_waiting is None
+        case _:
+            return True
+
+
+def _refused(link: LinkStatistics) -> str:
+    """Return which messages besides frames broke the contract; empty: none of late."""
+    bad = [f for f in link.fates if f.outcome == MALFORMED and f.kind != "frames"]
+    bad = [f for f in bad if f.age_s < FAULT_S]
+    if not bad:
+        return ""
+    kinds = ", ".join(sorted(f.kind for f in bad))
+    details = "; ".join(f"{f.kind}: {f.text}" for f in bad)
+    return f"messages of the RTC are not used ({kinds}): {details}: mend the RTC"
+
+
+def _flood(link: LinkStatistics) -> str:
+    rate_hz = sum(f.n for f in link.fates if f.kind == "status") / RECENT_S
+    if rate_hz <= MOST_STATUSES_HZ:
+        return ""
+    spared = any(f.outcome == SPARED and f.n for f in link.fates)
+    taken = "the latest is taken ten times a second" if spared else "each says something else"
+    return (
+        f"the RTC floods the service with statuses: {rate_hz:.0f} a second, 1 to 10 are expected; "
+        f"{taken}: slow them down"
+    )
+
+
+def news_of_link(link: LinkStatistics, state: TrackerState, now_ns: int) -> list[ev.Event]:
+    """Return which complaints are made, again or anew, and which are over.
+
+    One that differs in its numbers alone keeps its text: that is no news.
+    """
+    made, found = complaints(link), []
+    raised = {alarm.name: alarm for alarm in state.alarms if alarm.name in COMPLAINTS}
+    for name, text in made.items():
+        before = raised.get(name)
+        same = before is not None and _NUMBER.sub("", before.text) == _NUMBER.sub("", text)
+        found.append(ev.Trouble(name=name, text=before.text if before and same else text))
+    for name, alarm in raised.items():
+        if name not in made and now_ns - alarm.seen_ns_utc > OVER_NS:
+            found.append(ev.Trouble(name=name, text="over", over=True))
+    return list(found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """All that what the service waits for is derived from."""
+
+    state: TrackerState
+    link: LinkStatistics
+    preparing: bool
+    """The worker prepares the optical model."""
+
+    @property
+    def frames_come(self) -> bool:
+        """Whether frames, used or not, came of late."""
+        return any(f.kind == "frames" and f.age_s < 1.0 for f in self.link.fates)
+
+    @property
+    def status_silent_s(self) -> float:
+        """For how long no status has been taken in."""
+        age_s = self.link.status_age_s
+        return self.link.session_age_s if age_s is None else age_s
+
+
+def waiting_for(facts: Facts) -> tuple[Waiting, ...]:
+    """Return whom the service waits for and what they should do, what hinders most first."""
+    found = [waiting for look in _LOOKS for waiting in look(facts)]
+    return tuple(sorted(found, key=lambda waiting: not waiting.hinders))
+
+
+def _for_the_worker(facts: Facts) -> Iterator[Waiting]:
+    if facts.preparing:
+        text = "the optical model is being prepared: wait"
+        yield Waiting(name="model", party=Party.WORKER, text=text, hinders=True)
+    if facts.state.making_since_ns_utc is not None:
+        text = "a reconstructor is being computed and judged: wait"
+        yield Waiting(name="matrix", party=Party.WORKER, text=text)
+
+
+def _for_messages(facts: Facts) -> Iterator[Waiting]:
+    """Yield what of the RTC's telemetry does not come."""
+    link, where = facts.link, f"ao/v1/{facts.state.system}"
+    no_status = facts.status_silent_s >= SILENT_S
+    if facts.frames_come:
+        if no_status:
+            text = (
+                f"frames come, and no status that could be used for {SILENT_S:.0f} s: send one on "
+                f"{where}/tel/status 1 to 10 times a second"
+            )
+            yield Waiting(name="status", party=Party.RTC, text=text, hinders=True)
+    elif not link.rtc_alive:
+        text = f"no RTC is there: start it, as a zenoh client of this service, system {where}"
+        yield Waiting(name="rtc", party=Party.RTC, text=text)
+    elif link.session is None or no_status:
+        text = f"its token is there, and nothing comes: send {where}/tel/frames and tel/status"
+        yield Waiting(name="telemetry", party=Party.RTC, text=text)
+    elif link.frame_age_s is None or link.frame_age_s >= SILENT_S:
+        text = f"it sends statuses and no frames: send them on {where}/tel/frames"
+        yield Waiting(name="frames", party=Party.RTC, text=text)
+    if link.session_waiting is not None and facts.frames_come:
+        text = (
+            f"session {link.session_waiting} is taken for the RTC's once {link.session} has been "
+            "silent for 2 s"
+        )
+        yield Waiting(name="session", party=Party.RTC, text=text)
+
+
+def _for_frames(facts: Facts) -> Iterator[Waiting]:
+    text, fates = _unused(facts.link), facts.link.fates
+    if text and not any(f.n for f in fates if f.kind == "frames" and f.outcome == USED):
+        yield Waiting(name="frames-unused", party=Party.RTC, text=text, hinders=True)
+
+
+def _for_the_matrix(facts: Facts) -> Iterator[Waiting]:
+    """Yield what must be known of the reconstructor in use, or sent."""
+    state, rtc = facts.state, facts.state.rtc
+    if rtc is not None and rtc.cm_id is None:
+        text = (
+            "its status names no reconstructor (cm_id is nil): the loop is not judged until it "
+            f"does; rtc/cm/applied is asked meanwhile{_told(state)}"
+        )
+        yield Waiting(name="matrix-name", party=Party.RTC, text=text)
+    elif rtc is not None and rtc.cm_id and state.reconstructor(rtc.cm_id) is None:
+        text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_told(state)}"
+        yield Waiting(name="matrix-in-use", party=Party.RTC, text=text)
+    for record in state.reconstructors:
+        if record.state in {MatrixState.PUBLISHED, MatrixState.STAGED}:
+            text = f"reconstructor {record.id} was sent: acknowledge that it is applied"
+            yield Waiting(name="acknowledgement", party=Party.RTC, text=text)
+        elif record.state is MatrixState.PROPOSED and state.mode is not Mode.AUTO:
+            text = f"reconstructor {record.id} is proposed: approve or reject it"
+            yield Waiting(name="approval", party=Party.OPERATOR, text=text)
+
+
+def _told(state: TrackerState) -> str:
+    return f" (last: {state.unfetched})" if state.unfetched else ""
+
+
+_ALARMS: Final = {
+    "dither": Party.RTC,
+    "dither-lost": Party.RTC,
+    "dither-not-stopped": Party.RTC,
+    "no-acknowledgement": Party.RTC,
+    "wrong-matrix": Party.RTC,
+    "standing-by": Party.SERVICE,
+    "acquisition": Party.OPERATOR,
+    "loop-open": Party.OPERATOR,
+    "worker-behind": Party.WORKER,
+}
+"""Alarms whose end is waited for though they may forbid nothing, and by whom it comes."""
+
+
+def _for_alarms(facts: Facts) -> Iterator[Waiting]:
+    """Yield the alarms that keep the service from its job: their texts say what to do."""
+    for alarm in facts.state.alarms:
+        acts = [act for act in (Act.ASK, Act.DECIDE, Act.MEASURE) if forbids(alarm, act)]
+        if acts or alarm.name in _ALARMS:
+            party = _ALARMS.get(alarm.name, Party.OPERATOR)
+            hinders = Act.ASK in acts
+            yield Waiting(name=alarm.name, party=party, text=alarm.text, hinders=hinders)
+
+
+def _for_the_operator(facts: Facts) -> Iterator[Waiting]:
+    state, rtc = facts.state, facts.state.rtc
+    orders = {
+        "mode": (state.mode is Mode.HOLD, "mode is hold, nothing is made: PUT /v1/mode"),
+        "dither-stopped": (
+            state.dither_stopped,
+            "the dither was stopped by an operator: POST /v1/dither with start",
+        ),
+        "interrupted": (
+            state.acquisition.stage is AcquisitionStage.INTERRUPTED,
+            f"the acquisition was interrupted: {state.acquisition.text}",
+        ),
+    }
+    for name, (is_so, text) in orders.items():
+        if is_so:
+            yield Waiting(name=name, party=Party.OPERATOR, text=text)
+    if rtc is not None and state.dither is not None and state.registration is None:
+        text = f"{state.dither.id}: the first window of telemetry that holds it"
+        yield Waiting(name="window", party=Party.RTC, text=text)
+
+
+def _for_measurements(facts: Facts) -> Iterator[Waiting]:
+    state = facts.state
+    if state.measuring is not None:
+        text = f"interaction matrix {state.measuring.id} is being measured: wait, or give it up"
+        yield Waiting(name="measurement", party=Party.RTC, text=text)
+    if state.gathering is not None:
+        text = f"noisy interaction matrix {state.gathering.id} is gathered: wait, or give it up"
+        yield Waiting(name="noisy-matrix", party=Party.RTC, text=text)
+    if state.acquisition.under_way:
+        text = f"an acquisition is under way: {state.acquisition.text}"
+        yield Waiting(name="acquiring", party=Party.RTC, text=text)
+
+
+_LOOKS: Final[tuple[Callable[[Facts], Iterator[Waiting]], ...]] = (
+    _for_the_worker,
+    _for_messages,
+    _for_frames,
+    _for_alarms,
+    _for_the_matrix,
+    _for_measurements,
+    _for_the_operator,
+)
+
+
+class Told:
+    """Which waits are on record: each once it has lasted, and no more often than now and then."""
+
+    __slots__ = ("_since_ns", "_told_ns")
+
+    def __init__(self) -> None:
+        self._since_ns: dict[str, int] = {}
+        self._told_ns: dict[str, int] = {}
+
+    def news(
+        self, waiting: tuple[Waiting, ...], alarms: tuple[Alarm, ...], now_ns: int
+    ) -> list[str]:
+        """Return what is to be put on record now; alarms are by themselves."""
+        self._since_ns = {w.name: self._since_ns.get(w.name, now_ns) for w in waiting}
+        named = {alarm.name for alarm in alarms}
+        due = [wait for wait in waiting if wait.name not in named and self._due(wait.name, now_ns)]
+        self._told_ns |= {wait.name: now_ns for wait in due}
+        return [f"{wait.party}: {wait.text}" for wait in due]
+
+    def _due(self, name: str, now_ns: int) -> bool:
+        since_ns, told_ns = self._since_ns[name], self._told_ns.get(name)
+        if now_ns - since_ns < TOLD_AFTER_NS:
+            return False
+        return told_ns is None or (told_ns < since_ns and now_ns - told_ns >= TOLD_EVERY_NS)

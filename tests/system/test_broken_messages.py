@@ -1,0 +1,227 @@
+"""An RTC that breaks the contract, message by message: the service says so, and goes on."""
+
+import contextlib
+import time
+
+import msgpack
+import numpy as np
+import pytest
+
+from tests.system.night import a_night, wait_for
+from tests.system.stranger import Stranger, open_client, small_telescope
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+
+TOLD_WITHIN_S = 3.0
+"""A fault of the RTC's messages is named within this."""
+
+SLACK_S = 2.0
+"""For REST on a loaded machine."""
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory):
+    with a_night(tmp_path_factory.mktemp("night")) as night:
+        night.service("auto")
+        yield night
+
+
+@pytest.fixture
+def rtc(night, request):
+    """A stranger in a session of its own, all well so far."""
+    with stranger(night, request.node.name) as rtc:
+        met(night, rtc)
+        yield rtc
+
+
+@contextlib.contextmanager
+def stranger(night, name, **options):
+    response, variance_m2 = small_telescope()
+    rtc = Stranger(night.zenoh, response, variance_m2, **options)
+    rtc.session = f"{name}-{time.monotonic_ns()}"[-100:]
+    with rtc:
+        yield rtc
+
+
+def met(night, rtc):
+    wait_for(
+        lambda: (night.state["rtc"] or {}).get("session") == rtc.session, 10.0, "the RTC is known"
+    )
+
+
+def waits(night):
+    return {wait["name"]: wait["text"] for wait in night.state["waiting_for"]}
+
+
+def named(night, where, name, words, timeout_s=TOLD_WITHIN_S + SLACK_S):
+    """Wait until an alarm, or what is waited for, says these words."""
+    text = ""
+    until = time.monotonic() + timeout_s
+    while words not in text:
+        assert time.monotonic() < until, f"{words} is not in {name}: {text}"
+        time.sleep(0.1)
+        text = where(night).get(name, "")
+    return text
+
+
+def alarms(night):
+    return night.alarms
+
+
+def received(night):
+    return night.state["link"]["frames_received"]
+
+
+def goes_on(night):
+    before = received(night)
+    wait_for(lambda: received(night) > before + 500, 5.0, "telemetry goes on")
+
+
+def test_one_frame_with_a_leap_of_its_number_is_named_and_telemetry_goes_on(night, rtc):
+    def leap(header, *rows):
+        rtc.on_frames = None
+        return (header | {"seq0": 2**61}, *rows)
+
+    rtc.on_frames = leap
+    named(night, alarms, "frames-unused", "leaps from")
+    goes_on(night)
+    assert night.state["ready"]
+
+
+def test_a_sequence_that_starts_over_in_its_session_is_named_and_the_service_not_ready(night, rtc):
+    time.sleep(1.0)
+    rtc.on_frames = lambda header, *rows: (header | {"seq0": header["seq0"] % 50}, *rows)
+    named(night, alarms, "frames-unused", "goes back from")
+    text = named(night, waits, "frames-unused", "goes back from")
+    assert "new session" in text
+    answer = night.client.get("/readyz")
+    assert answer.status_code == 503
+    assert "goes back from" in answer.text
+    assert "frames-unused" in night.alarms
+
+
+@pytest.mark.parametrize("kind", ["frames", "status", "ack"])
+def test_a_message_of_an_unknown_session_takes_nothing_over_and_is_named(night, rtc, kind):
+    header, status = rtc.header(0, 1), rtc.status()
+    other = {"session": f"intruder-{time.monotonic_ns()}"}
+    with contextlib.closing(open_client(night.zenoh)) as outside:
+        if kind == "frames":
+            row = np.zeros((1, rtc.n_slopes + 2 * rtc.n_modes), "<f4").tobytes()
+            outside.put(f"{rtc.root}/tel/frames", row, attachment=msgpack.packb(header | other))
+        elif kind == "status":
+            outside.put(f"{rtc.root}/tel/status", msgpack.packb(status | other))
+        else:
+            ack = {"v": 1, "id": "cm-x", "sha256": "0" * 64, "state": "applied", "reason": ""}
+            ack |= {"frame_seq": 5} | other
+            outside.put(f"{rtc.root}/cm/ack", msgpack.packb(ack))
+        time.sleep(0.2)
+    named(night, alarms, "second-rtc", other["session"])
+    assert night.state["link"]["session"] == rtc.session
+    goes_on(night)
+
+
+@pytest.mark.parametrize(
+    ("twist", "found"),
+    [
+        ({"seq0": -1}, "seq0"),
+        ({"n_slopes": 5}, "float32"),
+        ({"v": 2}, "expected 1"),
+        ({"session": None}, "session"),
+    ],
+)
+def test_an_attachment_that_cannot_be_read_is_named_within_three_seconds(night, rtc, twist, found):
+    rtc.on_frames = lambda header, *rows: (header | twist, *rows)
+    named(night, alarms, "frames-unused", found)
+    rtc.on_frames = None
+    goes_on(night)
+
+
+def test_frames_that_are_not_finite_are_named_within_three_seconds(night, rtc):
+    def spoilt(header, slopes, commands, dither):
+        slopes[:, 3] = np.nan
+        return header, slopes, commands, dither
+
+    rtc.on_frames = spoilt
+    named(night, alarms, "frames-unused", "nonfinite")
+
+
+def test_statuses_that_break_the_contract_are_named_and_missed(night, rtc):
+    rtc.on_status = lambda status: status | {"leak": 1.5}
+    named(night, alarms, "messages-refused", "leak is 1.5")
+    named(night, waits, "status", "no status", 8.0)
+    assert night.client.get("/readyz").status_code == 503
+
+
+def test_frames_without_any_status_are_named(night):
+    with stranger(night, "mute") as rtc:
+        rtc.on_status = lambda _: None
+        named(night, waits, "status", "tel/status", 3.0 + TOLD_WITHIN_S + SLACK_S)
+        assert not night.state["ready"]
+        rtc.on_status = None
+        met(night, rtc)
+        wait_for(lambda: "status" not in waits(night), 5.0, "it is waited for no more")
+
+
+def test_an_rtc_that_pauses_is_waited_for(night, rtc):
+    rtc.on_frames = lambda *_: None
+    named(night, waits, "frames", "no frames", 3.0 + SLACK_S)
+    rtc.on_status = lambda _: None
+    named(night, waits, "telemetry", "nothing comes", 4.0 + SLACK_S)
+    rtc.on_frames = rtc.on_status = None
+    wait_for(lambda: not {"frames", "telemetry"} & set(waits(night)), 5.0, "all well")
+
+
+def test_an_rtc_that_is_not_there_is_waited_for(night):
+    named(night, waits, "rtc", "no RTC is there", 5.0)
+    assert night.client.get("/readyz").status_code == 200
+
+
+def test_a_loop_whose_matrix_has_no_name_is_registered_all_the_same(night):
+    with stranger(night, "nameless") as rtc:
+        rtc.told = {"cm_id": None}
+        rtc.on_frames = lambda header, *rows: (header | {"cm_id": None}, *rows)
+        met(night, rtc)
+        before = night.state["windows_accepted"]
+        named(night, waits, "matrix-name", "cm_id is nil")
+        wait_for(lambda: night.state["windows_accepted"] > before + 1, 40.0, "windows of a dither")
+
+
+def test_another_sum_in_an_acknowledgement_is_an_alarm_until_the_matrix_is_read_back(night):
+    response, variance_m2 = small_telescope(shift_x_subap=0.1)
+    assumed, _ = small_telescope()
+    rtc = Stranger(night.zenoh, response, variance_m2, assumed=assumed)
+    rtc.session = f"liar-{time.monotonic_ns()}"
+    rtc.on_ack = lambda ack: ack | {"sha256": "0" * 64}
+    with rtc:
+        named(night, alarms, "wrong-matrix", "0" * 64, 60.0)
+        n_sent = len({ack["id"] for ack in rtc.acks})
+        wait_for(lambda: "wrong-matrix" not in night.alarms, 15.0, "read back")
+        assert n_sent == 1
+
+
+def test_five_hundred_statuses_a_second_end_no_window_and_leave_rest_alone(night, rtc):
+    rtc.status_hz = 50.0
+    pumped = 0
+    assert "wait" not in rtc.told
+    before, until = night.state["windows_accepted"], time.monotonic() + 15.0
+    slowest_s = 0.0
+    while time.monotonic() < until:
+        for _ in range(50):
+            rtc.send_status()
+            pumped += 1
+        began = time.monotonic()
+        assert night.client.get("/healthz").status_code == 200
+        slowest_s = max(slowest_s, time.monotonic() - began)
+        time.sleep(0.06)
+    assert pumped > 3000
+    named(night, alarms, "status-flood", "statuses")
+    assert slowest_s < 2.0
+    assert night.state["windows_accepted"] > before
+
+
+def test_what_an_rtc_does_not_offer_is_said_at_once(night, rtc):
+    began = time.monotonic()
+    answer = night.client.post("/v1/loop/ramp")
+    assert answer.status_code in {409, 504}
+    assert "offers no ramp" in answer.text
+    assert time.monotonic() - began < 2.0

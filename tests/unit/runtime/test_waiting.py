@@ -1,0 +1,244 @@
+"""What the link complains of, and whom the service waits for, from what is known at one moment."""
+
+from dataclasses import replace
+
+import pytest
+
+from service.link.statistics import Fate, LinkStatistics, Tally
+from service.runtime.waiting import (
+    COMPLAINTS,
+    Facts,
+    Told,
+    complaints,
+    news_of_link,
+    waiting_for,
+)
+from service.state import (
+    Alarm,
+    MatrixState,
+    Mode,
+    Party,
+    TrackerState,
+    Waiting,
+)
+from tests.unit.reactions.situations import START_NS, record, rtc
+
+SECOND = 1_000_000_000
+
+
+def link(*fates, **changes):
+    """A link on which all is well but for what is given."""
+    counts = dict.fromkeys(
+        (
+            "batches_received",
+            "frames_received",
+            "frames_lost",
+            "frames_recovered",
+            "frames_duplicate",
+            "frames_late",
+            "frames_nonfinite",
+            "frames_overwritten",
+            "statuses_received",
+            "acknowledgements_received",
+            "acknowledgements_unknown",
+            "events_dropped",
+            "callback_errors",
+        ),
+        0,
+    )
+    values = {
+        "rtc_alive": True,
+        "session": "s1",
+        "basis_id": "b",
+        "config_id": "c",
+        "frames_refused": {},
+        "messages_malformed": {},
+        "frame_age_s": 0.01,
+        "status_age_s": 0.2,
+        "session_age_s": 60.0,
+        "latency_p50_s": None,
+        "fates": fates,
+    }
+    return LinkStatistics(**(counts | values | changes))
+
+
+def fate(outcome, n, kind="frames", text="", age_s=0.1):
+    return Fate(kind=kind, outcome=outcome, n=n, age_s=age_s, text=text)
+
+
+WELL = (fate("used", 2000), fate("used", 10, "status"))
+
+
+def waits(link, state=None, *, preparing=False):
+    state = state or TrackerState(system="small")
+    return {w.name: w for w in waiting_for(Facts(state=state, link=link, preparing=preparing))}
+
+
+# ---------------------------------------------------------------- complaints
+
+
+def test_nothing_is_complained_of_while_all_is_well():
+    assert complaints(link(*WELL)) == {}
+    assert complaints(link()) == {}
+
+
+@pytest.mark.parametrize(
+    "outcome",
+    ["late", "nonfinite", "shape", "leap", "sequence", "malformed", "session", "of-tomorrow"],
+)
+def test_frames_that_come_and_are_not_used_are_named_whatever_the_reason(outcome):
+    text = complaints(link(fate(outcome, 900, text="found x, expected y")))["frames-unused"]
+    assert outcome in text.partition(":")[0]
+    assert "found x, expected y" in text
+    assert "0 were used" in text
+
+
+def test_duplicates_are_missed_only_where_they_are_all_that_comes():
+    assert complaints(link(*WELL, fate("duplicate", 2000))) == {}
+    assert "duplicate" in complaints(link(fate("duplicate", 2000)))["frames-unused"]
+
+
+def test_a_few_late_or_unfinite_frames_are_no_alarm_and_one_broken_batch_is():
+    assert complaints(link(*WELL, fate("late", 100), fate("nonfinite", 100))) == {}
+    assert "leap" in complaints(link(*WELL, fate("leap", 1)))["frames-unused"]
+    assert "leap" in complaints(link(*WELL, fate("leap", 0, age_s=9.0)))["frames-unused"]
+    assert complaints(link(*WELL, fate("leap", 0, age_s=11.0))) == {}
+
+
+def test_while_another_session_waits_to_be_taken_its_frames_are_not_missed():
+    frames = fate("session", 900)
+    assert complaints(link(frames, session_waiting="s2")) == {}
+    assert "session" in complaints(link(frames))["frames-unused"]
+
+
+def test_messages_that_broke_the_contract_are_named_with_what_was_found():
+    bad = fate("malformed", 1, "status", "range: leak is 2")
+    assert "range: leak is 2" in complaints(link(*WELL, bad))["messages-refused"]
+    assert complaints(link(*WELL, replace(bad, n=0, age_s=11.0))) == {}
+
+
+def test_a_flood_of_statuses_is_named_with_its_rate():
+    text = complaints(link(*WELL, fate("spared", 990, "status")))["status-flood"]
+    assert "500 a second" in text
+
+
+def test_a_complaint_that_lasts_keeps_its_text_and_ends_some_seconds_after_the_last():
+    state = TrackerState(system="small")
+    (made,) = news_of_link(link(fate("late", 900, text="x 1")), state, START_NS)
+    alarm = Alarm(
+        name=made.name, since_ns_utc=START_NS, text=made.text, seen_ns_utc=START_NS + SECOND
+    )
+    state = replace(state, alarms=(alarm,))
+    (again,) = news_of_link(link(fate("late", 950, text="x 2")), state, START_NS + SECOND)
+    assert again.text == made.text
+    (other,) = news_of_link(link(fate("shape", 950, text="y")), state, START_NS + SECOND)
+    assert "shape" in other.text
+    assert news_of_link(link(*WELL), state, START_NS + 3 * SECOND) == []
+    (over,) = news_of_link(link(*WELL), state, START_NS + 5 * SECOND)
+    assert (over.name, over.over) == ("frames-unused", True)
+    assert {made.name, over.name} <= set(COMPLAINTS)
+
+
+def test_what_came_is_counted_for_two_seconds_and_remembered_for_good():
+    tally = Tally()
+    for k in range(100):
+        tally.add("frames", "used", 10, 0.1 * k)
+        tally.add("frames", "late", 3 * (k == 50), 0.1 * k, "why")
+    used, late = tally.fates(10.0)
+    assert 180 <= used.n <= 230
+    assert (late.n, late.age_s, late.text) == (0, 5.0, "why")
+    assert tally.of("frames") == {"used": 1000, "late": 3}
+
+
+# ---------------------------------------------------------------- waiting
+
+
+def test_nothing_is_waited_for_while_all_is_well():
+    state = TrackerState(
+        system="small",
+        mode=Mode.AUTO,
+        rtc=rtc(cm_id="a"),
+        reconstructors=(record("a", MatrixState.APPLIED),),
+    )
+    assert waits(link(*WELL), state) == {}
+
+
+@pytest.mark.parametrize(
+    ("found", "name", "party", "hinders"),
+    [
+        (link(rtc_alive=False, session=None, frame_age_s=None, status_age_s=None), "rtc", "rtc", 0),
+        (link(session=None, frame_age_s=None, status_age_s=None), "telemetry", "rtc", 0),
+        (link(*WELL[:1], status_age_s=None), "status", "rtc", 1),
+        (link(*WELL[:1], status_age_s=3.1), "status", "rtc", 1),
+        (link(frame_age_s=3.1), "frames", "rtc", 0),
+        (link(fate("late", 500, text="x")), "frames-unused", "rtc", 1),
+        (link(fate("session", 500), session_waiting="s2"), "session", "rtc", 0),
+    ],
+)
+def test_what_the_rtc_does_not_send_is_waited_for(found, name, party, hinders):
+    wait = waits(found)[name]
+    assert (wait.party, wait.hinders) == (party, bool(hinders))
+    assert len(wait.text) > 20
+
+
+def test_a_first_status_is_given_three_seconds():
+    assert waits(link(*WELL[:1], status_age_s=None, session_age_s=2.9)) == {}
+
+
+def test_the_model_is_waited_for_first():
+    found = waiting_for(
+        Facts(state=TrackerState(system="s"), link=link(rtc_alive=False), preparing=True)
+    )
+    assert (found[0].name, found[0].party, found[0].hinders) == ("model", Party.WORKER, True)
+
+
+def test_a_matrix_without_a_name_or_without_its_numbers_is_waited_for():
+    state = TrackerState(system="s", rtc=rtc(cm_id=None), unfetched="no answer")
+    wait = waits(link(*WELL), state)["matrix-name"]
+    assert "cm_id is nil" in wait.text
+    assert "no answer" in wait.text
+    state = replace(state, rtc=rtc(cm_id="theirs"))
+    assert "theirs" in waits(link(*WELL), state)["matrix-in-use"].text
+
+
+@pytest.mark.parametrize(
+    ("name", "party", "hinders"),
+    [
+        ("basis-mismatch", Party.OPERATOR, True),
+        ("standing-by", Party.SERVICE, True),
+        ("wrong-matrix", Party.RTC, False),
+        ("dither", Party.RTC, False),
+        ("loop-open", Party.OPERATOR, False),
+    ],
+)
+def test_alarms_that_keep_the_service_from_its_job_are_waits(name, party, hinders):
+    alarm = Alarm(name=name, since_ns_utc=0, text="as the alarm says")
+    wait = waits(link(*WELL), TrackerState(system="s", alarms=(alarm,)))[name]
+    assert (wait.party, wait.hinders, wait.text) == (party, hinders, "as the alarm says")
+
+
+def test_what_an_operator_has_to_do_is_named():
+    state = TrackerState(
+        system="s",
+        mode=Mode.HOLD,
+        dither_stopped=True,
+        reconstructors=(record("a"), record("b", MatrixState.PUBLISHED)),
+    )
+    found = waits(link(*WELL), state)
+    parties = {name: found[name].party for name in ("mode", "dither-stopped", "approval")}
+    assert set(parties.values()) == {Party.OPERATOR}
+    assert found["acknowledgement"].party is Party.RTC
+
+
+def test_a_wait_is_on_record_once_it_lasts_and_not_again_and_again():
+    told, wait = Told(), Waiting(name="status", party=Party.RTC, text="none comes")
+    lines = [told.news((wait,), (), k * SECOND) for k in range(100)]
+    assert [k for k, found in enumerate(lines) if found] == [2]
+    assert lines[2] == ["rtc: none comes"]
+    for k in range(100, 200):
+        present = (wait,) if k % 10 else ()
+        lines.append(told.news(present, (), k * SECOND))
+    assert len([k for k, found in enumerate(lines) if found and k > 99]) <= 2
+    alarm = Alarm(name="status", since_ns_utc=0, text="")
+    fresh = Told()
+    assert not any(fresh.news((wait,), (alarm,), k * SECOND) for k in range(10))

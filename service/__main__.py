@@ -53,10 +53,10 @@ def _understood(
     from service.commands.fit import add_fit_arguments, run_fit
     from service.commands.reconstruct import add_reconstruct_arguments, run_reconstruct
     from service.commands.run import add_run_arguments, run_service
-    from service.commands.terminal import with_negative_numbers
+    from service.commands.terminal import OneLineParser, with_negative_numbers
     from service.demo import add_demo_arguments, run_demo
 
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="pyrcal", description="Calibration service of an adaptive telescope."
     )
     parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")

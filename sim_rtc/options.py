@@ -333,3 +333,7 @@ def _add_run(group: argparse._ArgumentGroup) -> None:
         "images, slopes and residual wavefront, and end (needs the extra 'plots')",
     )
     group.add_argument("--quiet", action="store_true", help="say only what is wrong")
+
+
+if __name__ == "__main__":  # whether options make sense, for who would start the simulator later
+    parse_options()

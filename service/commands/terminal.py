@@ -7,11 +7,22 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import NoReturn, TypeVar
+
+from typing_extensions import override
 
 from service.errors import ConfigurationError
 
 Value = TypeVar("Value")
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage that would push it off the screen."""
+
+    @override
+    def error(self, message: str) -> NoReturn:
+        """End the program with status 2."""
+        self.exit(2, f"{self.prog}: {message}; {self.prog} --help\n")
 
 
 _NEGATIVE = re.compile(r"-[\d.][-+\d.eE]*,.*")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -20,7 +21,42 @@ TOLERANCE = {
 
 MAX_ERROR_IN_SIGMA = 4.0
 
+LONG_S = 5.0
+"""What has been missing for so long is missing."""
+
+REAL_TIME = 0.9
+"""A simulator below this share of real time is called slow."""
+
 View = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Circumstances:
+    """What the demo has seen from outside: it tells why something did not come out right."""
+
+    seconds_to_ready: float | None = None
+    """From the start until model and simulator were prepared; None: they never were."""
+
+    seconds_to_first_applied: float | None = None
+    """After that; None: no matrix of the service has been applied."""
+
+    pace: float | None = None
+    """Seconds of telemetry that the simulator made in a second; None: not known."""
+
+    unanswered_s: float = 0.0
+    """How long the service has not answered."""
+
+    frameless_s: float = 0.0
+    """How long the service has received no frame."""
+
+    untold_s: float = 0.0
+    """How long the simulator has written nothing."""
+
+    endings: tuple[str, ...] = ()
+    """Of processes that have ended, and their last words."""
+
+    refusal: str | None = None
+    """Why the last refused window was; None: not known."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -60,9 +96,17 @@ class Report:
     swaps: list[View] = field(default_factory=list)
     frames_received: int = 0
     frames_lost: int = 0
+    seconds_to_ready: float | None = None
     seconds_to_first_applied: float | None = None
+    """After all was ready."""
+
+    pace: float | None = None
+    """Seconds of telemetry that the simulator made in a second."""
+
     alarms: list[str] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+    """Why it failed, as far as it can be seen."""
 
     @property
     def good(self) -> bool:
@@ -78,22 +122,65 @@ def make_report(
     state: View | None,
     reconstructors: list[View],
     truth: TruthFile,
-    seconds_to_first_applied: float | None,
+    circumstances: Circumstances,
 ) -> Report:
     """Compare what the service says with what was true."""
-    report = Report(seconds_to_first_applied=seconds_to_first_applied)
+    report = Report(
+        seconds_to_ready=circumstances.seconds_to_ready,
+        seconds_to_first_applied=circumstances.seconds_to_first_applied,
+        pace=circumstances.pace,
+    )
     if state is None:
         report.failures.append("the service never answered")
-        return report
-    report.frames_received = state["link"]["frames_received"]
-    report.frames_lost = state["link"]["frames_lost"]
-    report.alarms = [f"{alarm['name']}: {alarm['text']}" for alarm in state["alarms"]]
-    report.swaps = truth.swaps
-    _count(report, reconstructors)
-    _stages(report, reconstructors, truth)
-    _compare(report, state, truth)
-    _judge(report)
+    else:
+        report.frames_received = state["link"]["frames_received"]
+        report.frames_lost = state["link"]["frames_lost"]
+        report.alarms = [f"{alarm['name']}: {alarm['text']}" for alarm in state["alarms"]]
+        report.swaps = truth.swaps
+        _count(report, reconstructors)
+        _stages(report, reconstructors, truth)
+        _compare(report, state, truth)
+        if circumstances.unanswered_s > LONG_S:
+            report.failures.append(
+                f"the service has not answered for {circumstances.unanswered_s:.0f} s"
+            )
+        _judge(report)
+    if report.failures:
+        report.reasons = [*circumstances.endings, *_reasons(state, circumstances)]
     return report
+
+
+def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
+    """Yield what may have kept the service from its job."""
+    if state is None:
+        return
+    if not state["ready"]:
+        yield f"the service was not ready: {state['ready_reason']}"
+        return
+    if circumstances.untold_s > LONG_S:
+        yield f"the simulator has made nothing for {circumstances.untold_s:.0f} s"
+    if circumstances.unanswered_s <= LONG_S:
+        yield from _of_frames(state, circumstances.frameless_s)
+    if circumstances.pace is not None and circumstances.pace < REAL_TIME:
+        yield f"too slow: the simulator made {circumstances.pace:.2f} s of telemetry a second"
+    yield from _of_windows(state, circumstances.refusal)
+    yield from (f"waiting for {text}" for text in state.get("waiting_for", ()))
+
+
+def _of_frames(state: View, frameless_s: float) -> Iterator[str]:
+    if state["link"]["frames_received"] == 0:
+        yield "no frames: none has reached the service"
+    elif frameless_s > LONG_S:
+        yield f"no frames: the last reached the service {frameless_s:.0f} s ago"
+
+
+def _of_windows(state: View, refusal: str | None) -> Iterator[str]:
+    accepted, refused = state["windows_accepted"], state["windows_refused"]
+    if refused > accepted:
+        last = "" if refusal is None else f"; the last: {refusal}"
+        yield f"refused windows: {refused} of {accepted + refused}{last}"
+    elif accepted == 0 and state["registration"] is None:
+        yield "no window of telemetry was finished"
 
 
 def _count(report: Report, reconstructors: list[View]) -> None:

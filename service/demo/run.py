@@ -1,30 +1,25 @@
-"""Starting, watching and stopping the two processes of the demo."""
+"""The demo's command line, and the two processes it starts."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import shutil
-import signal
+import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
 
 import httpx
 
-from service.demo.report import Report, make_report
-from service.demo.screen import HEADING, live_line, table
+from service.demo.children import children, interrupted_by_any_end
+from service.demo.screen import table
 from service.demo.truth import TruthFile
-from service.errors import ConfigurationError, LinkError
+from service.demo.watch import ANSWER_WITHIN_S, Promise, Watch
+from service.errors import ConfigurationError
 
-POLL_S = 0.5
-LINE_S = 2.0
-HEADING_EVERY = 20
-STOP_WITHIN_S = 15.0
 LOG = "service.log"
+CHECK_WITHIN_S = 60.0
 
 _FORWARDED = {
     "alpha": ("X,Y,ROT_DEG,MAG", "true registration; default random"),
@@ -52,47 +47,106 @@ def add_demo_arguments(commands: argparse._SubParsersAction[argparse.ArgumentPar
         help="the main job, end to end, on a simulated telescope",
         description="Start the service and a simulated RTC, show what happens, judge the outcome. "
         "Exit status 0: the registration was found, the margin recovered, the wavefront error "
-        "fell; 1: not so, and why is printed.",
+        "fell; 1: not so, and why is printed; 2: an argument makes no sense.",
     )
-    demo.add_argument("--seconds", type=float, metavar="N", help="stop by itself after N seconds")
+    demo.add_argument(
+        "--seconds",
+        type=_seconds,
+        metavar="N",
+        help="end when all has come out right and held for 5 s, at the latest N s of telemetry "
+        "after model and simulator are ready (with --jump, --drift or --fault: N s in any case); "
+        "default: run until Ctrl-C",
+    )
     for name, (metavar, text) in _FORWARDED.items():
         demo.add_argument(f"--{name}", metavar=metavar, help=text)
     for name, (metavar, text) in _REPEATED.items():
         demo.add_argument(f"--{name}", action="append", metavar=metavar, help=text)
-    demo.add_argument("--seed", type=int, default=1, metavar="S", help="of everything random")
+    demo.add_argument("--seed", type=_seed, default=1, metavar="S", help="of everything random")
     demo.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    demo.add_argument("--port", type=int, default=8080, help="of the REST API")
-    demo.add_argument("--zenoh-port", type=int, default=7447, help="of the link to the RTC")
+    demo.add_argument("--port", type=_port, default=8080, help="of the REST API")
+    demo.add_argument("--zenoh-port", type=_port, default=7447, help="of the link to the RTC")
     demo.add_argument(
         "--dir", type=Path, default=Path("var/demo"), help="logs, truth, archive; emptied first"
     )
 
 
 def run_demo(options: argparse.Namespace) -> int:
-    """Run the demo; return 0 if the main job was done, else 1."""
-    _emptied(options.dir)
+    """Run the demo; return 0 if the main job was done, else 1.
+
+    Raises
+    ------
+    ConfigurationError
+        If an argument makes no sense; nothing has been started then.
+    """
     service_words, sim_words = _commands(options)
+    _check(options, sim_words)
+    _emptied(options.dir)
     url = f"http://127.0.0.1:{options.port}"
     _say(f"service    pyrcal {' '.join(service_words)}")
     _say(f"simulator  pyrcal sim {' '.join(sim_words)}")
     _say(f"REST       {url}/v1/state   logs and truth: {options.dir}\n")
-    truth = TruthFile(options.dir / "truth.jsonl")
-    started_s = time.monotonic()
+    commands = {
+        "service": ["-m", "service", *service_words],
+        "simulator": ["-m", "sim_rtc", *sim_words],
+    }
     with (
-        _process("service", ["-m", "service", *service_words], options.dir) as service,
-        _process("simulator", ["-m", "sim_rtc", *sim_words], options.dir) as simulator,
-        httpx.Client(base_url=url, timeout=2.0) as client,
+        httpx.Client(base_url=url, timeout=ANSWER_WITHIN_S) as client,
+        interrupted_by_any_end(),
+        children(options.dir, commands) as started,
     ):
-        watch = _Watch(client, truth, service, simulator, started_s)
+        truth = TruthFile(options.dir / "truth.jsonl")
+        watch = Watch(client, truth, started, _promise(options), _say)
         try:
-            watch.until(options.seconds)
+            watch.run()
         except KeyboardInterrupt:
             _say("\nstopping")
-        report = watch.report()
+        report = watch.closing_report()
     _say(table(report))
     if options.json is not None:
         options.json.write_text(report.to_json() + "\n", encoding="utf-8")
     return 0 if report.good else 1
+
+
+def _promise(options: argparse.Namespace) -> Promise:
+    return Promise(
+        seconds=options.seconds,
+        whole=any(getattr(options, name) for name in ("jump", "drift", "fault")),
+        real_time=options.plant != "diffractive",
+    )
+
+
+def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
+    """Refuse what cannot be run before anything is started or emptied.
+
+    Raises
+    ------
+    ConfigurationError
+        With one line that says what was found and what was expected.
+    """
+    if options.json is not None and (
+        options.json.is_dir() or not options.json.absolute().parent.is_dir()
+    ):
+        raise ConfigurationError(f"--json {options.json}: expected a file in a folder that exists")
+    if options.port == options.zenoh_port:
+        raise ConfigurationError(f"--port and --zenoh-port: both {options.port}, expected two")
+    for name, port in (("--port", options.port), ("--zenoh-port", options.zenoh_port)):
+        try:
+            socket.create_server(("127.0.0.1", port)).close()
+        except OSError as error:
+            raise ConfigurationError(
+                f"{name} {port}: cannot listen on 127.0.0.1:{port}: {error.strerror or error}; "
+                "choose another, the service would not start"
+            ) from error
+    # the simulator alone knows what it understands, and the service does not know the simulator
+    checked = subprocess.run(
+        [sys.executable, "-m", "sim_rtc.options", *sim_words],
+        capture_output=True,
+        text=True,
+        timeout=CHECK_WITHIN_S,
+        check=False,
+    )
+    if checked.returncode != 0:
+        raise ConfigurationError(checked.stderr.strip().removeprefix("sim_rtc: "))
 
 
 def _emptied(directory: Path) -> None:
@@ -101,12 +155,15 @@ def _emptied(directory: Path) -> None:
     Raises
     ------
     ConfigurationError
-        If it holds something else.
+        If it holds something else, or is no directory.
     """
-    if directory.exists() and any(directory.iterdir()) and not (directory / LOG).exists():
-        raise ConfigurationError(f"--dir {directory}: holds other files; name a new directory")
-    shutil.rmtree(directory, ignore_errors=True)
-    directory.mkdir(parents=True)
+    try:
+        if directory.exists() and any(directory.iterdir()) and not (directory / LOG).exists():
+            raise ConfigurationError(f"--dir {directory}: holds other files; name a new directory")
+        shutil.rmtree(directory, ignore_errors=True)
+        directory.mkdir(parents=True)
+    except OSError as error:
+        raise ConfigurationError(f"--dir {directory}: {error.strerror or error}") from error
 
 
 def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
@@ -124,90 +181,26 @@ def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     return service, simulator
 
 
-class _Watch:
-    """Looks at REST and the truth file, and prints."""
-
-    def __init__(
-        self,
-        client: httpx.Client,
-        truth: TruthFile,
-        service: subprocess.Popen[bytes],
-        simulator: subprocess.Popen[bytes],
-        started_s: float,
-    ) -> None:
-        self._client = client
-        self._truth = truth
-        self._service = service
-        self._simulator = simulator
-        self._started_s = started_s
-        self._state: dict[str, Any] | None = None
-        self._reconstructors: list[dict[str, Any]] = []
-        self._first_applied_s: float | None = None
-        self._simulator_mourned = False
-
-    def until(self, seconds: float | None) -> None:
-        """Watch and print for ``seconds``, or until interrupted."""
-        n_lines, next_line_s = 0, 0.0
-        while seconds is None or self._elapsed_s() < seconds:
-            self._look()
-            self._check_processes()
-            if self._elapsed_s() >= next_line_s:
-                if n_lines % HEADING_EVERY == 0:
-                    _say(HEADING)
-                _say(live_line(self._elapsed_s(), self._state, self._truth.last))
-                n_lines, next_line_s = n_lines + 1, self._elapsed_s() + LINE_S
-            time.sleep(POLL_S)
-
-    def report(self) -> Report:
-        """Return the figures as they stand now."""
-        self._look()
-        return make_report(self._state, self._reconstructors, self._truth, self._first_applied_s)
-
-    def _elapsed_s(self) -> float:
-        return time.monotonic() - self._started_s
-
-    def _look(self) -> None:
-        self._truth.read()
-        try:
-            state = self._client.get("/v1/state")
-            shelf = self._client.get("/v1/reconstructors")
-        except httpx.TransportError:
-            return
-        if state.status_code == shelf.status_code == httpx.codes.OK:
-            self._state = state.json()
-            self._reconstructors = shelf.json()["reconstructors"]
-        applied = any(r["applied_frame_seq"] is not None for r in self._reconstructors)
-        if applied and self._first_applied_s is None:
-            self._first_applied_s = self._elapsed_s()
-
-    def _check_processes(self) -> None:
-        if self._service.poll() is not None:
-            raise LinkError(
-                f"the service ended with status {self._service.returncode}: see service.log"
-            )
-        if self._simulator.poll() is not None and not self._simulator_mourned:
-            self._simulator_mourned = True
-            _say("        the simulator has ended; start it again with the command above")
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number of seconds > 0")
+    return value
 
 
-@contextmanager
-def _process(name: str, words: list[str], directory: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a process of this Python while the ``with`` block lasts; its output goes to a file."""
-    log: IO[bytes]
-    with (directory / f"{name}.log").open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, *words], stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-        )
-        try:
-            yield process
-        finally:
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-            try:
-                process.wait(STOP_WITHIN_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+def _seed(text: str) -> int:
+    if not (text.isascii() and text.isdecimal()):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number from 0")
+    return int(text)
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and 1 <= int(text) <= 65535):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a port from 1 to 65535")
+    return int(text)
 
 
 def _say(text: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.demo.report import Report, Stage
+from service.demo.report import REAL_TIME, Report, Stage
 from service.demo.truth import Line
 from service.model.misregistration import PARAMETERS
 
@@ -46,6 +46,25 @@ def live_line(seconds: float, state: dict[str, Any] | None, truth: Line | None) 
     )
 
 
+def awaited(state: dict[str, Any] | None) -> str:
+    """Return what keeps the clock from starting."""
+    if state is None:
+        return "the service is starting"
+    if not state["ready"]:
+        return str(state["ready_reason"])
+    return "the simulated telescope is being prepared"
+
+
+def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | None:
+    """Return what to say where it takes longer than asked for; None: it does not."""
+    if pace is not None and pace < REAL_TIME:
+        who = "this machine is slow: the simulator" if real_time else "the diffractive telescope"
+        return f"         {who} runs at {pace:.1f} of real time; this takes longer"
+    if behind:
+        return "         this machine is slow: the service's worker is behind; this takes longer"
+    return None
+
+
 def _matrix(state: dict[str, Any]) -> str:
     alarms = " ".join(f"[{alarm['name']}]" for alarm in state["alarms"])
     if not state["ready"]:
@@ -67,9 +86,11 @@ def table(report: Report) -> str:
     ):
         lines.append(_stage_row(label, stage))
     seconds = report.seconds_to_first_applied
-    first = "never" if seconds is None else f"{seconds:.1f} s after the start"
+    first = "never" if seconds is None else f"{seconds:.1f} s after it was ready"
+    ready = report.seconds_to_ready
     lines += [
         "",
+        "never ready" if ready is None else f"ready {ready:.1f} s after the start",
         f"reconstructors: {report.reconstructors_published} published, "
         f"{report.reconstructors_applied} applied, {report.reconstructors_refused_by_gate} refused "
         f"by the gate, {report.reconstructors_rejected_by_rtc} rejected by the RTC; "
@@ -83,6 +104,7 @@ def table(report: Report) -> str:
     ]
     lines.append("")
     lines += [f"FAILED: {text}" for text in report.failures] or ["GOOD: the main job was done"]
+    lines += [f"because: {text}" for text in report.reasons]
     return "\n".join(lines)
 
 

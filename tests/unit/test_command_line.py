@@ -93,12 +93,46 @@ def test_a_host_that_is_not_ours_is_refused_in_one_line(capsys):
     assert "192.0.2.1" in refused(capsys, "run", "--host", "192.0.2.1", "--port", "0")
 
 
-def test_the_demo_refuses_a_busy_port_instead_of_watching_another_service(capsys, tmp_path):
+@pytest.mark.parametrize("option", ["--port", "--zenoh-port"])
+def test_the_demo_refuses_a_busy_port_instead_of_watching_another_service(capsys, tmp_path, option):
     with socket.create_server(("127.0.0.1", 0)) as busy:
         port = str(busy.getsockname()[1])
-        words = ["demo", "--seconds", "5", "--port", port, "--dir", str(tmp_path / "demo")]
-        assert main(words) != 0
-    assert "service" in capsys.readouterr().err
+        line = refused(capsys, "demo", option, port, "--dir", str(tmp_path / "demo"))
+    assert f"{option} {port}" in line
+    assert not (tmp_path / "demo").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--seconds", "-3"),
+        ("--seconds", "0"),
+        ("--seconds", "nan"),
+        ("--seconds", "soon"),
+        ("--seed", "-1"),
+        ("--port", "70000"),
+        ("--alpha", "1,2"),
+        ("--mag", "x"),
+        ("--jump", "30"),
+        ("--json", "nowhere/figures.json"),
+        ("--nonsense", "1"),
+    ],
+)
+def test_the_demo_refuses_an_argument_in_one_line_before_it_starts_anything(
+    capsys, tmp_path, monkeypatch, option, value
+):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setattr("service.demo.run.children", None)  # whoever starts something fails
+    words = ["demo", "--dir", str(tmp_path / "demo"), option, value]
+    try:
+        status = main(words)
+    except SystemExit as end:
+        status = end.code
+    lines = capsys.readouterr().err.splitlines()
+    assert status == 2
+    assert len(lines) == 1
+    assert option in lines[0]
+    assert not (tmp_path / "demo").exists()
 
 
 @pytest.mark.parametrize(

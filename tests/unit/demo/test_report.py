@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from service.demo.report import make_report
+from service.demo.report import Circumstances, make_report
 from service.demo.truth import TruthFile
 
 TRUE = {"shift_x_subap": 0.1, "shift_y_subap": 0.0, "rotation_deg": 0.2, "magnification": 1.003}
@@ -12,6 +12,9 @@ SIGMA = {
     "rotation_deg": 0.006,
     "magnification": 0.0004,
 }
+
+
+WELL = Circumstances(seconds_to_ready=4.0, seconds_to_first_applied=12.0, pace=1.0)
 
 
 def gate(radius):
@@ -44,6 +47,11 @@ def shelf(**changes):
 def service_state(alarms=(), **error):
     alpha = {name: TRUE[name] + error.get(name, 0.0) for name in TRUE}
     return {
+        "ready": True,
+        "ready_reason": "ready",
+        "uptime_s": 70.0,
+        "windows_accepted": 30,
+        "windows_refused": 2,
         "link": {"frames_received": 50_000, "frames_lost": 0},
         "alarms": [{"name": name, "text": "found"} for name in alarms],
         "registration": {"alpha": alpha, "sigma": SIGMA, "floor": SIGMA},
@@ -76,7 +84,7 @@ def truth(tmp_path):
 
 
 def test_a_night_that_went_well_is_good(truth):
-    report = make_report(service_state(), shelf(), truth, 12.0)
+    report = make_report(service_state(), shelf(), truth, WELL)
     assert report.failures == []
     assert report.good
     assert report.start.worst_pole_radius == 0.93
@@ -95,19 +103,19 @@ def test_a_night_that_went_well_is_good(truth):
     ],
 )
 def test_an_estimate_beyond_its_tolerance_fails(truth, name, error):
-    report = make_report(service_state(**{name: error}), shelf(), truth, 12.0)
+    report = make_report(service_state(**{name: error}), shelf(), truth, WELL)
     assert not report.good
     assert any(text.startswith(f"{name} is off by") for text in report.failures)
 
 
 def test_an_estimate_within_its_tolerance_but_surer_than_it_may_be_fails(truth):
-    report = make_report(service_state(rotation_deg=0.03), shelf(), truth, 12.0)
+    report = make_report(service_state(rotation_deg=0.03), shelf(), truth, WELL)
     assert report.failures == ["rotation_deg is off by +5.0 sigma"]
     assert report.error_in_sigma["rotation_deg"] == pytest.approx(5.0)
 
 
 def test_a_margin_that_did_not_recover_fails(truth):
-    report = make_report(service_state(), shelf(cm_400={"gate": gate(0.94)}), truth, 12.0)
+    report = make_report(service_state(), shelf(cm_400={"gate": gate(0.94)}), truth, WELL)
     assert report.failures == ["the stability margin has not recovered"]
 
 
@@ -115,36 +123,36 @@ def test_more_modes_that_do_not_lower_the_wavefront_error_fail(truth):
     for line in truth.lines:
         if line["cm_id"] == "cm-500":
             line["wavefront_error_nm"] = 121.0
-    report = make_report(service_state(), shelf(), truth, 12.0)
+    report = make_report(service_state(), shelf(), truth, WELL)
     assert report.failures == ["the wavefront error with more modes is not below that of the start"]
 
 
 def test_a_night_without_more_modes_fails(truth):
-    report = make_report(service_state(), shelf()[:2], truth, 12.0)
+    report = make_report(service_state(), shelf()[:2], truth, WELL)
     assert report.target_modes.id is None
     assert not report.good
 
 
 def test_frames_skipped_at_a_swap_fail(truth):
     truth.lines.append({"kind": "swap", "cm_id": "cm-500", "frames_skipped": 3})
-    report = make_report(service_state(), shelf(), truth, 12.0)
+    report = make_report(service_state(), shelf(), truth, WELL)
     assert report.failures == ["3 frames skipped at the swap to cm-500"]
 
 
 def test_an_alarm_that_lasts_to_the_end_fails(truth):
-    report = make_report(service_state(alarms=["margin"]), shelf(), truth, 12.0)
+    report = make_report(service_state(alarms=["margin"]), shelf(), truth, WELL)
     assert report.failures == ["alarm margin: found"]
 
 
 def test_without_a_registration_there_is_nothing_to_compare(truth):
     state = service_state() | {"registration": None}
-    report = make_report(state, shelf(), truth, None)
+    report = make_report(state, shelf(), truth, Circumstances())
     assert "no estimate of the registration" in report.failures
     assert report.true_alpha == TRUE
 
 
 def test_a_service_that_never_answered_fails(truth):
-    report = make_report(None, [], truth, None)
+    report = make_report(None, [], truth, Circumstances())
     assert report.failures == ["the service never answered"]
 
 
@@ -153,14 +161,73 @@ def test_what_was_refused_and_rejected_is_counted(truth):
         shelf(cm_400={"state": state, "applied_frame_seq": None})[1]
         for state in ("refused", "rejected", "rejected")
     ]
-    report = make_report(service_state(), shelf() + extra, truth, 12.0)
+    report = make_report(service_state(), shelf() + extra, truth, WELL)
     assert report.reconstructors_refused_by_gate == 1
     assert report.reconstructors_rejected_by_rtc == 2
 
 
 def test_the_report_is_json_with_its_verdict(truth):
-    report = make_report(service_state(), shelf(), truth, 12.0)
+    report = make_report(service_state(), shelf(), truth, WELL)
     found = json.loads(report.to_json())
     assert found["good"] is True
     assert found["true_alpha"] == TRUE
     assert found["target_modes"]["n_modes"] == 500
+
+
+def failed(truth, circumstances=WELL, **changes):
+    """A night without an estimate, and what is said of it."""
+    state = service_state() | {"registration": None, "windows_accepted": 0} | changes
+    report = make_report(state, shelf()[:1], truth, circumstances)
+    assert not report.good
+    return report.reasons
+
+
+def test_a_good_night_needs_no_reasons(truth):
+    slow = Circumstances(pace=0.3, frameless_s=9.0)
+    assert make_report(service_state(), shelf(), truth, slow).reasons == []
+
+
+def test_refused_windows_are_the_reason_with_what_was_said_of_the_last(truth):
+    circumstances = Circumstances(refusal="the loop changed within the window")
+    assert failed(truth, circumstances, windows_refused=27) == [
+        "refused windows: 27 of 27; the last: the loop changed within the window"
+    ]
+
+
+def test_telemetry_that_gave_no_window_at_all_is_the_reason(truth):
+    assert failed(truth, windows_refused=0) == ["no window of telemetry was finished"]
+
+
+def test_frames_that_never_came_or_stopped_are_the_reason(truth):
+    link = {"frames_received": 0, "frames_lost": 0}
+    assert "no frames: none has reached the service" in failed(truth, link=link)
+    stopped = failed(truth, Circumstances(frameless_s=12.3))
+    assert "no frames: the last reached the service 12 s ago" in stopped
+
+
+def test_a_simulator_that_is_slow_or_silent_is_the_reason(truth):
+    slow = failed(truth, Circumstances(pace=0.62))
+    assert "too slow: the simulator made 0.62 s of telemetry a second" in slow
+    silent = failed(truth, Circumstances(untold_s=8.0))
+    assert "the simulator has made nothing for 8 s" in silent
+
+
+def test_a_service_that_was_never_ready_says_what_it_waited_for(truth):
+    reasons = failed(truth, ready=False, ready_reason="the optical model is being prepared")
+    assert reasons == ["the service was not ready: the optical model is being prepared"]
+
+
+def test_what_the_service_waits_for_is_passed_on(truth):
+    assert "waiting for the RTC's status" in failed(truth, waiting_for=["the RTC's status"])
+
+
+def test_a_process_that_ended_is_named_with_its_last_words(truth):
+    ending = "the service ended with status 2: pyrcal: no such thing"
+    report = make_report(None, [], truth, Circumstances(endings=(ending,)))
+    assert report.failures == ["the service never answered"]
+    assert report.reasons == [ending]
+
+
+def test_an_old_answer_is_not_a_good_one(truth):
+    report = make_report(service_state(), shelf(), truth, Circumstances(unanswered_s=7.2))
+    assert report.failures == ["the service has not answered for 7 s"]

@@ -1,7 +1,7 @@
 import re
 
 from service.demo.report import Report, Stage
-from service.demo.screen import HEADING, live_line, table
+from service.demo.screen import HEADING, awaited, live_line, slow_line, table
 
 STATE = {
     "ready": True,
@@ -70,3 +70,31 @@ def test_the_table_shows_what_was_reached_and_what_was_not():
     assert "400" in text
     assert "0.930" in text
     assert text.count("never reached") == 2
+
+
+def test_the_table_names_the_reasons_behind_a_failure():
+    text = table(Report(failures=["no estimate"], reasons=["no frames"]))
+    assert text.endswith("FAILED: no estimate\nbecause: no frames")
+
+
+def test_the_table_tells_preparing_from_doing():
+    text = table(Report(seconds_to_ready=7.5, seconds_to_first_applied=9.2))
+    assert "ready 7.5 s after the start" in text
+    assert "first applied 9.2 s after it was ready" in text
+    assert "never ready" in table(Report())
+
+
+def test_a_slow_machine_is_said_to_be_slow_and_a_slow_telescope_is_not_its_fault():
+    assert slow_line(0.97, real_time=True, behind=False) is None
+    assert slow_line(None, real_time=True, behind=False) is None
+    slow = slow_line(0.61, real_time=True, behind=False)
+    assert "this machine is slow: the simulator runs at 0.6 of real time" in slow
+    assert "this machine" not in slow_line(0.2, real_time=False, behind=False)
+    assert "worker is behind" in slow_line(1.0, real_time=True, behind=True)
+
+
+def test_while_it_prepares_the_demo_says_what_it_waits_for():
+    assert awaited(None) == "the service is starting"
+    preparing = {"ready": False, "ready_reason": "the optical model is being prepared"}
+    assert awaited(preparing) == "the optical model is being prepared"
+    assert "telescope" in awaited({"ready": True})

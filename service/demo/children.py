@@ -1,0 +1,103 @@
+"""The two processes of the demo: started together, ended together, nothing left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+GRACE_S = 3.0
+"""They may take so long to end by themselves, both together; then they are killed."""
+
+_POLL_S = 0.05
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Child:
+    """A process in a session of its own, its output in a file."""
+
+    name: str
+    log: Path
+    process: subprocess.Popen[bytes]
+
+    @property
+    def ended(self) -> str | None:
+        """How it ended, with its last words; None: it runs."""
+        status = self.process.poll()
+        if status is None:
+            return None
+        words = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
+        last = next((line.strip() for line in reversed(words) if line.strip()), "it said nothing")
+        how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+        return f"the {self.name} {how}: {last}"
+
+    def signal(self, number: signal.Signals) -> None:
+        """Tell the process itself; it ends what it has started."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+
+    def kill_all(self) -> None:
+        """Kill it and whatever it has started: they share its process group."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+
+
+@contextmanager
+def children(directory: Path, commands: dict[str, Sequence[str]]) -> Iterator[list[Child]]:
+    """Run processes of this Python by name while the ``with`` block lasts."""
+    started: list[Child] = []
+    try:
+        for name, words in commands.items():
+            started.append(_started(name, words, directory))
+        yield started
+    finally:
+        _end(started)
+
+
+def _started(name: str, words: Sequence[str], directory: Path) -> Child:
+    path = directory / f"{name}.log"
+    with path.open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, *words], stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+        )
+    return Child(name=name, log=path, process=process)
+
+
+def _end(started: list[Child]) -> None:
+    """End all within ``GRACE_S``, whatever they do; an impatient Ctrl-C cannot leave one behind."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
+    try:
+        for child in started:
+            child.signal(signal.SIGINT)
+        until_s = time.monotonic() + GRACE_S
+        while time.monotonic() < until_s and any(c.process.poll() is None for c in started):
+            time.sleep(_POLL_S)
+        for child in started:
+            child.kill_all()
+            child.process.wait()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def interrupted_by_any_end() -> Iterator[None]:
+    """Let a terminal that closes, or ``kill``, end the ``with`` block like Ctrl-C."""
+
+    def interrupt(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in _ENDING}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

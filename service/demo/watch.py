@@ -1,0 +1,256 @@
+"""Looking at REST and the truth while the demo runs, and knowing when it is over."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+
+from service.demo.children import Child
+from service.demo.report import Circumstances, Report, make_report
+from service.demo.screen import HEADING, awaited, live_line, slow_line
+from service.demo.truth import TruthFile
+
+POLL_S = 0.5
+LINE_S = 2.0
+HEADING_EVERY = 20
+
+FRESH_S = 1.5
+"""An answer older than this is not shown as if it were one of now."""
+
+ANSWER_WITHIN_S = 1.0
+
+PREPARE_WITHIN_S = 180.0
+"""Until service and simulator are ready; a slow machine without a cache needs a third of it."""
+
+HOLD_S = 5.0
+"""All must have been right for so long before the demo ends by itself."""
+
+SILENCE_S = 5.0
+"""Truth or frames that have not grown for so long have stopped: the clock goes on without them."""
+
+STRETCH = 6.0
+"""A machine that does not keep real time may take so many times longer than asked for."""
+
+WORKER_BEHIND = "worker-behind"
+"""The alarm that says so: the estimate may come late, and the demo waits for it."""
+
+_LINE_S = 0.5
+"""Loop time between two lines of the truth: one more than the wall clock allows may be there."""
+
+View = dict[str, Any]
+
+
+class Stopwatch:
+    """Seconds since all was ready: those of the telemetry, where a slow machine makes it late."""
+
+    def __init__(self, now_s: float, telemetry_ns: int) -> None:
+        self._start_s = self._now_s = self._grown_s = now_s
+        self._telemetry_ns = telemetry_ns
+        self._idle_s = 0.0
+        self.telemetry_s = 0.0
+        """Loop time the simulator has gone through."""
+
+    def look(self, now_s: float, telemetry_ns: int) -> None:
+        """Take note of the wall clock and of the simulator's; a step of the latter is left out."""
+        step_s = (telemetry_ns - self._telemetry_ns) / 1e9
+        if step_s != 0.0:
+            self.telemetry_s += min(max(step_s, 0.0), now_s - self._grown_s + _LINE_S)
+            self._grown_s = now_s
+        elif now_s - self._grown_s > SILENCE_S:
+            self._idle_s += now_s - self._now_s
+        self._now_s, self._telemetry_ns = now_s, telemetry_ns
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds by the clock on the wall."""
+        return self._now_s - self._start_s
+
+    @property
+    def spent_s(self) -> float:
+        """Seconds that count; a simulator that stands still does not stop the clock."""
+        return min(self.wall_s, self.telemetry_s + self._idle_s)
+
+    @property
+    def silent_s(self) -> float:
+        """How long the simulator has written nothing."""
+        return self._now_s - self._grown_s
+
+    @property
+    def pace(self) -> float | None:
+        """Seconds of telemetry a second; None: too early to say."""
+        return self.telemetry_s / self.wall_s if self.wall_s > SILENCE_S else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Promise:
+    """How long the demo takes, and whether it may end before."""
+
+    seconds: float | None
+    """After all is ready; None: until Ctrl-C."""
+
+    whole: bool
+    """Something is to happen at a time of its own: all the seconds are wanted."""
+
+    real_time: bool
+    """The simulator keeps real time on an ordinary machine."""
+
+
+class Watch:
+    """Looks at REST and the truth file, and prints."""
+
+    def __init__(
+        self,
+        client: httpx.Client,
+        truth: TruthFile,
+        started: Sequence[Child],
+        promise: Promise,
+        say: Callable[[str], None],
+    ) -> None:
+        self._client = client
+        self._truth = truth
+        self._children = started
+        self._promise = promise
+        self._say = say
+        self._state: View | None = None
+        self._reconstructors: list[View] = []
+        self._begun_s = self._answered_s = self._frames_grown_s = time.monotonic()
+        self._frames = 0
+        self._ready_s: float | None = None
+        self._stopwatch: Stopwatch | None = None
+        self._first_applied_s: float | None = None
+        self._right_since_s: float | None = None
+        self._behind = False
+        self._said: set[str] = set()
+
+    def run(self) -> None:
+        """Wait until all is ready, then watch until all has come out right or time is up."""
+        if not self._prepared():
+            return
+        n_lines, next_line_s = 0, 0.0
+        while not self._is_over():
+            self._look()
+            if time.monotonic() >= next_line_s:
+                self._say_lines(n_lines)
+                n_lines, next_line_s = n_lines + 1, time.monotonic() + LINE_S
+            time.sleep(POLL_S)
+
+    def report(self, refusal: str | None = None) -> Report:
+        """Return the figures as they stand now; ``refusal``: of the last window."""
+        clock, now_s = self._stopwatch, time.monotonic()
+        circumstances = Circumstances(
+            seconds_to_ready=self._ready_s,
+            seconds_to_first_applied=self._first_applied_s,
+            pace=None if clock is None else clock.pace,
+            unanswered_s=now_s - self._answered_s,
+            frameless_s=0.0 if clock is None else now_s - self._frames_grown_s,
+            untold_s=0.0 if clock is None else clock.silent_s,
+            endings=self._endings(),
+            refusal=refusal,
+        )
+        return make_report(self._state, self._reconstructors, self._truth, circumstances)
+
+    def closing_report(self) -> Report:
+        """Return the figures at the end, with what only the service's log can say."""
+        self._truth.read()
+        report = self.report()
+        return report if report.good else self.report(self._last_refusal())
+
+    def _last_refusal(self) -> str | None:
+        try:
+            log = self._client.get("/v1/events").raise_for_status().json()["log"]
+        except (httpx.HTTPError, ValueError):
+            return None
+        return next((e["text"] for e in reversed(log) if e["name"] == "window.refused"), None)
+
+    def _prepared(self) -> bool:
+        """Wait for the model and the simulated telescope; return whether both are there."""
+        next_line_s = 0.0
+        while (waited_s := time.monotonic() - self._begun_s) < PREPARE_WITHIN_S:
+            self._look()
+            last = self._truth.last
+            if self._endings():
+                return False
+            if last is not None and self._state is not None and self._state["ready"]:
+                self._ready_s = waited_s
+                self._frames_grown_s = time.monotonic()
+                self._stopwatch = Stopwatch(self._frames_grown_s, last["t_ns_utc"])
+                self._say(f"{waited_s:7.1f}  ready: the clock starts\n")
+                return True
+            if waited_s >= next_line_s:
+                self._say(f"{waited_s:7.1f}  preparing: {awaited(self._state)}")
+                next_line_s = waited_s + LINE_S
+            time.sleep(POLL_S)
+        return False
+
+    def _is_over(self) -> bool:
+        clock, promise = self._stopwatch, self._promise
+        if clock is None or promise.seconds is None:
+            return any(child.name == "service" for child in self._children if child.ended)
+        right_s = 0.0 if self._right_since_s is None else clock.spent_s - self._right_since_s
+        if self._endings() or (right_s >= HOLD_S and not promise.whole):
+            return True
+        longest_s = STRETCH * promise.seconds
+        slow = self._behind and self._right_since_s is None
+        return clock.wall_s >= longest_s or (clock.spent_s >= promise.seconds and not slow)
+
+    def _look(self) -> None:
+        self._truth.read()
+        last = self._truth.last
+        if self._stopwatch is not None and last is not None:
+            self._stopwatch.look(time.monotonic(), last["t_ns_utc"])
+        for ending in self._endings():
+            self._say_once(f"         {ending}")
+        try:
+            state = self._client.get("/v1/state").raise_for_status().json()
+            shelf = self._client.get("/v1/reconstructors").raise_for_status().json()
+        except (httpx.HTTPError, ValueError):
+            self._right_since_s = None
+            return
+        self._state, self._reconstructors = state, shelf["reconstructors"]
+        self._answered_s = time.monotonic()
+        if self._stopwatch is not None:
+            self._take_note(state, self._stopwatch)
+
+    def _take_note(self, state: View, clock: Stopwatch) -> None:
+        """Follow what has become of the frames, of the first matrix and of the promise."""
+        if state["link"]["frames_received"] != self._frames:
+            self._frames = state["link"]["frames_received"]
+            self._frames_grown_s = self._answered_s
+        applied = any(r["applied_frame_seq"] is not None for r in self._reconstructors)
+        if applied and self._first_applied_s is None:
+            self._first_applied_s = clock.wall_s
+        self._behind = any(alarm["name"] == WORKER_BEHIND for alarm in state["alarms"])
+        if not self.report().good:
+            self._right_since_s = None
+        elif self._right_since_s is None:
+            self._right_since_s = clock.spent_s
+
+    def _say_lines(self, n_lines: int) -> None:
+        if n_lines % HEADING_EVERY == 0:
+            self._say(HEADING)
+        clock = self._stopwatch
+        slow = slow_line(
+            None if clock is None else clock.pace,
+            real_time=self._promise.real_time,
+            behind=self._behind,
+        )
+        if slow is not None:
+            self._say_once(slow)
+        seconds = 0.0 if clock is None else clock.wall_s
+        silent_s = time.monotonic() - self._answered_s
+        if silent_s > FRESH_S:
+            self._say(f"{seconds:7.1f}  no answer from the service for {silent_s:.0f} s")
+        else:
+            self._say(live_line(seconds, self._state, self._truth.last))
+
+    def _endings(self) -> tuple[str, ...]:
+        return tuple(ending for child in self._children if (ending := child.ended) is not None)
+
+    def _say_once(self, line: str) -> None:
+        if line not in self._said:
+            self._said.add(line)
+            self._say(line)

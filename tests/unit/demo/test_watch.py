@@ -1,0 +1,206 @@
+import json
+import time
+
+import httpx
+import pytest
+
+from service.demo.children import Child
+from service.demo.truth import TruthFile
+from service.demo.watch import HOLD_S, STRETCH, Promise, Stopwatch, Watch
+from tests.unit.demo.test_report import TRUE, service_state, shelf
+
+SECOND_NS = 1_000_000_000
+
+
+def stopwatch(*looks):
+    """A stopwatch that has seen pairs of wall clock and telemetry, seconds."""
+    clock = Stopwatch(100.0, 5 * SECOND_NS)
+    for wall_s, telemetry_s in looks:
+        clock.look(100.0 + wall_s, round((5.0 + telemetry_s) * SECOND_NS))
+    return clock
+
+
+def steadily(seconds, pace):
+    return [(n * 0.5, n * 0.5 * pace) for n in range(1, 2 * seconds + 1)]
+
+
+def test_in_real_time_the_seconds_of_wall_and_telemetry_are_the_same():
+    clock = stopwatch(*steadily(20, 1.0))
+    assert clock.spent_s == pytest.approx(20.0)
+    assert clock.pace == pytest.approx(1.0)
+
+
+def test_on_a_slow_machine_the_seconds_of_telemetry_count():
+    clock = stopwatch(*steadily(20, 0.6))
+    assert clock.wall_s == pytest.approx(20.0)
+    assert clock.spent_s == pytest.approx(12.0)
+    assert clock.pace == pytest.approx(0.6)
+
+
+def test_a_simulator_that_stops_does_not_stop_the_clock():
+    clock = stopwatch(*steadily(10, 1.0), *[(10.0 + n, 10.0) for n in range(1, 21)])
+    assert clock.spent_s == pytest.approx(25.0)
+    assert clock.silent_s == pytest.approx(20.0)
+
+
+def test_a_step_of_the_simulators_clock_is_not_time_that_passed():
+    clock = stopwatch((0.5, 0.5), (1.0, 3601.0), (1.5, 3601.5), (2.0, 12.0), (2.5, 12.5))
+    assert clock.spent_s <= 2.5
+    assert clock.telemetry_s == pytest.approx(2.5)
+
+
+def test_the_pace_of_the_first_seconds_is_not_told():
+    assert stopwatch((0.5, 0.0), (1.0, 0.5)).pace is None
+
+
+class Scene:
+    """A service over REST and a truth file, both on a clock that only a sleep moves."""
+
+    def __init__(self, tmp_path, monkeypatch):
+        self.now_s, self.pace, self.ready_at_s = 0.0, 1.0, 6.0
+        self.answers, self.right_at_s = True, 20.0
+        self.alarms, self.lines = [], []
+        self.path = tmp_path / "truth.jsonl"
+        monkeypatch.setattr(time, "monotonic", lambda: self.now_s)
+        monkeypatch.setattr(time, "sleep", self.sleep)
+        self.client = httpx.Client(
+            transport=httpx.MockTransport(self.answer), base_url="http://service"
+        )
+
+    def sleep(self, seconds):
+        self.now_s += seconds
+        telemetry_s = self.now_s * self.pace
+        cm_id, error_nm = ("cm-500", 100.0) if self.right else ("initial", 120.0)
+        line = TRUE | {"kind": "truth", "t_ns_utc": round(telemetry_s * SECOND_NS)}
+        line |= {"wavefront_error_nm": error_nm, "cm_id": cm_id}
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    @property
+    def right(self):
+        return self.now_s >= self.right_at_s
+
+    def answer(self, request):
+        if not self.answers:
+            raise httpx.ConnectError("no service", request=request)
+        if request.url.path == "/v1/events":
+            log = [{"name": "window.refused", "text": "the loop is open"}]
+            return httpx.Response(200, json={"alarms": [], "log": log})
+        records = shelf() if self.right else shelf()[:1]
+        if request.url.path == "/v1/reconstructors":
+            return httpx.Response(200, json={"reconstructors": records})
+        state = service_state(self.alarms) | {"ready": self.now_s >= self.ready_at_s}
+        state["rtc"], state["in_use"], state["margin"] = {"n_controlled": 400}, "initial", None
+        state["link"] = {"frames_received": round(1000 * self.now_s), "frames_lost": 0}
+        if not self.right:
+            state["registration"] = None
+            state |= {"windows_accepted": 0, "windows_refused": 3}
+        else:
+            state["registration"]["age_s"] = 0.5
+        return httpx.Response(200, json=state)
+
+    def watch(self, seconds=60.0, *, whole=False, started=()):
+        promise = Promise(seconds=seconds, whole=whole, real_time=True)
+        truth = TruthFile(self.path)
+        return Watch(self.client, truth, list(started), promise, self.lines.append)
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    return Scene(tmp_path, monkeypatch)
+
+
+def test_the_clock_starts_when_all_is_ready_and_until_then_it_says_what_it_waits_for(scene):
+    watch = scene.watch()
+    watch.run()
+    report = watch.closing_report()
+    assert report.good
+    assert report.seconds_to_ready == pytest.approx(6.0, abs=0.6)
+    assert report.seconds_to_first_applied == pytest.approx(14.0, abs=0.6)
+    assert [line for line in scene.lines if "preparing:" in line]
+
+
+def test_it_ends_when_all_has_been_right_for_some_seconds(scene):
+    scene.watch().run()
+    assert 20.0 + HOLD_S <= scene.now_s <= 20.0 + HOLD_S + 3.0
+
+
+def test_it_takes_all_its_time_where_something_is_to_happen_later(scene):
+    scene.watch(whole=True).run()
+    assert scene.now_s == pytest.approx(66.0, abs=1.1)
+
+
+def test_when_time_is_up_it_fails_and_names_the_reason(scene):
+    scene.right_at_s = 1e9
+    watch = scene.watch()
+    watch.run()
+    report = watch.closing_report()
+    assert scene.now_s == pytest.approx(66.0, abs=1.1)
+    assert "no estimate of the registration" in report.failures
+    assert report.reasons == ["refused windows: 3 of 3; the last: the loop is open"]
+
+
+def test_a_slow_machine_gets_its_seconds_of_telemetry_and_is_told_that_it_is_slow(scene):
+    scene.pace, scene.right_at_s = 0.5, 90.0
+    watch = scene.watch()
+    watch.run()
+    assert watch.closing_report().good
+    assert any("0.5 of real time" in line for line in scene.lines)
+
+
+def test_a_machine_however_slow_comes_to_an_end(scene):
+    scene.pace, scene.right_at_s = 0.01, 1e9
+    scene.watch(seconds=20.0).run()
+    assert scene.now_s == pytest.approx(6.0 + STRETCH * 20.0, abs=1.1)
+
+
+def test_a_worker_that_is_behind_gets_more_time(scene):
+    scene.alarms, scene.right_at_s = ["worker-behind"], 1e9
+    scene.watch(seconds=20.0).run()
+    assert scene.now_s == pytest.approx(6.0 + STRETCH * 20.0, abs=1.1)
+    assert any("worker is behind" in line for line in scene.lines)
+
+
+def test_an_old_answer_is_never_shown_as_a_fresh_one(scene):
+    watch = scene.watch(seconds=30.0)
+    sleep = scene.sleep
+
+    def sleep_and_fall_silent(seconds):
+        scene.answers = scene.now_s < 12.0
+        sleep(seconds)
+
+    time.sleep = sleep_and_fall_silent  # the scene's own patch is undone with it
+    watch.run()
+    silent = [line for line in scene.lines if "no answer from the service for" in line]
+    assert len(silent) >= 8
+    assert not any("modes)" in line for line in scene.lines[scene.lines.index(silent[0]) :])
+    failures = watch.closing_report().failures
+    assert any("the service has not answered for" in text for text in failures)
+
+
+def test_a_model_that_is_never_ready_ends_the_demo_with_the_reason(scene):
+    scene.ready_at_s = scene.right_at_s = 1e9
+    watch = scene.watch()
+    watch.run()
+    assert 100.0 < scene.now_s < 300.0
+    assert watch.closing_report().reasons[0].startswith("the service was not ready")
+
+
+class Ended:
+    """A process that has ended."""
+
+    returncode = 3
+
+    def poll(self):
+        return self.returncode
+
+
+def test_a_process_that_ends_ends_the_demo_with_its_last_words(scene, tmp_path):
+    log = tmp_path / "simulator.log"
+    log.write_text("starting\nsim_rtc: no such telescope\n", encoding="utf-8")
+    child = Child(name="simulator", log=log, process=Ended())
+    watch = scene.watch(started=[child])
+    watch.run()
+    assert scene.now_s < 10.0
+    ending = "the simulator ended with status 3: sim_rtc: no such telescope"
+    assert ending in watch.closing_report().reasons

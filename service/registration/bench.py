@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
 from service.model.instrument import Instrument, Stop
 from service.model.interaction import InteractionModel
 from service.model.modes import Basis
@@ -19,6 +16,17 @@ from service.registration.lowest import Lowest, lowest_of
 COARSE, CHEAP, FINE = 1, 2, 3
 """Pupil points per subaperture, and nodes, of the models for far steps, derivatives, residuals.
 Against 8 points the fine one is biased by 0.02 % of a subaperture and 0.004 % of magnification."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Other:
+    """A change of the instrument file."""
+
+    words: str
+    """Key and value, as the file would say them."""
+
+    says_what_moves: bool = False
+    """Whether a registration means something else with it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,14 +76,16 @@ class Bench:
         """Decides."""
         return self.model(FINE)
 
-    def others(self, modes: NDArray[np.intp]) -> dict[str, InteractionModel]:
-        """Return instruments that this one may be taken for, modes of them, by what to change."""
-        wfs, subset = self.instrument.wfs, self.basis.subset(modes)
+    @property
+    def others(self) -> dict[Other, Instrument]:
+        """Instruments that this one may be taken for, by what to change in the file."""
+        wfs = self.instrument.wfs
         radius = wfs.modulation_lambda_over_d
         stop = Stop.TELESCOPE if self.instrument.stop is Stop.MIRROR else Stop.MIRROR
-        found = {f'stop = "{stop}"': replace(self.instrument, stop=stop)}
+        moves = Other(words=f'stop = "{stop}"', says_what_moves=True)
+        found = {moves: replace(self.instrument, stop=stop)}
         for factor in (0.5, 2.0) if radius > 0.0 else ():
             changed = replace(wfs, modulation_lambda_over_d=factor * radius)
-            words = f"modulation_lambda_over_d = {factor * radius:g}"
-            found[words] = replace(self.instrument, wfs=changed)
-        return {words: self.model(CHEAP, subset, instrument) for words, instrument in found.items()}
+            turned = Other(words=f"modulation_lambda_over_d = {factor * radius:g}")
+            found[turned] = replace(self.instrument, wfs=changed)
+        return found

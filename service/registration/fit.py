@@ -223,7 +223,9 @@ def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, options: 
         gains=seen.gains,
         uncertainty=sure,
         landing=found.landing,
-        others=rivals(bench, target, solution) if residual_fraction > SUSPICIOUS else {},
+        others=rivals(bench, target, solution, found.nuisances)
+        if residual_fraction > SUSPICIOUS
+        else (),
         axes=axes.refusal,
         passes=usable.reference.passes,
         stroke_known=bench.instrument.mirror.stroke_known,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.registration.hypotheses import BETTER, Rival
 from service.registration.search import Landing
 from service.registration.uncertainty import Uncertainty
 
@@ -31,10 +32,8 @@ MOST_SCATTER = 0.35
 LARGEST_SIGMA = np.array([0.3, 0.3, np.deg2rad(3.0), 0.06])
 """Less certain than this is not determined (numeric units)."""
 
-BETTER = 0.95
-"""Another instrument is believed when it leaves less than this share of χ². On the diffractive
-telescope the right stop has left 0.83 to 0.94 of what the wrong one does, noise included, from a
-shift of 0.08 subaperture on; at no shift the two differ by less than 0.01."""
+LEAVES_ALPHA = 0.5
+"""Another instrument that moves the registration by less, in σ, is told and refuses nothing."""
 
 _PASS_TOLERANCE = 0.12
 _PASS_SCATTER = 0.12
@@ -55,8 +54,8 @@ class Evidence:
     landing: Landing | None
     """Where the starts led; None for methods that do not search."""
 
-    others: dict[str, float]
-    """χ² of other instruments over this one's, by what to change in the file."""
+    others: tuple[Rival, ...]
+    """Other instruments, the one that explains the matrix best first."""
 
     axes: str
     """Why the orientation cannot be told; empty: it can."""
@@ -136,15 +135,22 @@ def _another_minimum(evidence: Evidence) -> str:
 
 
 def _another_instrument(evidence: Evidence) -> str:
-    if not evidence.others:
-        return ""
-    words, share = min(evidence.others.items(), key=lambda item: item[1])
-    if share >= BETTER:
-        return ""
-    return (
-        f"another instrument explains the matrix better: with {words} the misfit is "
-        f"{share:.0%} of what it is now; correct the instrument file"
-    )
+    for rival in evidence.others:
+        if rival.share < BETTER and not _leaves_alpha(rival, evidence):
+            return (
+                f"another instrument explains the matrix better: with {rival.change.words} the "
+                f"misfit is {rival.share:.0%} of what it is now; correct the instrument file"
+            )
+    return ""
+
+
+def _leaves_alpha(rival: Rival, evidence: Evidence) -> bool:
+    return rival.moved is not None and _distance(rival.moved, evidence) < LEAVES_ALPHA
+
+
+def _distance(moved: Array, evidence: Evidence) -> float:
+    """Return how far another instrument moves the registration, in σ of that parameter."""
+    return float(np.max(np.abs(moved) / np.sqrt(np.diag(evidence.uncertainty.covariance))))
 
 
 def _another_basis(evidence: Evidence) -> str:

@@ -65,6 +65,7 @@ def document(report: FitReport) -> dict[str, Any]:
         "subset_scatter": _four(fit.subset_scatter * BOUNDARY_SCALE),
         "converged": bool(fit.converged),
         "verdict": verdict_line(fit),
+        "notes": list(report.notes),
         "seconds": round(report.seconds, 3),
     }
 

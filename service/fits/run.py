@@ -61,7 +61,7 @@ def fit_file(
         reference_sha256=recorded.sha256,
         double_pass=reference.double_pass,
         seconds=time.perf_counter() - begun,
-        notes=notes,
+        notes=(*notes, *fit.remarks),
     )
 
 

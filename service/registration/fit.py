@@ -23,6 +23,7 @@ from service.registration.options import Fit, FitOptions, Method, ScanStep
 from service.registration.orientation import LEAST_CORRELATION, find_orientation
 from service.registration.paper import scan
 from service.registration.reference import Checked, Reference, checked
+from service.registration.remarks import remarks
 from service.registration.search import Landing, land, settle, settle_at
 from service.registration.sensitivity import project_on_sensitivities
 from service.registration.target import Target, oriented, target_of
@@ -80,7 +81,7 @@ def fit_matrix(
     )
     used = basis.subset(usable.reference.columns)
     tell("orientation")
-    instrument = _masked(instrument)
+    instrument, told = _masked(instrument), instrument.slopes.order
     axes = _axes(instrument, usable, used, options, mapper)
     instrument = oriented(instrument, axes.order, axes.orientation)
     target = target_of(usable.reference, instrument)
@@ -95,7 +96,7 @@ def fit_matrix(
         start[2] = axes.rotation_rad if axes.rotation_rad is not None else start[2]
     found = _found(bench, target, start, options)
     tell("verdict")
-    return _answer(bench, found, usable, axes, options)
+    return _answer(bench, found, usable, axes, told)
 
 
 def _silent(_: str) -> None:
@@ -199,7 +200,7 @@ def _found(bench: Bench, target: Target, start: Array, options: FitOptions) -> _
             return _Found(solution=solution, target=seen, nuisances=nuisances, table=table)
 
 
-def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, options: FitOptions) -> Fit:
+def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, told: SlopeOrder) -> Fit:
     solution, target = found.solution, found.target
     seen = solution.projection
     values = np.concatenate([np.zeros(4), solution.nuisances])
@@ -246,6 +247,7 @@ def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, options: 
         accepted=accepted,
         converged=solution.converged,
         verdict=verdict,
+        remarks=remarks(evidence, solution, target, told=told, found=axes.order),
         left_out=usable.left_out + _rows_left_out(target),
         n_evaluations=bench.counter.n,
         synthetic=solution.matrix,

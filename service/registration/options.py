@@ -126,6 +126,9 @@ class Fit:
     left_out: tuple[str, ...]
     """Columns and slopes that were not used, one sentence for each kind."""
 
+    remarks: tuple[str, ...]
+    """What should be known beside the verdict, one sentence each."""
+
     n_evaluations: int
     """Interaction matrices computed on the way, those for derivatives included."""
 

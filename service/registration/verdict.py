@@ -134,6 +134,11 @@ def _another_minimum(evidence: Evidence) -> str:
     )
 
 
+def harmless(evidence: Evidence) -> tuple[Rival, ...]:
+    """Return instruments that explain the matrix better and leave the registration where it is."""
+    return tuple(r for r in evidence.others if r.share < BETTER and _leaves_alpha(r, evidence))
+
+
 def _another_instrument(evidence: Evidence) -> str:
     for rival in evidence.others:
         if rival.share < BETTER and not _leaves_alpha(rival, evidence):
@@ -181,17 +186,32 @@ def _another_unit(evidence: Evidence) -> str:
             f"the measured slopes are {middle:.1e} times the model's: the matrix is in another "
             "unit than slope per metre of OPD (per nanometre would be 1e-09)"
         )
-    uniform = float(np.std(gains) / middle) < _PASS_SCATTER
-    for factor, words in ((2.0, "twice"), (0.5, "half")):
-        told = "double_pass = true" if factor > 1 else "double_pass = false"
-        possible = (evidence.passes == 1) == (factor > 1)
-        if possible and uniform and abs(middle / factor - 1.0) < _PASS_TOLERANCE:
-            return (
-                f"the measured slopes are {words} the model's in every mode ({middle:.2f}): the "
-                f"light met the mirror {'twice' if factor > 1 else 'once'}; set {told}, or correct "
-                "the unit (surface for OPD)"
-            )
-    return ""
+    factor = factor_of_passes(evidence)
+    if factor is None or float(np.std(gains) / middle) >= _PASS_SCATTER:
+        return ""
+    words = "twice" if factor > 1.0 else "half"
+    cause = (
+        "the matrix is per metre of the mirror's surface, which is half the OPD: divide it by two, "
+        'or write modes_kind = "surface" where the modes were measured'
+        if (evidence.passes, factor) == (2, 2.0)
+        else f"the light met the mirror {'twice' if factor > 1.0 else 'once'}; set double_pass = "
+        f"{'true' if factor > 1.0 else 'false'}, or correct the unit (surface for OPD)"
+    )
+    return f"the measured slopes are {words} the model's in every mode ({middle:.2f}): {cause}"
+
+
+def factor_of_passes(evidence: Evidence) -> float | None:
+    """Return 2 or 0.5 where gains, uniform or not, look like a forgotten factor; else None.
+
+    Half the slopes after one pass are what the sky leaves of them.
+    """
+    middle = float(np.median(evidence.gains))
+    if not evidence.stroke_known:
+        return None
+    for factor in (2.0,) if evidence.passes == 1 else (2.0, 0.5):
+        if abs(middle / factor - 1.0) < _PASS_TOLERANCE:
+            return factor
+    return None
 
 
 def _divided(evidence: Evidence) -> str:

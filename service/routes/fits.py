@@ -181,6 +181,9 @@ class FitDocument(View):
     verdict: str
     """Begins with "accepted" or "refused"; names what was left out."""
 
+    notes: list[str]
+    """What was decided on the way, or overruled, and should be known."""
+
     seconds: Number
 
 

@@ -42,6 +42,7 @@ def a_fit(**changes):
         accepted=True,
         converged=True,
         verdict="accepted: sets of modes agree",
+        remarks=(),
         left_out=(),
         n_evaluations=9,
         synthetic=SYNTHETIC,

@@ -20,6 +20,7 @@ KEYS = {
     "subset_scatter",
     "converged",
     "verdict",
+    "notes",
     "seconds",
 }
 
@@ -53,6 +54,12 @@ def test_the_orientation_is_said_as_the_instrument_file_would():
     }
     both = a_fit(orientation=Orientation(sign_x=-1, sign_y=-1))
     assert document(a_report(both))["orientation"]["sign"] == -1
+
+
+def test_what_should_be_known_beside_the_verdict_is_in_the_document():
+    assert document(a_report(notes=("columns of the wrong sign: 3",)))["notes"] == [
+        "columns of the wrong sign: 3"
+    ]
 
 
 def test_what_was_left_out_is_named_in_the_verdict():

@@ -56,7 +56,7 @@ def _understood(
     from service.commands.terminal import OneLineParser, with_negative_numbers
     from service.demo import add_demo_arguments, run_demo
 
-    parser = OneLineParser(
+    parser: argparse.ArgumentParser = OneLineParser(
         prog="pyrcal", description="Calibration service of an adaptive telescope."
     )
     parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")

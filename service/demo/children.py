@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +51,7 @@ class Child:
 
 
 @contextmanager
-def children(directory: Path, commands: dict[str, Sequence[str]]) -> Iterator[list[Child]]:
+def children(directory: Path, commands: Mapping[str, Sequence[str]]) -> Iterator[list[Child]]:
     """Run processes of this Python by name while the ``with`` block lasts."""
     started: list[Child] = []
     try:

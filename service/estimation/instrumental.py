@@ -135,7 +135,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> Wi
         modes=spectra.plan.modes,
         gain_sigma=_modulus_sigma(gains, every[4:, 4:]),
         dither_m=_total_dither_m(spectra),
-        window_s=spectra.plan.n_frames / spectra.plan.frame_rate_hz,
+        window_s=spectra.window_s,
     )
 
 

@@ -103,6 +103,14 @@ class Spectra:
     dither: NDArray[np.complex64]
     """``(n_lines, n_modes)`` its known dither part at the lines, metres."""
 
+    n_windows: int = 1
+    """Windows, one after the other, that this is the mean of."""
+
+    @property
+    def window_s(self) -> float:
+        """Seconds of telemetry in it."""
+        return self.n_windows * self.plan.n_frames / self.plan.frame_rate_hz
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LockIn:
@@ -149,6 +157,33 @@ def accumulate(lock_in: LockIn, block: FrameBlock) -> tuple[LockIn, list[Spectra
     """Add a block of frames; return the new state and the windows that ended in it."""
     window, ended = cut(lock_in.plan, lock_in.window, block, _STEPS)
     return replace(lock_in, window=window), ended
+
+
+def joined(one: Spectra, other: Spectra) -> Spectra | None:
+    """Return two windows of the same dither, one right after the other, as a longer one.
+
+    Their mean, each bin turned to the phase it has in the first: what the loop and the sensor make
+    of a line is the same in both, and the noise at the side bins falls as it does at the lines.
+    None: they are of different loops or dithers, or too far apart.
+    """
+    later = other.first_seq - one.first_seq
+    follows = later // one.plan.n_frames in {one.n_windows, one.n_windows + 1}
+    same = replace(one.plan, first_seq=0) == replace(other.plan, first_seq=0)
+    if not (same and follows and (one.session, one.cm_id) == (other.session, other.cm_id)):
+        return None
+    turns = np.exp(-2j * np.pi * later * one.plan.bins_hz / one.plan.frame_rate_hz)
+    n_windows = one.n_windows + other.n_windows
+    share = np.float32(one.n_windows / n_windows)
+    turned = ((1 - share) * turns).astype(np.complex64)[:, :, None]
+    return replace(
+        other,
+        first_seq=one.first_seq,
+        n_missing=one.n_missing + other.n_missing,
+        slopes=share * one.slopes + turned * other.slopes,
+        commands=share * one.commands + turned * other.commands,
+        dither=share * one.dither + turned[:, 0] * other.dither,
+        n_windows=n_windows,
+    )
 
 
 def _begin(plan: LockInPlan, block: FrameBlock) -> _Sums:

@@ -128,6 +128,8 @@ class Correlated:
     """End of exposure of the last frame."""
 
     n_missing: int
+    n_windows: int = 1
+    """Windows, one after the other, that are joined here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -197,6 +199,7 @@ def joined(one: Correlated, other: Correlated) -> Correlated:
         ),
         first_seq=one.first_seq,
         n_missing=one.n_missing + other.n_missing,
+        n_windows=one.n_windows + other.n_windows,
     )
 
 

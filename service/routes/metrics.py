@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 from service import __version__
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.routes.registration_views import age_s
-from service.routes.service import Link, Snapshot
+from service.routes.service import Link, Pace, Snapshot
 from service.state import (
     DitherPhase,
     MatrixState,
@@ -67,6 +67,7 @@ class SnapshotCollector(Collector):
         )
         waiting = "Lines of the audit trail that are not on the disk yet"
         yield _gauge("archive_waiting", waiting, snapshot.archive_waiting)
+        yield from _of_pace(snapshot.pace)
         yield from _of_link(snapshot.link)
         yield from _of_registration(snapshot)
         yield from _of_the_dither(snapshot.tracker)
@@ -78,6 +79,19 @@ class SnapshotCollector(Collector):
         expected = "1 for what is waited for, 2 where nothing can be done meanwhile"
         yield _labelled_gauge("waiting_for", expected, "name", waits)
         yield _labelled_gauge("alarm", "1 for each alarm that lasts", "name", alarms)
+
+
+def _of_pace(pace: Pace) -> Iterator[Metric]:
+    text = "Processor time of the worker per second of telemetry, last minute"
+    yield _gauge("worker_load_ratio", text, pace.worker_per_s)
+    yield _labelled_gauge("worker_job_load_ratio", f"{text}, by job", "job", pace.by_job)
+    text = "Processor time of the service itself per second, last minute"
+    yield _gauge("service_load_ratio", text, pace.service_per_s)
+    busy = "Share of the last minute in which the worker had a job"
+    yield _gauge("worker_busy_ratio", busy, pace.busy_ratio)
+    yield _gauge("window_seconds", "Mean length of the windows of the last minute", pace.window_s)
+    late = "Windows of the last minute that were joined to one the worker had no hand free for"
+    yield _gauge("windows_late", late, pace.windows_late)
 
 
 def _of_link(link: Link) -> Iterator[Metric]:

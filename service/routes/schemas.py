@@ -204,6 +204,28 @@ class ModeLimitView(View):
     """What the gate said of more."""
 
 
+class PaceView(View):
+    """What the work of the last minute cost."""
+
+    worker_per_s: Number
+    """Processor time of the worker for each second of telemetry; null: there was none."""
+
+    by_job: dict[str, float]
+    """The same by kind of job, what costs most first."""
+
+    service_per_s: Number
+    """Processor time of the service itself for each second of the clock."""
+
+    busy_ratio: Number
+    """Share of the time in which the worker had a job."""
+
+    window_s: Number
+    """Mean length of the windows fitted, seconds; null: none was."""
+
+    windows_late: int
+    """Windows that came while another still waited for the worker, and were joined to it."""
+
+
 class StateView(View):
     """What the service knows, at one glance."""
 
@@ -283,6 +305,7 @@ class StateView(View):
     windows_outlying: int
     """Believable in themselves, but too far from all others to be believed."""
 
+    pace: PaceView
     link: LinkView
 
     @classmethod
@@ -305,5 +328,6 @@ class StateView(View):
                 "uptime_s": (snapshot.now_ns - snapshot.started_ns) / 1e9,
                 "registration": registration and AlphaView.of(registration, snapshot),
                 "link": snapshot.link,
+                "pace": snapshot.pace,
             }
         )

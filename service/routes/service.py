@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Protocol
 
 import numpy as np
@@ -94,6 +94,29 @@ class Link(Protocol):
         """Faults of the service itself while it took a message in."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pace:
+    """What the work of the last minute cost, and whether it keeps up."""
+
+    worker_per_s: float | None = None
+    """Processor time of the worker for each second of telemetry; None: there was none."""
+
+    by_job: Mapping[str, float] = field(default_factory=dict)
+    """The same by kind of job, what costs most first."""
+
+    service_per_s: float | None = None
+    """Processor time of the service itself for each second of the clock."""
+
+    busy_ratio: float | None = None
+    """Share of the time in which the worker had a job."""
+
+    window_s: float | None = None
+    """Mean length of the windows fitted, seconds; None: none was."""
+
+    windows_late: int = 0
+    """Windows that came while another still waited for the worker, and were joined to it."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Snapshot:
     """Everything a reader may want to know at one moment."""
@@ -118,6 +141,9 @@ class Snapshot:
 
     waiting_for: tuple[Waiting, ...] = ()
     """Whom the service waits for and what they should do, what hinders most first."""
+
+    pace: Pace = field(default_factory=Pace)
+    """What the work costs."""
 
     estimate_arrival_ns: int | None = None
     """When the last window that entered the estimate arrived, on the service's clock.

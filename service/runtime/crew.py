@@ -1,10 +1,15 @@
-"""The worker process as the event loop sees it: one job at a time, replaced when it dies."""
+"""The worker as the event loop sees it: one job at a time, replaced when it dies or hangs."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import heapq
+import itertools
+import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
@@ -14,20 +19,80 @@ from service.worker import Done, Workbench, Worker, run_job
 P = ParamSpec("P")
 R = TypeVar("R")
 
+PATIENCE_S = {"make": 1.0, "work_out": 5.0, "watch": 6.0, "margin": 10.0}
+"""How long a job may wait for those that are asked for later; all others go first. What waits long
+enough has its turn before anything new, so that nothing waits for ever."""
+
+STILL_S = 5.0
+"""A worker that has taken no processor time for so long is named,"""
+
+HUNG_S = 15.0
+"""and for so long, killed: one of the lowest priority gets a hundredth of a loaded core."""
+
+UNKNOWN_LIMIT_S = 900.0
+"""Processor time of a job of which none has been done yet; ten times the largest telescopes'."""
+
+LEAST_LIMIT_S = 60.0
+LIMIT_RATIO = 20.0
+"""Processor time of a job, over the longest one of its kind so far."""
+
+LOOK_S = 0.5
+"""Between two looks at what a worker takes."""
+
 
 class Crew:
-    """Hands jobs to a worker made by ``hire``; a dead one costs one job, not the service."""
+    """Hands jobs to a worker made by ``hire``; a dead or hung one costs one job, not the service.
+
+    Belongs to the event loop. What is most urgent goes first, see :data:`PATIENCE_S`.
+    """
 
     def __init__(self, hire: Callable[[], Worker]) -> None:
         self._hire = hire
         self._worker: Worker | None = None
-        self._turn = asyncio.Lock()
         self.first: Callable[[], Done[None]] | None = None
         """What every new worker does before anything else; None: nothing."""
 
+        self._threads: ThreadPoolExecutor | None = None
+        self._waiting: list[tuple[float, int, asyncio.Future[None]]] = []
+        self._numbers = itertools.count()
+        self._turn: asyncio.Future[None] | None = None
+        self._owner: asyncio.Task[object] | None = None
+        self._limit_s: dict[str, float] = {}
+        self._longest_s: defaultdict[str, float] = defaultdict(float)
+        self._busy_s = 0.0
+        self._busy_since_s: float | None = None
         self.n_lost = 0
+        self.trouble = ""
+        """What is wrong with the worker, until one has done a job again; empty: nothing."""
+
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
         """Processor time of the worker by name of the job, seconds; a job that fails is not in."""
+
+    @property
+    def busy_s(self) -> float:
+        """Seconds of the clock in which the worker has had a job."""
+        since_s = self._busy_since_s
+        return self._busy_s + (0.0 if since_s is None else time.monotonic() - since_s)
+
+    @contextlib.asynccontextmanager
+    async def turn(self, name: str) -> AsyncIterator[None]:
+        """Have the worker for jobs of this name: what they are of is then chosen as late as can be.
+
+        ``call`` waits for its turn by itself; within this block it has it.
+        """
+        mine: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        due_s = time.monotonic() + PATIENCE_S.get(name, 0.0)
+        heapq.heappush(self._waiting, (due_s, next(self._numbers), mine))
+        self._admit()
+        try:
+            await mine
+            self._owner = asyncio.current_task()
+            yield
+        finally:
+            mine.cancel()
+            if self._turn is mine:
+                self._turn = self._owner = None
+                self._admit()
 
     async def call(
         self, job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
@@ -37,33 +102,95 @@ class Crew:
         Raises
         ------
         WorkerError
-            If the worker process died, and a new one is there for the next job; or if the job
-            failed in a way nobody foresaw, which must not end the service.
+            If the worker process died, or hung and was killed, and a new one is there for the next
+            job; or if the job failed in a way nobody foresaw, which must not end the service.
         """
-        async with self._turn:
-            done = await self._done(job.__name__, partial(run_job, job, *args, **kwargs))
-        self.cpu_s[job.__name__] += done.cpu_s
+        work = partial(run_job, job, *args, **kwargs)
+        if self._owner is asyncio.current_task():
+            done = await self._done(job.__name__, work)
+        else:
+            async with self.turn(job.__name__):
+                done = await self._done(job.__name__, work)
         return done.result
 
+    def dismiss(self) -> None:
+        """End the worker, whatever it is at; the next job finds a new one."""
+        worker, self._worker = self._worker, None
+        threads, self._threads = self._threads, None
+        if worker is not None:
+            worker.kill()
+        if threads is not None:
+            threads.shutdown(wait=False)
+
+    def _admit(self) -> None:
+        while self._turn is None and self._waiting:
+            *_, first = heapq.heappop(self._waiting)
+            if not first.done():  # nobody waits for it any more
+                self._turn = first
+                first.set_result(None)
+
     async def _done(self, name: str, work: Callable[[], Done[R]]) -> Done[R]:
-        hired = self._worker is None
-        worker = self._worker = self._worker or self._hire()
+        worker = self._worker or self._hire()
+        first, self._worker = (None if worker is self._worker else self.first), worker
+        # a thread of its own: one that waited for other threads would look like a hung worker
+        self._threads = threads = self._threads or ThreadPoolExecutor(1)
+        self._busy_since_s = time.monotonic()
+        under_way = asyncio.get_running_loop().run_in_executor(threads, _run, worker, first, work)
+        # where nobody waits for it to the end, it says nothing
+        under_way.add_done_callback(lambda job: job.cancelled() or job.exception())
         try:
-            if hired and self.first is not None:
-                await asyncio.to_thread(worker.run, self.first)
-            return await asyncio.to_thread(worker.run, work)
+            await self._watched(name, worker, under_way)
+            done = under_way.result()
         except EOFError as error:
-            self.n_lost += 1
-            self.dismiss()
-            raise WorkerError(f"the worker process died during {name}") from error
+            raise WorkerError(self._lost(f"the worker process died during {name}")) from error
+        except TimeoutError as error:
+            raise WorkerError(self._lost(f"{error} and was killed")) from error
         except WorkerError as error:
             raise WorkerError(f"{name} {error}") from error
         except asyncio.CancelledError:
             self.dismiss()  # it would go on with what nobody waits for
             raise
+        finally:
+            self._busy_s, self._busy_since_s = self.busy_s, None
+        self.trouble = ""
+        self.cpu_s[name] += done.cpu_s
+        self._longest_s[name] = max(self._longest_s[name], done.cpu_s)
+        self._limit_s[name] = max(LEAST_LIMIT_S, LIMIT_RATIO * self._longest_s[name])
+        return done
 
-    def dismiss(self) -> None:
-        """End the worker, whatever it is at; the next job finds a new one."""
-        worker, self._worker = self._worker, None
-        if worker is not None:
-            worker.kill()
+    async def _watched(self, name: str, worker: Worker, under_way: asyncio.Future[Done[R]]) -> None:
+        """Wait for a job.
+
+        Raises
+        ------
+        TimeoutError
+            If the worker stands still, or takes far more than such a job ever has.
+        """
+        begun_cpu_s = last_cpu_s = worker.cpu_s()
+        moved_s, limit_s = time.monotonic(), self._limit_s.get(name, UNKNOWN_LIMIT_S)
+        while not (await asyncio.wait({under_way}, timeout=LOOK_S))[0]:
+            cpu_s, now_s = worker.cpu_s(), time.monotonic()
+            if cpu_s != last_cpu_s:
+                last_cpu_s, moved_s, self.trouble = cpu_s, now_s, ""
+            still_s = now_s - moved_s
+            if still_s >= STILL_S:
+                self.trouble = f"the worker has stood still for {still_s:.0f} s in {name}"
+            if still_s >= HUNG_S:
+                raise TimeoutError(self.trouble)
+            if cpu_s - begun_cpu_s > limit_s:
+                self._limit_s[name] = 2 * limit_s  # a telescope where it takes so long
+                raise TimeoutError(f"the worker took more than {limit_s:.0f} s for {name}")
+
+    def _lost(self, text: str) -> str:
+        self.n_lost += 1
+        self.dismiss()
+        self.trouble = text
+        return text
+
+
+def _run(
+    worker: Worker, first: Callable[[], Done[None]] | None, work: Callable[[], Done[R]]
+) -> Done[R]:
+    if first is not None:
+        worker.run(first)
+    return worker.run(work)

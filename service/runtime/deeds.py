@@ -74,6 +74,7 @@ class Deeds:
         self._clock_ns = clock_ns
         self._matrices: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
         self._commanded_modes: int | None = None
+        self._judging: set[str] = set()
         self.noisy = NoisyDesk(crew=crew, archive=archive, instrument=instrument)
         """Sums of the noisy interaction matrix under way."""
 
@@ -209,25 +210,40 @@ class Deeds:
         await self._keep(record, matrix, None, why)
         return ev.MatrixMade(record=record, wanted=True)
 
-    async def _judge(self, effect: ev.JudgeMatrix | ev.JudgeProposal, state: TrackerState) -> Event:
+    async def _judge(
+        self, effect: ev.JudgeMatrix | ev.JudgeProposal, state: TrackerState
+    ) -> Event | None:
+        if isinstance(effect, ev.JudgeMatrix):
+            return await self._margin(effect, state)
         rtc, registration = _there(state), _registered(state)
         matrix = await asyncio.to_thread(self.matrix, effect.id)
-        gains = rtc.gains[: len(matrix)] if isinstance(effect, ev.JudgeMatrix) else effect.gains
+        judged = judged_now(rtc, effect.gains, registration)
+        verdict = await self._verdict(matrix, effect.gains, state, registration)
+        return ev.ProposalJudged(id=effect.id, verdict=verdict, judged=judged)
+
+    async def _margin(self, effect: ev.JudgeMatrix, state: TrackerState) -> Event | None:
+        if effect.id in self._judging:
+            return None  # the answer to the question that waits serves
+        rtc, registration = _there(state), _registered(state)
+        self._judging.add(effect.id)
+        try:
+            matrix = await asyncio.to_thread(self.matrix, effect.id)
+            gains = rtc.gains[: len(matrix)]
+            question = InUse(
+                matrix=matrix,
+                alpha=registration.alpha,
+                covariance=registration.total_covariance,
+                loop=loop_settings(
+                    rtc, gains, registration, n_holding=modes_that_hold(state, gains)
+                ),
+                bound=self._publishing.pole_radius_bound,
+                timing=timing(rtc, len(matrix), registration),
+                magnitude=rtc.magnitude,
+            )
+            margin = await self._crew.call(Workbench.margin, question)
+        finally:
+            self._judging.discard(effect.id)
         judged = judged_now(rtc, gains, registration)
-        if isinstance(effect, ev.JudgeProposal):
-            verdict = await self._verdict(matrix, gains, state, registration)
-            return ev.ProposalJudged(id=effect.id, verdict=verdict, judged=judged)
-        n_holding = modes_that_hold(state, gains)
-        question = InUse(
-            matrix=matrix,
-            alpha=registration.alpha,
-            covariance=registration.total_covariance,
-            loop=loop_settings(rtc, gains, registration, n_holding=n_holding),
-            bound=self._publishing.pole_radius_bound,
-            timing=timing(rtc, len(matrix), registration),
-            magnitude=rtc.magnitude,
-        )
-        margin = await self._crew.call(Workbench.margin, question)
         return ev.MarginJudged(
             id=effect.id,
             verdict=margin.verdict,

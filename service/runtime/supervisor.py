@@ -28,10 +28,11 @@ from service.runtime.asking import why_not
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.runtime.following import followed, news, shape_news
+from service.runtime.pace import PaceMeter
 from service.runtime.recording import Recorder
 from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.waiting import Facts, Told, news_of_link, waiting_for
-from service.runtime.windows import fitted, listened, watched
+from service.runtime.windows import Backlog, fitted, listened, watched
 from service.state import Level, LogEntry, MeasureState, TrackerState, Waiting
 from service.tracker import step
 from service.wire import TEXT_LIMIT, AlarmMessage
@@ -42,9 +43,6 @@ POLL_S = 0.05
 
 WATCH_INTERVAL_S = 4.0
 """Between two looks of the passive watchdog: a jump is to be seen within 5 s."""
-
-WINDOWS_WAITING = 1
-"""Windows that may wait for the worker; a newer one says more, so the older is given up."""
 
 DESCRIBE_ATTEMPTS = 3
 """Workers that may die while the model is prepared before the service gives up."""
@@ -73,7 +71,8 @@ class Supervisor:
         self._recorder = Recorder(archive, lambda: self._state, self._post)
         self._deeds = deeds
         self._streams: Streams | None = None
-        self._windows: asyncio.Queue[Spectra | Correlated] = asyncio.Queue(WINDOWS_WAITING)
+        self._backlog = Backlog()
+        self._meter = PaceMeter(crew)
         self._running: set[asyncio.Task[None]] = set()
         self._started_ns = time.time_ns()
         self._log = structlog.get_logger().bind(system=state.system)
@@ -89,6 +88,7 @@ class Supervisor:
             ready=not any(wait.hinders for wait in waiting),
             ready_reason="; ".join(f"{wait.party}: {wait.text}" for wait in waiting) or "ready",
             waiting_for=waiting,
+            pace=self._meter.pace,
             estimate_arrival_ns=known.arrived_ns_utc if known is not None else None,
             archive_failures=self._recorder.failures,
             archive_waiting=self._recorder.waiting,
@@ -100,6 +100,7 @@ class Supervisor:
             state=self._state,
             link=self._bridge.statistics(),
             preparing=self._streams is None,
+            worker_trouble=self._crew.trouble,
         )
         return waiting_for(facts)
 
@@ -215,6 +216,7 @@ class Supervisor:
             return
         was_silent_s = self._streams.dither_silent_s
         for block in self._bridge.drain():
+            self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
             self._streams, windows = fed(self._streams, block)
             for window in windows:
                 self._take(window)
@@ -227,18 +229,20 @@ class Supervisor:
             return
         if isinstance(window, Correlated):
             self._deeds.noisy.take(window, self._state)
-        if self._windows.full():
-            late = self._windows.get_nowait()
-            reason = "the worker is too slow for the telemetry: a window was given up"
-            refused = WindowRefused(reason=reason, t_ns_utc=late.t_end_ns_utc)
-            self._post(ev.WindowLost(refused=refused))
-        self._windows.put_nowait(window)
+        if self._backlog.waits:
+            self._meter.was_late()
+        given_up = self._backlog.put(window)
+        if given_up is not None:
+            self._post(ev.WindowLost(refused=given_up))
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
         told = Told()
         while True:
             self._post(ev.Tick())
+            self._meter.look()
+            for trouble in self._meter.news(self._state):
+                self._post(trouble)
             now_ns = time.time_ns()
             for event in news_of_link(self._bridge.statistics(), self._state, now_ns):
                 self._post(event)
@@ -262,16 +266,24 @@ class Supervisor:
 
     async def _fit(self) -> None:
         while True:
-            window = await self._windows.get()
-            self._post(await fitted(window, self._state, self._crew, self._deeds))
+            await self._backlog.some()
+            async with self._crew.turn("fit"):
+                window = self._backlog.take()
+                if window is None:
+                    continue
+                if isinstance(window, Spectra):
+                    self._meter.fitted(window.window_s)
+                event = await fitted(window, self._state, self._crew, self._deeds)
+            self._post(event)
 
     async def _watch(self) -> None:
         while True:
             await asyncio.sleep(WATCH_INTERVAL_S)
             if self._streams is None:
                 continue
-            self._streams, sums = taken(self._streams)
-            event = await watched(sums, self._state, self._crew)
+            async with self._crew.turn("watch"):
+                self._streams, sums = taken(self._streams)
+                event = await watched(sums, self._state, self._crew)
             if event is not None:
                 self._post(event)
 

@@ -147,6 +147,9 @@ class Facts:
     preparing: bool
     """The worker prepares the optical model."""
 
+    worker_trouble: str = ""
+    """What is wrong with the worker; empty: nothing."""
+
     @property
     def frames_come(self) -> bool:
         """Whether frames, used or not, came of late."""
@@ -169,6 +172,9 @@ def _for_the_worker(facts: Facts) -> Iterator[Waiting]:
     if facts.preparing:
         text = "the optical model is being prepared: wait"
         yield Waiting(name="model", party=Party.WORKER, text=text, hinders=True)
+    if facts.worker_trouble:
+        text = f"{facts.worker_trouble}: until it, or another, has done a job"
+        yield Waiting(name="worker-lost", party=Party.WORKER, text=text, hinders=True)
     if facts.state.making_since_ns_utc is not None:
         text = "a reconstructor is being computed and judged: wait"
         yield Waiting(name="matrix", party=Party.WORKER, text=text)

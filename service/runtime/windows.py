@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from service import events as ev
 from service.errors import PyrcalError, UnknownIdError
+from service.estimation import lockin, randomdither
 from service.estimation.estimator import Window
 from service.estimation.instrumental import Loop
 from service.estimation.lockin import Spectra, WindowRefused
@@ -23,6 +25,70 @@ from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.state import Level, ReconstructorRecord, RtcView, TrackerState
 from service.worker import Workbench, run_job
+
+LONGEST_S = 30.0
+"""Later ones are not joined to a window: α moves meanwhile."""
+
+
+class Backlog:
+    """The window that waits for the worker: those that end meanwhile are joined to it.
+
+    So windows grow as long as the worker needs, and what they say is not lost.
+    """
+
+    def __init__(self) -> None:
+        self._window: Spectra | Correlated | None = None
+        self._first_end_ns = 0
+        self._news = asyncio.Event()
+
+    @property
+    def waits(self) -> bool:
+        """Whether a window waits."""
+        return self._window is not None
+
+    def put(self, window: Spectra | Correlated) -> WindowRefused | None:
+        """Add a window; return why the one that waited is given up, where it has to be."""
+        waiting = self._window
+        late = window.t_end_ns_utc - self._first_end_ns > LONGEST_S * 1e9
+        both = None if waiting is None or late else _joined(waiting, window)
+        self._window = both or window
+        self._news.set()
+        if both is not None:
+            return None
+        self._first_end_ns = window.t_end_ns_utc
+        if waiting is None:
+            return None
+        return WindowRefused(
+            reason="the worker had no hand free before the dither, the reconstructor or the "
+            f"session changed, or for {LONGEST_S:.0f} s: the window was given up",
+            t_ns_utc=waiting.t_end_ns_utc,
+        )
+
+    async def some(self) -> None:
+        """Wait until a window is there."""
+        await self._news.wait()
+
+    def take(self) -> Spectra | Correlated | None:
+        """Return the window that waits."""
+        self._news.clear()
+        window, self._window = self._window, None
+        return window
+
+
+def _joined(one: Spectra | Correlated, other: Spectra | Correlated) -> Spectra | Correlated | None:
+    if isinstance(one, Spectra) and isinstance(other, Spectra):
+        return lockin.joined(one, other)
+    if isinstance(one, Correlated) and isinstance(other, Correlated) and _alike(one, other):
+        return randomdither.joined(one, other)
+    return None
+
+
+def _alike(one: Correlated, other: Correlated) -> bool:
+    return (one.session, one.cm_id, replace(one.plan, first_seq=0)) == (
+        other.session,
+        other.cm_id,
+        replace(other.plan, first_seq=0),
+    )
 
 
 async def fitted(
@@ -125,7 +191,8 @@ def _began_ns(window: Spectra | Correlated, rtc: RtcView | None) -> int:
     """Return when a window began, by the RTC's clock; 0: no RTC tells how long it was."""
     if rtc is None:
         return 0
-    return window.t_end_ns_utc - round(window.plan.n_frames * 1e9 / rtc.frame_rate_hz)
+    n_frames = window.n_windows * window.plan.n_frames
+    return window.t_end_ns_utc - round(n_frames * 1e9 / rtc.frame_rate_hz)
 
 
 async def listened(

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Concatenate, Generic, ParamSpec, TypeVar, cast
 
 from threadpoolctl import threadpool_limits
@@ -60,6 +61,19 @@ class Apart:
     def pid(self) -> int | None:
         """Process id; None: nothing has been asked of it yet."""
         return None if self._process is None else self._process.pid
+
+    def cpu_s(self) -> float:
+        """Return the processor time it has taken, as the kernel counts it; the clock elsewhere.
+
+        Where there is no such file a process cannot be told to stand still: it never seems to.
+        """
+        if self.pid is None:
+            return 0.0
+        try:
+            words = Path(f"/proc/{self.pid}/stat").read_text("ascii").rpartition(")")[2].split()
+        except (OSError, UnicodeDecodeError):
+            return time.monotonic()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
     def do(self, work: Callable[[], R]) -> R:
         """Have it done and return the result; ``work`` must be picklable, like what it returns.

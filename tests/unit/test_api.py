@@ -896,6 +896,7 @@ async def test_every_reference_in_openapi_has_a_target(client):
 UNITS = ("_s", "_m", "_hz", "_ns", "_ns_utc", "_deg", "_subap", "_frames", "_seq")
 DIMENSIONLESS = {
     "bound",
+    "busy_ratio",
     "condition_number",
     "effective_gain",
     "first",

@@ -16,6 +16,7 @@ from service.estimation.lockin import (
     Spectra,
     WindowRefused,
     accumulate,
+    joined,
 )
 from tests.numerics import DT_NS, FRAME_RATE_HZ, T0_NS, block_of, part, sines
 
@@ -252,3 +253,64 @@ def test_a_dither_a_little_weaker_than_its_request_is_used():
     block = telemetry(1100)
     (spectra,) = run(replace(block, dither_m=block.dither_m * np.float32(0.6)))
     assert isinstance(spectra, Spectra)
+
+
+# --- windows that are joined
+
+
+def white(n_frames: int, seed: int) -> FrameBlock:
+    rng = np.random.default_rng(seed)
+    dither = sines(PLAN, n_frames, N_SMALL_MODES)
+    return block_of(rng.normal(size=(n_frames, 400)), dither, dither)
+
+
+def test_joined_windows_show_the_dither_as_each_of_them_does():
+    first, second = run(telemetry(2200))
+    both = joined(first, second)
+    assert both is not None
+    lines = np.arange(2), [3, 1]
+    np.testing.assert_allclose(both.dither[lines], first.dither[lines], rtol=1e-4)
+    assert (both.n_windows, both.window_s) == (2, 2.0)
+    assert (both.first_seq, both.t_end_ns_utc) == (first.first_seq, second.t_end_ns_utc)
+
+
+def test_a_line_that_begins_a_window_with_another_phase_is_turned_back():
+    first, second = run(
+        without(telemetry(2300), 1100, 1103)[0], without(telemetry(2300), 0, 1103)[1]
+    )
+    assert second.first_seq - first.first_seq == 1003
+    both = joined(first, second)
+    lines = np.arange(2), [3, 1]
+    np.testing.assert_allclose(both.dither[lines], first.dither[lines], rtol=1e-4)
+
+
+def test_noise_falls_as_in_a_longer_window_at_the_lines_and_beside_them():
+    windows = run(white(4200, seed=3))
+    one = np.mean([np.abs(w.slopes) ** 2 for w in windows])
+    both = joined(joined(windows[0], windows[1]), joined(windows[2], windows[3]))
+    two = np.mean(np.abs(both.slopes) ** 2)
+    # 29,600 complex numbers: the ratio of their powers is good to 1 %
+    assert both.n_windows == 4
+    assert two / one == pytest.approx(0.25, rel=0.05)
+
+
+def test_three_windows_count_the_same():
+    windows = run(white(3200, seed=4))
+    both = joined(joined(*windows[:2]), windows[2])
+    mean = np.mean([w.slopes[0, 0] for w in windows], axis=0)
+    # the lines have whole periods in a window, so there is no phase to turn
+    np.testing.assert_allclose(both.slopes[0, 0], mean, atol=1e-3 * np.abs(mean).max())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"session": "another"},
+        {"cm_id": "another"},
+        {"first_seq": 3100},
+        {"plan": replace(PLAN, amplitude_m=(5e-9, 9e-9))},
+    ],
+)
+def test_windows_of_other_loops_dithers_or_times_are_not_joined(change):
+    first, second = run(telemetry(2200))
+    assert joined(first, replace(second, **change)) is None

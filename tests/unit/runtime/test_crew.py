@@ -8,6 +8,7 @@ from functools import partial
 import pytest
 
 from service.errors import WorkerError
+from service.runtime import crew as crew_module
 from service.runtime.crew import Crew
 from service.worker import Workbench, run_job, start_worker
 from tests.unit.runtime.small import COMPUTE, small_instrument
@@ -31,6 +32,15 @@ def interrupted(_bench: Workbench) -> str:
 
 def asleep(_bench: Workbench) -> None:
     time.sleep(60.0)
+
+
+def napping(_bench: Workbench) -> None:
+    time.sleep(1.2)
+
+
+def endless(_bench: Workbench) -> None:
+    while True:
+        pass
 
 
 def killed(_bench: Workbench) -> None:
@@ -165,3 +175,89 @@ def test_what_every_worker_must_be_told_is_told_to_one_that_takes_a_dead_ones_pl
         return await crew.call(remembered)
 
     assert asyncio.run(jobs()) == "first"
+
+
+async def test_what_is_urgent_goes_first_and_what_waits_long_has_its_turn(crew, monkeypatch):
+    order = []
+
+    async def job(name):
+        async with crew.turn(name):
+            order.append(name)
+            await asyncio.sleep(0.05)
+
+    first = asyncio.create_task(job("describe"))
+    await asyncio.sleep(0)
+    rest = [asyncio.create_task(job(name)) for name in ("margin", "watch", "make", "fit", "judge")]
+    await asyncio.gather(first, *rest)
+    assert order == ["describe", "fit", "judge", "make", "watch", "margin"]
+
+    order.clear()
+    monkeypatch.setitem(crew_module.PATIENCE_S, "watch", 0.1)
+    tasks = [asyncio.create_task(job("describe")), asyncio.create_task(job("watch"))]
+    for _ in range(8):  # more windows than a look has patience for
+        await asyncio.sleep(0.03)
+        tasks.append(asyncio.create_task(job("fit")))
+    await asyncio.gather(*tasks)
+    assert order.index("watch") < 5
+
+
+async def test_within_a_turn_calls_are_done_at_once(crew):
+    async with crew.turn("fit"):
+        assert await crew.call(process_id)
+    async with asyncio.timeout(5.0):
+        assert await crew.call(process_id)
+
+
+async def test_a_turn_nobody_takes_any_more_is_passed_on(crew):
+    async with crew.turn("fit"):
+        waiting = asyncio.create_task(crew.call(process_id))
+        await asyncio.sleep(0)
+        waiting.cancel()
+    async with asyncio.timeout(20.0):
+        assert await crew.call(process_id)
+
+
+async def test_a_worker_that_stands_still_is_named_then_killed_and_replaced(
+    crew, hired, monkeypatch
+):
+    monkeypatch.setattr("service.runtime.crew.STILL_S", 0.6)
+    monkeypatch.setattr("service.runtime.crew.HUNG_S", 2.0)
+    before = await crew.call(process_id)
+    os.kill(before, signal.SIGSTOP)
+    job = asyncio.create_task(crew.call(process_id))
+    await asyncio.sleep(1.7)
+    assert "has stood still for" in crew.trouble
+    with pytest.raises(WorkerError, match=r"stood still for \d s in process_id and was killed"):
+        await job
+    assert "was killed" in crew.trouble
+    assert await crew.call(process_id) != before
+    assert crew.trouble == ""
+    assert (crew.n_lost, len(hired)) == (1, 2)
+
+
+async def test_a_worker_that_never_comes_to_an_end_is_killed(crew, hired, monkeypatch):
+    await crew.call(process_id)
+    monkeypatch.setattr("service.runtime.crew.UNKNOWN_LIMIT_S", 0.5)
+    with pytest.raises(WorkerError, match="took more than 0 s for endless and was killed"):
+        await crew.call(endless)
+    assert await crew.call(process_id) == hired[1].pid
+
+
+async def test_a_job_that_rightly_takes_long_is_let_finish_in_the_end(crew, monkeypatch):
+    await crew.call(process_id)
+    monkeypatch.setattr("service.runtime.crew.UNKNOWN_LIMIT_S", 0.2)
+    for _ in range(5):
+        try:
+            assert await crew.call(spinning) is None
+            break
+        except WorkerError:
+            continue
+    else:
+        pytest.fail("it never was")
+
+
+async def test_a_job_that_waits_for_the_disk_a_moment_is_not_a_hung_one(crew, monkeypatch):
+    monkeypatch.setattr("service.runtime.crew.STILL_S", 0.6)
+    await crew.call(napping)
+    assert crew.trouble == ""
+    assert crew.n_lost == 0

@@ -7,10 +7,11 @@ import pytest
 
 from service import events as ev
 from service.estimation import passive
-from service.runtime.windows import watched
+from service.runtime.windows import Backlog, watched
 from service.state import Mode
 from service.worker import Workbench
 from tests.numerics import block_of
+from tests.unit.estimation.test_lockin import run, telemetry
 from tests.unit.reactions.situations import ALPHA, Story
 from tests.unit.reactions.test_watchdog import watched as look
 
@@ -52,3 +53,31 @@ async def test_why_there_is_none_is_told_once():
     story.tell(event)
     assert await watched("the loop is open", story.state, worker) is None
     assert worker.begun_at == []
+
+
+async def test_windows_that_end_while_one_waits_are_joined_to_it():
+    backlog, windows = Backlog(), run(telemetry(6200))
+    assert [backlog.put(window) for window in windows] == [None] * 6
+    await backlog.some()
+    window = backlog.take()
+    assert (window.n_windows, window.window_s) == (6, 6.0)
+    assert window.t_end_ns_utc == windows[-1].t_end_ns_utc
+    assert backlog.take() is None
+    assert not backlog.waits
+
+
+async def test_a_window_that_cannot_be_joined_is_given_up_and_why_is_said():
+    backlog, (first, second) = Backlog(), run(telemetry(2200))
+    backlog.put(first)
+    refused = backlog.put(replace(second, cm_id="another"))
+    assert refused.t_ns_utc == first.t_end_ns_utc
+    assert "no hand free before the dither, the reconstructor" in refused.reason
+    assert backlog.take().cm_id == "another"
+
+
+async def test_no_window_becomes_so_long_that_alpha_moves_in_it():
+    backlog, (first, second) = Backlog(), run(telemetry(2200))
+    backlog.put(first)
+    late = replace(second, t_end_ns_utc=first.t_end_ns_utc + 31 * 10**9)
+    assert "for 30 s" in backlog.put(late).reason
+    assert backlog.take().n_windows == 1

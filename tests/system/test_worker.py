@@ -1,0 +1,76 @@
+"""A worker that is slow or hangs, as an operator and a process manager see it."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.system.night import a_night, session_members, wait_for
+from tests.system.stranger import Stranger, small_telescope
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+
+
+@pytest.fixture
+def night(tmp_path):
+    with a_night(tmp_path) as night:
+        yield night
+
+
+def worker_of(service):
+    """Return the process of the service that has numpy, besides itself."""
+    for member in session_members(service.popen.pid):
+        maps = Path(f"/proc/{member}/maps").read_text(encoding="utf-8")
+        if member != service.popen.pid and "_multiarray_umath" in maps:
+            return member
+    raise AssertionError("no worker")
+
+
+def stranger(night):
+    return Stranger(night.zenoh, *small_telescope(0.1, -0.05, 0.3, 1.003))
+
+
+def test_a_worker_that_hangs_is_named_killed_and_replaced(night):
+    service = night.service("hold")
+    with stranger(night):
+        wait_for(lambda: night.state["windows_accepted"] > 0, 40.0, "it tracks")
+        worker = worker_of(service)
+        os.kill(worker, signal.SIGSTOP)
+        wait_for(lambda: "worker-lost" in night.alarms, 12.0, "the alarm")
+        assert "stood still" in night.alarms["worker-lost"]
+        answer = night.client.get("/readyz")
+        assert answer.status_code == 503
+        assert "stood still" in answer.json()["detail"]
+        wait_for(lambda: worker not in session_members(service.popen.pid), 20.0, "it is killed")
+        accepted = night.state["windows_accepted"]
+        wait_for(lambda: night.state["windows_accepted"] > accepted, 40.0, "another one works")
+        wait_for(lambda: "worker-lost" not in night.alarms, 5.0, "the alarm is over")
+        assert night.client.get("/readyz").status_code == 200
+
+
+def test_a_slow_worker_gets_longer_windows_and_is_named(night):
+    """A worker that runs for 0.3 of every 5 s: no window is lost, and the alarm says why."""
+    service = night.service("hold")
+    with stranger(night):
+        wait_for(lambda: night.state["windows_accepted"] > 0, 40.0, "it tracks")
+        worker, before = worker_of(service), night.state
+        deadline = time.monotonic() + 70.0
+        try:
+            while "worker-behind" not in night.alarms:
+                assert time.monotonic() < deadline, night.state["pace"]
+                os.kill(worker, signal.SIGSTOP)
+                time.sleep(4.7)
+                os.kill(worker, signal.SIGCONT)
+                time.sleep(0.3)
+        finally:
+            os.kill(worker, signal.SIGCONT)
+        after = night.state
+        assert "Windows are now" in night.alarms["worker-behind"]
+        assert "the machine is loaded" in night.alarms["worker-behind"]
+        assert after["windows_accepted"] > before["windows_accepted"]
+        assert after["windows_refused"] == before["windows_refused"]
+        assert after["pace"]["window_s"] > 2.0
+        assert night.metrics["pyrcal_windows_late"] >= 3
+        wait_for(lambda: "worker-behind" not in night.alarms, 90.0, "the alarm is over")

@@ -6,7 +6,7 @@ look healthy almost to the end.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,14 @@ DIVERGING_RATIO = 10.0
 CALM_RATIO = 5.0
 """Below this a loop that was diverging counts as holding again."""
 
+ABSURD_RATIO = 1e4
+"""Times the expected turbulence that no mirror reaches: commands are in another unit."""
+
+_STILL_RATIO = 1e-3
+"""A mirror that moves less than this, against turbulence, does not move."""
+
+_DECADES = {9: "nanometres", 6: "micrometres"}
+
 _MEMORY_S = 0.5
 
 
@@ -30,6 +38,22 @@ class LoopHealth:
     """RMS of the command in the upper half of the controlled modes over its expectation."""
 
     diverging: bool = False
+    sane: bool = False
+    """Whether any frame since the loop closed was one that a mirror can play."""
+
+    @property
+    def absurd(self) -> bool:
+        """Whether commands are beyond any mirror, and always were: no loop comes to that."""
+        return not self.sane and self.ratio > ABSURD_RATIO
+
+    @property
+    def unit(self) -> str:
+        """What the unit of absurd commands looks like."""
+        decades = np.log10(max(self.ratio, 1.0))
+        nearest = min(_DECADES, key=lambda decade: abs(decade - decades))
+        if abs(nearest - decades) > 2.0:
+            return "they are in another unit than metres of OPD, or decoded wrongly"
+        return f"they look like {_DECADES[nearest]}, metres of OPD are expected"
 
 
 def observe(
@@ -43,11 +67,15 @@ def observe(
         return LoopHealth()
     upper = in_loop[len(in_loop) // 2 :]
     commands = block.commands_m[:, upper]
-    power = float(np.mean(np.sum(commands.astype(np.float64) ** 2, axis=1)))
+    powers = np.sum(commands.astype(np.float64) ** 2, axis=1)
+    power = float(np.mean(powers))
     expected = float(mode_variance_m2[upper].sum())
     if expected <= 0.0:
         return health
+    # a loop that diverges passes through what a mirror can play; one just closed begins at 0
+    possible = (powers > _STILL_RATIO**2 * expected) & (powers <= ABSURD_RATIO**2 * expected)
+    sane = health.sane or bool(possible.any())
     fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / _MEMORY_S))
     ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * power / expected))
     limit = CALM_RATIO if health.diverging else DIVERGING_RATIO
-    return replace(health, ratio=ratio, diverging=ratio > limit)
+    return LoopHealth(ratio=ratio, diverging=sane and ratio > limit, sane=sane)

@@ -127,7 +127,9 @@ def judged(law: LoopLaw, terms: LoopTerms, last_seq: int) -> tuple[LoopLaw, Foun
         return law, None
     law = replace(law, judged_seq=int(law.seq[at[-1]]))
     fits = [
-        _fitted(law.commands_m[:, mode].astype(float), law.seen_m[:, mode].astype(float), at, n_taps)
+        _fitted(
+            law.commands_m[:, mode].astype(float), law.seen_m[:, mode].astype(float), at, n_taps
+        )
         for mode in range(len(law.modes))
     ]
     clear = [number for number, fit in enumerate(fits) if fit is not None]

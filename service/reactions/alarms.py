@@ -19,6 +19,12 @@ WRONG_MATRIX = "matrix-mismatch"
 WRONG_ANSWER = "response-mismatch"
 """The alarm of slopes that answer a dither otherwise than the file tells."""
 
+WRONG_LOOP = "loop-law"
+"""The alarm of an RTC whose leak, gains or delay are others than its status says."""
+
+WRONG_UNIT = "command-unit"
+"""The alarm of commands that no mirror can play."""
+
 ARCHIVE_FAILED = "archive-failed"
 """The alarm of a disk that refuses: what cannot be recorded is not done."""
 
@@ -72,6 +78,8 @@ RULES: dict[str, Rule] = {
     "loop-diverging": Rule("the loop was diverging", _OUT_OF_HAND),
     "edge-slip": Rule("the edge had slipped", _OUT_OF_HAND),
     WRONG_MATRIX: Rule("the RTC's matrix was of other slopes or commands", _MISTOLD),
+    WRONG_LOOP: Rule("the loop was not what the RTC tells of it", _MISTOLD | {Act.DECIDE}),
+    WRONG_UNIT: Rule("the commands were in another unit", _MISTOLD | {Act.DECIDE}),
     # windows go on: one that is as it should be ends it
     WRONG_ANSWER: Rule("slopes answered otherwise than told", _MISTOLD - {Act.MEASURE}),
     ARCHIVE_FAILED: Rule("the disk refused to be written", frozenset({Act.DECIDE})),

@@ -8,18 +8,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation import lockin, loopcheck, passive, randomdither
+from service.estimation import lockin, loopcheck, looplaw, passive, randomdither
 from service.estimation.edge import EdgeHealth, EdgeWatch, edge_watch, observe_edge
 from service.estimation.frames import FrameBlock
 from service.estimation.health import LoopHealth, observe
 from service.estimation.lockin import LockIn, Spectra, WindowRefused
 from service.estimation.loopcheck import LoopCheck, LoopTerms, Obedience
+from service.estimation.looplaw import LoopLaw
 from service.estimation.passive import Passive
 from service.estimation.randomdither import Correlated, RandomDither
 from service.estimation.vibration import Hearing, heard, hearing
-from service.reactions.alarms import OFF_LOOP
+from service.reactions.alarms import OFF_LOOP, WRONG_LOOP, WRONG_UNIT
 from service.reactions.dither_choice import SETTLING_S, lock_in_plan
 from service.reactions.random_dither import random_plan
+from service.reactions.verdicts import same_loop
 from service.state import DitherKind, DitherView, RtcView
 from service.worker import Description
 
@@ -27,6 +29,9 @@ PASSIVE_MEMORY_S = 10.0
 
 WINDOW_SAMPLES = 5
 """Frames of a window that must have been looked at before it can be said to be off the loop."""
+
+VERDICTS = 2
+"""On the loop's law that must agree that something is otherwise than told."""
 
 MATRICES_KEPT = 2
 """The reconstructor in use, and the one before: frames of it may still come."""
@@ -79,6 +84,10 @@ class Streams:
     off: Obedience | None = None
     """How the commands fail to obey the loop; None: they obey, or nobody knows."""
 
+    law: LoopLaw = field(default_factory=LoopLaw)
+    unlawful: tuple[str, ...] = ()
+    """What the last verdicts on the loop's law found to be otherwise than told, without a break."""
+
 
 Window = Spectra | Correlated | WindowRefused
 
@@ -97,8 +106,13 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
             dither=None,
             check=LoopCheck(),
             off=None,
+            law=LoopLaw(),
+            unlawful=(),
             edge_watch=None,
         )
+    if before is not None and before.session != rtc.session:
+        streams = replace(streams, health=LoopHealth())
+    streams = _lawful(streams, before, rtc)
     if before is not None and _same_loop(before, rtc):
         return streams if before.seq == rtc.seq else _confirmed(streams, rtc)
     in_loop = np.array(rtc.in_loop, dtype=np.intp)
@@ -185,6 +199,33 @@ def _terms(streams: Streams, cm_id: str | None) -> LoopTerms | None:
     )
 
 
+def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:
+    """Judge the loop's law by the frames up to a status, or begin anew with another loop.
+
+    Gains may follow the seeing meanwhile.
+    """
+    if before is None or not _much_the_same_loop(before, rtc):
+        return replace(streams, law=LoopLaw(from_seq=rtc.seq + 1), unlawful=())
+    terms = _terms(streams, rtc.cm_id)
+    if terms is None or streams.law.cm_id != rtc.cm_id:
+        return streams
+    law, found = looplaw.judged(streams.law, terms, rtc.seq)
+    if found is None:
+        return replace(streams, law=law)
+    unlawful = (*streams.unlawful, found.wrong)[-VERDICTS:] if found.wrong else ()
+    return replace(streams, law=law, unlawful=unlawful)
+
+
+def _much_the_same_loop(before: RtcView, after: RtcView) -> bool:
+    return (
+        before.session == after.session
+        and before.loop == after.loop
+        and before.frame_rate_hz == after.frame_rate_hz
+        and before.n_controlled == after.n_controlled
+        and same_loop(before, after)
+    )
+
+
 def _confirmed(streams: Streams, rtc: RtcView) -> Streams:
     """Judge the frames up to a status that shows the same loop as the one before."""
     span, terms = loopcheck.last_samples(streams.check, rtc.seq), _terms(streams, rtc.cm_id)
@@ -232,7 +273,8 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     streams = replace(streams, heard_ns_utc=end_ns)
     terms = _terms(streams, block.cm_id)
     if terms is not None:
-        streams = replace(streams, check=loopcheck.observe(streams.check, block, terms))
+        check = loopcheck.observe(streams.check, block, terms)
+        streams = replace(streams, check=check, law=looplaw.follow(streams.law, block, terms))
     streams = _listening(streams, rtc, block)
     streams, ended = _dithered(streams, rtc, block)
     windows = [_obeying(streams, window) for window in ended]
@@ -246,7 +288,7 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     variance = streams.description.mode_variance_m2
     health = observe(streams.health, block, variance, streams.in_loop)
     streams = replace(streams, health=health)
-    if streams.edge_watch is not None:
+    if streams.edge_watch is not None and not health.absurd:
         edge = observe_edge(streams.edge, block, streams.edge_watch)
         streams = replace(streams, edge=edge)
     return streams, windows
@@ -359,7 +401,18 @@ def troubles(streams: Streams) -> list[tuple[str, str | None, str]]:
         "the edge has slipped, whatever the slopes say; open the loop and close it again with "
         "fewer modes or a leak of 0.99"
     )
+    absurd = (
+        f"commands are {health.ratio:.3g} times what turbulence asks: {health.unit}; nothing is "
+        "measured, made or sent until the RTC sends metres"
+    )
+    unlawful = (
+        f"the RTC's loop is not what its status tells: {'; '.join(streams.unlawful[-1:])}; mend "
+        "its status, or its loop"
+    )
+    n_verdicts = len(streams.unlawful)
     return [
+        (WRONG_UNIT, absurd if health.absurd else None, "commands are what a mirror can play"),
+        (WRONG_LOOP, unlawful if n_verdicts >= VERDICTS else None, "the loop is as told again"),
         ("loop-diverging", diverging if health.diverging else None, "the high modes are calm"),
         ("edge-slip", slipped if edge.slipped else None, "the outer ring is back"),
         (OFF_LOOP, None if off is None else off.text, "commands obey the loop equation again"),

@@ -1,5 +1,7 @@
 """An RTC that tells something wrong of its slopes, commands or loop gets no matrix, and is told."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -50,3 +52,34 @@ def test_an_orientation_left_open_is_found_adopted_and_the_matrix_sent_holds(nig
         wait_for(lambda: len(rtc.residuals) > n_batches + 100, 10.0, "two seconds more")
         after = np.median([value for _, value in rtc.residuals[n_batches:]])
         assert after < 1.1 * np.median([value for _, value in rtc.residuals[:n_batches]])
+
+
+def test_another_leak_than_told_is_named_and_no_matrix_is_sent(night):
+    night.service("auto")
+    response, variance_m2 = small_telescope(**ALPHA)
+    assumed, _ = small_telescope()
+    with Stranger(night.zenoh, response, variance_m2, assumed=assumed, leak=0.9) as rtc:
+        rtc.told["leak"] = 0.99
+        wait_for(lambda: "loop-law" in wrong(night) or rtc.applied, 20.0, "an alarm")
+        assert "leak 0.900 found, 0.990 told" in wrong(night)["loop-law"]
+        time.sleep(5.0)
+        assert not rtc.applied
+
+
+def test_commands_in_nanometres_are_named_and_the_healthy_loop_stays_closed(night):
+    night.service("auto")
+    response, variance_m2 = small_telescope(**ALPHA)
+    assumed, _ = small_telescope()
+    with Stranger(night.zenoh, response, variance_m2, assumed=assumed) as rtc:
+        rtc.on_frames = lambda header, slopes, commands, dither: (
+            header,
+            slopes,
+            1e9 * commands,
+            1e9 * dither,
+        )
+        wait_for(lambda: "command-unit" in wrong(night), 20.0, "an alarm")
+        assert "nanometres" in wrong(night)["command-unit"]
+        time.sleep(8.0)
+        assert not rtc.applied
+        assert "loop" not in [kind for kind, _ in rtc.commands]
+        assert "nanometres" in wrong(night)["command-unit"]

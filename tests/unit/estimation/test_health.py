@@ -125,3 +125,30 @@ def test_a_loop_that_is_opened_is_well():
 
 def test_an_rtc_that_controls_no_mode_is_not_diverging():
     assert not observe(LoopHealth(), times_expectation(1.0), VARIANCE, IN_LOOP[:0]).diverging
+
+
+@pytest.mark.parametrize(
+    ("unit", "name"), [(1e9, "nanometres"), (1e8, "nanometres"), (1e6, "micrometres")]
+)
+def test_commands_that_no_mirror_plays_are_in_another_unit_and_no_divergence(unit, name):
+    health = after(LoopHealth(), unit)
+    assert health.absurd
+    assert not health.diverging
+    assert name in health.unit
+
+
+def test_a_loop_in_another_unit_that_has_just_closed_begins_at_zero():
+    health = observe(LoopHealth(), times_expectation(0.0, n_frames=3), VARIANCE, IN_LOOP)
+    assert after(health, 1e9).absurd
+
+
+def test_a_loop_that_runs_away_beyond_all_measure_is_diverging_and_not_in_another_unit():
+    health = LoopHealth()
+    for factor in 3.0 ** np.arange(20):
+        health = observe(health, times_expectation(factor), VARIANCE, IN_LOOP)
+    assert health.diverging
+    assert not health.absurd
+
+
+def test_commands_that_are_metres_again_are_sane_again():
+    assert not after(after(LoopHealth(), 1e9), 1.0, n_blocks=200).absurd

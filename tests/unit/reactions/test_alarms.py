@@ -14,7 +14,7 @@ from tests.unit.reactions.situations import Story, judged, of_kind, record
 STRANGERS = ["second-rtc", "basis-mismatch", "instrument-mismatch"]
 OUT_OF_HAND = ["loop-diverging", "edge-slip", "commands-off-loop"]
 
-MISTOLD = ["matrix-mismatch", "response-mismatch"]
+MISTOLD = ["matrix-mismatch", "response-mismatch", "loop-law", "command-unit"]
 
 FORBIDDING = pytest.mark.parametrize("name", [*STRANGERS, *OUT_OF_HAND])
 
@@ -101,6 +101,13 @@ def test_where_only_new_matrices_are_forbidden_one_that_was_in_use_may_come_back
 def test_a_name_that_is_in_no_table_forbids_nothing():
     story = settled("margin")
     assert of_kind(story.tell(ev.MatrixMade(record=made(story), wanted=False)), ev.SendMatrix)
+
+
+@pytest.mark.parametrize("name", MISTOLD)
+def test_no_loop_is_opened_for_what_is_only_told_wrongly(name):
+    story = settled(name)
+    story.wait(60)
+    assert not of_kind(story.effects, ev.AskLoop)
 
 
 @pytest.mark.parametrize("name", MISTOLD)

@@ -21,6 +21,7 @@ from service.runtime.streams import (
 )
 from service.state import DitherView, TrackerState
 from service.worker import Description
+from tests.unit.estimation import test_loopcheck as loops
 from tests.unit.reactions.situations import rtc
 
 N_SLOPES, N_MODES = 6, 8
@@ -446,3 +447,56 @@ class TestLooks:
         rest, sums = taken(one)
         assert not isinstance(sums, str)
         assert isinstance(taken(rest)[1], str)
+
+
+class TestLaw:
+    """A loop that is not what the status tells, on the loops of the loop check."""
+
+    TOLD = rtc(
+        16,
+        n_modes=24,
+        n_slopes=60,
+        gains=(float(loops.GAIN),) * 16 + (0.0,) * 8,
+        leak=loops.LEAK,
+        cm_id="cm-1",
+        seq=0,
+    )
+
+    def after(self, telemetry, told=TOLD, **moving):
+        """Streams after two and a half seconds with a status five times a second."""
+        description = Description(n_slopes=60, n_modes=24, mode_variance_m2=np.full(24, 4e-14 / 24))
+        streams = with_rtc(Streams(description=description), told)
+        streams = with_matrix(streams, "cm-1", loops.INVERSE)
+        for part in loops.blocks(telemetry, lengths=(50,)):
+            streams, _ = fed(streams, part)
+            seq = part.first_seq + part.n_frames
+            if seq % 200 == 0:
+                gains = tuple(g * (1 + 0.01 * seq / 1000) for g in told.gains)
+                now = replace(told, seq=seq - 1)
+                streams = with_rtc(streams, replace(now, gains=gains) if moving else now)
+        return {name: text for name, text, _ in troubles(streams) if text is not None}
+
+    def test_one_that_is_as_told_raises_nothing(self):
+        assert self.after(loops.closed_loop()) == {}
+
+    def test_another_leak_is_named_within_a_second_and_a_half_whatever_the_gains_do(self):
+        telemetry = loops.closed_loop(n_frames=1500)
+        for moving in ({}, {"moving": True}):
+            found = self.after(telemetry, replace(self.TOLD, leak=0.9), **moving)
+            assert "leak 0.995 found, 0.900 told" in found["loop-law"]
+
+    def test_another_delay_is_named(self):
+        found = self.after(loops.closed_loop(), replace(self.TOLD, delay_frames=3.0))
+        assert "delay 2.00 frames found, 3.00 told" in found["loop-law"]
+
+    def test_a_status_that_tells_the_truth_at_last_ends_it(self):
+        telemetry = loops.closed_loop()
+        found = self.after(telemetry, replace(self.TOLD, leak=0.9))
+        assert "loop-law" in found
+        assert "loop-law" not in self.after(telemetry, self.TOLD)
+
+    def test_commands_in_nanometres_are_a_unit_and_nothing_else_is_opened_for(self):
+        slopes, commands, _ = loops.closed_loop()
+        found = self.after((slopes, commands * np.float32(1e9), None))
+        assert "nanometres" in found["command-unit"]
+        assert not {"loop-diverging", "edge-slip"} & set(found)

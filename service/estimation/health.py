@@ -22,9 +22,6 @@ CALM_RATIO = 5.0
 ABSURD_RATIO = 1e4
 """Times the expected turbulence that no mirror reaches: commands are in another unit."""
 
-_STILL_RATIO = 1e-3
-"""A mirror that moves less than this, against turbulence, does not move."""
-
 _DECADES = {9: "nanometres", 6: "micrometres"}
 
 _MEMORY_S = 0.5
@@ -38,13 +35,8 @@ class LoopHealth:
     """RMS of the command in the upper half of the controlled modes over its expectation."""
 
     diverging: bool = False
-    sane: bool = False
-    """Whether any frame since the loop closed was one that a mirror can play."""
-
-    @property
-    def absurd(self) -> bool:
-        """Whether commands are beyond any mirror, and always were: no loop comes to that."""
-        return not self.sane and self.ratio > ABSURD_RATIO
+    absurd: bool = False
+    """Whether commands are beyond any mirror and came there at once, as no loop does."""
 
     @property
     def unit(self) -> str:
@@ -67,15 +59,23 @@ def observe(
         return LoopHealth()
     upper = in_loop[len(in_loop) // 2 :]
     commands = block.commands_m[:, upper]
-    powers = np.sum(commands.astype(np.float64) ** 2, axis=1)
-    power = float(np.mean(powers))
     expected = float(mode_variance_m2[upper].sum())
     if expected <= 0.0:
         return health
-    # a loop that diverges passes through what a mirror can play; one just closed begins at 0
-    possible = (powers > _STILL_RATIO**2 * expected) & (powers <= ABSURD_RATIO**2 * expected)
-    sane = health.sane or bool(possible.any())
+    levels = np.sqrt(np.sum(commands.astype(np.float64) ** 2, axis=1) / expected)
+    absurd = _absurd(health, levels)
+    if absurd != health.absurd:
+        health = LoopHealth(ratio=float(np.sqrt(np.mean(levels**2))))
     fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / _MEMORY_S))
-    ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * power / expected))
+    ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * np.mean(levels**2)))
     limit = CALM_RATIO if health.diverging else DIVERGING_RATIO
-    return LoopHealth(ratio=ratio, diverging=sane and ratio > limit, sane=sane)
+    return LoopHealth(ratio=ratio, diverging=not absurd and ratio > limit, absurd=absurd)
+
+
+def _absurd(health: LoopHealth, levels: NDArray[np.float64]) -> bool:
+    """Return whether the frames are in another unit: one that runs away passes what is possible."""
+    beyond = levels > ABSURD_RATIO
+    if health.absurd or not beyond.any():
+        return health.absurd and bool(beyond[-1])
+    before = levels[: int(np.argmax(beyond))]
+    return not health.diverging and not bool((before > DIVERGING_RATIO).any())

@@ -115,7 +115,8 @@ def follow(law: LoopLaw, block: FrameBlock, terms: LoopTerms) -> LoopLaw:
 
 def judged(law: LoopLaw, terms: LoopTerms, last_seq: int) -> tuple[LoopLaw, FoundLaw | None]:
     """Return what the frames up to one say of the loop; None: nothing, or nothing new."""
-    if law.seq is None or law.modes is None or law.commands_m is None or law.seen_m is None:
+    modes, commands, seen = law.modes, law.commands_m, law.seen_m
+    if law.seq is None or modes is None or commands is None or seen is None:
         return law, None
     if last_seq - law.judged_seq < JUDGED_EVERY:
         return law, None
@@ -126,16 +127,12 @@ def judged(law: LoopLaw, terms: LoopTerms, last_seq: int) -> tuple[LoopLaw, Foun
     if len(at) < ENOUGH_FRAMES:
         return law, None
     law = replace(law, judged_seq=int(law.seq[at[-1]]))
-    fits = [
-        _fitted(
-            law.commands_m[:, mode].astype(float), law.seen_m[:, mode].astype(float), at, n_taps
-        )
-        for mode in range(len(law.modes))
-    ]
+    commands, seen = commands.astype(float), seen.astype(float)
+    fits = [_fitted(commands[:, m], seen[:, m], at, n_taps) for m in range(len(modes))]
     clear = [number for number, fit in enumerate(fits) if fit is not None]
     if 2 * len(clear) < len(fits) or not clear:
         return law, None
-    gains = terms.gains[law.modes[clear]].astype(float)
+    gains = terms.gains[modes[clear]].astype(float)
     return law, _compared([fit for fit in fits if fit is not None], gains, terms)
 
 

@@ -150,5 +150,11 @@ def test_a_loop_that_runs_away_beyond_all_measure_is_diverging_and_not_in_anothe
     assert not health.absurd
 
 
-def test_commands_that_are_metres_again_are_sane_again():
-    assert not after(after(LoopHealth(), 1e9), 1.0, n_blocks=200).absurd
+def test_a_unit_that_changes_at_once_is_no_divergence_either():
+    assert after(after(LoopHealth(), 1.0), 1e9).absurd
+
+
+def test_commands_that_are_metres_again_are_sane_at_once():
+    health = after(after(LoopHealth(), 1e9), 1.0, n_blocks=1)
+    assert not health.absurd
+    assert not health.diverging

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from service import __version__
-from service.errors import PyrcalError
+from service.errors import PyrcalError, shown
 
 _OTHER_PROGRAMS = {"sim": "sim_rtc", "campaign": "studies.campaign"}
 """Run in this one's place: the service does not know the simulator."""
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
         return run(options)
     except PyrcalError as error:
-        sys.stderr.write(f"pyrcal: {error}\n")
+        sys.stderr.write(f"pyrcal: {shown(str(error))}\n")
         return 2
     except KeyboardInterrupt:
         return 130

@@ -19,7 +19,29 @@
 
 Expected outcomes (a rejected fit, a refused reconstructor, too few frames) are values, not
 exceptions: their text tells the operator what to do.
+
+Such texts quote what strangers have written, so they reach a terminal as :func:`shown` has it.
 """
+
+import unicodedata
+
+_UNSEEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
+"""Categories of characters that move a cursor, turn the writing round, or have no shape."""
+
+
+def shown(text: str, keep: str = "") -> str:
+    """Return a text as a terminal may have it: control characters are written out.
+
+    Characters in ``keep`` stay: the ends of a program's own lines.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        character
+        if character in keep or unicodedata.category(character) not in _UNSEEN
+        else character.encode("unicode_escape").decode("ascii")
+        for character in text
+    )
 
 
 class PyrcalError(Exception):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import structlog
 import uvicorn
+from structlog.typing import EventDict
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
@@ -24,7 +26,7 @@ from service.api import create_app
 from service.archive import Archive
 from service.config import Settings, load_instrument, load_settings, packaged_instrument
 from service.config.policy import policy_of
-from service.errors import ConfigurationError, PyrcalError
+from service.errors import ConfigurationError, PyrcalError, shown
 from service.fits.upload import UploadFitter
 from service.model.instrument import Instrument
 from service.prepared import usual_folder
@@ -93,17 +95,46 @@ def run_service(options: argparse.Namespace) -> int:
     instrument = load_instrument(settings.service.instrument)
     # the event loop's own products are small; a second BLAS thread would only fight the RTC link
     threadpool_limits(1)
+    log_to_the_terminal()
+    for remark in instrument.remarks:
+        structlog.get_logger().warning("instrument.remark", text=remark)
+    return asyncio.run(_serve(settings, instrument))
+
+
+def log_to_the_terminal() -> None:
+    """Have everything that is logged, by libraries too, written to standard error."""
     structlog.configure(
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
+            structlog.processors.format_exc_info,
+            _harmless,
+            structlog.dev.ConsoleRenderer(
+                colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
+            ),
         ],
         logger_factory=structlog.PrintLoggerFactory(sys.stderr),
     )
-    for remark in instrument.remarks:
-        structlog.get_logger().warning("instrument.remark", text=remark)
-    return asyncio.run(_serve(settings, instrument))
+    logging.getLogger().handlers = [_IntoStructlog()]
+
+
+def _harmless(_logger: object, _method: str, event: EventDict) -> EventDict:
+    """Write out the control characters in what the RTC, files and clients have said."""
+    return {
+        key: shown(value, keep="\n" if key == "exception" else "")
+        if isinstance(value, str)
+        else value
+        for key, value in event.items()
+    }
+
+
+class _IntoStructlog(logging.Handler):
+    """Takes what libraries log."""
+
+    @override
+    def emit(self, record: logging.LogRecord) -> None:
+        log = structlog.get_logger()
+        log.log(record.levelno, record.getMessage(), exc_info=record.exc_info or None)
 
 
 async def _serve(settings: Settings, instrument: Instrument) -> int:

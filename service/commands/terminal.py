@@ -11,7 +11,7 @@ from typing import NoReturn, TypeVar
 
 from typing_extensions import override
 
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, shown
 
 Value = TypeVar("Value")
 
@@ -38,7 +38,7 @@ def with_negative_numbers(given: Sequence[str]) -> list[str]:
 
 def say(line: str) -> None:
     """Tell the user something beside the answer."""
-    sys.stderr.write(f"{line}\n")
+    sys.stderr.write(f"{shown(line)}\n")
 
 
 def show_progress(step: str) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from service.errors import shown
 from service.fits.report import FitReport, orientation_words, verdict_line
 from service.model.misregistration import BOUNDARY_SCALE
 from service.registration.options import Fit, ScanStep
@@ -27,17 +28,16 @@ _NAMED = 8
 def table(report: FitReport) -> str:
     """Return the verdict, the registration and what it rests on, as text."""
     fit = report.fit
-    return "\n".join(
-        [
-            verdict_line(fit),
-            "",
-            *_registration(fit),
-            "",
-            *_basis(report),
-            *_extras(fit),
-            *(f"note: {note}" for note in report.notes),
-        ]
-    )
+    lines = [
+        verdict_line(fit),
+        "",
+        *_registration(fit),
+        "",
+        *_basis(report),
+        *_extras(fit),
+        *(f"note: {note}" for note in report.notes),
+    ]
+    return "\n".join(shown(line) for line in lines)
 
 
 def _registration(fit: Fit) -> Iterator[str]:

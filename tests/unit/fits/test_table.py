@@ -77,3 +77,10 @@ def test_a_refused_fit_without_a_size_is_still_told():
         "0.0010",
         "subapertures",
     ]
+
+
+def test_what_a_file_says_of_itself_cannot_write_lines_of_the_table():
+    evil = "\x1b[2J\naccepted: by a stranger"
+    text = table(a_report(reference=evil, notes=(evil,)))
+    assert "\x1b" not in text
+    assert "\naccepted: by a stranger" not in text

@@ -16,7 +16,7 @@ from service.demo.children import children, interrupted_by_any_end
 from service.demo.screen import table
 from service.demo.truth import TruthFile
 from service.demo.watch import ANSWER_WITHIN_S, Promise, Watch
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, shown
 
 LOG = "service.log"
 CHECK_WITHIN_S = 60.0
@@ -204,5 +204,5 @@ def _port(text: str) -> int:
 
 
 def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
+    sys.stdout.write(shown(text, keep="\n") + "\n")
     sys.stdout.flush()

@@ -2,7 +2,7 @@ import argparse
 
 import pytest
 
-from service.demo.run import _commands, _emptied, add_demo_arguments
+from service.demo.run import _commands, _emptied, _say, add_demo_arguments
 from service.errors import ConfigurationError
 from sim_rtc.options import parse_options
 
@@ -52,3 +52,8 @@ def test_a_directory_of_somebody_else_is_left_alone(tmp_path):
 def test_a_new_directory_is_made(tmp_path):
     _emptied(tmp_path / "a" / "b")
     assert (tmp_path / "a" / "b").is_dir()
+
+
+def test_what_the_service_tells_of_others_is_harmless_on_the_screen(capsys):
+    _say("two lines\nof \x1b[2J an \u202ealarm")
+    assert capsys.readouterr().out == "two lines\nof \\x1b[2J an \\u202ealarm\n"

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky
 from scipy.sparse import csr_array
@@ -31,6 +32,15 @@ _FAR_STRIDE = 4
 _BURN_IN_OUTER_SCALES = 6.0
 _MARGIN_ROWS = 2
 """Rows beyond the pupil that the cubic interpolation reaches."""
+
+_TOGETHER = 32
+"""Steps read at a time."""
+
+_POINTS_TOGETHER = 1024
+"""Points read at a time: with these steps they stay in a processor's cache."""
+
+_TAPS = 4
+"""Rows, or columns, that a cubic interpolation reads."""
 
 _SEEING_COEFFICIENT = 0.98
 _ARCSEC_RAD = np.pi / 180.0 / 3600.0
@@ -85,20 +95,20 @@ class ExtrudedScreen:
         capacity = 8 * self._n_kept
         self._rows = np.zeros((capacity, n_columns))
         self._newest = capacity - self._n_kept
-        for _ in range(int(_BURN_IN_OUTER_SCALES * turbulence.outer_scale_m / pitch_m)):
-            self.extrude()
+        self.extrude(int(_BURN_IN_OUTER_SCALES * turbulence.outer_scale_m / pitch_m))
 
-    def extrude(self) -> None:
-        """Add one row upwind; the oldest is forgotten."""
-        if self._newest == 0:
-            keep = self._rows[: self._n_kept].copy()
-            self._newest = len(self._rows) - self._n_kept
-            self._rows[self._newest :] = keep
-        flat = self._rows.reshape(-1)[self._newest * self._n_columns :]
-        noise = self._rng.standard_normal(self._n_columns)
-        row = self._weights @ flat[self._offset] + self._noise @ noise
-        self._newest -= 1
-        self._rows[self._newest] = row
+    def extrude(self, n_rows: int = 1) -> None:
+        """Add rows upwind, one after the other; the oldest are forgotten."""
+        fresh = self._rng.standard_normal((n_rows, self._n_columns)) @ self._noise.T
+        for row in fresh:
+            if self._newest == 0:
+                keep = self._rows[: self._n_kept].copy()
+                self._newest = len(self._rows) - self._n_kept
+                self._rows[self._newest :] = keep
+            flat = self._rows.reshape(-1)[self._newest * self._n_columns :]
+            row += self._weights @ flat[self._offset]
+            self._newest -= 1
+            self._rows[self._newest] = row
 
     def window(self, n_rows: int) -> Array:
         """Return a view of the newest ``n_rows`` rows, ``(n_rows, n_columns)``, newest first."""
@@ -123,10 +133,10 @@ class FrozenLayer:
         radius = np.hypot(along, across).max()
         self._n_rows = int(np.ceil(2 * radius)) + 2 * _MARGIN_ROWS + 1
         centre = (self._n_rows - 1) / 2
-        self._sample = _cubic_sampling(along + centre, across + centre, self._n_rows)
+        self._sample = _CubicSampling(along + centre, across + centre, self._n_rows)
         self._screen = ExtrudedScreen(
             n_columns=self._n_rows,
-            n_kept=self._n_rows,
+            n_kept=self._n_rows + _TOGETHER,
             pitch_m=pitch_m,
             turbulence=turbulence,
             rng=rng,
@@ -137,12 +147,12 @@ class FrozenLayer:
 
     def advance(self, n_steps: int) -> Array32:
         """Return the pupil phase after each of the next steps, ``(n_steps, n_points)``, metres."""
-        out = np.empty((n_steps, self._sample.shape[0]), dtype=np.float32)
-        for k in range(n_steps):
-            self._screen.extrude()
-            window = self._screen.window(self._n_rows).astype(np.float32)
-            window -= window.mean()
-            out[k] = self._sample @ window.reshape(-1)
+        out = np.empty((n_steps, self._sample.n_points), dtype=np.float32)
+        for start in range(0, n_steps, _TOGETHER):
+            rows = out[start : start + _TOGETHER]
+            self._screen.extrude(len(rows))
+            strip = self._screen.window(self._n_rows + len(rows) - 1)
+            self._sample.read(strip, rows[::-1])
         out *= self._amplitude
         return out
 
@@ -224,17 +234,52 @@ def _covariance(
     return np.asarray(values[where].reshape(len(a), len(b)))
 
 
-def _cubic_sampling(row: Array, column: Array, n_columns: int) -> csr_array:
-    """Return the matrix that reads a flattened window at fractional rows and columns."""
-    taps = np.arange(-1, 3)
-    row0, column0 = np.floor(row), np.floor(column)
-    rows = row0[:, None].astype(np.intp) + taps
-    columns = column0[:, None].astype(np.intp) + taps
-    weights = cubic_weights(row - row0)[:, :, None] * cubic_weights(column - column0)[:, None, :]
-    index = rows[:, :, None] * n_columns + columns[:, None, :]
-    n = len(row)
-    pointer = np.arange(0, 16 * n + 1, 16)
-    return csr_array(
-        (weights.reshape(-1).astype(np.float32), index.reshape(-1), pointer),
-        shape=(n, n_columns * n_columns),
-    )
+class _CubicSampling:
+    """Reads square windows of a strip at the same fractional rows and columns in each.
+
+    The next window is the same strip a row on. So columns are interpolated once per row of the
+    strip and point, and rows after that: 8 products a point and window, where 16 taps would be.
+    """
+
+    def __init__(self, row: Array, column: Array, n_rows: int) -> None:
+        """Take positions ``(n_points,)`` in windows of ``n_rows`` rows and columns."""
+        row0, column0 = np.floor(row), np.floor(column)
+        self.n_points = len(row)
+        self._n_rows = n_rows
+        self._row_weights = cubic_weights(row - row0).astype(np.float32)
+        columns = column0[:, None].astype(np.intp) + np.arange(-1, 3)
+        index = columns * n_rows + row0[:, None].astype(np.intp) - 1
+        weights = cubic_weights(column - column0).astype(np.float32)
+        self._pieces = [
+            (piece, _reading(index[piece], weights[piece], n_rows**2))
+            for piece in (
+                slice(first, first + _POINTS_TOGETHER)
+                for first in range(0, len(row), _POINTS_TOGETHER)
+            )
+        ]
+
+    def read(self, strip: Array, out: Array32) -> None:
+        """Put what the points see into ``out`` ``(n_windows, n_points)``, window means taken off.
+
+        ``strip`` is ``(n_rows + n_windows - 1, n_columns)``; window k begins at its row k.
+        """
+        n_windows, reach = len(out), len(out) + _TAPS - 1
+        # Three rows more for the taps: those of the last windows reach no further than its end.
+        padded = np.zeros((strip.shape[1], len(strip) + _TAPS - 1), dtype=np.float32)
+        padded[:, : len(strip)] = (strip - strip.mean()).T
+        runs = sliding_window_view(padded, reach, axis=1).reshape(-1, reach)
+        means = sliding_window_view(padded.mean(axis=0), self._n_rows)[:n_windows].mean(axis=1)
+        for piece, reading in self._pieces:
+            across, weights = reading @ runs, self._row_weights[piece]
+            seen = across[:, :n_windows] * weights[:, :1]
+            for tap in range(1, _TAPS):
+                seen += across[:, tap : tap + n_windows] * weights[:, tap : tap + 1]
+            seen -= means
+            out[:, piece] = seen.T
+
+
+def _reading(index: NDArray[np.intp], weights: Array32, n_cells: int) -> csr_array:
+    """Return the matrix that adds up these cells, ``(n_points, n_taps)``, with their weights."""
+    n_points, n_taps = index.shape
+    pointer = np.arange(0, n_taps * n_points + 1, n_taps)
+    return csr_array((weights.reshape(-1), index.reshape(-1), pointer), shape=(n_points, n_cells))

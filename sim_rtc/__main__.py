@@ -21,7 +21,7 @@ from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.clock import FrameClock, Pace
 from sim_rtc.computer import RealTimeComputer
 from sim_rtc.faults import FaultPlan
-from sim_rtc.feed import BATCH_FRAMES, Ahead
+from sim_rtc.feed import Ahead, message_frames
 from sim_rtc.link import Link, Rehearsal
 from sim_rtc.options import Options, parse_options
 from sim_rtc.record import Recorder, Recording
@@ -54,7 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _check_writable(options.truth)
         # Nested threading makes small products slower, and the service needs the other core.
         with threadpool_limits(1):
-            telescope = build_telescope(options, instrument)
+            telescope = build_telescope(
+                options, instrument, batch_frames=message_frames(options.frame_rate_hz)
+            )
             if options.snapshot is not None:
                 write_snapshot(telescope, options.snapshot)
                 return 0
@@ -67,7 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(telescope: Telescope, options: Options, stopped: threading.Event) -> None:
     """Run the loop in this thread until ``stopped`` or the time is up."""
-    batch_s = BATCH_FRAMES / options.frame_rate_hz / options.speed if options.speed else 0.0
+    batch_frames = telescope.feed.batch_frames
+    batch_s = batch_frames / options.frame_rate_hz / options.speed if options.speed else 0.0
     pace = Pace(batch_s=batch_s)
     with ExitStack() as stack:
         ahead = stack.enter_context(Ahead(telescope.feed.blocks()))
@@ -85,6 +88,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
                 clock=clock,
                 detector=telescope.detector,
                 magnitude=options.magnitude,
+                batch_frames=batch_frames,
                 elevation=options.sky.elevation,
                 rehearsal=Rehearsal(plan=plan, recorder=recorder, seed=options.seed),
             )
@@ -98,19 +102,19 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         sabotage = Sabotage(plan, computer, clock=clock, pace=pace, absence=link.absence)
         last_batch = float("inf")
         if options.seconds is not None:
-            last_batch = round(options.seconds * options.frame_rate_hz / BATCH_FRAMES)
+            last_batch = round(options.seconds * options.frame_rate_hz / batch_frames)
         if options.gain_ramp_s is not None:
             computer.ramp_up(options.gain_ramp_s)
-        watch = Watch(computer, pace, link)
+        watch = Watch(computer, pace, link, batch_frames)
         n_batches = 0
         _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.snapshot().session)
         while not stopped.is_set() and n_batches < last_batch:
             pace.wait(stopped)
-            sabotage.before_batch(n_batches * BATCH_FRAMES / options.frame_rate_hz, stopped)
+            sabotage.before_batch(n_batches * batch_frames / options.frame_rate_hz, stopped)
             batch = computer.next_batch()
             link.offer(batch)
             if truth is not None:
-                truth.offer(batch, pace.late_batches * BATCH_FRAMES)
+                truth.offer(batch, pace.late_batches * batch_frames)
             pace.done()
             watch.look(batch)
             n_batches += 1
@@ -126,7 +130,10 @@ def _replay(path: Path, options: Options, stopped: threading.Event) -> int:
 class Watch:
     """Tells the log, at most every few seconds, how the loop is doing."""
 
-    def __init__(self, computer: RealTimeComputer, pace: Pace, link: Link) -> None:
+    def __init__(
+        self, computer: RealTimeComputer, pace: Pace, link: Link, batch_frames: int
+    ) -> None:
+        self._batch_frames = batch_frames
         self._computer = computer
         self._pace = pace
         self._link = link
@@ -152,8 +159,8 @@ class Watch:
             frames=self._seq,
             cm_id=self._computer.snapshot().reconstructor.manifest.id,
             cpu_per_second=round((cpu_s - self._cpu_s) / max(now_s - self._since_s, 1e-9), 3),
-            overrun_frames=late * BATCH_FRAMES,
-            unpublished_frames=self._link.n_dropped_batches * BATCH_FRAMES,
+            overrun_frames=late * self._batch_frames,
+            unpublished_frames=self._link.n_dropped_batches * self._batch_frames,
         )
         if self._clipped:
             _log.warning("loop.clipped", commands=self._clipped, text="the loop may diverge")

@@ -28,7 +28,7 @@ from sim_rtc.devices import (
 )
 from sim_rtc.dither import DitherLimits
 from sim_rtc.drive import MirrorDrive
-from sim_rtc.feed import Block, Feed
+from sim_rtc.feed import BATCH_FRAMES, Block, Feed
 from sim_rtc.gains import by_group
 from sim_rtc.motion import MovingOptics, background_executor
 from sim_rtc.options import Options
@@ -86,12 +86,16 @@ def _modes(instrument: Instrument) -> ModalBasis:
 
 
 def build_telescope(
-    options: Options, instrument: Instrument, executor: Executor | None = None
+    options: Options,
+    instrument: Instrument,
+    executor: Executor | None = None,
+    batch_frames: int = BATCH_FRAMES,
 ) -> Telescope:
     """Return the telescope of these options.
 
     Optics to come are computed by ``executor``, a thread beside the loop unless given: then a
-    movement of the registration may come late.
+    movement of the registration may come late. ``batch_frames`` are processed together if the
+    plant is linear.
 
     Raises
     ------
@@ -119,7 +123,7 @@ def build_telescope(
     double_pass = options.sky.scene.passes == 2
     identity = replace(identity_of(instrument, plant.valid), double_pass=double_pass)
     return Telescope(
-        feed=build_feed(options, plant, sky, optics, detector, noise_rng),
+        feed=build_feed(options, plant, sky, optics, detector, noise_rng, batch_frames),
         plant=plant,
         optics=optics,
         detector=detector,

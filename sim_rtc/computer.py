@@ -38,8 +38,11 @@ from sim_rtc.reconstructors import Reconstructor, Terms
 from sim_rtc.telemetry import Batch, Identity, LoopSettings, Snapshot, new_session
 from sim_rtc.tuning import Tuning
 
+Array32 = NDArray[np.float32]
+
 _LEAD_BATCHES = 1
-"""Whole batches between a command's acceptance and the first frame that contains it."""
+"""Whole batches between a command's acceptance and the first frame that contains it: its answer
+is there before them."""
 
 _SETTLING_FRAMES = 20
 """Between the opening of the loop and the first stroke: the mirror comes to rest."""
@@ -99,6 +102,7 @@ class RealTimeComputer:
         self._terms: ControlTerms | None = None
         self._block: Block | None = None
         self._row = 0
+        self._batch_frames = BATCH_FRAMES
         self._optics = optics
 
     def prepare(self) -> None:
@@ -108,11 +112,12 @@ class RealTimeComputer:
     def next_batch(self) -> Batch:
         """Process the next frames, whatever the clock says."""
         block, row = self._next_rows()
+        n_frames = self._batch_frames = block.batch_frames
         with self._lock:
             self._swap()
             terms = self._current_terms(block.optics)
             exercises = self._exercises
-            result = block.run(row, self._loop, terms, exercises.commands(self._seq))
+            result = block.run(row, self._loop, terms, exercises.commands(self._seq, n_frames))
             batch = Batch(
                 session=self._session,
                 seq0=self._seq,
@@ -127,7 +132,7 @@ class RealTimeComputer:
                 phase_m=block.phase_at(row),
             )
             self._set(exercises.look(batch, self._active.matrix, self._settings))
-            self._seq += BATCH_FRAMES
+            self._seq += n_frames
             return batch
 
     def stage(self, reconstructor: Reconstructor) -> None:
@@ -233,7 +238,7 @@ class RealTimeComputer:
         if self._block is None or self._row >= self._block.n_frames:
             self._block, self._row = next(self._blocks), 0
         row = self._row
-        self._row += BATCH_FRAMES
+        self._row += self._block.batch_frames
         return self._block, row
 
     def _swap(self) -> None:
@@ -250,15 +255,22 @@ class RealTimeComputer:
     def _current_terms(self, optics: TelescopeOptics) -> ControlTerms:
         matrix = self._active.matrix
         if self._terms is None or self._optics is not optics:
-            gains = np.array(self._effective_gains()[: len(matrix)], dtype=np.float32)
-            self._terms = optics.terms(matrix, gains, self._settings.leak)
+            self._terms = optics.terms(matrix, self._gains(), self._settings.leak)
             self._optics = optics
         return self._terms
 
     def _set(self, settings: LoopSettings) -> None:
         """Put settings in force from the next batch on."""
-        if settings != self._settings:
-            self._settings, self._terms = settings, None
+        if settings == self._settings:
+            return
+        self._settings = settings
+        if self._terms is not None:
+            self._terms = replace(self._terms, gains=self._gains(), leak=settings.leak)
+
+    def _gains(self) -> Array32:
+        """Return the gains of the modes that the matrix in use controls."""
+        controlled = self._effective_gains()[: len(self._active.matrix)]
+        return np.array(controlled, dtype=np.float32)
 
     def _effective_gains(self) -> tuple[float, ...]:
         n_controlled = len(self._active.matrix) if self._settings.closed else 0
@@ -278,7 +290,7 @@ class RealTimeComputer:
             reason = reason or self._exercises.on_the_mirror()
             if reason:
                 return refused(request.id, reason)
-            start_seq = self._seq + _LEAD_BATCHES * BATCH_FRAMES
+            start_seq = self._seq + _LEAD_BATCHES * self._batch_frames
             self._exercises.begin_dither(request, start_seq)
         return accepted(request.id, start_seq)
 
@@ -303,7 +315,7 @@ class RealTimeComputer:
             if measurement.needs_open_loop and was_closed:
                 self._set(replace(self._settings, closed=False))
                 self._start_over()
-            start_seq = self._seq + _LEAD_BATCHES * BATCH_FRAMES + _SETTLING_FRAMES
+            start_seq = self._seq + _LEAD_BATCHES * self._batch_frames + _SETTLING_FRAMES
             measurement.start_seq = start_seq
             exercises.begin_measurement(measurement, closes_again=was_closed)
         return accepted(request.id, start_seq)

@@ -14,7 +14,7 @@ from sim_rtc.atmosphere import fried_parameter_m, frozen_layers
 from sim_rtc.detector import Detector
 from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.drive import MirrorDrive
-from sim_rtc.feed import Feed, OpenLoopFeed
+from sim_rtc.feed import BATCH_FRAMES, Feed, OpenLoopFeed
 from sim_rtc.influence import read_influence
 from sim_rtc.motion import MovingOptics
 from sim_rtc.options import Options
@@ -159,8 +159,12 @@ def build_feed(
     optics: MovingOptics,
     detector: Detector,
     rng: np.random.Generator,
+    batch_frames: int = BATCH_FRAMES,
 ) -> Feed:
-    """Return what feeds the loop: slopes of a linear plant, phases for any other."""
+    """Return what feeds the loop: slopes of a linear plant, phases for any other.
+
+    ``batch_frames`` are a linear plant's: of any other a frame takes milliseconds.
+    """
     jump_times_s = tuple(jump.time_s for jump in options.jumps)
     if options.plant == "diffractive":
         return PhaseFeed(
@@ -181,4 +185,5 @@ def build_feed(
         frame_rate_hz=options.frame_rate_hz,
         jump_times_s=jump_times_s,
         rng=rng,
+        batch_frames=batch_frames,
     )

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from service.wire import DitherRequest, DitherStatus, Loop, LoopRequest
 from sim_rtc.dither import Dither
-from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.measure import Measured, Measurement, Measurements
 from sim_rtc.telemetry import Batch, LoopSettings
 from sim_rtc.tuning import Tuning
@@ -106,15 +105,15 @@ class Exercises:
         self._dither = None
         return self.end_ramp(settings, "the loop started over")
 
-    def commands(self, seq0: int) -> Array32 | None:
+    def commands(self, seq0: int, n_frames: int) -> Array32 | None:
         """Return what is added to the commands of the batch ``(n_frames, n_modes)``, metres."""
         dither, measuring = self._dither, self._measurements.current
         commands = None
         if dither is not None:
-            commands = dither.commands(seq0, BATCH_FRAMES)
-            if seq0 + BATCH_FRAMES >= dither.stop_seq:
+            commands = dither.commands(seq0, n_frames)
+            if seq0 + n_frames >= dither.stop_seq:
                 self._dither = None
-        return commands if measuring is None else measuring.commands(seq0, BATCH_FRAMES)
+        return commands if measuring is None else measuring.commands(seq0, n_frames)
 
     def look(self, batch: Batch, matrix: Array32, settings: LoopSettings) -> LoopSettings:
         """Read a batch back; return the settings of the next one.

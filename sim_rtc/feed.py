@@ -9,7 +9,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -24,11 +24,38 @@ from sim_rtc.sky import Sky
 Array32 = NDArray[np.float32]
 
 BATCH_FRAMES = 10
-"""Frames the loop processes together: one message on the wire."""
+"""Frames the loop processes together unless told otherwise: one message on the wire."""
 
-_BLOCK_BATCHES = 50
+_MESSAGE_S = 0.04
+"""Of telemetry in a message where frames come fast: the more, the less processor time a frame takes."""
+
+_MOST_MESSAGE_FRAMES = 50
+"""More are refused by the wire."""
+
+_BLOCK_FRAMES = 500
+_MODES_FRAMES = 250
+"""Frames reconstructed at a time: for ten, the library's copy of the matrix costs four times the
+product."""
+
 _AHEAD_BLOCKS = 2
 _POLL_S = 0.2
+
+
+class OpenModes:
+    """What the reconstructor makes of a block's slopes, computed for many frames at a time."""
+
+    def __init__(self) -> None:
+        self._reconstructor: Array32 | None = None
+        self._first = 0
+        self._modes = np.empty((0, 0), dtype=np.float32)
+
+    def rows(self, slopes: Array32, row: int, n_frames: int, reconstructor: Array32) -> Array32:
+        """Return ``(n_frames, n_controlled)`` of the block's ``slopes`` from ``row`` on."""
+        known = self._first <= row and row + n_frames <= self._first + len(self._modes)
+        if not known or self._reconstructor is not reconstructor:
+            self._reconstructor, self._first = reconstructor, row
+            self._modes = slopes[row : row + max(n_frames, _MODES_FRAMES)] @ reconstructor.T
+        return self._modes[row - self._first : row - self._first + n_frames]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,6 +78,9 @@ class OpenLoopBlock:
     played_m: Array32 | None = None
     """``(n_frames, n_modes)`` turbulence played on the mirror; None: none is."""
 
+    batch_frames: int = BATCH_FRAMES
+    open_modes: OpenModes = field(default_factory=OpenModes)
+
     @property
     def n_frames(self) -> int:
         """Frames of the block."""
@@ -58,7 +88,7 @@ class OpenLoopBlock:
 
     def phase_at(self, row: int) -> Array32:
         """Return the turbulence OPD ``(n_points,)`` of a batch's first frame."""
-        return np.asarray(self.phases_m[row // BATCH_FRAMES])
+        return np.asarray(self.phases_m[row // self.batch_frames])
 
     def run(
         self, row: int, loop: ModalLoop, terms: ControlTerms, dither_m: Array32 | None
@@ -66,8 +96,10 @@ class OpenLoopBlock:
         """Run the batch that begins at ``row`` through the loop."""
         if not isinstance(terms, LoopTerms):
             raise TypeError(f"loop: found {type(terms).__name__}; a linear plant needs LoopTerms")
-        played = batch_rows(self.played_m, row)
-        return loop.run(self.slopes[row : row + BATCH_FRAMES], terms, dither_m, played)
+        n_frames = self.batch_frames
+        modes = self.open_modes.rows(self.slopes, row, n_frames, terms.reconstructor)
+        played = batch_rows(self.played_m, row, n_frames)
+        return loop.run(self.slopes[row : row + n_frames], terms, dither_m, played, modes)
 
 
 class Block(Protocol):
@@ -85,6 +117,10 @@ class Block(Protocol):
     def n_frames(self) -> int:
         """Frames of the block, a multiple of the batch."""
 
+    @property
+    def batch_frames(self) -> int:
+        """Frames of a batch."""
+
     def phase_at(self, row: int) -> Array32:
         """Return the turbulence OPD ``(n_points,)`` of a batch's first frame."""
 
@@ -96,6 +132,10 @@ class Block(Protocol):
 
 class Feed(Protocol):
     """What makes blocks for ever."""
+
+    @property
+    def batch_frames(self) -> int:
+        """Frames of a batch."""
 
     def blocks(self) -> Iterator[Block]:
         """Yield the blocks; one ends where a jump falls."""
@@ -114,14 +154,18 @@ class OpenLoopFeed:
         frame_rate_hz: float,
         jump_times_s: tuple[float, ...],
         rng: np.random.Generator,
+        batch_frames: int = BATCH_FRAMES,
     ) -> None:
         """Take among others the static OPD ``(n_points,)`` that only the sensor sees."""
+        self.batch_frames = batch_frames
         self._sky = sky
         self._optics = optics
         self._sources = np.column_stack([sky.vibrations.phase_per_line, sensor_opd_m])
         self._detector = detector
         self._frame_rate_hz = frame_rate_hz
-        self._jump_frames = [batch_boundary(time, frame_rate_hz) for time in jump_times_s]
+        self._jump_frames = [
+            batch_boundary(time, frame_rate_hz, batch_frames) for time in jump_times_s
+        ]
         self._rng = rng
 
     def blocks(self) -> Iterator[OpenLoopBlock]:
@@ -130,7 +174,7 @@ class OpenLoopFeed:
         frame = 0
         while True:
             n_frames = min(
-                [_BLOCK_BATCHES * BATCH_FRAMES]
+                [_BLOCK_FRAMES // self.batch_frames * self.batch_frames]
                 + [jump - frame for jump in self._jump_frames if jump > frame]
             )
             time_s = (frame + np.arange(n_frames)) / self._frame_rate_hz
@@ -154,11 +198,11 @@ class OpenLoopFeed:
         strength = self._sky.vibrations.frames(len(time_s))
         slopes += strength @ source_slopes[:-1]
         slopes += source_slopes[-1]
-        phases = strength[::BATCH_FRAMES] @ self._sky.vibrations.phase_per_line.T
+        phases = strength[:: self.batch_frames] @ self._sky.vibrations.phase_per_line.T
         turbulence, played = self._sky.turbulence.at(time_s), self._sky.played
         if played is None:
             slopes += turbulence.through(optics.slopes_per_phase)
-            phases += turbulence.phases_m(BATCH_FRAMES)
+            phases += turbulence.phases_m(self.batch_frames)
         if optics.stuck_opd_m is not None:
             phases += optics.stuck_opd_m
         return OpenLoopBlock(
@@ -167,6 +211,7 @@ class OpenLoopFeed:
             slopes=slopes,
             phases_m=phases,
             played_m=None if played is None else turbulence.through(played.commands_per_phase),
+            batch_frames=self.batch_frames,
         )
 
 
@@ -216,14 +261,19 @@ class Ahead:
         return False
 
 
-def batch_rows(played_m: Array32 | None, row: int) -> Array32 | None:
+def message_frames(frame_rate_hz: float) -> int:
+    """Return how many frames a message of a loop in real time should have."""
+    return min(max(round(_MESSAGE_S * frame_rate_hz), BATCH_FRAMES), _MOST_MESSAGE_FRAMES)
+
+
+def batch_rows(played_m: Array32 | None, row: int, n_frames: int) -> Array32 | None:
     """Return the rows of the batch that begins at ``row`` of the block."""
-    return None if played_m is None else played_m[row : row + BATCH_FRAMES]
+    return None if played_m is None else played_m[row : row + n_frames]
 
 
-def batch_boundary(time_s: float, frame_rate_hz: float) -> int:
+def batch_boundary(time_s: float, frame_rate_hz: float, batch_frames: int = BATCH_FRAMES) -> int:
     """Return the first frame of the first batch that begins at this time or later."""
-    return int(np.ceil(time_s * frame_rate_hz / BATCH_FRAMES)) * BATCH_FRAMES
+    return int(np.ceil(time_s * frame_rate_hz / batch_frames)) * batch_frames
 
 
 def _linear(optics: TelescopeOptics) -> Optics:

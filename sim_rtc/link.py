@@ -24,7 +24,6 @@ from sim_rtc.computer import RealTimeComputer
 from sim_rtc.detector import Detector
 from sim_rtc.elevation import Elevation
 from sim_rtc.faults import FaultPlan
-from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.intake import Intake
 from sim_rtc.messages import frames_of, status_of
 from sim_rtc.outlet import Outlet
@@ -75,6 +74,7 @@ class Link:
         clock: FrameClock,
         detector: Detector,
         magnitude: float,
+        batch_frames: int,
         elevation: Elevation | None = None,
         rehearsal: Rehearsal | None = None,
     ) -> None:
@@ -89,6 +89,7 @@ class Link:
         self._clock = clock
         self._detector = detector
         self._magnitude = magnitude
+        self._batch_frames = batch_frames
         self._elevation = elevation or Elevation()
         self._keys = Keys(computer.identity.system)
         self._backlog: deque[_Outgoing] = deque()
@@ -174,7 +175,7 @@ class Link:
 
     def _publish(self, session: zenoh.Session, token: Token) -> None:
         rate_hz = 1e9 / self._clock.dt_ns
-        frames = frames_publisher(session, self._keys, rate_hz / BATCH_FRAMES)
+        frames = frames_publisher(session, self._keys, rate_hz / self._batch_frames)
         status = status_publisher(session, self._keys)
         next_status_s = 0.0
         while not self._stopped.is_set():

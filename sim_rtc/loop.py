@@ -1,9 +1,9 @@
 """The modal integrator, in blocks of frames.
 
 ``c[k+d] = leak c[k+d-1] - gain R s[k]``, the dither added to what is applied and never fed back.
-A linear plant gives ``R s = R s_open + (R D) c``: the first term is one product for the whole
-block, the second one small product per frame, and the slopes themselves follow at the end. Any
-other plant is asked for its slopes frame by frame.
+A linear plant gives ``R s = R s_open + (R D) c``: the first term is one product for many frames,
+the second a small one for each ``d`` of them, whose commands are decided already, and the slopes
+themselves follow at the end. Any other plant is asked for its slopes frame by frame.
 """
 
 from __future__ import annotations
@@ -99,6 +99,7 @@ class ModalLoop:
         terms: LoopTerms,
         dither_m: Array32 | None,
         played_m: Array32 | None = None,
+        open_modes: Array32 | None = None,
     ) -> LoopBlock:
         """Run the frames whose slopes, mirror apart, are ``open_slopes`` ``(n_frames, n_slopes)``.
 
@@ -106,22 +107,32 @@ class ModalLoop:
         command: the dither is told on the wire, what is played is not.
         A command beyond the stroke limit is clipped, in the integrator too: a loop that diverges
         stays finite and recovers.
+        ``open_modes`` are ``open_slopes @ R.T`` where they are known already.
         """
-        open_modes = open_slopes @ terms.reconstructor.T
+        if open_modes is None:
+            open_modes = open_slopes @ terms.reconstructor.T
+        added = _Added.of(dither_m, played_m, (len(open_slopes), len(self._decided[0])))
+        moved = self._moved(added, len(terms.gains))
+        response = terms.modal_response[:, :moved]
 
-        def estimate(k: int, command: Array32) -> Array32:
-            modes = terms.modal_response @ command
-            modes += open_modes[k]
+        def estimate(first: int, commands: Array32) -> Array32:
+            modes = commands[:, :moved] @ response.T
+            modes += open_modes[first : first + len(modes)]
             return modes
 
-        added = _Added.of(dither_m, played_m, (len(open_slopes), len(self._decided[0])))
         n_clipped = self._integrate(estimate, terms, added)
+        slopes = added.applied[:, :moved] @ terms.slopes_per_command[:, :moved].T
+        slopes += open_slopes
         return LoopBlock(
-            slopes=open_slopes + added.applied @ terms.slopes_per_command.T,
-            commands_m=added.applied,
-            dither_m=added.dither,
-            n_clipped=n_clipped,
+            slopes=slopes, commands_m=added.applied, dither_m=added.dither, n_clipped=n_clipped
         )
+
+    def _moved(self, added: _Added, n_controlled: int) -> int:
+        """Return how many of the first modes may move: nothing corrects those beyond the loop."""
+        if self._drive is not None:
+            return added.applied.shape[1]
+        beyond = added.applied.any(axis=0) | self._decided.any(axis=0)
+        return max(n_controlled, int(np.flatnonzero(beyond)[-1]) + 1 if beyond.any() else 0)
 
     def run_frames(
         self,
@@ -134,9 +145,10 @@ class ModalLoop:
         """Run frames one by one, each with the slopes that ``sense`` says it makes."""
         slopes = np.empty((n_frames, terms.reconstructor.shape[1]), dtype=np.float32)
 
-        def estimate(k: int, command: Array32) -> Array32:
-            slopes[k] = sense(k, command)
-            return np.asarray(terms.reconstructor @ slopes[k])
+        def estimate(first: int, commands: Array32) -> Array32:
+            for k, command in enumerate(commands, first):
+                slopes[k] = sense(k, command)
+            return np.asarray(slopes[first : first + len(commands)] @ terms.reconstructor.T)
 
         added = _Added.of(dither_m, played_m, (n_frames, len(self._decided[0])))
         n_clipped = self._integrate(estimate, terms, added)
@@ -152,32 +164,42 @@ class ModalLoop:
     ) -> int:
         """Complete the commands of ``added`` frame by frame; return how many were clipped.
 
-        ``estimate`` gives the modes ``(n_controlled,)`` that frame k shows; a frame in which one of
-        them is not finite corrects nothing.
+        ``estimate`` gives the modes ``(n, n_controlled)`` that frames k, k + 1, ... show under n
+        commands; a frame in which one of them is not finite corrects nothing.
         """
-        applied, dither = added.applied, added.dither
+        applied = added.applied
         n_frames, delay = len(applied), len(self._decided)
         integrator = np.empty((n_frames + delay, applied.shape[1]), dtype=np.float32)
         integrator[:delay] = self._decided
         leak, stroke = np.float32(terms.leak), self._stroke_m
         n_controlled = len(terms.gains)
         n_limited = 0
-        for k in range(n_frames):
-            command = applied[k]
-            command += integrator[k]
-            np.minimum(np.maximum(command, -stroke, out=command), stroke, out=command)
-            if self._drive is not None:
-                n_limited += self._drive.follow(command, None if dither is None else dither[k])
-            correction = estimate(k, command)
-            correction *= terms.gains
-            decided = integrator[k + delay]
-            np.multiply(integrator[k + delay - 1], leak, out=decided)
+        for first in range(0, n_frames, delay):
+            commands = applied[first : first + delay]
+            commands += integrator[first : first + len(commands)]
+            np.minimum(np.maximum(commands, -stroke, out=commands), stroke, out=commands)
+            n_limited += self._follow(first, added)
+            corrections = estimate(first, commands)
+            corrections *= terms.gains
             # a slope that is no number would stay in the integrator for ever, at a gain of 0, too
-            if math.isfinite(correction.sum()):
+            if not math.isfinite(corrections.sum()):
+                corrections[~np.isfinite(corrections).all(axis=1)] = 0.0
+            for k, correction in enumerate(corrections, first + delay):
+                decided = integrator[k]
+                np.multiply(integrator[k - 1], leak, out=decided)
                 decided[:n_controlled] -= correction
-            np.minimum(np.maximum(decided, -stroke, out=decided), stroke, out=decided)
+                np.minimum(np.maximum(decided, -stroke, out=decided), stroke, out=decided)
         self._decided = integrator[n_frames:].copy()
         return n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
+
+    def _follow(self, first: int, added: _Added) -> int:
+        """Let the drive, if any, make what it can of the next commands; count its limits."""
+        if self._drive is None:
+            return 0
+        return sum(
+            self._drive.follow(added.applied[k], None if added.dither is None else added.dither[k])
+            for k in range(first, min(first + len(self._decided), len(added.applied)))
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -50,6 +50,11 @@ class PhaseBlock:
         """Frames of the block."""
         return len(self.phases_m)
 
+    @property
+    def batch_frames(self) -> int:
+        """Frames of a batch: each takes milliseconds, so a message has few of them."""
+        return BATCH_FRAMES
+
     def phase_at(self, row: int) -> Array32:
         """Return the OPD ``(n_points,)`` of a frame, commands left out."""
         return np.asarray(self.phases_m[row])
@@ -64,12 +69,14 @@ class PhaseBlock:
             opd_m += self.phases_m[row + k]
             return self.optics.slopes(opd_m, self.detector, self.rng)
 
-        played = batch_rows(self.played_m, row)
+        played = batch_rows(self.played_m, row, BATCH_FRAMES)
         return loop.run_frames(BATCH_FRAMES, sense, terms, dither_m, played)
 
 
 class PhaseFeed:
     """Blocks of phases, one after the other for ever."""
+
+    batch_frames = BATCH_FRAMES
 
     def __init__(
         self,

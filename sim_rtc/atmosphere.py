@@ -33,10 +33,10 @@ _BURN_IN_OUTER_SCALES = 6.0
 _MARGIN_ROWS = 2
 """Rows beyond the pupil that the cubic interpolation reaches."""
 
-_TOGETHER = 32
+_TOGETHER = 128
 """Steps read at a time."""
 
-_POINTS_TOGETHER = 1024
+_POINTS_TOGETHER = 512
 """Points read at a time: with these steps they stay in a processor's cache."""
 
 _TAPS = 4

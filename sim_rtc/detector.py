@@ -6,11 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from service.model.instrument import Instrument
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
+
+
+_FRAMES_TOGETHER = 50
+"""Frames of noise drawn at a time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +77,8 @@ class Detector:
         """``(n_slopes,)`` 1 σ of a slope in one frame."""
         if silent is not None:
             self.sigma[np.tile(silent, 2)] = 0.0
+        # Drawn from by number, in a third of the time of a normal deviate; they end at 4.3 sigma.
+        self._normal = _normal_values(2**16)
 
     def counts(self, images: Array) -> Array32:
         """Return ``(4, n, n)`` electrons per frame of these images ``(2, n, 2, n)``.
@@ -88,6 +95,16 @@ class Detector:
         The x and y slopes of a subaperture use the same four pixels with signs that make their
         noise uncorrelated.
         """
-        noise = rng.standard_normal((n_frames, len(self.sigma)), dtype=np.float32)
-        noise *= self.sigma
+        noise = np.empty((n_frames, len(self.sigma)), dtype=np.float32)
+        for start in range(0, n_frames, _FRAMES_TOGETHER):
+            some = noise[start : start + _FRAMES_TOGETHER]
+            drawn = rng.integers(0, len(self._normal), some.shape, dtype=np.uint16)
+            np.take(self._normal, drawn, out=some, mode="clip")
+            some *= self.sigma
         return noise
+
+
+def _normal_values(n: int) -> Array32:
+    """Return n equally probable values of a normal distribution, of variance 1."""
+    values = ndtri((np.arange(n) + 0.5) / n)
+    return np.asarray(values / values.std(), dtype=np.float32)

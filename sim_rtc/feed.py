@@ -26,7 +26,7 @@ Array32 = NDArray[np.float32]
 BATCH_FRAMES = 10
 """Frames the loop processes together unless told otherwise: one message on the wire."""
 
-_MESSAGE_S = 0.04
+_MESSAGE_S = 0.05
 """Of telemetry in a message where frames come fast: the more, the less processor time a frame takes."""
 
 _MOST_MESSAGE_FRAMES = 50
@@ -195,10 +195,13 @@ class OpenLoopFeed:
     ) -> OpenLoopBlock:
         """Return the block of these times; ``source_slopes`` are vibrations' and static slopes."""
         slopes = self._detector.noise(len(time_s), self._rng)
-        strength = self._sky.vibrations.frames(len(time_s))
-        slopes += strength @ source_slopes[:-1]
-        slopes += source_slopes[-1]
-        phases = strength[:: self.batch_frames] @ self._sky.vibrations.phase_per_line.T
+        vibrations = self._sky.vibrations
+        strength = vibrations.frames(len(time_s))
+        if strength.any():
+            slopes += strength @ source_slopes[:-1]
+        if source_slopes[-1].any():
+            slopes += source_slopes[-1]
+        phases = strength[:: self.batch_frames] @ vibrations.phase_per_line.T
         turbulence, played = self._sky.turbulence.at(time_s), self._sky.played
         if played is None:
             slopes += turbulence.through(optics.slopes_per_phase)

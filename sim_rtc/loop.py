@@ -171,13 +171,15 @@ class ModalLoop:
         n_frames, delay = len(applied), len(self._decided)
         integrator = np.empty((n_frames + delay, applied.shape[1]), dtype=np.float32)
         integrator[:delay] = self._decided
-        leak, stroke = np.float32(terms.leak), self._stroke_m
+        # Arrays of no dimension: a scalar is converted again in every frame.
+        leak, stroke = np.array(terms.leak, dtype=np.float32), np.array(self._stroke_m)
+        least = -stroke
         n_controlled = len(terms.gains)
         n_limited = 0
         for first in range(0, n_frames, delay):
             commands = applied[first : first + delay]
             commands += integrator[first : first + len(commands)]
-            np.minimum(np.maximum(commands, -stroke, out=commands), stroke, out=commands)
+            commands.clip(least, stroke, out=commands)
             n_limited += self._follow(first, added)
             corrections = estimate(first, commands)
             corrections *= terms.gains
@@ -188,7 +190,7 @@ class ModalLoop:
                 decided = integrator[k]
                 np.multiply(integrator[k - 1], leak, out=decided)
                 decided[:n_controlled] -= correction
-                np.minimum(np.maximum(decided, -stroke, out=decided), stroke, out=decided)
+                decided.clip(least, stroke, out=decided)
         self._decided = integrator[n_frames:].copy()
         return n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
 

@@ -1,8 +1,10 @@
-"""Frames per second of the diffractive telescope, beside OOPAO's.
+"""What a second of the simulated telescope costs, linear and diffractive, beside OOPAO's.
 
 One core. A step is a frame of the closed loop: atmosphere, mirror, pyramid with 24 modulation
-points, photons and read noise, slopes, control. Processor time is counted, not the clock on the
-wall: other programs do not disturb it. OOPAO runs in an interpreter of its own::
+points, photons and read noise, slopes, control. The linear telescope replaces the optics by
+products: its cost is told per second of telemetry, encoded for the wire, and in products of
+2000 x 2000 numbers, for a processor that others use is slower for both. Processor time is counted,
+not the clock on the wall. OOPAO runs in an interpreter of its own::
 
     python -m venv peer && peer/bin/pip install OOPAO
     python -m benchmarks.plant --oopao-python peer/bin/python
@@ -23,9 +25,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
+from service.wire import encode_frames
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.diffractive_plant import DiffractiveOptics
-from sim_rtc.feed import BATCH_FRAMES
+from sim_rtc.feed import BATCH_FRAMES, message_frames
+from sim_rtc.messages import frames_of
 from sim_rtc.options import parse_options
 
 _PEER = Path(__file__).with_name("plant_oopao.py")
@@ -33,9 +37,57 @@ _PEER_SAMPLINGS = (2, 4)
 """Pupil points per subaperture: OOPAO refuses 3, its grids are multiples of four points."""
 
 _PEER_TIMEOUT_S = 300.0
+_PRODUCT = 2000
+_TARGET_LINEAR = 0.25
+"""Of a core."""
+
 _TARGET_FPS = 150.0
 _TARGET_RATIO = 10.0
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinearCost:
+    """Processor time of the linear telescope."""
+
+    per_second_s: float
+    """Of telemetry at 1 kHz, seconds."""
+
+    product_s: float
+    """Of one float32 product of 2000 x 2000, in the median of those in between, seconds."""
+
+    @property
+    def in_products(self) -> float:
+        """What a second of telemetry costs, over that product."""
+        return self.per_second_s / self.product_s
+
+    @property
+    def gflops(self) -> float:
+        """Of that product."""
+        return 2 * _PRODUCT**3 / self.product_s / 1e9
+
+
+def measure_linear(n_seconds: int) -> LinearCost:
+    """Return what telemetry of the linear telescope costs here, as a process would make it."""
+    with threadpool_limits(1):
+        options = parse_options(["--seed", "1"])
+        batch_frames = message_frames(options.frame_rate_hz)
+        telescope = build_telescope(
+            options, load_instrument(options.instrument), batch_frames=batch_frames
+        )
+        computer = telescope.computer(telescope.feed.blocks())
+        computer.prepare()
+        factor = np.ones((_PRODUCT, _PRODUCT), dtype=np.float32)
+        n_batches = round(options.frame_rate_hz / batch_frames)
+        costs_s, products_s = [], []
+        for _ in range(n_seconds + 1):
+            products_s.append(_processor_s(lambda: factor @ factor, 1))
+            start_s = time.process_time()
+            for _ in range(n_batches):
+                batch = computer.next_batch()
+                encode_frames(*frames_of(batch, telescope.identity, 0, 1_000_000))
+            costs_s.append(time.process_time() - start_s)
+        return LinearCost(per_second_s=float(np.mean(costs_s[1:])), product_s=float(np.median(products_s)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +154,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--blocks", type=int, default=3, help="of 200 frames to time")
     parser.add_argument("--oopao-python", metavar="PATH", help="interpreter that has OOPAO")
+    parser.add_argument("--seconds", type=int, default=20, help="of linear telemetry to time")
     given = parser.parse_args()
+    linear = measure_linear(given.seconds)
+    print(
+        f"linear plant, 1 kHz: {linear.per_second_s:.3f} s of processor time per second of "
+        f"telemetry, on a core of {linear.gflops:.0f} GFLOPS: {linear.in_products:.2f} products; "
+        f"expected: {_TARGET_LINEAR:.2f} s at 55 GFLOPS"
+    )
     own = measure(given.blocks)
     fps = 1e3 / own.step_ms
     print("24 modulation points, 30 x 30 subapertures, noise on, one core")

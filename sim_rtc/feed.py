@@ -27,7 +27,7 @@ BATCH_FRAMES = 10
 """Frames the loop processes together unless told otherwise: one message on the wire."""
 
 _MESSAGE_S = 0.05
-"""Of telemetry in a message where frames come fast: the more, the less processor time a frame takes."""
+"""Of telemetry in a message where frames come fast: the longer, the less a frame costs."""
 
 _MOST_MESSAGE_FRAMES = 50
 """More are refused by the wire."""

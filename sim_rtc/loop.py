@@ -130,7 +130,7 @@ class ModalLoop:
     def _moved(self, added: _Added, n_controlled: int) -> int:
         """Return how many of the first modes may move: nothing corrects those beyond the loop."""
         if self._drive is not None:
-            return added.applied.shape[1]
+            return int(added.applied.shape[1])
         beyond = added.applied.any(axis=0) | self._decided.any(axis=0)
         return max(n_controlled, int(np.flatnonzero(beyond)[-1]) + 1 if beyond.any() else 0)
 

@@ -32,9 +32,7 @@ class TurbulentFrames:
 
     def phases_m(self, every: int = 1) -> Array32:
         """Return the OPD of each ``every``-th frame, ``(n_frames, n_points)``."""
-        return _total(
-            [between.every(every).of(history.phases) for history, between in self._parts]
-        )
+        return _total([between.every(every).of(history.phases) for history, between in self._parts])
 
     def through(self, response: Array32) -> Array32:
         """Return ``response @ phase`` of every frame, ``(n_frames, n_outputs)``.
@@ -42,9 +40,7 @@ class TurbulentFrames:
         ``response`` is ``(n_outputs, n_points)``. It is applied to the steps of the screens, which
         are fewer than the frames, and only to those it has not been applied to before.
         """
-        return _total(
-            [between.of(history.responses(response)) for history, between in self._parts]
-        )
+        return _total([between.of(history.responses(response)) for history, between in self._parts])
 
 
 class Turbulence:

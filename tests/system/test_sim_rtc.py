@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from benchmarks.plant import measure_linear
 from service.wire import (
     CommandKind,
     DitherAction,
@@ -58,6 +59,11 @@ def open_router(port: int) -> zenoh.Session:
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("scouting/gossip/enabled", "false")
     return zenoh.open(config)
+
+
+def test_a_second_of_linear_telemetry_costs_little_more_than_a_large_product():
+    """Beside a product of 2000 x 2000: what else the machine does slows both."""
+    assert measure_linear(4).in_products < 2.5
 
 
 class Listener:

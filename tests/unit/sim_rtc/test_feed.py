@@ -8,7 +8,7 @@ from service.model.instrument import KarhunenLoeve
 from service.model.misregistration import Misregistration
 from sim_rtc.atmosphere import Layer, frozen_layers
 from sim_rtc.detector import Detector
-from sim_rtc.feed import Ahead, OpenLoopFeed
+from sim_rtc.feed import BATCH_FRAMES, Ahead, OpenLoopFeed, OpenModes, message_frames
 from sim_rtc.imperfections import SETS, Imperfections
 from sim_rtc.mirror import MirrorFaults
 from sim_rtc.motion import MovingOptics
@@ -53,6 +53,7 @@ def make_feed(
     seeing=STEADY,
     lines=(),
     played=None,
+    batch_frames=BATCH_FRAMES,
 ):
     optics = MovingOptics(plant, schedule, executor or Immediate())
     detector = Detector(
@@ -87,6 +88,7 @@ def make_feed(
         frame_rate_hz=500.0,
         jump_times_s=tuple(jump.time_s for jump in schedule.jumps),
         rng=np.random.default_rng(3),
+        batch_frames=batch_frames,
     )
 
 
@@ -243,3 +245,33 @@ def test_a_stuck_actuator_is_in_slopes_and_phases(small_instrument, small_basis)
     assert np.abs(expected).max() > 0.01
     # the same sky and noise, and no optical gain that goes by the modes
     np.testing.assert_allclose(stuck.slopes - free.slopes, np.tile(expected, (500, 1)), atol=1e-5)
+
+
+def test_the_length_of_a_batch_changes_no_frame(plant, small_instrument):
+    short, long = (
+        list(islice(make_feed(plant, small_instrument, STILL, batch_frames=n).blocks(), 2))
+        for n in (10, 50)
+    )
+    for a, b in zip(short, long, strict=True):
+        np.testing.assert_array_equal(a.slopes, b.slopes)
+        np.testing.assert_allclose(a.phases_m[::5], b.phases_m, atol=1e-12)
+        np.testing.assert_array_equal(b.phase_at(100), b.phases_m[2])
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "n_frames"), [(3000.0, 50), (1000.0, 50), (400.0, 20), (90.0, 10)]
+)
+def test_a_message_is_of_fifty_milliseconds_within_what_the_wire_takes(rate_hz, n_frames):
+    assert message_frames(rate_hz) == n_frames
+
+
+def test_open_modes_are_those_of_the_reconstructor_in_use():
+    rng = np.random.default_rng(7)
+    slopes = rng.standard_normal((600, 8), dtype=np.float32)
+    first, second = (rng.standard_normal((3, 8), dtype=np.float32) for _ in range(2))
+    modes = OpenModes()
+    # the matrix is swapped within what has been computed ahead
+    for row, matrix in ((0, first), (50, first), (100, second), (350, second), (550, first)):
+        np.testing.assert_allclose(
+            modes.rows(slopes, row, 50, matrix), slopes[row : row + 50] @ matrix.T, atol=1e-5
+        )

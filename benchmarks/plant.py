@@ -87,7 +87,9 @@ def measure_linear(n_seconds: int) -> LinearCost:
                 batch = computer.next_batch()
                 encode_frames(*frames_of(batch, telescope.identity, 0, 1_000_000))
             costs_s.append(time.process_time() - start_s)
-        return LinearCost(per_second_s=float(np.mean(costs_s[1:])), product_s=float(np.median(products_s)))
+        return LinearCost(
+            per_second_s=float(np.mean(costs_s[1:])), product_s=float(np.median(products_s))
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

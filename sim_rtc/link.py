@@ -28,7 +28,14 @@ from sim_rtc.intake import Intake
 from sim_rtc.messages import frames_of, status_of
 from sim_rtc.outlet import Outlet
 from sim_rtc.record import Kind, Recorder
-from sim_rtc.session import RETRY_S, Token, client_config, frames_publisher, status_publisher
+from sim_rtc.session import (
+    RETRY_S,
+    Lifeline,
+    Token,
+    client_config,
+    frames_publisher,
+    status_publisher,
+)
 from sim_rtc.telemetry import Batch
 from sim_rtc.wire_faults import WireFaults
 
@@ -138,11 +145,14 @@ class Link:
             self._absent.clear()
 
     def _run(self) -> None:
-        session = self._open()
-        if session is None:
-            return
+        answers = Answers(self._keys, self._computer)
+        while (session := self._open()) is not None:
+            self._speak(session, answers)
+
+    def _speak(self, session: zenoh.Session, answers: Answers) -> None:
+        """Do an RTC's part in a session until it is cut off or the link ends."""
         with session:
-            Answers(self._keys, self._computer).declare(session)
+            answers.declare(session)
             with self._ready:
                 # What has waited for a service is old: it would only arrive as a burst.
                 self._backlog.clear()
@@ -178,6 +188,7 @@ class Link:
         frames = frames_publisher(session, self._keys, rate_hz / self._batch_frames)
         status = status_publisher(session, self._keys)
         next_status_s = 0.0
+        lifeline = Lifeline(time.monotonic())
         while not self._stopped.is_set():
             outgoing = self._next()
             if outgoing is not None:
@@ -195,6 +206,9 @@ class Link:
                 status.put(data)
                 self._record(Kind.STATUS, data)
                 next_status_s = now_s + _STATUS_PERIOD_S
+                if lifeline.cut(session, now_s):
+                    _log.warning("link.cut-off", text=lifeline.text)
+                    return
 
     def _note_matrix(self, cm_id: str) -> None:
         """Record a matrix when the first frames that it multiplies are sent."""

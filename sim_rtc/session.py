@@ -14,6 +14,9 @@ from sim_rtc.record import Kind, Recorder
 RETRY_S = 0.2
 """Between two attempts to find the service's router."""
 
+_CUT_OFF_S = 5.0
+"""Without a router, until a session is given up: zenoh itself reconnects within 1.6 s."""
+
 _OPEN_TIMEOUT_MS = 1000
 _LEASE_MS = 2000
 _WAIT_BEFORE_DROP_US = 20_000
@@ -73,6 +76,27 @@ def status_publisher(session: zenoh.Session, keys: Keys) -> zenoh.Publisher:
         encoding=Encodings.STATUS,
         congestion_control=zenoh.CongestionControl.DROP,
     )
+
+
+class Lifeline:
+    """Whether a session still has a router.
+
+    When both ends have stood still for longer than the lease, zenoh's client may connect twice at
+    once. One of the connections stays open and unused, and the router takes no second one of the
+    same session (``MAX_LINKS``): its token is there, and nothing that it publishes arrives, for
+    ever. Only a new session, under a new name, ends that.
+    """
+
+    text = f"no router for {_CUT_OFF_S:.0f} s: the session is closed and opened anew"
+
+    def __init__(self, now_s: float) -> None:
+        self._seen_s = now_s
+
+    def cut(self, session: zenoh.Session, now_s: float) -> bool:
+        """Return whether the session has been without a router for so long that it is given up."""
+        if session.info.routers_zid():
+            self._seen_s = now_s
+        return now_s - self._seen_s > _CUT_OFF_S
 
 
 class Token:

@@ -71,7 +71,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
     """Run the loop in this thread until ``stopped`` or the time is up."""
     batch_frames = telescope.feed.batch_frames
     batch_s = batch_frames / options.frame_rate_hz / options.speed if options.speed else 0.0
-    pace = Pace(batch_s=batch_s)
+    pace = Pace(batch_s=batch_s, batch_frames=batch_frames)
     with ExitStack() as stack:
         ahead = stack.enter_context(Ahead(telescope.feed.blocks()))
         computer = telescope.computer(iter(ahead))
@@ -105,7 +105,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
             last_batch = round(options.seconds * options.frame_rate_hz / batch_frames)
         if options.gain_ramp_s is not None:
             computer.ramp_up(options.gain_ramp_s)
-        watch = Watch(computer, pace, link, batch_frames)
+        watch = Watch(computer, pace, link, options)
         n_batches = 0
         _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.snapshot().session)
         while not stopped.is_set() and n_batches < last_batch:
@@ -114,7 +114,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
             batch = computer.next_batch()
             link.offer(batch)
             if truth is not None:
-                truth.offer(batch, pace.late_batches * batch_frames)
+                truth.offer(batch, pace.late_frames, pace.behind_s)
             pace.done()
             watch.look(batch)
             n_batches += 1
@@ -128,46 +128,63 @@ def _replay(path: Path, options: Options, stopped: threading.Event) -> int:
 
 
 class Watch:
-    """Tells the log, at most every few seconds, how the loop is doing."""
+    """Tells the log how the loop is doing: every few seconds, and at once when it falls behind."""
 
     def __init__(
-        self, computer: RealTimeComputer, pace: Pace, link: Link, batch_frames: int
+        self, computer: RealTimeComputer, pace: Pace, link: Link, options: Options
     ) -> None:
-        self._batch_frames = batch_frames
         self._computer = computer
         self._pace = pace
         self._link = link
+        self._rate_hz = options.frame_rate_hz * (options.speed or 1.0)
         self._since_s = time.monotonic()
         self._cpu_s = time.process_time()
         self._seq = 0
+        self._frames = 0
         self._clipped = 0
         self._late = 0
+        self._behind = False
 
     def look(self, batch: Batch) -> None:
         """Take note of a batch."""
         self._clipped += batch.n_clipped
+        self._frames += len(batch.slopes)
         self._seq = batch.seq0 + len(batch.slopes)
-        if time.monotonic() - self._since_s >= _REPORT_PERIOD_S:
+        fell_behind = self._pace.behind_s > _WORRYING_DELAY_S and not self._behind
+        if fell_behind or time.monotonic() - self._since_s >= _REPORT_PERIOD_S:
             self.report()
 
     def report(self) -> None:
         """Log what has happened since the last report."""
         now_s, cpu_s = time.monotonic(), time.process_time()
-        late = self._pace.late_batches - self._late
+        elapsed_s = max(now_s - self._since_s, 1e-9)
         _log.info(
             "loop.report",
             frames=self._seq,
             cm_id=self._computer.snapshot().reconstructor.manifest.id,
-            cpu_per_second=round((cpu_s - self._cpu_s) / max(now_s - self._since_s, 1e-9), 3),
-            overrun_frames=late * self._batch_frames,
-            unpublished_frames=self._link.n_dropped_batches * self._batch_frames,
+            cpu_per_second=round((cpu_s - self._cpu_s) / elapsed_s, 3),
+            overrun_frames=self._pace.late_frames - self._late,
+            unpublished_frames=self._link.n_dropped_frames,
         )
         if self._clipped:
             _log.warning("loop.clipped", commands=self._clipped, text="the loop may diverge")
-        if self._pace.behind_s > _WORRYING_DELAY_S:
-            _log.warning("loop.behind", behind_s=round(self._pace.behind_s, 2))
+        self._tell_delay(self._frames / elapsed_s / self._rate_hz)
         self._since_s, self._cpu_s, self._clipped = now_s, cpu_s, 0
-        self._late = self._pace.late_batches
+        self._late, self._frames = self._pace.late_frames, 0
+
+    def _tell_delay(self, share: float) -> None:
+        """Say how far behind real time the loop is, and when it is so no more."""
+        behind_s = self._pace.behind_s
+        if behind_s > _WORRYING_DELAY_S:
+            text = (
+                f"{behind_s:.1f} s behind real time; {100 * share:.0f} % of it was kept of late: "
+                "telemetry comes late and in bursts; leave this machine more of a processor, or "
+                "ask for less with --rate or --speed"
+            )
+            _log.warning("loop.behind", behind_s=round(behind_s, 2), text=text)
+        elif self._behind:
+            _log.warning("loop.on-time", text="in real time again")
+        self._behind = behind_s > _WORRYING_DELAY_S
 
 
 def _check_writable(path: Path | None) -> None:

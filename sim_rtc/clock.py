@@ -36,13 +36,14 @@ class FrameClock:
 class Pace:
     """Holds the loop to real time, or to a multiple of it; late frames are made up for."""
 
-    def __init__(self, *, batch_s: float) -> None:
-        """Take the wall-clock duration of a batch; 0: as fast as it goes."""
+    def __init__(self, *, batch_s: float, batch_frames: int = 1) -> None:
+        """Take a batch's wall-clock duration, 0: as fast as it goes; and how many frames it has."""
         self._batch_s = batch_s
+        self._batch_frames = batch_frames
         self._start_s: float | None = None
         self._batches = 0
-        self.late_batches = 0
-        """Batches that were finished after the next one was due."""
+        self.late_frames = 0
+        """Frames of batches that were finished after the next one was due."""
 
         self.behind_s = 0.0
         """How late the last batch was, seconds."""
@@ -69,4 +70,4 @@ class Pace:
         due_s = self._start_s + self._batches * self._batch_s
         self.behind_s = time.perf_counter() - due_s
         if self.behind_s > self._batch_s:
-            self.late_batches += 1
+            self.late_frames += self._batch_frames

@@ -40,8 +40,8 @@ from sim_rtc.telemetry import Batch
 from sim_rtc.wire_faults import WireFaults
 
 _STATUS_PERIOD_S = 0.2
-_BACKLOG_BATCHES = 100
-"""Batches that wait for the publishing thread; beyond it the oldest is dropped and counted."""
+_BACKLOG_S = 1.0
+"""Of telemetry that waits for the publishing thread; beyond it the oldest is dropped, counted."""
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -116,16 +116,15 @@ class Link:
         self._thread.join()
 
     @property
-    def n_dropped_batches(self) -> int:
-        """Batches that were never published: the thread was behind, or there was no service yet."""
+    def n_dropped_frames(self) -> int:
+        """Frames that were never published: the thread was behind, or there was no service yet."""
         return self._dropped
 
     def offer(self, batch: Batch) -> None:
         """Queue a batch for publication; never waits."""
         with self._ready:
-            if len(self._backlog) >= _BACKLOG_BATCHES:
-                self._backlog.popleft()
-                self._dropped += 1
+            if len(self._backlog) * len(batch.slopes) * self._clock.dt_ns >= _BACKLOG_S * 1e9:
+                self._dropped += len(self._backlog.popleft().batch.slopes)
             self._backlog.append(
                 _Outgoing(
                     batch=batch,

@@ -21,7 +21,7 @@ _LINE_S = 0.5
 _SWAP_S = 1.0
 """Stretch before and after a swap in which the largest wavefront error is sought."""
 
-_BACKLOG_BATCHES = 2000
+_BACKLOG_BATCHES = 400
 
 
 @dataclass(slots=True, kw_only=True)
@@ -70,7 +70,7 @@ class TruthRecorder:
         self._clock = clock
         self._line_frames = round(_LINE_S * 1e9 / clock.dt_ns)
         self._swap_frames = round(_SWAP_S * 1e9 / clock.dt_ns)
-        self._queue: queue.Queue[tuple[Batch, int] | None] = queue.Queue(_BACKLOG_BATCHES)
+        self._queue: queue.Queue[tuple[Batch, int, float] | None] = queue.Queue(_BACKLOG_BATCHES)
         self._thread = threading.Thread(target=self._run, name="truth", daemon=True)
         self._recent: deque[tuple[int, float]] = deque()
         self._swaps: list[_Swap] = []
@@ -88,24 +88,27 @@ class TruthRecorder:
         self._thread.join()
         self._file.close()
 
-    def offer(self, batch: Batch, overrun_frames: int) -> None:
-        """Queue a batch; waits only if the recorder is minutes of work behind."""
-        self._queue.put((batch, overrun_frames))
+    def offer(self, batch: Batch, overrun_frames: int, behind_s: float = 0.0) -> None:
+        """Queue a batch; waits only if the recorder is seconds of work behind.
+
+        ``overrun_frames`` so far came late; the batch came ``behind_s`` after it was due.
+        """
+        self._queue.put((batch, overrun_frames, behind_s))
 
     def _run(self) -> None:
         pending: list[Batch] = []
-        overruns = 0
+        overruns, behind_s = 0, 0.0
         while True:
             item = self._queue.get()
             if item is None:
                 break
-            batch, overruns = item
+            batch, overruns, behind_s = item
             if pending and self._is_boundary(pending, batch):
-                self._write_interval(pending, overruns)
+                self._write_interval(pending, overruns, behind_s)
                 pending = []
             pending.append(batch)
         if pending:
-            self._write_interval(pending, overruns)
+            self._write_interval(pending, overruns, behind_s)
 
     def _is_boundary(self, pending: list[Batch], batch: Batch) -> bool:
         """Return whether ``batch`` begins a new line: time is up, or something else is true."""
@@ -117,7 +120,7 @@ class TruthRecorder:
             or batch.session != first.session
         )
 
-    def _write_interval(self, batches: list[Batch], overruns: int) -> None:
+    def _write_interval(self, batches: list[Batch], overruns: int, behind_s: float) -> None:
         errors_nm = self._error.rms_nm(batches)
         first, last = batches[0], batches[-1]
         self._note_swap(first)
@@ -142,6 +145,7 @@ class TruthRecorder:
                 "dither_on": any(batch.dither_m is not None for batch in batches),
                 "clipped": sum(batch.n_clipped for batch in batches),
                 "overrun_frames": overruns,
+                "behind_s": round(max(behind_s, 0.0), 2),
             }
         )
         self._finish_swaps(end_seq)

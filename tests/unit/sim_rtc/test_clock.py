@@ -22,7 +22,7 @@ def test_a_late_batch_is_counted_and_made_up_for():
         pace.done()
     # The stall of 70 ms is gone by the end: 20 batches of 20 ms.
     assert time.perf_counter() - began == pytest.approx(0.4, abs=0.05)
-    assert pace.late_batches >= 2
+    assert pace.late_frames >= 2
     assert pace.behind_s < 0.02
 
 
@@ -33,7 +33,7 @@ def test_without_a_pace_nothing_waits():
         pace.wait(stopped)
         pace.done()
     assert time.perf_counter() - began < 0.5
-    assert pace.late_batches == 0
+    assert pace.late_frames == 0
 
 
 def test_being_told_to_stop_ends_the_wait():

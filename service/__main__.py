@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import signal
 import sys
@@ -15,6 +16,19 @@ _OTHER_PROGRAMS = {"sim": "sim_rtc", "campaign": "studies.campaign"}
 """Run in this one's place: the service does not know the simulator."""
 
 
+_COMMANDS = {
+    "run": ("service.commands.run", "add_run_arguments", "run_service"),
+    "fit": ("service.commands.fit", "add_fit_arguments", "run_fit"),
+    "reconstruct": (
+        "service.commands.reconstruct",
+        "add_reconstruct_arguments",
+        "run_reconstruct",
+    ),
+    "demo": ("service.demo", "add_demo_arguments", "run_demo"),
+}
+"""Module of each command, what declares its arguments, what runs it."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 refused at the start."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -23,6 +37,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.execv(sys.executable, [sys.executable, "-m", program, *words[1:]])
     if arguments is None:
         _leave_when_asked(words)
+    if arguments is None and words[:1] == ["run"]:
+        from service.worker import begin_early
+
+        begin_early()
     try:
         run, options = _understood(words)
         if arguments is None and options.command != "run":
@@ -49,29 +67,27 @@ def _leave_when_asked(words: Sequence[str]) -> None:
 def _understood(
     words: Sequence[str],
 ) -> tuple[Callable[[argparse.Namespace], int], argparse.Namespace]:
-    """Return the command that is meant, and its options."""
-    from service.commands.fit import add_fit_arguments, run_fit
-    from service.commands.reconstruct import add_reconstruct_arguments, run_reconstruct
-    from service.commands.run import add_run_arguments, run_service
+    """Return the command that is meant, and its options; the other commands are not imported."""
     from service.commands.terminal import OneLineParser, with_negative_numbers
-    from service.demo import add_demo_arguments, run_demo
 
     parser: argparse.ArgumentParser = OneLineParser(
         prog="pyrcal", description="Calibration service of an adaptive telescope."
     )
     parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
-    add_run_arguments(commands)
-    add_fit_arguments(commands)
-    add_reconstruct_arguments(commands)
-    add_demo_arguments(commands)
+    meant = words[0] if words and words[0] in _COMMANDS else None
+    for name, (module, add, _) in _COMMANDS.items():
+        if meant in {None, name}:
+            getattr(importlib.import_module(module), add)(commands)
+        else:
+            commands.add_parser(name, add_help=False)
     commands.add_parser("sim", help="the simulated RTC: pyrcal sim --help", add_help=False)
     commands.add_parser(
         "campaign", help="many simulated nights: pyrcal campaign --help", add_help=False
     )
     options = parser.parse_args(with_negative_numbers(words))
-    run = {"run": run_service, "fit": run_fit, "reconstruct": run_reconstruct, "demo": run_demo}
-    return run[options.command], options
+    module, _, run = _COMMANDS[options.command]
+    return getattr(importlib.import_module(module), run), options
 
 
 if __name__ == "__main__":

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+_CHUNK = 256
+"""Points compared with all others at once."""
 
 
 def rings(first_ring: int, last_ring: int, pitch_m: float) -> NDArray[np.float64]:
@@ -36,15 +38,32 @@ def grid(n_across: int, pitch_m: float, diameter_m: float) -> NDArray[np.float64
 
 def typical_pitch(positions_m: NDArray[np.float64]) -> float:
     """Return the median distance to the nearest neighbour, metres."""
-    distances, _ = cKDTree(positions_m).query(positions_m, k=2)
-    return float(np.median(distances[:, 1]))
+    return float(np.median(_nearest(positions_m)[0]))
 
 
 def coincident(positions_m: NDArray[np.float64]) -> tuple[int, int] | None:
     """Return the indices of two actuators in the same place, or None."""
-    distances, neighbours = cKDTree(positions_m).query(positions_m, k=2)
-    same = np.flatnonzero(distances[:, 1] <= 1e-6 * np.ptp(positions_m))
+    distances, neighbours = _nearest(positions_m)
+    same = np.flatnonzero(distances <= 1e-6 * np.ptp(positions_m))
     if same.size == 0:
         return None
-    first, second = sorted(int(index) for index in neighbours[same[0]])
+    first, second = sorted((int(same[0]), int(neighbours[same[0]])))
     return first, second
+
+
+def _nearest(positions_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Return how far every point's nearest neighbour is, and which it is.
+
+    By brute force: a tree would take longer to import than this takes for a few thousand points.
+    """
+    n = len(positions_m)
+    distances, neighbours = np.full(n, np.inf), np.zeros(n, dtype=np.intp)
+    if n < 2:
+        return distances, neighbours
+    for start in range(0, n, _CHUNK):
+        rows = np.arange(start, min(start + _CHUNK, n))
+        apart = np.hypot(*(positions_m[rows, None] - positions_m).transpose(2, 0, 1))
+        apart[np.arange(len(rows)), rows] = np.inf
+        neighbours[rows] = apart.argmin(axis=1)
+        distances[rows] = apart.min(axis=1)
+    return distances, neighbours

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import svd
 
 from service.errors import ModelError
 
@@ -44,7 +44,7 @@ def invert(
     Heritier et al. 2018, section 2.2.
     """
     controlled = checked_columns(interaction_matrix, n_modes)
-    left, singular, right = svd(controlled, full_matrices=False)
+    left, singular, right = scipy.linalg.svd(controlled, full_matrices=False)
     kept = singular > singular[0] / max_condition
     inverse = (right[kept].T / singular[kept]) @ left[:, kept].T
     return Inversion(

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, svdvals
 
 from service.control.reconstructor import Inversion, checked_columns
 from service.errors import ModelError
@@ -76,11 +76,11 @@ def invert_with_prior(interaction_matrix: NDArray[Any], n_modes: int, prior: Pri
     amplitude = np.sqrt(prior.variance_m2[:n_estimated])
     # in units of noise and of the prior both matrices are of order one: nothing overflows
     white = matrix * amplitude / prior.slope_noise[:, None]
-    system = cho_factor(white.T @ white + np.eye(n_estimated))
-    estimate = cho_solve(system, white.T)[:n_modes] * amplitude[:n_modes, None]
+    system = scipy.linalg.cho_factor(white.T @ white + np.eye(n_estimated))
+    estimate = scipy.linalg.cho_solve(system, white.T)[:n_modes] * amplitude[:n_modes, None]
     estimate /= prior.slope_noise
     estimate /= np.einsum("ij,ji->i", estimate, controlled)[:, None]
-    singular = svdvals(controlled)
+    singular = scipy.linalg.svdvals(controlled)
     return Inversion(
         matrix=np.ascontiguousarray(estimate, dtype=np.float32),
         condition_number=float(singular[0] / singular[-1]),

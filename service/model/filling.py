@@ -8,9 +8,8 @@ are left out), it only has to join smoothly.
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt
-from scipy.sparse import csr_array
 
 Table = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -23,8 +22,8 @@ def known_samples(cube: Table) -> Mask:
     zero. A line of zeros one sample wide does: odd modes vanish together on an axis.
     """
     zero = np.pad(~np.any(cube, axis=0), 1, constant_values=True)
-    region = binary_opening(zero, np.ones((2, 2), bool))
-    zeros = binary_dilation(region, mask=zero)[1:-1, 1:-1]
+    region = scipy.ndimage.binary_opening(zero, np.ones((2, 2), bool))
+    zeros = scipy.ndimage.binary_dilation(region, mask=zero)[1:-1, 1:-1]
     return np.asarray(np.isfinite(cube).all(axis=0) & ~zeros)
 
 
@@ -52,9 +51,11 @@ def _resized(planes: NDArray[np.generic], margin: tuple[int, int]) -> NDArray[np
     return np.pad(planes[:, cut[0], cut[1]], [(0, 0), *grown])
 
 
-def _continuation(known: Mask) -> tuple[NDArray[np.intp], csr_array]:
+def _continuation(known: Mask) -> tuple[NDArray[np.intp], scipy.sparse.csr_array]:
     """Return the unknown samples and the weights ``(n_unknown, n_samples)`` that make them."""
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(
+        ~known, return_distances=False, return_indices=True
+    )
     place = np.argwhere(~known)
     edge = nearest[:, ~known].T
     mirrored = 2 * edge - place
@@ -64,7 +65,7 @@ def _continuation(known: Mask) -> tuple[NDArray[np.intp], csr_array]:
     at_image = at_edge.copy()
     at_image[inside] = np.ravel_multi_index(tuple(mirrored[inside].T), known.shape)
     rows = np.arange(len(place))
-    weights = csr_array(
+    weights = scipy.sparse.csr_array(
         (
             np.concatenate([np.full(len(rows), 2.0), np.full(len(rows), -1.0)]),
             (np.concatenate([rows, rows]), np.concatenate([at_edge, at_image])),

@@ -8,8 +8,8 @@ from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from service.model.instrument import Instrument, Stop
 from service.model.misregistration import Misregistration
@@ -153,7 +153,7 @@ class InteractionModel:
         y, x = np.nonzero(self.valid)
         centre = (len(self.valid) - 1) / 2
         seen = np.column_stack([x, y]) - centre - self._image_shift(alpha)
-        distance, _ = cKDTree(self.pupil.points[unknown]).query(seen, p=np.inf)
+        distance, _ = scipy.spatial.cKDTree(self.pupil.points[unknown]).query(seen, p=np.inf)
         return np.tile(distance <= 0.5 + UNKNOWN_REACH_SUBAP, 2)
 
     def _at_rest(self, shift: tuple[float, float]) -> Response:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import lu_factor, lu_solve
 
 from service.model.instrument import Influence, Mirror
 
@@ -53,7 +53,7 @@ class ThinPlate:
         system[:n, n:] = affine
         system[n:, :n] = affine.T
         padded = np.vstack([strokes, np.zeros((3, strokes.shape[1]))])
-        return np.asarray(lu_solve(lu_factor(system), padded))
+        return np.asarray(scipy.linalg.lu_solve(scipy.linalg.lu_factor(system), padded))
 
     def basis(self, points: Array) -> Array:
         """Evaluate r² log r about each actuator, then 1, x, y."""

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, eigh, solve_triangular
-from scipy.spatial import KDTree
 
 from service.errors import ModelError
 from service.model.instrument import BasisKind, Instrument, Mirror, TabulatedModes
@@ -224,7 +223,7 @@ def _parity_sectors(positions_m: Array) -> list[Array]:
     One sector with everything when the layout has no such symmetry.
     """
     n = len(positions_m)
-    distance, image = KDTree(positions_m).query(positions_m * [1.0, -1.0])
+    distance, image = scipy.spatial.KDTree(positions_m).query(positions_m * [1.0, -1.0])
     if distance.max() > 1e-6 * np.ptp(positions_m) or len(set(image)) != n:
         return [np.eye(n)]
     even, odd = [], []
@@ -250,10 +249,10 @@ def _diagonalise(
     """
     found = []
     for parity, sector in enumerate(sectors):
-        power, axes = eigh(sector.T @ gram @ sector)
+        power, axes = scipy.linalg.eigh(sector.T @ gram @ sector)
         kept = power > _PISTON_RATIO * power[-1]
         whiten = sector @ (axes[:, kept] / np.sqrt(power[kept]))
-        variance, vectors = eigh(whiten.T @ covariance @ whiten)
+        variance, vectors = scipy.linalg.eigh(whiten.T @ covariance @ whiten)
         strokes = whiten @ vectors
         found += [(variance[j], parity, strokes[:, j]) for j in range(len(variance))]
     found.sort(key=lambda mode: -mode[0])
@@ -281,8 +280,8 @@ def _unit_rms(strokes: Array, surface: Surface, influence: Array, pupil: PupilGr
     """Orthonormalise the modes over the pupil, in order, on a finer grid than they came from."""
     shapes = piston_free(surface.basis(pupil.points) @ (influence @ strokes), pupil.weights)
     gram = shapes.T @ (shapes * pupil.weights[:, None])
-    upper = cholesky(gram)
-    return np.asarray(solve_triangular(upper, strokes.T, trans="T").T)
+    upper = scipy.linalg.cholesky(gram)
+    return np.asarray(scipy.linalg.solve_triangular(upper, strokes.T, trans="T").T)
 
 
 def _tilts_along_axes(strokes: Array, positions_m: Array) -> Array:

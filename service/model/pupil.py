@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 
 from service.errors import ModelError
 
@@ -46,7 +46,7 @@ class Illumination:
         clipped = np.clip(coordinates, low, high)
         axes = (self.coordinates, self.coordinates)
         points = np.stack(np.meshgrid(clipped, clipped, indexing="ij"), axis=-1)
-        return np.asarray(RegularGridInterpolator(axes, self.intensity)(points))
+        return np.asarray(scipy.interpolate.RegularGridInterpolator(axes, self.intensity)(points))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import spline_filter
-from scipy.sparse import csr_array
 
 from service.errors import ModelError
 from service.model.filling import filled, padded
@@ -114,7 +113,7 @@ class TabulatedBasis:
     def _combined(self, rows: NDArray[np.intp], columns: NDArray[np.intp], weights: Array) -> Array:
         n_points = len(rows)
         index = rows[:, :, None] * self.surface_known.shape[1] + columns[:, None, :]
-        matrix = csr_array(
+        matrix = scipy.sparse.csr_array(
             (
                 weights.astype(self.coefficients.dtype).ravel(),
                 index.astype(np.int32).ravel(),
@@ -147,7 +146,9 @@ def tabulated_basis(instrument: Instrument, table: TabulatedModes) -> TabulatedB
         raise ModelError("modes: found a table that knows nothing of the surface over the pupil")
     samples = filled(table.cube, table.known, margin)
     for mode in samples.T:
-        mode[:] = spline_filter(mode.reshape(known.shape), order=3, output=mode.dtype).ravel()
+        mode[:] = scipy.ndimage.spline_filter(
+            mode.reshape(known.shape), order=3, output=mode.dtype
+        ).ravel()
     return TabulatedBasis(
         instrument=instrument,
         coefficients=samples,

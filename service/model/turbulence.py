@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.linalg import pinvh
-from scipy.special import gamma, kv
 
 from service.model.instrument import Instrument, KarhunenLoeve
 from service.model.pupil import PupilGrid, annular_pupil
@@ -29,12 +27,18 @@ def von_karman_covariance(separation_m: Array, turbulence: KarhunenLoeve) -> Arr
     Conan 2000, PhD thesis; Heritier et al. 2018 use the same spectrum.
     """
     scale = (turbulence.outer_scale_m / turbulence.r0_m) ** (5 / 3)
-    shape = (24 / 5 * gamma(6 / 5)) ** (5 / 6) / np.pi ** (8 / 3) * gamma(11 / 6)
+    shape = (
+        (24 / 5 * scipy.special.gamma(6 / 5)) ** (5 / 6)
+        / np.pi ** (8 / 3)
+        * scipy.special.gamma(11 / 6)
+    )
     x = 2 * np.pi * np.asarray(separation_m, dtype=np.float64) / turbulence.outer_scale_m
-    at_zero = scale * shape * gamma(5 / 6) / 2
+    at_zero = scale * shape * scipy.special.gamma(5 / 6) / 2
     safe = np.maximum(x, 1e-12)
     phase = np.where(
-        x > 1e-9, scale * shape / 2 ** (5 / 6) * safe ** (5 / 6) * kv(5 / 6, safe), at_zero
+        x > 1e-9,
+        scale * shape / 2 ** (5 / 6) * safe ** (5 / 6) * scipy.special.kv(5 / 6, safe),
+        at_zero,
     )
     return np.asarray(phase * (REFERENCE_WAVELENGTH_M / (2 * np.pi)) ** 2)
 
@@ -68,15 +72,15 @@ def pupil_statistics(
     shapes = piston_free(render(pupil.points), weights)
     weighted = shapes * weights[:, None]
     n = len(pupil.coordinates)
-    size = next_fast_len(2 * n, real=True)
+    size = scipy.fft.next_fast_len(2 * n, real=True)
     lag = np.minimum(np.arange(size), size - np.arange(size))
     separation = np.hypot(lag[:, None], lag) / pupil.sampling * instrument.subaperture_m
-    kernel = rfft2(von_karman_covariance(separation, instrument.modes))
+    kernel = scipy.fft.rfft2(von_karman_covariance(separation, instrument.modes))
     convolved = np.empty_like(weighted)
     plane = np.zeros((n, n))
     for j in range(weighted.shape[1]):
         plane[pupil.lit] = weighted[:, j]
-        spread = irfft2(rfft2(plane, (size, size)) * kernel, (size, size))
+        spread = scipy.fft.irfft2(scipy.fft.rfft2(plane, (size, size)) * kernel, (size, size))
         convolved[:, j] = spread[:n, :n][pupil.lit]
     return shapes.T @ weighted, weighted.T @ convolved
 
@@ -87,5 +91,5 @@ def expected_variance(instrument: Instrument, render: Callable[[Array], Array]) 
     The shapes need be neither orthogonal nor independent: the fit is the shortest.
     """
     gram, covariance = pupil_statistics(instrument, render)
-    inverse = pinvh(gram)
+    inverse = scipy.linalg.pinvh(gram)
     return np.asarray(np.einsum("ij,jk,ki->i", inverse, covariance, inverse, optimize=True))

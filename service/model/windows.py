@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline
-from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
@@ -237,8 +236,10 @@ def _disc(light: Array) -> Array:
     bright = light[light > np.percentile(light, 98) / 3]
     typical = np.median(bright) if bright.size else 1.0
     lit = np.clip((light / typical - _DARK) / (_LIT - _DARK), 0.0, 1.0)
-    solid = binary_fill_holes(lit > 0.5)
-    return np.where(binary_erosion(solid), 1.0, lit * binary_dilation(solid))
+    solid = scipy.ndimage.binary_fill_holes(lit > 0.5)
+    return np.where(
+        scipy.ndimage.binary_erosion(solid), 1.0, lit * scipy.ndimage.binary_dilation(solid)
+    )
 
 
 def _profiles(disc: Array) -> tuple[Array, Array]:
@@ -258,7 +259,9 @@ def _axis(centre_px: float, n: int, pixels: int, length: int, name: str) -> tupl
     first = max(int(np.floor(edges[0])) - _REACH_PX, 0)
     last = min(int(np.ceil(edges[-1])) + _REACH_PX, length)
     running = np.tri(last - first + 1, last - first, -1)
-    spline = make_interp_spline(np.arange(first, last + 1), running, k=_SPLINE_DEGREE)
+    spline = scipy.interpolate.make_interp_spline(
+        np.arange(first, last + 1), running, k=_SPLINE_DEGREE
+    )
     return slice(first, last), np.diff(spline(np.clip(edges, first, last)), axis=0)
 
 

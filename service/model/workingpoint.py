@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import j0
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
@@ -71,13 +71,15 @@ def working_point(
     frequency, power = _residual_spectrum(instrument, n_controlled, r0)
     distance = np.linspace(0.0, instrument.wfs.pupil_diameter, _N_SAMPLES)
     step = np.gradient(frequency)
-    covariance = j0(np.outer(distance, frequency)) @ (power * frequency * step) / (2 * np.pi)
+    covariance = (
+        scipy.special.j0(np.outer(distance, frequency)) @ (power * frequency * step) / (2 * np.pi)
+    )
     coherence = np.exp(covariance - covariance[0])
     far = float(np.exp(-covariance[0]))
     circle = 2 * np.pi * instrument.wfs.modulation_lambda_over_d / instrument.wfs.pupil_diameter
-    shape = (coherence - far) * j0(circle * distance) * distance
+    shape = (coherence - far) * scipy.special.j0(circle * distance) * distance
     tilt = np.linspace(0.0, np.pi * sampling, _N_SAMPLES)
-    halo = j0(np.outer(tilt, distance)) @ (shape * np.gradient(distance))
+    halo = scipy.special.j0(np.outer(tilt, distance)) @ (shape * np.gradient(distance))
     return _rings(tilt, np.maximum(halo * tilt, 0.0), far)
 
 

@@ -14,8 +14,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
@@ -93,13 +93,17 @@ def _filled(share: Array, lit: NDArray[np.bool_]) -> Array:
     padded = np.pad(np.where(lit, share, 0.0), _MARGIN)
     known = np.pad(lit.astype(np.float64), _MARGIN)
     width = _SMOOTHING_SUBAP
-    weight = gaussian_filter(known, width, mode="constant")
-    filled = gaussian_filter(padded, width, mode="constant") / np.maximum(weight, 1e-12)
+    weight = scipy.ndimage.gaussian_filter(known, width, mode="constant")
+    filled = scipy.ndimage.gaussian_filter(padded, width, mode="constant") / np.maximum(
+        weight, 1e-12
+    )
     reached = known > 0.0
     width = _SPREAD_SUBAP
     while not reached.all():
-        weight = gaussian_filter(known, width, mode="constant")
-        wider = gaussian_filter(padded, width, mode="constant") / np.maximum(weight, 1e-12)
+        weight = scipy.ndimage.gaussian_filter(known, width, mode="constant")
+        wider = scipy.ndimage.gaussian_filter(padded, width, mode="constant") / np.maximum(
+            weight, 1e-12
+        )
         new = ~reached & (weight > 1e-3)
         filled = np.where(new, wider, filled)
         reached = reached | new
@@ -111,6 +115,6 @@ def _beam(smooth: Array, position: PupilPosition) -> Illumination:
     """Return the map with the beam's centre in its middle."""
     rows, columns = np.indices(smooth.shape, dtype=np.float64)
     places = [rows + position.y_subap, columns + position.x_subap]
-    centred = map_coordinates(smooth, places, order=3, mode="nearest")
+    centred = scipy.ndimage.map_coordinates(smooth, places, order=3, mode="nearest")
     coordinates = np.arange(len(centred), dtype=np.float64) - (len(centred) - 1) / 2
     return Illumination(coordinates=coordinates, intensity=np.maximum(centred, 0.0))

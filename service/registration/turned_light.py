@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from service.errors import ModelError
 from service.model.pupil import Illumination
@@ -177,7 +177,7 @@ def _turned(
     y = rows - (n - 1) / 2 - position.y_subap
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     places = [middle + cosine * y - sine * x, middle + cosine * x + sine * y]
-    return np.asarray(map_coordinates(reference, places, order=1, mode="nearest"))
+    return np.asarray(scipy.ndimage.map_coordinates(reference, places, order=1, mode="nearest"))
 
 
 def _smooth_shapes(known: NDArray[np.bool_], order: int) -> Array:

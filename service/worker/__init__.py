@@ -6,7 +6,7 @@ alone.
 
 from service.worker.bench import Workbench
 from service.worker.margin import InUse, Margin
-from service.worker.process import Apart, Done, Worker, run_job, start_worker
+from service.worker.process import Apart, Done, Worker, begin_early, run_job, start_worker
 from service.worker.records import Compute, Description, Made
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "Margin",
     "Workbench",
     "Worker",
+    "begin_early",
     "run_job",
     "start_worker",
 ]

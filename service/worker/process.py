@@ -98,6 +98,17 @@ class Apart:
             raise answer
         return cast(R, answer)
 
+    def begin(self) -> None:
+        """Begin the process before there is work for it.
+
+        Raises
+        ------
+        EOFError, OSError
+            If there is no process to be had.
+        """
+        with self._busy:
+            self._started()
+
     def kill(self) -> None:
         """End the process at once, whatever it is at; whoever waits for it waits no longer."""
         self._ended.set()
@@ -128,22 +139,40 @@ class Apart:
 class Worker(Apart):
     """A process that keeps the workbench between jobs."""
 
-    def __init__(self, instrument: Instrument, compute: Compute) -> None:
-        super().__init__(nice=compute.nice)
+    def __init__(self) -> None:
+        super().__init__(nice=0)  # until it knows how nice it is to be
         self._entered = False
+        self._enter: Callable[[], None] | None = None
+
+    def told(self, instrument: Instrument, compute: Compute) -> Worker:
+        """Tell it what to work with, and return it."""
         self._enter = functools.partial(_enter, instrument, compute)
+        return self
 
     def run(self, job: Callable[[], Done[R]]) -> Done[R]:
         """Do a job on the workbench; see :meth:`Apart.do`."""
-        if not self._entered:
+        if not self._entered and self._enter is not None:
             self.do(self._enter)
             self._entered = True
         return self.do(job)
 
 
+_early: list[Worker] = []
+"""At most one that waits to be told."""
+
+
+def begin_early() -> None:
+    """Begin the process of the first worker: it imports what it needs while its parent does."""
+    worker = Worker()
+    with contextlib.suppress(EOFError, OSError):  # then the first job begins it, or says why not
+        worker.begin()
+    _early[:] = [worker]
+
+
 def start_worker(instrument: Instrument, compute: Compute) -> Worker:
-    """Return a nice'd worker process; nothing runs before the first job."""
-    return Worker(instrument, compute)
+    """Return a nice'd worker process; nothing runs before the first job but what is early."""
+    worker = _early.pop() if _early else Worker()
+    return worker.told(instrument, compute)
 
 
 def run_job(
@@ -160,6 +189,7 @@ def run_job(
 def _enter(instrument: Instrument, compute: Compute) -> None:
     """Prepare the worker process."""
     global _open_workbench
+    os.nice(compute.nice)
     # made by the first job, so that an impossible instrument fails that job and says why
     _open_workbench = functools.cache(lambda: Workbench(instrument, compute))
 

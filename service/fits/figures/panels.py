@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import svdvals
 
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.interaction import rotation
@@ -28,7 +28,7 @@ def singular_values(axes: Axes, fit: Fit) -> None:
         (fit.synthetic * fit.gains, "synthetic", SYNTHETIC, "-"),
         (fit.measured, "measured", MEASURED, "--"),
     ):
-        values = svdvals(np.asarray(matrix, dtype=np.float64))
+        values = scipy.linalg.svdvals(np.asarray(matrix, dtype=np.float64))
         condition = values[0] / values[-1]
         label = f"{name}, condition {condition:.2f}"
         axes.semilogy(values / values[0], style, color=colour, label=label)

@@ -153,3 +153,20 @@ def test_simulator_and_campaigns_are_reached_through_the_same_program(words, beg
     )
     assert found.returncode == 2
     assert found.stderr.startswith(begins)
+
+
+def test_a_start_imports_no_more_than_it_needs():
+    """Each of these takes a tenth of a second or more, and a start is to take two."""
+    code = (
+        "import sys, service.commands.run; from service.config import load_instrument; "
+        "load_instrument('flao-lbt'); "
+        "late = ('scipy.linalg', 'scipy.spatial', 'scipy.ndimage', 'scipy.interpolate', "
+        "'scipy.sparse', 'scipy.special', 'matplotlib', 'astropy'); "
+        "print([name for name in late if name in sys.modules])"
+    )
+    root = Path(__file__).parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
+    )
+    assert found.stdout.strip() == "[]"

@@ -10,7 +10,7 @@ import pytest
 from service.errors import WorkerError
 from service.runtime import crew as crew_module
 from service.runtime.crew import Crew
-from service.worker import Workbench, run_job, start_worker
+from service.worker import Workbench, begin_early, run_job, start_worker
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 pytestmark = pytest.mark.timeout(60)
@@ -122,6 +122,21 @@ async def test_the_worker_tells_the_processor_time_of_every_kind_of_job(crew):
 
 async def test_an_interrupt_from_the_keyboard_is_the_services_business(crew):
     assert await crew.call(interrupted) == "still here"
+
+
+async def test_a_worker_that_began_early_is_the_first_one_and_as_polite():
+    begin_early()
+    worker = start_worker(small_instrument(), type(COMPUTE)(threads=1, nice=5))
+    early = worker.pid
+    assert early is not None
+    crew = Crew(lambda: worker)
+    try:
+        assert await crew.call(process_id) == early
+        assert await crew.call(niceness) == os.nice(0) + 5
+        other = start_worker(small_instrument(), COMPUTE)
+        assert other.pid is None
+    finally:
+        crew.dismiss()
 
 
 async def test_the_worker_is_polite():

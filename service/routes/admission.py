@@ -215,9 +215,9 @@ class _Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._since_s = self.loop.time()
-        others = [c for c in self.connections if isinstance(c, _Connection) and c is not self]
-        if len(others) >= MOST_CONNECTIONS:
-            resting = [c for c in others if c.rests]
+        others = [c for c in self.connections if isinstance(c, _Connection) and c.stands]
+        if len(others) > MOST_CONNECTIONS:
+            resting = [c for c in others if c.rests and c is not self]
             if resting:
                 min(resting, key=lambda c: c._since_s).transport.abort()  # noqa: SLF001 - its own
             else:
@@ -243,6 +243,11 @@ class _Connection(H11Protocol):
     @override
     def send_400_response(self, msg: str) -> None:
         self._answer(HTTPStatus.BAD_REQUEST, "http", msg)
+
+    @property
+    def stands(self) -> bool:
+        """Whether it has not been ended yet; one that has is gone a moment later."""
+        return not self.transport.is_closing()
 
     @property
     def rests(self) -> bool:

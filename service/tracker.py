@@ -15,6 +15,7 @@ from service.reactions.activity import refuse_if_occupied
 from service.reactions.decision import decide
 from service.reactions.dither import on_dither, on_silence, on_vibrations
 from service.reactions.dither_schedule import learnt
+from service.reactions.dither_unwanted import on_measured
 from service.reactions.evidence import over as ended
 from service.reactions.journal import logged, with_alarm
 from service.reactions.loop import close_again, on_loop
@@ -146,6 +147,8 @@ def _react_to_matrices(  # noqa: C901 - one line for each event
             return on_dither(state, event, now_ns), ()
         case ev.DitherSilent():
             return on_silence(state, event, now_ns), ()
+        case ev.DitherMeasured():
+            return on_measured(state, event, policy, now_ns)
         case ev.JobFailed(effect=effect, text=text):
             return on_failure(state, effect, text, now_ns), ()
         case _:

@@ -23,7 +23,8 @@ CHUNK_FRAMES = 512
 """Frames multiplied at once: the sums, 2 MB, are read from memory once for all of them."""
 
 MIN_AMPLITUDE_RATIO = 0.5
-"""A dither weaker than this share of its request was not applied as asked."""
+MAX_AMPLITUDE_RATIO = 1.5
+"""A dither weaker or stronger than these shares of its request was not applied as asked."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -264,12 +265,14 @@ def _close(plan: LockInPlan, window: Window[_Sums]) -> Spectra | WindowRefused:
     weight = 0.5 * plan.n_frames / np.sqrt(2.0)
     applied = np.abs(dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
     ratio = applied / np.array(plan.amplitude_m)
-    if ratio.min() < MIN_AMPLITUDE_RATIO:
-        weakest = int(ratio.argmin())
+    if ratio.min() < MIN_AMPLITUDE_RATIO or ratio.max() > MAX_AMPLITUDE_RATIO:
+        weak = ratio.min() < MIN_AMPLITUDE_RATIO
+        worst = int(ratio.argmin() if weak else ratio.argmax())
+        see = "see whether the RTC clips it" if weak else "see the RTC's units"
         return WindowRefused(
-            reason=f"mode {plan.modes[weakest]} carries {applied[weakest] * 1e9:.2f} nm of dither "
-            f"at {plan.frequencies_hz[weakest]} Hz, {plan.amplitude_m[weakest] * 1e9:.2f} nm were "
-            "asked for: see whether the RTC clips it",
+            reason=f"mode {plan.modes[worst]} carries {applied[worst] * 1e9:.2f} nm of dither at "
+            f"{plan.frequencies_hz[worst]} Hz, {plan.amplitude_m[worst] * 1e9:.2f} nm were asked "
+            f"for: {see}",
             t_ns_utc=window.span.next_t_ns,
         )
     return Spectra(

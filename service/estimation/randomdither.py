@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.estimation.frames import FrameBlock
-from service.estimation.lockin import MIN_AMPLITUDE_RATIO
+from service.estimation.lockin import MAX_AMPLITUDE_RATIO, MIN_AMPLITUDE_RATIO
 from service.estimation.span import Steps, Window, WindowRefused, advanced, cut
 
 Array = NDArray[Any]
@@ -302,12 +302,13 @@ def _close(plan: RandomPlan, window: Window[_Sums]) -> Correlated | WindowRefuse
     power = np.diag(sums.dither_power.sum(axis=0)) / max(sums.n_pairs, 1)
     applied = np.sqrt(power)
     ratio = applied / np.array(plan.amplitude_m)
-    if ratio.min() < MIN_AMPLITUDE_RATIO:
-        weakest = int(ratio.argmin())
+    if ratio.min() < MIN_AMPLITUDE_RATIO or ratio.max() > MAX_AMPLITUDE_RATIO:
+        weak = ratio.min() < MIN_AMPLITUDE_RATIO
+        worst = int(ratio.argmin() if weak else ratio.argmax())
+        see = "see whether the RTC clips it" if weak else "see the RTC's units"
         return WindowRefused(
-            reason=f"mode {plan.modes[weakest]} carries {applied[weakest] * 1e9:.2f} nm of dither, "
-            f"{plan.amplitude_m[weakest] * 1e9:.2f} nm were asked for: see whether the RTC clips "
-            "it",
+            reason=f"mode {plan.modes[worst]} carries {applied[worst] * 1e9:.2f} nm of dither, "
+            f"{plan.amplitude_m[worst] * 1e9:.2f} nm were asked for: {see}",
             t_ns_utc=window.span.next_t_ns,
         )
     return Correlated(

@@ -39,6 +39,7 @@ from service.events.effects import (
 from service.events.heard import (
     Acknowledged,
     DitherAnswered,
+    DitherMeasured,
     DitherSilent,
     Event,
     FarFitted,
@@ -76,6 +77,7 @@ __all__ = [
     "Command",
     "CopyMatrix",
     "DitherAnswered",
+    "DitherMeasured",
     "DitherSilent",
     "Effect",
     "Event",

@@ -206,6 +206,19 @@ class DitherSilent:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DitherMeasured:
+    """What the frames hold of a dither is otherwise than it was asked for, or is so no more."""
+
+    id: str
+    found_m: float
+    """RMS of all modes together, metres OPD."""
+
+    asked_m: float
+    text: str
+    """What is otherwise; empty: nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Vibrations:
     """The vibration lines in the slopes are others than before."""
 
@@ -264,6 +277,7 @@ Event = (
     | Acknowledged
     | DitherAnswered
     | DitherSilent
+    | DitherMeasured
     | Vibrations
     | LoopAnswered
     | MatrixMeasured

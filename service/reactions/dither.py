@@ -108,7 +108,7 @@ def _corrected(
     if running == asked:
         return state
     if total_m(running) > ROUNDING * max(total_m(asked), state.dithering.budget_m):
-        state = replace(state, dithering=replace(state.dithering, loud_id=running.id))
+        state = replace(state, dithering=replace(state.dithering, loud_id=running.id, loud_text=""))
     text = (
         f"{asked.id}: the RTC plays modes {running.modes}, {running.frequency_hz} Hz, "
         f"{running.amplitude_m} m from frame {running.start_seq}; asked for were modes "

@@ -10,6 +10,7 @@ from service.control.dither_modes import SPAN, most_telling
 from service.control.dithering import clear_of
 from service.errors import ModelError
 from service.estimation.lockin import SIDE_OFFSETS_HZ, LockInPlan
+from service.estimation.played import Asked
 from service.reactions.policy import Policy
 from service.state import DitherKind, DitherView, RtcView
 
@@ -137,6 +138,20 @@ def lock_in_plan(dither: DitherView, rtc: RtcView, window_s: float) -> LockInPla
         frame_rate_hz=rtc.frame_rate_hz,
         n_frames=round((dither.window_s or window_s) * rtc.frame_rate_hz),
         first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
+    )
+
+
+def asked_of(dither: DitherView, rtc: RtcView) -> Asked:
+    """Return a dither as the frames should hold it."""
+    first_seq = dither.start_seq or 0
+    return Asked(
+        modes=dither.modes,
+        amplitude_m=dither.amplitude_m,
+        frequency_hz=dither.frequency_hz,
+        frame_rate_hz=rtc.frame_rate_hz,
+        first_seq=first_seq,
+        stop_seq=first_seq + round(dither.duration_s * rtc.frame_rate_hz),
+        own=tuple(mode not in rtc.in_loop for mode in dither.modes),
     )
 
 

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service import events as ev
 from service.events import AskNoDither
 from service.reactions.activity import GONE_WITHIN_S
 from service.reactions.dither_choice import OUR_DITHERS, OWN_DITHER, total_m
 from service.reactions.dither_pace import budget_m
 from service.reactions.journal import with_alarm, without_alarm
 from service.reactions.matrices import Step
+from service.reactions.noisy import cut_off
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import DitherKind, DitherView, RtcView, TrackerState
 
@@ -22,6 +24,12 @@ NOT_STOPPED = "dither-not-stopped"
 
 OVER_BUDGET = "dither-over-budget"
 """Alarm from when the RTC plays a dither stronger than it may until it plays one as it may."""
+
+NOT_AS_ASKED = "dither-not-as-asked"
+"""Alarm while the frames hold another dither than the one that was asked for."""
+
+MEASURED = 1.1
+"""What a second of frames may hold more than is allowed, before it is too strong."""
 
 ROUNDING = 1.001
 """What a dither may be stronger by than what was asked for."""
@@ -54,6 +62,31 @@ def without_unwanted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: 
         state = with_alarm(state, NOT_STOPPED, text, now_ns)
     if now_ns - state.dithering.told_ns_utc < TELL_EVERY_S * SECOND_NS:
         return state, ()
+    return told_to_stop(state, now_ns), (AskNoDither(),)
+
+
+def on_measured(state: TrackerState, event: ev.DitherMeasured, policy: Policy, now_ns: int) -> Step:
+    """Name a dither that the frames show to be otherwise than asked; stop one that is too strong.
+
+    What the commands hold is what the mirror does, whatever the RTC's status says.
+    """
+    rtc, dither = state.rtc, state.dither
+    if not event.text:
+        state = replace(state, dithering=replace(state.dithering, loud_text="", amiss_id=None))
+        return without_alarm(without_alarm(state, NOT_AS_ASKED, now_ns), OVER_BUDGET, now_ns), ()
+    if rtc is None or dither is None or dither.id != event.id:
+        return state, ()
+    dithering = replace(state.dithering, amiss_id=event.id, amiss_m=event.found_m)
+    state = replace(state, dithering=dithering)
+    most_m = budget_m(rtc, policy)
+    if event.found_m <= MEASURED * max(event.asked_m, most_m):
+        text = f"{event.text}; look at the RTC's dither"
+        return with_alarm(state, NOT_AS_ASKED, text, now_ns), ()
+    loud = f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
+    state = cut_off(state, f"its dither was too strong: {event.text}", now_ns)
+    state = _met(state, event.id, now_ns)
+    dithering = replace(state.dithering, loud_id=event.id, loud_text=loud)
+    state = _alarmed(replace(state, dithering=dithering), event.id, loud, now_ns)
     return told_to_stop(state, now_ns), (AskNoDither(),)
 
 
@@ -104,10 +137,17 @@ def _alarmed(state: TrackerState, running: str, loud: str, now_ns: int) -> Track
 
 def _forgiven(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState:
     """End the alarm of a dither too strong once one is played as it may, or none is wanted."""
-    fine = state.dither is not None and rtc.dither is not None and rtc.dither.id == state.dither.id
-    if fine or state.dither_stopped or not policy.dither_enabled:
-        return without_alarm(state, OVER_BUDGET, now_ns)
-    return state
+    by_frames = bool(state.dithering.loud_text)
+    fine = (
+        not by_frames
+        and state.dither is not None
+        and rtc.dither is not None
+        and rtc.dither.id == state.dither.id
+    )
+    given_up = state.dither_stopped or not policy.dither_enabled
+    if given_up:
+        state = without_alarm(state, NOT_AS_ASKED, now_ns)
+    return without_alarm(state, OVER_BUDGET, now_ns) if fine or given_up else state
 
 
 def _too_strong(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
@@ -122,6 +162,8 @@ def _too_strong(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None
     over = own_sine(running) and found_m > ROUNDING * most_m
     if not over and running.id != state.dithering.loud_id:
         return None
+    if running.id == state.dithering.loud_id and state.dithering.loud_text:
+        return state.dithering.loud_text
     return (
         f"the RTC plays a dither of {1e9 * found_m:.3g} nm RMS in all, more than the budget of "
         f"{1e9 * most_m:.3g} nm"

@@ -9,12 +9,15 @@ from dataclasses import replace
 
 from service import events as ev
 from service.errors import ModelError
+from service.estimation.played import LOUDER, Finding
 from service.events import Event
-from service.reactions.alarms import Act, forbidding
+from service.reactions.alarms import OFF_LOOP, WRONG_LOOP, WRONG_UNIT, Act, forbidding
 from service.reactions.dither import SILENT_S
+from service.reactions.dither_unwanted import NOT_AS_ASKED, OVER_BUDGET
 from service.reactions.policy import Policy
-from service.runtime.streams import Streams, shape_mismatch, troubles, with_dither, with_rtc
-from service.state import Level, TrackerState
+from service.runtime.streams import VERDICTS, Streams, with_dither, with_rtc
+from service.state import Level, RtcView, TrackerState
+from service.worker import Description
 
 
 def followed(
@@ -47,6 +50,8 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
     due = silent_s >= SILENT_S and int(2 * silent_s) > int(2 * was_silent_s)
     if dither is not None and due:
         found.append(ev.DitherSilent(id=dither.id, silent_s=silent_s))
+    if dither is not None and streams.played is not None:
+        found += _misplayed(dither.id, streams.played, state)
     lines = () if streams.hearing is None else streams.hearing.lines_hz
     if streams.hearing is not None and lines != state.vibrations_hz:
         found.append(ev.Vibrations(lines_hz=lines))
@@ -56,6 +61,21 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
             text, t_ns = trouble or over, streams.heard_ns_utc
             found.append(ev.Trouble(name=name, text=text, over=known, t_ns_utc=t_ns))
     return found
+
+
+def _misplayed(dither_id: str, played: Finding, state: TrackerState) -> list[Event]:
+    """Return what the frames hold of the dither, where it is told for the first time or is over."""
+    told = state.dithering
+    raised = any(alarm.name in {NOT_AS_ASKED, OVER_BUDGET} for alarm in state.alarms)
+    louder = played.found_m > LOUDER * told.amiss_m
+    news = told.amiss_id != dither_id or louder if played.text else raised
+    if not news:
+        return []
+    return [
+        ev.DitherMeasured(
+            id=dither_id, found_m=played.found_m, asked_m=played.asked_m, text=played.text
+        )
+    ]
 
 
 def shape_news(streams: Streams, state: TrackerState) -> Event | None:
@@ -68,3 +88,43 @@ def shape_news(streams: Streams, state: TrackerState) -> Event | None:
         return None
     text = reason or "the RTC's telemetry fits the instrument file again"
     return ev.Trouble(name="instrument-mismatch", text=text, over=known)
+
+
+def shape_mismatch(description: Description, rtc: RtcView) -> str | None:
+    """Return why this RTC's telemetry is not of the instrument in the file, or None."""
+    if (rtc.n_slopes, rtc.n_modes) == (description.n_slopes, description.n_modes):
+        return None
+    return (
+        f"the RTC has {rtc.n_slopes} slopes and {rtc.n_modes} modes, the instrument file "
+        f"{description.n_slopes} and {description.n_modes}: wrong instrument file?"
+    )
+
+
+def troubles(streams: Streams) -> list[tuple[str, str | None, str]]:
+    """Return name, text (None: all is well) and what is said when it is over, of each alarm."""
+    health, edge, off = streams.health, streams.edge, streams.off
+    diverging = (
+        f"the loop is diverging: its high modes carry {health.ratio:.0f} times what turbulence "
+        "asks of them; open the loop, lower the gain or control fewer modes"
+    )
+    slipped = (
+        f"an outer actuator stands {edge.ratio:.0f} sigma from where turbulence would have it: "
+        "the edge has slipped, whatever the slopes say; open the loop and close it again with "
+        "fewer modes or a leak of 0.99"
+    )
+    absurd = (
+        f"commands are {health.ratio:.3g} times what turbulence asks: {health.unit}; nothing is "
+        "measured, made or sent until the RTC sends metres"
+    )
+    unlawful = (
+        f"the RTC's loop is not what its status tells: {'; '.join(streams.unlawful[-1:])}; mend "
+        "its status, or its loop"
+    )
+    n_verdicts = len(streams.unlawful)
+    return [
+        (WRONG_UNIT, absurd if health.absurd else None, "commands are what a mirror can play"),
+        (WRONG_LOOP, unlawful if n_verdicts >= VERDICTS else None, "the loop is as told again"),
+        ("loop-diverging", diverging if health.diverging else None, "the high modes are calm"),
+        ("edge-slip", slipped if edge.slipped else None, "the outer ring is back"),
+        (OFF_LOOP, None if off is None else off.text, "commands obey the loop equation again"),
+    ]

@@ -16,10 +16,10 @@ from service.estimation.lockin import LockIn, Spectra, WindowRefused
 from service.estimation.loopcheck import LoopCheck, LoopTerms, Obedience
 from service.estimation.looplaw import LoopLaw
 from service.estimation.passive import Passive
+from service.estimation.played import Finding, Meter, measured
 from service.estimation.randomdither import Correlated, RandomDither
 from service.estimation.vibration import Hearing, heard, hearing
-from service.reactions.alarms import OFF_LOOP, WRONG_LOOP, WRONG_UNIT
-from service.reactions.dither_choice import SETTLING_S, lock_in_plan
+from service.reactions.dither_choice import SETTLING_S, asked_of, lock_in_plan
 from service.reactions.random_dither import random_plan
 from service.reactions.verdicts import same_loop
 from service.state import DitherKind, DitherView, RtcView
@@ -61,6 +61,12 @@ class Streams:
 
     dither: DitherView | None = None
     """The one whose windows are under way, or cannot be."""
+
+    meter: Meter | None = None
+    """Of how strong that is on the mirror; None as above."""
+
+    played: Finding | None = None
+    """What the last second of frames held of it; None: too few have come."""
 
     dither_seen_seq: int = 0
     """Up to here the frames held it, or it need not have been there."""
@@ -245,7 +251,8 @@ def with_dither(streams: Streams, dither: DitherView | None, window_s: float) ->
     """
     rtc = streams.rtc
     if dither is None or dither.start_seq is None or rtc is None:
-        return replace(streams, lock_in=None, random=None, dither=None, dither_silent_s=0.0)
+        streams = replace(streams, lock_in=None, random=None, dither=None, dither_silent_s=0.0)
+        return replace(streams, meter=None, played=None)
     dither = replace(dither, asked_ns_utc=0)
     if dither == streams.dither:
         return streams
@@ -256,6 +263,8 @@ def with_dither(streams: Streams, dither: DitherView | None, window_s: float) ->
         lock_in=None,
         random=None,
         dither=dither,
+        meter=Meter(asked=asked_of(dither, rtc)),
+        played=None,
         dither_seen_seq=seen_seq,
         dither_silent_s=0.0,
     )
@@ -366,7 +375,11 @@ def _beyond_the_dither(streams: Streams, rtc: RtcView, reading: LockIn | RandomD
 def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:
     """Note whether a block holds the dither that should be there."""
     dither, next_seq = streams.dither, block.first_seq + block.n_frames
-    if block.dither_m is not None:
+    if streams.meter is not None:
+        meter, found = measured(streams.meter, block)
+        streams = replace(streams, meter=meter, played=found or streams.played)
+    # an RTC may always send the columns
+    if block.dither_m is not None and block.dither_m.any():
         return replace(streams, dither_seen_seq=next_seq, dither_silent_s=0.0)
     if dither is None:
         return streams
@@ -389,46 +402,6 @@ def _obeying(streams: Streams, window: Window) -> Window:
     return WindowRefused(reason=found.text, t_ns_utc=window.t_end_ns_utc)
 
 
-def troubles(streams: Streams) -> list[tuple[str, str | None, str]]:
-    """Return name, text (None: all is well) and what is said when it is over, of each alarm."""
-    health, edge, off = streams.health, streams.edge, streams.off
-    diverging = (
-        f"the loop is diverging: its high modes carry {health.ratio:.0f} times what turbulence "
-        "asks of them; open the loop, lower the gain or control fewer modes"
-    )
-    slipped = (
-        f"an outer actuator stands {edge.ratio:.0f} sigma from where turbulence would have it: "
-        "the edge has slipped, whatever the slopes say; open the loop and close it again with "
-        "fewer modes or a leak of 0.99"
-    )
-    absurd = (
-        f"commands are {health.ratio:.3g} times what turbulence asks: {health.unit}; nothing is "
-        "measured, made or sent until the RTC sends metres"
-    )
-    unlawful = (
-        f"the RTC's loop is not what its status tells: {'; '.join(streams.unlawful[-1:])}; mend "
-        "its status, or its loop"
-    )
-    n_verdicts = len(streams.unlawful)
-    return [
-        (WRONG_UNIT, absurd if health.absurd else None, "commands are what a mirror can play"),
-        (WRONG_LOOP, unlawful if n_verdicts >= VERDICTS else None, "the loop is as told again"),
-        ("loop-diverging", diverging if health.diverging else None, "the high modes are calm"),
-        ("edge-slip", slipped if edge.slipped else None, "the outer ring is back"),
-        (OFF_LOOP, None if off is None else off.text, "commands obey the loop equation again"),
-    ]
-
-
 def _fits(rtc: RtcView, block: FrameBlock) -> bool:
     """Return whether a block has as many slopes and modes as the RTC's status says."""
     return (block.slopes.shape[1], block.commands_m.shape[1]) == (rtc.n_slopes, rtc.n_modes)
-
-
-def shape_mismatch(description: Description, rtc: RtcView) -> str | None:
-    """Return why this RTC's telemetry is not of the instrument in the file, or None."""
-    if (rtc.n_slopes, rtc.n_modes) == (description.n_slopes, description.n_modes):
-        return None
-    return (
-        f"the RTC has {rtc.n_slopes} slopes and {rtc.n_modes} modes, the instrument file "
-        f"{description.n_slopes} and {description.n_modes}: wrong instrument file?"
-    )

@@ -119,6 +119,15 @@ class Dithering:
     loud_ns_utc: int = 0
     """When one that was too strong was last told to stop; 0: none ever was."""
 
+    loud_text: str = ""
+    """What the frames held of that one; empty: its status told."""
+
+    amiss_id: str | None = None
+    """The last dither of which the frames held something else than was asked for."""
+
+    amiss_m: float = 0.0
+    """RMS of all of it, metres OPD."""
+
     mean_square_m2: float = 0.0
     """Mean square of what has been on the mirror, over ten minutes, metres OPD squared."""
 

@@ -9,11 +9,12 @@ from service.reactions.dither_choice import total_m
 from service.reactions.dither_unwanted import (
     CALM_S,
     GONE_WITHIN_S,
+    NOT_AS_ASKED,
     NOT_STOPPED,
     OVER_BUDGET,
     TELL_EVERY_S,
 )
-from service.state import DitherPhase
+from service.state import AcquisitionStage, DitherPhase, NoisyState
 from tests.unit.reactions.situations import POLICY, Story, of_kind, rtc
 
 START = 1000
@@ -235,3 +236,84 @@ def test_settings_that_forbid_it_do_not_tolerate_what_an_earlier_service_has_lef
     asked = of_kind(playing(story, dither, 20), ev.AskNoDither)
     assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
     assert "the settings forbid" in next(a.text for a in story.state.alarms)
+
+
+class TestByTheFrames:
+    """The status says what was asked for; the frames hold something else."""
+
+    @pytest.fixture
+    def on(self, story):
+        accept(story, story.state.dither)
+        playing(story, story.state.dither)
+        return story.state.dither
+
+    def measured(self, story, dither, by, text="the frames hold much"):
+        asked = total_m(dither)
+        return story.tell(
+            ev.DitherMeasured(id=dither.id, found_m=by * asked, asked_m=asked, text=text)
+        )
+
+    def test_too_strong_it_is_stopped_at_once_and_named(self, story, on):
+        assert of_kind(self.measured(story, on, 20.0), ev.AskNoDither)
+        assert story.state.dither is None
+        (alarm,) = [a for a in story.state.alarms if a.name == OVER_BUDGET]
+        assert "the frames hold much; the budget is 8 nm" in alarm.text
+
+    def test_a_status_that_goes_on_saying_all_is_well_ends_no_alarm(self, story, on):
+        self.measured(story, on, 20.0)
+        (asked,) = of_kind(silent(story, round(CALM_S) + 3), ev.AskDither)
+        accept(story, asked.dither)
+        playing(story, asked.dither, 2)
+        assert OVER_BUDGET in story.alarms
+        self.measured(story, asked.dither, 1.0, text="")
+        assert OVER_BUDGET not in story.alarms
+
+    def test_one_that_is_not_stopped_is_told_again_and_again(self, story, on):
+        self.measured(story, on, 20.0)
+        asked = of_kind(playing(story, on, 20), ev.AskNoDither)
+        assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+        assert {OVER_BUDGET, NOT_STOPPED} <= story.alarms
+
+    def test_otherwise_than_asked_but_within_the_budget_it_is_named_and_goes_on(self, story, on):
+        assert not self.measured(story, on, 0.1)
+        assert story.state.dither is not None
+        assert NOT_AS_ASKED in story.alarms
+        self.measured(story, on, 1.0, text="")
+        assert NOT_AS_ASKED not in story.alarms
+
+    def test_what_an_operator_asked_for_may_cost_more_than_the_budget(self, story):
+        story.tell(ev.StopDither())
+        story.tell(ev.StatusSeen(rtc=rtc()), after_s=1.0)
+        meant = ev.StartDither(
+            modes=(501,), frequency_hz=(250.0,), amplitude_m=15e-9, over_budget=True
+        )
+        story.tell(meant)
+        dither = story.state.dither
+        accept(story, dither)
+        playing(story, dither)
+        assert not self.measured(story, dither, 1.05)
+        assert of_kind(self.measured(story, dither, 2.0), ev.AskNoDither)
+
+    def test_an_acquisition_ends_and_says_why(self):
+        story = Story(policy=replace(POLICY, acquires=True)).meet()
+        story.tell(ev.Acquire())
+        story.tell(ev.SessionStarted(session="s2"))
+        view = rtc(session="s2", loop="open", gains=(0.0,) * 594)
+        story.tell(ev.StatusSeen(rtc=view))
+        dither = story.state.dither
+        accept(story, dither)
+        self.measured(story, dither, 5.0)
+        assert story.state.acquisition.stage is AcquisitionStage.FAILED
+        assert "the frames hold much" in story.state.acquisition.text
+
+    def test_a_noisy_matrix_ends_and_says_why(self, story):
+        story.tell(ev.StopDither())
+        story.tell(ev.StatusSeen(rtc=rtc()), after_s=1.0)
+        story.tell(ev.MeasureNoisy(id="noisy-1"))
+        dither = story.state.dither
+        accept(story, dither)
+        playing(story, dither)
+        self.measured(story, dither, 5.0)
+        (noisy,) = story.state.noisy
+        assert noisy.state is NoisyState.FAILED
+        assert "too strong" in noisy.reason

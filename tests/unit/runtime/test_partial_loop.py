@@ -10,7 +10,8 @@ from service import events as ev
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.estimation.edge import LOW_MODES
-from service.runtime.streams import Streams, fed, shape_mismatch, taken, with_rtc
+from service.runtime.following import shape_mismatch
+from service.runtime.streams import Streams, fed, taken, with_rtc
 from service.state import Mode, Source
 from service.worker import Workbench
 from studies.campaign.observatory import Observatory

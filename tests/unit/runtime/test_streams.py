@@ -8,13 +8,11 @@ from service.errors import ModelError
 from service.estimation.edge import LOW_MODES, Actuators
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra, WindowRefused
-from service.runtime.following import news
+from service.runtime.following import news, shape_mismatch, troubles
 from service.runtime.streams import (
     Streams,
     fed,
-    shape_mismatch,
     taken,
-    troubles,
     with_dither,
     with_matrix,
     with_rtc,
@@ -500,3 +498,32 @@ class TestLaw:
         found = self.after((slopes, commands * np.float32(1e9), None))
         assert "nanometres" in found["command-unit"]
         assert not {"loop-diverging", "edge-slip"} & set(found)
+
+
+class TestStrengthOfTheDither:
+    """By the frames, whatever the status says."""
+
+    def test_windows_of_one_that_is_twenty_times_too_strong_are_refused(self, streams):
+        asked = replace(DITHER, amplitude_m=(5e-9 / 20,))
+        streams = with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), asked, WINDOW_S)
+        _, windows = play(streams, 0, 20)
+        assert windows
+        assert all(isinstance(window, WindowRefused) for window in windows)
+        assert "0.25 nm were asked for" in windows[0].reason
+
+    def test_it_is_news_once_and_again_when_it_is_over(self, streams):
+        state = TrackerState(system="s", rtc=RTC)
+        asked = replace(DITHER, amplitude_m=(5e-9 / 20,))
+        streams = with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), asked, WINDOW_S)
+        streams, _ = play(streams, 0, 12)
+        (told,) = [e for e in news(0.0, streams, state) if isinstance(e, ev.DitherMeasured)]
+        assert told.found_m == pytest.approx(5e-9, rel=0.01)
+        told_of = replace(state.dithering, amiss_id=told.id, amiss_m=told.found_m)
+        state = replace(state, dithering=told_of)
+        assert not [e for e in news(0.0, streams, state) if isinstance(e, ev.DitherMeasured)]
+
+    def test_columns_that_hold_nothing_hold_no_dither(self, streams):
+        quiet = block(0, dither=True)
+        quiet = replace(quiet, dither_m=np.zeros_like(quiet.dither_m))
+        streams, _ = fed(streams, quiet)
+        assert streams.dither_silent_s == pytest.approx(0.1)

@@ -75,6 +75,7 @@ class Bridge:
         self._measured = MeasuredIntake(self._keys)
         self._outbox = Outbox(endpoint.offer_s)
         self._session: zenoh.Session | None = None
+        self._closed = False
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._held: list[object] = []
 
@@ -105,6 +106,10 @@ class Bridge:
         """
         if self._session is not None:
             raise LinkError(f"the link of {self._endpoint.system} is open already")
+        self._closed = False
+        self._open()
+
+    def _open(self) -> None:
         self._session = session = link.open_session(self._endpoint)
         try:
             self._declare(session)
@@ -115,6 +120,7 @@ class Bridge:
 
     def close(self) -> None:
         """Leave the network; the process can exit. Closing twice does nothing."""
+        self._closed = True
         session, self._session = self._session, None
         self._publishers.clear()
         self._held.clear()
@@ -122,6 +128,25 @@ class Bridge:
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
             self._log.info("link.closed")
+
+    def reopen(self) -> None:
+        """Close the session and open another, unless the link is closed: every RTC connects anew.
+
+        Raises
+        ------
+        LinkError
+            If the port has been taken meanwhile, or no router answers: then it is closed.
+        """
+        session, self._session = self._session, None
+        self._publishers.clear()
+        self._held.clear()
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+        self._intake.liveliness(alive=False)
+        if not self._closed:
+            self._open()
+        if self._closed:  # meanwhile, in another thread
+            self.close()
 
     def expect(self, basis_id: str | None, config_id: str | None) -> None:
         """Refuse frames of any other basis or sensor configuration; None: adopt the first seen."""

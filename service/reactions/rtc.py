@@ -178,5 +178,8 @@ def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> T
 def on_vanished(state: TrackerState, now_ns: int) -> TrackerState:
     """Forget what belonged to the RTC, and nothing else."""
     state = gone(found_again(replace(state, rtc=None, dither=None), now_ns), now_ns)
-    text = "the RTC vanished; α and every reconstructor are kept: restart the RTC"
+    text = (
+        "the RTC's token is gone: it has ended, stood still for over 2 s or lost the network; α "
+        "and every reconstructor are kept; it comes back by itself if it runs, else restart it"
+    )
     return with_alarm(state, "rtc-vanished", text, now_ns)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service import events as ev
 from service.archive import Archive
-from service.errors import PyrcalError, StorageError, WorkerError
+from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.randomdither import Correlated
 from service.events import Command, Effect, Event
@@ -31,7 +31,7 @@ from service.runtime.following import followed, news, shape_news
 from service.runtime.pace import PaceMeter
 from service.runtime.recording import Recorder
 from service.runtime.streams import Streams, Window, fed, taken, with_matrix
-from service.runtime.waiting import Facts, Told, news_of_link, waiting_for
+from service.runtime.waiting import Facts, Revival, Told, news_of_link, waiting_for
 from service.runtime.windows import Backlog, fitted, listened, watched
 from service.state import Level, LogEntry, MeasureState, TrackerState, Waiting
 from service.tracker import step
@@ -237,8 +237,10 @@ class Supervisor:
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
-        told = Told()
+        told, revival = Told(), Revival()
         while True:
+            if revival.due(self._bridge.statistics(), time.monotonic()):
+                await self._reopen_link()
             self._post(ev.Tick())
             self._meter.look()
             for trouble in self._meter.news(self._state):
@@ -263,6 +265,19 @@ class Supervisor:
                 )
             alarms = raised
             await asyncio.sleep(1.0)
+
+    async def _reopen_link(self) -> None:
+        """Open the link anew, for as long as that takes."""
+        while True:
+            try:
+                await asyncio.to_thread(self._bridge.reopen)
+            except LinkError as error:
+                self._note("link.lost", f"{error}; tried again every 5 s", Level.ALARM)
+                await asyncio.sleep(5.0)
+            else:
+                text = "the RTC's token was there and nothing came: the link was opened anew"
+                self._note("link.reopened", text, Level.WARNING)
+                return
 
     async def _fit(self) -> None:
         while True:

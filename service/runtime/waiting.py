@@ -25,6 +25,12 @@ from service.state import (
 SILENT_S: Final = 3.0
 """What has not come for so long is waited for."""
 
+REVIVED_AFTER_S: Final = 10.0
+"""With the RTC's token there and no message, until the link is opened anew for the first time."""
+
+REVIVED_AT_MOST_S: Final = 300.0
+"""Longest time between two such attempts."""
+
 FAULT_S: Final = 10.0
 """A message that broke the contract is complained of for so long."""
 
@@ -195,7 +201,10 @@ def _for_messages(facts: Facts) -> Iterator[Waiting]:
         text = f"no RTC is there: start it, as a zenoh client of this service, system {where}"
         yield Waiting(name="rtc", party=Party.RTC, text=text)
     elif link.session is None or no_status:
-        text = f"its token is there, and nothing comes: send {where}/tel/frames and tel/status"
+        text = (
+            f"its token is there, and nothing comes: send {where}/tel/frames and tel/status (after "
+            f"{REVIVED_AFTER_S:.0f} s the link is opened anew: a connection may be left over)"
+        )
         yield Waiting(name="telemetry", party=Party.RTC, text=text)
     elif link.frame_age_s is None or link.frame_age_s >= SILENT_S:
         text = f"it sends statuses and no frames: send them on {where}/tel/frames"
@@ -306,6 +315,36 @@ _LOOKS: Final[tuple[Callable[[Facts], Iterator[Waiting]], ...]] = (
     _for_measurements,
     _for_the_operator,
 )
+
+
+class Revival:
+    """When the link is opened anew: the RTC's token is there, and nothing comes.
+
+    After a standstill of both ends zenoh can leave a connection over under the RTC's name. It
+    carries the token and nothing else, and the router lets no second one of that name in: the RTC
+    runs, and nothing of it arrives until one of the ends begins anew.
+    """
+
+    __slots__ = ("_since_s", "_wait_s")
+
+    def __init__(self) -> None:
+        self._since_s: float | None = None
+        self._wait_s = REVIVED_AFTER_S
+
+    def due(self, link: LinkStatistics, now_s: float) -> bool:
+        """Return whether it is time; each time in vain, it is twice as long to the next."""
+        heard = any(fate.age_s < SILENT_S for fate in link.fates)
+        if heard:
+            self._wait_s = REVIVED_AFTER_S
+        if heard or not link.rtc_alive:
+            self._since_s = None
+            return False
+        if self._since_s is None:
+            self._since_s = now_s
+        if now_s - self._since_s < self._wait_s:
+            return False
+        self._since_s, self._wait_s = None, min(2 * self._wait_s, REVIVED_AT_MOST_S)
+        return True
 
 
 class Told:

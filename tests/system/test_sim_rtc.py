@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -40,6 +39,7 @@ from service.wire import (
     split,
 )
 from sim_rtc.session import client_config
+from tests.system.cable import Cable
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -209,46 +209,6 @@ def rtc(tmp_path_factory):
         process.kill()
         process.wait()
         listener.close()
-
-
-class Cable:
-    """A TCP connection through here that can be cut, and kept from coming back."""
-
-    def __init__(self, to_port: int) -> None:
-        self.to_port, self.plugged = to_port, threading.Event()
-        self.plugged.set()
-        self.ends: list[socket.socket] = []
-        self.door = socket.create_server(("127.0.0.1", 0))
-        self.port = int(self.door.getsockname()[1])
-        threading.Thread(target=self._serve, daemon=True).start()
-
-    def cut(self) -> None:
-        self.plugged.clear()
-        for end in self.ends:
-            end.close()
-
-    def _serve(self) -> None:
-        while True:
-            near, _ = self.door.accept()
-            if not self.plugged.is_set():
-                near.close()
-                continue
-            far = socket.create_connection(("127.0.0.1", self.to_port))
-            self.ends += [near, far]
-            for a, b in ((near, far), (far, near)):
-                threading.Thread(target=self._carry, args=(a, b), daemon=True).start()
-
-    @staticmethod
-    def _carry(source: socket.socket, sink: socket.socket) -> None:
-        try:
-            while data := source.recv(65536):
-                sink.sendall(data)
-        except OSError:
-            pass
-        finally:
-            for end in (source, sink):
-                with suppress(OSError):
-                    end.shutdown(socket.SHUT_RDWR)
 
 
 def test_a_connection_left_over_under_its_name_does_not_silence_it_for_ever():

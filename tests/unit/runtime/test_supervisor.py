@@ -20,6 +20,7 @@ from service.runtime.resuming import taken_up
 from service.runtime.supervisor import Supervisor
 from service.state import Level, LogEntry, Mode, TrackerState
 from service.worker import start_worker
+from tests.system.fake_rtc import client_session
 from tests.unit.reactions.situations import POLICY, Story, record
 from tests.unit.reactions.test_acquisition import Acquiring
 from tests.unit.runtime.small import COMPUTE, small_instrument
@@ -392,3 +393,24 @@ async def test_alpha_that_could_not_be_saved_is_an_alarm_and_saved_later(
         part.rmdir()
         await until(lambda: archive.tracking.read() is not None)
         await until(lambda: alarm_of(supervisor, "archive-failed") is None)
+
+
+async def test_a_token_without_a_message_has_the_link_opened_anew_and_is_told(
+    supervisor, bridge, monkeypatch
+):
+    monkeypatch.setattr("service.runtime.waiting.REVIVED_AFTER_S", 1.0)
+    async with running(supervisor):
+        def logged():
+            return [entry.name for entry in supervisor.snapshot().tracker.log]
+
+        first = bridge._session
+        bridge._intake.liveliness(alive=True)
+        await until(lambda: "link.reopened" in logged(), 15.0)
+        assert bridge._session not in {None, first}
+        assert not bridge.statistics().rtc_alive
+        # it goes on as before: a token is seen, and its end
+        with client_session(bridge._endpoint.listen[0]) as rtc:
+            token = rtc.liveliness().declare_token("ao/v1/small/alive/rtc")
+            await until(lambda: bridge.statistics().rtc_alive)
+            token.undeclare()
+            await until(lambda: not bridge.statistics().rtc_alive)

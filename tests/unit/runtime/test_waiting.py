@@ -8,6 +8,7 @@ from service.link.statistics import Fate, LinkStatistics, Tally
 from service.runtime.waiting import (
     COMPLAINTS,
     Facts,
+    Revival,
     Told,
     complaints,
     news_of_link,
@@ -242,3 +243,29 @@ def test_a_wait_is_on_record_once_it_lasts_and_not_again_and_again():
     alarm = Alarm(name="status", since_ns_utc=0, text="")
     fresh = Told()
     assert not any(fresh.news((wait,), (alarm,), k * SECOND) for k in range(10))
+
+
+def test_a_silent_token_has_the_link_opened_anew_ever_less_often():
+    revival, silent = Revival(), link(fate("used", 0, age_s=30.0))
+    assert [t for t in range(100) if revival.due(silent, float(t))] == [10, 31, 72]
+    assert [t for t in range(100, 3000) if revival.due(silent, float(t))][-2:] == [2421, 2722]
+    assert not revival.due(link(*WELL), 3000.0)
+    assert [t for t in range(3001, 3020) if revival.due(silent, float(t))] == [3011]
+
+
+@pytest.mark.parametrize(
+    "heard", [link(*WELL), link(fate("used", 5, "status")), link(fate("shape", 9)), link()]
+)
+def test_a_link_on_which_anything_comes_is_left_as_it_is(heard):
+    gone = replace(heard, rtc_alive=False, fates=())
+    revival = Revival()
+    assert not any(revival.due(heard if heard.fates else gone, float(t)) for t in range(1000))
+
+
+def test_a_token_that_came_back_is_given_its_time():
+    revival, silent = Revival(), link()
+    for t in range(9):
+        assert not revival.due(silent, float(t))
+    assert not revival.due(link(rtc_alive=False), 9.0)
+    assert not any(revival.due(silent, float(t)) for t in range(10, 20))
+    assert revival.due(silent, 20.0)

@@ -1,0 +1,45 @@
+"""A TCP connection that a test can cut."""
+
+import socket
+import threading
+from contextlib import suppress
+
+
+class Cable:
+    """A TCP connection through here that can be cut, and kept from coming back."""
+
+    def __init__(self, to_port: int) -> None:
+        self.to_port, self.plugged = to_port, threading.Event()
+        self.plugged.set()
+        self.ends: list[socket.socket] = []
+        self.door = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self.door.getsockname()[1])
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def cut(self) -> None:
+        self.plugged.clear()
+        for end in self.ends:
+            end.close()
+
+    def _serve(self) -> None:
+        while True:
+            near, _ = self.door.accept()
+            if not self.plugged.is_set():
+                near.close()
+                continue
+            far = socket.create_connection(("127.0.0.1", self.to_port))
+            self.ends += [near, far]
+            for a, b in ((near, far), (far, near)):
+                threading.Thread(target=self._carry, args=(a, b), daemon=True).start()
+
+    @staticmethod
+    def _carry(source: socket.socket, sink: socket.socket) -> None:
+        try:
+            while data := source.recv(65536):
+                sink.sendall(data)
+        except OSError:
+            pass
+        finally:
+            for end in (source, sink):
+                with suppress(OSError):
+                    end.shutdown(socket.SHUT_RDWR)

@@ -400,6 +400,7 @@ async def test_a_token_without_a_message_has_the_link_opened_anew_and_is_told(
 ):
     monkeypatch.setattr("service.runtime.waiting.REVIVED_AFTER_S", 1.0)
     async with running(supervisor):
+
         def logged():
             return [entry.name for entry in supervisor.snapshot().tracker.log]
 

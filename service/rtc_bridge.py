@@ -26,6 +26,7 @@ from service.link.events import LinkEvent
 from service.link.intake import Intake
 from service.link.measured import MeasuredIntake
 from service.link.outbox import Offer, Outbox
+from service.link.standby import Standby
 from service.link.statistics import LinkStatistics
 from service.wire import (
     ATTACHMENT_LIMIT,
@@ -78,6 +79,7 @@ class Bridge:
         self._closed = False
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._held: list[object] = []
+        self._standby = Standby(self._keys, drive=self._drive, report=self._intake.event)
 
     def __enter__(self) -> Self:
         """Open the link."""
@@ -123,6 +125,7 @@ class Bridge:
         self._closed = True
         session, self._session = self._session, None
         self._publishers.clear()
+        self._standby.leave()
         self._held.clear()
         self._intake.set_wakeup(None)
         if session is not None:
@@ -171,6 +174,7 @@ class Bridge:
 
     def events(self) -> list[LinkEvent]:
         """Return what else has happened since the last call, oldest first."""
+        self._standby.look_again()
         return self._intake.events()
 
     def statistics(self) -> LinkStatistics:
@@ -255,15 +259,21 @@ class Bridge:
         keys = self._keys
         for key in (keys.state, keys.alarm):
             self._publishers[key] = link.last_value(session, key)
+        self._held += self._standby.join(session, self._guarded, wait=bool(self._endpoint.connect))
         # zenoh takes back what nobody holds: a token within microseconds
         self._held += [
-            link.serve(session, keys.all_matrices, self._answer),
-            link.announce(session, keys.alive(Role.SERVICE)),
             link.subscribe(session, keys.acknowledgement, self._guarded("ack", self._on_ack)),
             link.subscribe(session, keys.status, self._guarded("status", self._on_status)),
             link.subscribe(session, keys.all_measured, self._guarded("im", self._on_measured)),
             link.watch(session, keys.alive(Role.RTC), self._guarded("alive", self._on_alive)),
             link.subscribe_frames(session, keys.frames, self._guarded("frames", self._on_frames)),
+        ]
+
+    def _drive(self, session: zenoh.Session) -> list[object]:
+        """Be the service of this system: the RTC may ask from now on."""
+        return [
+            link.serve(session, self._keys.all_matrices, self._answer),
+            link.announce(session, self._keys.alive(Role.SERVICE)),
         ]
 
     def _guarded(self, kind: str, take: Callable[[_T], None]) -> Callable[[_T], None]:
@@ -312,8 +322,8 @@ class Bridge:
         if event is not None:
             self._intake.event(event)
 
-    def _on_alive(self, alive: bool) -> None:
-        self._intake.liveliness(alive=alive)
+    def _on_alive(self, token: tuple[str, bool]) -> None:
+        self._intake.liveliness(alive=token[1])
 
     def _answer(self, query: zenoh.Query) -> None:
         """Answer a query for a reconstructor; a text says why there is none."""
@@ -353,7 +363,7 @@ class Bridge:
         return offer
 
     def _publish(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
-        session = self._opened()
+        session = self._driven()
         offer = self._prepare(manifest, matrix)
         for index, part in enumerate(offer.parts):
             key = self._keys.chunk(manifest.id, index)
@@ -363,7 +373,7 @@ class Bridge:
         self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
 
     def _command(self, command: Command) -> Reply:
-        answer = requests.send_command(self._opened(), self._endpoint, command)
+        answer = requests.send_command(self._driven(), self._endpoint, command)
         try:
             reply = decode_reply(answer)
         except WireError as error:
@@ -377,7 +387,16 @@ class Bridge:
         publisher = self._publishers.get(key)
         if publisher is None:
             raise LinkError(f"cannot send on {key}: the link is not open")
+        if not self._standby.drives:
+            return
         publisher.put(data, encoding=encoding)
+
+    def _driven(self) -> zenoh.Session:
+        """Return the session of a service that may command and publish: the last guard."""
+        session = self._opened()
+        if not self._standby.drives:
+            raise LinkError("another service drives the RTC: this one stands by")
+        return session
 
     def _opened(self) -> zenoh.Session:
         if self._session is None:

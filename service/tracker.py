@@ -36,6 +36,7 @@ from service.reactions.policy import Policy
 from service.reactions.rtc import (
     on_failure,
     on_new_session,
+    on_services,
     on_status,
     on_tick,
     on_vanished,
@@ -88,6 +89,8 @@ def _react(  # noqa: C901 - one line for each event
             return on_new_session(state, session, now_ns), ()
         case ev.RtcVanished():
             return on_vanished(state, now_ns), ()
+        case ev.ServicesMet():
+            return on_services(state, event, now_ns), ()
         case ev.Trouble(name=name, text=text, over=over):
             if over:
                 return ended(state, name, now_ns, event.t_ns_utc), ()

@@ -50,6 +50,17 @@ class RtcVanished:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ServicesMet:
+    """Other services of this system came or went."""
+
+    drives: bool
+    """Whether this service drives the RTC; otherwise it stands by."""
+
+    others: tuple[str, ...]
+    """In words, the first one first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Trouble:
     """A condition that must be seen while it lasts."""
 
@@ -263,6 +274,7 @@ Event = (
     | StatusSeen
     | SessionStarted
     | RtcVanished
+    | ServicesMet
     | Trouble
     | Noted
     | WindowFitted

@@ -64,6 +64,17 @@ class SecondRtc:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ServicesChanged:
+    """Other services of this system came or went, or who drives has changed."""
+
+    drives: bool
+    """Whether this service drives the RTC."""
+
+    others: tuple[str, ...]
+    """The others, the first one first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class IdsAdopted:
     """Nothing was pinned, so the first basis and configuration seen are expected from now on."""
 
@@ -108,6 +119,7 @@ LinkEvent = (
     | RtcAppeared
     | RtcVanished
     | SecondRtc
+    | ServicesChanged
     | IdsAdopted
     | BasisMismatch
     | MalformedMessage

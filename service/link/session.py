@@ -19,6 +19,9 @@ HISTORY_S = 0.5
 """Telemetry asked for when the service comes late: asking for all of an RTC's cache stalled its
 sender for seconds."""
 
+TOKENS_TIMEOUT_S = 1.0
+"""For the routers to say which tokens are there; they do within milliseconds."""
+
 RETRY = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
 """Back-off of a client that lost its router; zenoh's own is 3 s at the first loss."""
 
@@ -82,11 +85,24 @@ def subscribe(session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample
     return session.declare_subscriber(key, callback)
 
 
-def watch(session: zenoh.Session, key: str, callback: Callable[[bool], None]) -> object:
-    """Call ``callback`` with whether the liveliness token is there, now and at each change."""
+def subscribe_others(
+    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None]
+) -> object:
+    """Call ``callback``, on a thread of its own, for each message that is not this session's."""
+    return session.declare_subscriber(key, callback, allowed_origin=zenoh.Locality.REMOTE)
+
+
+def tokens(session: zenoh.Session, key: str) -> list[str]:
+    """Return the keys of the liveliness tokens that are there."""
+    replies = session.liveliness().get(key, timeout=TOKENS_TIMEOUT_S)
+    return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+
+def watch(session: zenoh.Session, key: str, callback: Callable[[tuple[str, bool]], None]) -> object:
+    """Call ``callback`` with key and presence of liveliness tokens, now and at each change."""
 
     def changed(sample: zenoh.Sample) -> None:
-        callback(sample.kind == zenoh.SampleKind.PUT)
+        callback((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
 
     return session.liveliness().declare_subscriber(key, changed, history=True)
 

@@ -13,6 +13,7 @@ from typing import get_args
 from service import events as ev
 from service.errors import CommandError
 from service.events import Command, Event
+from service.reactions.alarms import STANDING_BY
 from service.reactions.dither_choice import OUR_DITHERS, OWN_DITHER
 from service.reactions.policy import SECOND_NS
 from service.state import CommandState, LoopCommand, MatrixState, TrackerState
@@ -33,6 +34,7 @@ class Activity(StrEnum):
     ACQUIRING = "an acquisition is under way"
     OWN_DITHER = "a dither of the service's own choice plays"
     OTHER_DITHER = "a dither of an operator's, or of somebody else, plays"
+    STANDING_BY = "another service drives the RTC"
     MAKING = "a reconstructor is being computed"
     SENDING = "a reconstructor is on its way to the RTC"
 
@@ -61,6 +63,7 @@ ALLOWS: dict[Activity, frozenset[type]] = {
     # it makes way for what needs the loop, and an RTC measures under no dither
     Activity.OWN_DITHER: _ALL - {ev.Measure, ev.StartDither},
     Activity.OTHER_DITHER: _ALL - {ev.Measure, ev.StartDither, ev.MeasureNoisy},
+    Activity.STANDING_BY: frozenset[type]({ev.Reject, ev.SetMode, ev.SetPointing}),
     Activity.MAKING: _ALL - {ev.Measure, ev.Refit, ev.Publish, ev.Rollback},
     Activity.SENDING: _ALL - {ev.Measure},
 }
@@ -111,7 +114,11 @@ def ramping(state: TrackerState, now_ns: int) -> LoopCommand | None:
 
 
 def _exclusive(state: TrackerState, now_ns: int) -> tuple[Running, ...]:
-    found = []
+    found = [
+        Running(Activity.STANDING_BY, alarm.text)
+        for alarm in state.alarms
+        if alarm.name == STANDING_BY
+    ]
     if state.measuring is not None:
         text = (
             f"interaction matrix {state.measuring.id} is being measured; wait for it, or give it up"

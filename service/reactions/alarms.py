@@ -31,6 +31,9 @@ ARCHIVE_FAILED = "archive-failed"
 OTHER_SUM = "wrong-matrix"
 """The alarm of an RTC that acknowledges, or holds, other numbers than were sent."""
 
+SECOND_SERVICE = "second-service"
+"""The alarm of two services for one RTC; it forbids nothing to the one that drives."""
+
 STANDING_BY = "standing-by"
 """The alarm of a service that leaves the RTC to another one."""
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from service import events as ev
 from service.events import Effect
-from service.reactions.alarms import OTHER_SUM
+from service.reactions.alarms import OTHER_SUM, SECOND_SERVICE, STANDING_BY
 from service.reactions.dither import follow_status, found_again
 from service.reactions.dither_unwanted import gone
 from service.reactions.evidence import over, pointed, voided
@@ -154,6 +154,31 @@ def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerSta
     )
     state = without_alarm(gone(found_again(state, now_ns), now_ns), OTHER_SUM, now_ns)
     return logged(state, "rtc.session", f"the RTC started session {session}", now_ns)
+
+
+def on_services(state: TrackerState, event: ev.ServicesMet, now_ns: int) -> TrackerState:
+    """Stand by while another service drives the RTC, or say that one stands by."""
+    who = " and ".join(event.others)
+    stood_by = any(alarm.name == STANDING_BY for alarm in state.alarms)
+    if not event.others:
+        state = without_alarm(state, SECOND_SERVICE, now_ns)
+    else:
+        does = "drives the RTC" if event.drives else "stands by"
+        text = (
+            f"more than one service of system {state.system}: beside this one, which {does}, "
+            f"{who}: end all but one"
+        )
+        state = with_alarm(state, SECOND_SERVICE, text, now_ns)
+    if not event.drives:
+        text = (
+            f"another service drives the RTC: {who}; this one asks and sends nothing until that "
+            "one has gone: end one of them"
+        )
+        return with_alarm(replace(state, dither=None), STANDING_BY, text, now_ns)
+    if stood_by:
+        text = "the service that drove the RTC has gone: this one drives it from now on"
+        state = logged(state, "service.takes-over", text, now_ns, Level.WARNING)
+    return without_alarm(state, STANDING_BY, now_ns)
 
 
 def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> TrackerState:

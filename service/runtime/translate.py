@@ -43,6 +43,8 @@ def event_of(event: heard.LinkEvent) -> ev.Event | None:
             return _acknowledged(acknowledgement)
         case heard.SessionChanged(new=new):
             return ev.SessionStarted(session=new)
+        case heard.ServicesChanged(drives=drives, others=others):
+            return ev.ServicesMet(drives=drives, others=others)
         case heard.RtcVanished():
             return ev.RtcVanished()
         case heard.RtcAppeared():

@@ -140,6 +140,15 @@ class Keys:
         """Liveliness token of one side."""
         return f"{self.root}/alive/{role}"
 
+    @property
+    def all_ranks(self) -> str:
+        """Every :meth:`rank`."""
+        return f"{self.root}/alive/{Role.SERVICE}/*"
+
+    def rank(self, name: str) -> str:
+        """Liveliness token of one of several services; its name tells who was first."""
+        return f"{self.root}/alive/{Role.SERVICE}/{name}"
+
     def matrix_id_of(self, key: str) -> str:
         """Return the id in a key of a matrix, a chunk or a commit (``cm`` and ``im`` alike).
 

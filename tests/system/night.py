@@ -124,6 +124,16 @@ class Night:
         self.processes.append(process)
         return process
 
+    def second_service(self):
+        """Start another service of the same system, a client of the first one's router."""
+        other = Night.__new__(Night)
+        other.__dict__ |= self.__dict__ | {"port": free_port()}
+        other.client = httpx.Client(base_url=f"http://127.0.0.1:{other.port}", timeout=5.0)
+        words = ["service", "run", "--config", str(self.settings), "--instrument", str(INSTRUMENT)]
+        words += ["--mode", "auto", "--connect", self.zenoh, "--port", str(other.port)]
+        other.start("second", [*words, "--data-dir", str(self.directory / "second")])
+        return other
+
     def service(self, mode="auto", instrument=INSTRUMENT, *, wait=True):
         words = ["service", "run", "--config", str(self.settings), "--instrument", str(instrument)]
         words += ["--mode", mode, "--listen", self.zenoh, "--port", str(self.port)]

@@ -4,6 +4,7 @@ import asyncio
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,6 +24,7 @@ from service.link.events import (
     RtcAppeared,
     RtcVanished,
     SecondRtc,
+    ServicesChanged,
     SessionChanged,
     StatusReceived,
 )
@@ -46,6 +48,7 @@ from service.wire import (
     encode_frames,
     encode_measured_manifest,
     encode_reply,
+    encode_state,
     layout_of,
 )
 from tests.system.fake_rtc import FakeRtc, client_session
@@ -449,6 +452,84 @@ def test_the_services_token_goes_with_the_service(endpoint):
             time.sleep(0.2)
             assert tokens(outside, key) == [key]
         wait_until(lambda: tokens(outside, key) == [], 3.0)
+
+
+# ---------------------------------------------------------------- several services
+
+
+def drives(bridge, rtc, name):
+    """Whether this service reaches the RTC with a command."""
+    try:
+        return asyncio.run(bridge.command(LoopRequest(id=name, leak=0.98))).accepted
+    except LinkError:
+        return False
+
+
+def test_a_later_service_stands_by_and_takes_over_when_the_first_has_gone(endpoint):
+    router = Bridge(replace(endpoint, system="router"))
+    client = Endpoint(system=SYSTEM, connect=endpoint.listen, chunk_bytes=64)
+    with router, FakeRtc(endpoint.listen[0]) as rtc:
+        first, second = Bridge(client), Bridge(client)
+        with second:
+            second.close()
+            with first:
+                met = Seen(first)
+                second.open()
+                event = met.first(ServicesChanged)
+                assert event.drives
+                assert len(event.others) == 1
+                assert not Seen(second).first(ServicesChanged).drives
+                assert drives(first, rtc, "l-1")
+                assert not drives(second, rtc, "l-2")
+                with pytest.raises(LinkError, match="stands by"):
+                    asyncio.run(second.publish(*reconstructor(rtc)))
+            assert Seen(second).first(ServicesChanged, drives=True).others == ()
+            wait_until(lambda: tokens(rtc.zenoh, rtc.keys.alive(Role.SERVICE)), 3.0)
+            assert drives(second, rtc, "l-3")
+        assert [command.id for command in rtc.commands] == ["l-1", "l-3"]
+
+
+def test_of_services_that_come_at_the_same_time_exactly_one_drives(endpoint):
+    router = Bridge(replace(endpoint, system="router"))
+    with router, FakeRtc(endpoint.listen[0]) as rtc:
+        bridges = [Bridge(Endpoint(system=SYSTEM, connect=endpoint.listen)) for _ in range(4)]
+        threads = [threading.Thread(target=bridge.open) for bridge in bridges]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(10.0)
+        for left in (4, 3, 2, 1):
+            driving = wait_until(
+                lambda left=left: [
+                    bridge
+                    for k, bridge in enumerate(bridges)
+                    if drives(bridge, rtc, f"l-{left}-{k}-{time.monotonic_ns()}")
+                ]
+            )
+            assert len(driving) == 1
+            driving[0].close()
+            bridges.remove(driving[0])
+
+
+def test_a_service_that_holds_only_the_contracts_token_was_first_if_it_was_there_first(endpoint):
+    router = Bridge(replace(endpoint, system="router"))
+    with router, FakeRtc(endpoint.listen[0]) as rtc:
+        token = rtc.zenoh.liveliness().declare_token(rtc.keys.alive(Role.SERVICE))
+        wait_until(lambda: tokens(rtc.zenoh, rtc.keys.alive(Role.SERVICE)))
+        with Bridge(Endpoint(system=SYSTEM, connect=endpoint.listen)) as late:
+            event = Seen(late).first(ServicesChanged)
+            assert (event.drives, event.others) == (False, ("one that gives no name",))
+            assert not drives(late, rtc, "l-1")
+            token.undeclare()
+            assert Seen(late).first(ServicesChanged).drives
+            assert drives(late, rtc, "l-2")
+
+
+def test_a_later_service_that_gives_no_name_is_known_by_its_state(bridge, rtc):
+    state = StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use=None)
+    rtc.send_bytes(rtc.keys.state, encode_state(state))
+    event = Seen(bridge).first(ServicesChanged)
+    assert (event.drives, event.others) == (True, ("one that gives no name",))
 
 
 # ---------------------------------------------------------------- reconstructors

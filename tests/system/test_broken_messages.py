@@ -3,6 +3,7 @@
 import contextlib
 import time
 
+import httpx
 import msgpack
 import numpy as np
 import pytest
@@ -217,6 +218,35 @@ def test_five_hundred_statuses_a_second_end_no_window_and_leave_rest_alone(night
     named(night, alarms, "status-flood", "statuses")
     assert slowest_s < 2.0
     assert night.state["windows_accepted"] > before
+
+
+def test_a_second_service_stands_by_and_the_rtc_hears_of_one_alone(night):
+    response, variance_m2 = small_telescope(shift_x_subap=0.1)
+    assumed, _ = small_telescope()
+    second = night.second_service()
+    try:
+        with Stranger(night.zenoh, response, variance_m2, assumed=assumed) as rtc:
+            rtc.session = f"shared-{time.monotonic_ns()}"
+            wait_for(lambda: not isinstance(_state_of(second), str), 40.0, "a second service")
+            named(second, waits, "standing-by", "another service drives", 20.0)
+            named(night, alarms, "second-service", "end all but one")
+            wait_for(lambda: rtc.applied, 60.0, "a matrix applied")
+            time.sleep(5.0)
+            assert night.ids("applied")
+            assert not second.shelf
+            assert second.client.get("/readyz").status_code == 503
+            answer = second.client.post("/v1/loop", json={"loop": "open"})
+            assert "another service drives" in answer.json()["detail"]
+            assert set(rtc.applied) <= {record["id"] for record in night.shelf}
+    finally:
+        second.client.close()
+
+
+def _state_of(night):
+    try:
+        return night.state
+    except httpx.TransportError as error:
+        return str(error)
 
 
 def test_what_an_rtc_does_not_offer_is_said_at_once(night, rtc):

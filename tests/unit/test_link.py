@@ -18,6 +18,7 @@ from service.link.intake import Intake
 from service.link.measured import MeasuredIntake
 from service.link.outbox import OFFERS, Offer, Outbox
 from service.link.sessions import SessionWatch
+from service.link.standby import Order
 from service.wire import (
     Acknowledgement,
     AckState,
@@ -139,6 +140,72 @@ def test_endless_strangers_are_remembered_within_bounds():
     for k in range(100):
         watch.admit(f"s{k}", 0.01 * k)
     assert len(watch._rivals) <= 16
+
+
+# ---------------------------------------------------------------- several services
+
+
+def order(found=(), own="b", now_ns=1000, **facts):
+    made = Order()
+    made.contract_held = facts.get("contract_held", False)
+    made.join(found, own, now_ns)
+    return made
+
+
+def test_a_service_alone_drives():
+    alone = order()
+    assert alone.settle()
+    assert alone.others(0.0) == ()
+    alone.contract_held = True  # its own token
+    assert alone.settle()
+
+
+def test_a_later_service_stands_by_whatever_its_clock_says_and_takes_over_when_the_first_goes():
+    late = order(["5000-aa"], now_ns=1000, contract_held=True)
+    assert late.name == "5001-b"
+    assert not late.settle()
+    assert late.others(0.0) == ("aa (there since 1970-01-01T00:00:00Z)",)
+    late.contract_held = False
+    assert not late.settle()
+    late.named("5000-aa", alive=False)
+    assert late.settle()
+
+
+def test_the_first_of_two_drives_on():
+    first = order()
+    first.settle()
+    first.named("2000-aa", alive=True)
+    assert first.settle()
+    assert len(first.others(0.0)) == 1
+    first.named("2000-aa", alive=False)
+    assert first.others(0.0) == ()
+
+
+@pytest.mark.parametrize("starts", [(1000, 1000), (1000, 999), (1000, 1001)])
+def test_of_two_that_come_at_the_same_time_exactly_one_drives(starts):
+    one, other = order(own="a", now_ns=starts[0]), order(own="b", now_ns=starts[1])
+    one.named(other.name, alive=True)
+    other.named(one.name, alive=True)
+    assert one.settle() is not other.settle()
+
+
+def test_one_that_gives_no_name_was_first_if_it_was_there_first():
+    late = order(contract_held=True)
+    assert not late.settle()
+    assert late.others(0.0) == ("one that gives no name",)
+    late.contract_held = False
+    assert late.settle()
+    late.heard(10.0)
+    assert late.settle()
+    assert late.others(11.0) == ("one that gives no name",)
+    assert late.others(16.0) == ()
+
+
+def test_tokens_that_are_no_names_are_nobody():
+    alone = order(["x", "12-XYZ", "-ab"])
+    alone.named("rubbish", alive=True)
+    assert alone.settle()
+    assert alone.others(0.0) == ()
 
 
 # ---------------------------------------------------------------- intake

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from service import events as ev
+from service.errors import CommandError
 from service.state import Level, MatrixState, Mode
 from tests.unit.reactions.situations import POLICY, Story, estimate, of_kind, rtc
 
@@ -35,6 +36,31 @@ def test_a_matrix_fetched_twice_is_on_the_shelf_once(story):
     fetched = story.state.reconstructor("initial")
     story.tell(ev.MatrixFetched(record=fetched))
     assert [record.id for record in story.state.reconstructors] == ["initial"]
+
+
+def test_a_service_that_is_not_the_first_stands_by_until_the_first_has_gone(story):
+    story.tell(ev.ServicesMet(drives=False, others=("abc",)))
+    assert {"second-service", "standing-by"} <= story.alarms
+    story.effects.clear()
+    story.tell(ev.StatusSeen(rtc=rtc()))
+    story.see(n_windows=3)
+    story.wait(120.0)
+    assert not story.effects
+    for command in (ev.Refit(), ev.Rollback(), ev.StopDither(), ev.SetLoop(closed=False)):
+        with pytest.raises(CommandError, match="another service drives the RTC"):
+            story.tell(command)
+    story.tell(ev.ServicesMet(drives=True, others=()))
+    assert not {"second-service", "standing-by"} & story.alarms
+    assert "service.takes-over" in story.logged
+    story.wait(10.0)
+    assert story.asked(ev.AskDither)
+
+
+def test_the_first_of_two_services_drives_on_and_says_so(story):
+    story.tell(ev.ServicesMet(drives=True, others=("abc",)))
+    assert "second-service" in story.alarms
+    assert "standing-by" not in story.alarms
+    assert story.tell(ev.StopDither()) == (ev.AskNoDither(),)
 
 
 def test_an_open_loop_is_an_alarm_until_it_is_closed(story):

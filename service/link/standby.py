@@ -1,0 +1,209 @@
+"""Which of several services of one system drives its RTC: the first; every other stands by."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final
+
+from service.link import session as link
+from service.link.events import ServicesChanged
+from service.wire import Keys, Role
+
+if TYPE_CHECKING:
+    import zenoh
+
+NAME: Final = re.compile(r"[0-9]{1,19}-[0-9a-f]{1,32}")
+"""When a service came, nanoseconds since the Unix epoch, and its zenoh id."""
+
+HEARD_S: Final = 5.0
+"""A service that gives no name is there for so long after its last word."""
+
+UNDER_WAY_S: Final = 0.3
+"""For the tokens of services that came at the same time."""
+
+
+class Order:
+    """The order of the services that are there.
+
+    A service takes a name that ranks after all that it finds, whatever its clock says; of two that
+    come at the same time the names decide. One that holds only the token of the contract, and so
+    no name, was first if it was there first. Not thread-safe.
+    """
+
+    __slots__ = ("_heard_s", "_names", "contract_held", "drives", "name")
+
+    def __init__(self) -> None:
+        self._names: set[str] = set()
+        self._heard_s: float | None = None
+        self.name = ""
+        self.drives = False
+        self.contract_held = False
+        """Whether somebody holds the token of the contract; it may be this service."""
+
+    def join(self, found: Iterable[str], own_id: str, now_ns: int) -> str:
+        """Take a name after all that are there, and return it."""
+        self._names = {name for name in found if NAME.fullmatch(name)}
+        latest_ns = max((_rank(name)[0] for name in self._names), default=0)
+        self.name = f"{max(now_ns, latest_ns + 1)}-{own_id}"
+        return self.name
+
+    def named(self, name: str, *, alive: bool) -> None:
+        """Note that a service has come or gone."""
+        if name != self.name and NAME.fullmatch(name):
+            (self._names.add if alive else self._names.discard)(name)
+
+    def heard(self, now_s: float) -> None:
+        """Note a word of another service, that need not have a name, while this one drives."""
+        # the last word of the one that has driven before is no second service
+        if self.drives:
+            self._heard_s = now_s
+
+    def settle(self) -> bool:
+        """Return whether this service drives from now on."""
+        before = any(_rank(name) < _rank(self.name) for name in self._names)
+        self.drives = not before and (self.drives or not self.contract_held)
+        return self.drives
+
+    def others(self, now_s: float) -> tuple[str, ...]:
+        """Return the other services that are there, in words, the first one first."""
+        names = tuple(_words(name) for name in sorted(self._names, key=_rank))
+        heard = self._heard_s is not None and now_s - self._heard_s < HEARD_S
+        nameless = heard or (self.contract_held and not self.drives)
+        return names if names or not nameless else ("one that gives no name",)
+
+
+class Standby:
+    """Keeps this service's place among those that are there; thread-safe."""
+
+    def __init__(
+        self,
+        keys: Keys,
+        *,
+        drive: Callable[[zenoh.Session], list[object]],
+        report: Callable[[ServicesChanged], None],
+    ) -> None:
+        """Take no place yet.
+
+        Parameters
+        ----------
+        keys
+            Of the system.
+        drive
+            Declares what only the service that drives holds, and returns it.
+        report
+            Is told when others came or went.
+        """
+        self._keys = keys
+        self._drive = drive
+        self._report = report
+        self._lock = threading.Lock()
+        self._order = Order()
+        self._session: zenoh.Session | None = None
+        self._driving: list[object] = []
+        self._met: tuple[bool, tuple[str, ...]] = (True, ())
+
+    @property
+    def drives(self) -> bool:
+        """Whether this service drives the RTC: it alone commands and publishes."""
+        return self._order.drives
+
+    def join(
+        self,
+        session: zenoh.Session,
+        guarded: Callable[[str, Callable[[Any], None]], Callable[[Any], None]],
+        *,
+        wait: bool,
+    ) -> list[object]:
+        """Take a place, and drive the RTC unless another service was first.
+
+        Parameters
+        ----------
+        session
+            Open.
+        guarded
+            Makes a callback one that lets nothing escape.
+        wait
+            Whether others may come at the same time, to the same routers.
+
+        Returns
+        -------
+        list
+            What is to be held while the link is open.
+        """
+        keys, contract = self._keys, self._keys.alive(Role.SERVICE)
+        found = [_name_of(key) for key in link.tokens(session, keys.all_ranks)]
+        with self._lock:
+            self._order = Order()
+            self._order.contract_held = bool(link.tokens(session, contract))
+            name = self._order.join(found, str(session.zid()), time.time_ns())
+        held = [
+            link.announce(session, keys.rank(name)),
+            link.watch(session, keys.all_ranks, guarded("alive", self._on_token)),
+            link.watch(session, contract, guarded("alive", self._on_token)),
+            link.subscribe_others(session, keys.state, guarded("state", self._on_state)),
+        ]
+        if wait:
+            time.sleep(UNDER_WAY_S)
+        with self._lock:
+            self._session = session
+        self._settle()
+        return held
+
+    def leave(self) -> None:
+        """Give the place up."""
+        with self._lock:
+            self._session = None
+            self._driving.clear()
+
+    def look_again(self) -> None:
+        """See whether one has gone that nobody hears go."""
+        if self._met[1]:
+            self._settle()
+
+    def _on_token(self, token: tuple[str, bool]) -> None:
+        key, alive = token
+        with self._lock:
+            if key == self._keys.alive(Role.SERVICE):
+                self._order.contract_held = alive
+            else:
+                self._order.named(_name_of(key), alive=alive)
+        self._settle()
+
+    def _on_state(self, _: zenoh.Sample) -> None:
+        with self._lock:
+            self._order.heard(time.monotonic())
+        self._settle()
+
+    def _settle(self) -> None:
+        """Drive or stand by as the order says, and report what is new."""
+        with self._lock:
+            if self._session is None:
+                return
+            drives = self._order.settle()
+            if drives and not self._driving:
+                self._driving = self._drive(self._session)
+            elif not drives:
+                self._driving = []
+            met = (drives, self._order.others(time.monotonic()))
+            news, self._met = met != self._met, met
+        if news:
+            self._report(ServicesChanged(drives=met[0], others=met[1]))
+
+
+def _name_of(key: str) -> str:
+    return key.rpartition("/")[2]
+
+
+def _rank(name: str) -> tuple[int, str]:
+    since, _, own_id = name.partition("-")
+    return int(since), own_id
+
+
+def _words(name: str) -> str:
+    since_ns, own_id = _rank(name)
+    since = datetime.fromtimestamp(since_ns / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return f"{own_id} (there since {since})"

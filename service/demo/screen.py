@@ -66,12 +66,19 @@ def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | Non
 
 
 def _matrix(state: dict[str, Any]) -> str:
-    alarms = " ".join(f"[{alarm['name']}]" for alarm in state["alarms"])
+    alarms = " ".join([*(f"[{alarm['name']}]" for alarm in state["alarms"]), *_waits(state)])
     if not state["ready"]:
         return f"- {state['ready_reason']} {alarms}"
     if state["rtc"] is None:
         return f"- no RTC {alarms}"
     return f"{state['in_use'] or '-'} ({state['rtc']['n_controlled']} modes) {alarms}"
+
+
+def _waits(state: dict[str, Any]) -> list[str]:
+    """Return what is waited for besides the end of alarms."""
+    known = {alarm["name"] for alarm in state["alarms"]}
+    names = [wait["name"] for wait in state.get("waiting_for", ()) if wait["name"] not in known]
+    return [f"waits for {', '.join(names)}"] if names else []
 
 
 def table(report: Report) -> str:

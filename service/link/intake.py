@@ -326,12 +326,12 @@ class Intake:
 
     def _place(self, ring: FrameRing, batch: FrameBatch, now_s: float) -> None:
         """Put frames in their places, and count what became of them."""
-        before = asdict(self._counts)
+        counts = self._counts
+        received, before = counts.received, [getattr(counts, name) for name in PLACED]
         ring.store(batch, now_s)
-        after = asdict(self._counts)
-        self._tally.add("frames", USED, after["received"] - before["received"], now_s)
-        for name, text in PLACED.items():
-            self._tally.add("frames", name, after[name] - before[name], now_s, text)
+        self._tally.add("frames", USED, counts.received - received, now_s)
+        for (name, text), n_before in zip(PLACED.items(), before, strict=True):
+            self._tally.add("frames", name, getattr(counts, name) - n_before, now_s, text)
 
     def _capacity(self, header: FrameHeader) -> int:
         row_bytes = 4 * (header.n_slopes + 2 * header.n_modes)

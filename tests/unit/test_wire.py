@@ -48,6 +48,7 @@ from service.wire import (
     encode_measured_manifest,
     encode_state,
     encode_status,
+    essentials,
     layout_of,
     split,
 )
@@ -285,6 +286,36 @@ def test_an_rtc_may_say_where_the_telescope_looks_or_know_nothing_of_it():
 def test_a_bad_status_is_refused_by_key_found_and_expected(changes, words):
     with pytest.raises(WireError, match=words):
         decode_status(changed(encode_status(STATUS), **changes))
+
+
+def test_before_the_first_frame_a_status_has_no_number():
+    assert decode_status(changed(encode_status(STATUS), seq=None)).seq is None
+
+
+def test_the_images_of_a_status_come_on_top_of_its_limit():
+    images = np.ones((4, 130, 130), "<f4").tobytes()
+    status = decode_status(changed(encode_status(STATUS), flux=images))
+    assert status.flux_images.shape == (4, 130, 130)
+    with pytest.raises(WireError, match="besides its flux, expected at most 65536"):
+        decode_status(changed(encode_status(STATUS), flux=images, more="x" * 65536))
+
+
+def test_what_must_not_be_missed_of_a_status_differs_in_nothing_else():
+    data = encode_status(STATUS)
+    assert essentials(data) == essentials(changed(data, seq=9, magnitude=3.0, gains=[0.1] * 3))
+    for change in ({"loop": "open"}, {"cm_id": "x"}, {"session": "x"}, {"dither": None}):
+        assert essentials(data) != essentials(changed(data, **change)), change
+    with pytest.raises(WireError):
+        essentials(b"junk")
+
+
+def test_a_commit_that_could_not_be_read_is_rejected_without_id_and_sum():
+    nameless = replace(
+        ACKNOWLEDGEMENT, id=None, sha256=None, state=AckState.REJECTED, frame_seq=None
+    )
+    assert decode_acknowledgement(encode_acknowledgement(nameless)) == nameless
+    with pytest.raises(WireError, match="both, unless rejected"):
+        decode_acknowledgement(changed(encode_acknowledgement(ACKNOWLEDGEMENT), id=None))
 
 
 def test_a_whole_number_is_good_where_a_number_is_asked_for():

@@ -9,6 +9,7 @@ STATE = {
     "rtc": {"n_controlled": 400},
     "in_use": "cm-1",
     "alarms": [],
+    "waiting_for": [],
     "margin": {"worst_pole_radius": 0.712},
     "link": {"frames_received": 12_345, "frames_lost": 2},
     "registration": {
@@ -55,6 +56,9 @@ def test_alarms_and_what_is_waited_for_are_seen():
     assert "no RTC" in live_line(1.0, STATE | {"rtc": None}, None)
     preparing = STATE | {"ready": False, "ready_reason": "the model is being prepared"}
     assert "the model is being prepared" in live_line(1.0, preparing, None)
+    waits = [{"name": "margin"}, {"name": "status"}]
+    waiting = STATE | {"alarms": [{"name": "margin"}], "waiting_for": waits}
+    assert "[margin] waits for status" in live_line(1.0, waiting, None)
     assert "the service is starting" in live_line(1.0, None, None)
 
 

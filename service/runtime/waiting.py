@@ -98,8 +98,8 @@ def _is_lost(fate: Fate, link: LinkStatistics, used: int) -> bool:
             return False
         case "duplicate":
             return not used
-        case "session":  # while the one that counts is silent, another may be taking over
-            return link.session_waiting is None
+        case "session":  # another may be taking over; beside one that sends it is a second RTC
+            return not used and link.session_waiting is None
         case _:
             return True
 

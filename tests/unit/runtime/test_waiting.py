@@ -109,6 +109,7 @@ def test_a_few_late_or_unfinite_frames_are_no_alarm_and_one_broken_batch_is():
 def test_while_another_session_waits_to_be_taken_its_frames_are_not_missed():
     frames = fate("session", 900)
     assert complaints(link(frames, session_waiting="s2")) == {}
+    assert complaints(link(*WELL, frames)) == {}
     assert "session" in complaints(link(frames))["frames-unused"]
 
 

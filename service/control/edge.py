@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.stability import loop_modes
+
 Array = NDArray[np.float64]
 
 LIMIT_M = 195e-9
@@ -54,17 +56,19 @@ def edge_motion_m(
     ``H_i = z^-d / (1 - leak z^-1 + λ_i z^-d)``, so that its covariance is ``V (N o <H H*>) V*``
     with ``N`` that of ``V^-1 g R n`` and the mean taken over the unit circle.
     """
-    eigenvalues, vectors = np.linalg.eig(gains[:, None] * coupling.astype(float))
+    eigenvalues, vectors = loop_modes(gains[:, None] * coupling.astype(float))
     commanded = gains[:, None] * reconstructor.astype(float)
     # V^-1 S V^-H of the real n by n S: the slopes are many, and complex they would cost most of all
-    half = np.linalg.solve(vectors, commanded @ commanded.T)
-    driven = np.linalg.solve(vectors, half.conj().T)
+    driven = commanded @ commanded.T
+    seen = outer.actuators[:, : len(gains)]
+    if vectors is not None:
+        driven = np.linalg.solve(vectors, np.linalg.solve(vectors, driven).conj().T)
+        seen = seen @ vectors
     turns = np.pi * (np.arange(_N_FREQUENCIES) + 0.5) / _N_FREQUENCIES
     delayed = np.exp(-1j * turns * delay_frames)[:, None]
     response = delayed / (1.0 - leak * np.exp(-1j * turns)[:, None] + eigenvalues * delayed)
     # conjugate pairs of eigenvalues make the other half of the circle the conjugate of this one
     covariance = driven * (response.T @ response.conj() / _N_FREQUENCIES)
-    seen = outer.actuators[:, : len(gains)] @ vectors
     power = np.einsum("ai,ai->a", seen @ covariance, seen.conj()).real
     return float(np.sqrt(power.max()))
 

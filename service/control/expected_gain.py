@@ -23,16 +23,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.stability import pole_radius
+from service.control.stability import loop_modes, pole_radius
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 N_FREQUENCIES = 96
 """Between a thousandth and half of the frame rate: twice as many change nothing in 1e-3."""
-
-ROUNDING = 1e-5
-"""Of couplings computed in single precision, over the largest."""
 
 _N_GROUPS = 10
 """Of modes that share one temporal spectrum."""
@@ -189,7 +186,7 @@ def _left(
     n = len(reconstructor)
     gains = timing.gains[:, None]
     coupling = gains * (reconstructor @ seen).astype(float)
-    eigenvalues, vectors = _eigen(coupling[:, :n])
+    eigenvalues, vectors = loop_modes(coupling[:, :n])
     radius = pole_radius(eigenvalues, leak=timing.leak, delay_frames=timing.delay_frames).max()
     rejected = 1.0 / (1.0 + spectra.integrator[:, None] * eigenvalues)
     passed = spectra.integrator[:, None] * rejected
@@ -206,18 +203,6 @@ def _left(
     # half of it on each side of zero
     total += basis.left(_factor(noise @ noise.T), passed, 2.0 * spectra.widths)
     return total, float(radius)
-
-
-def _eigen(coupling: Array) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """Return eigenvalues ``(n,)`` and vectors ``(n, n)``; None: the modes themselves.
-
-    A new reconstructor leaves rounding beside the diagonal, and its eigenvectors mean nothing.
-    """
-    own = np.diag(coupling)
-    beside = np.abs(coupling - np.diag(own)).max(initial=0.0)
-    if beside <= ROUNDING * np.abs(own).max(initial=0.0):
-        return own, None
-    return np.linalg.eig(coupling)
 
 
 def _factor(covariance: Array) -> Array:

@@ -12,6 +12,18 @@ from service.control.stability import pole_radius
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
+Coupling = NDArray[np.float32]
+
+NEAR = 0.02
+"""Where everything is within the bound the largest radius is sought no closer than this: each point
+costs as much as all bounds together."""
+
+ROUNDING = 1e-3
+"""Of eigenvalues in single precision, and of a radius between two points of a border."""
+
+_BORDER = 24
+"""Points on each side of a rectangle."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateVerdict:
@@ -21,7 +33,8 @@ class GateVerdict:
     """True only if every pole, everywhere within α ± 3σ, stays inside the bound."""
 
     worst_pole_radius: float
-    """Largest closed-loop pole radius found; 1 is the edge of stability."""
+    """Largest closed-loop pole radius found; 1 is the edge of stability. Of what is accepted no
+    pole is beyond the bound, and none more than ``NEAR`` above this."""
 
     aligned_pole_radius: float
     """The same for a perfect reconstructor at these gains: nothing can do better."""
@@ -93,13 +106,11 @@ def judge(
     centre = reconstructor @ linearisation.matrix_at(registration)[:, :n]
     slopes = [reconstructor @ derivative[:, :n] for derivative in linearisation.derivatives]
     gains = (loop.gains * loop.optical_gain).astype(np.float32)
-    couplings = (
-        centre + np.tensordot(step.astype(np.float32), np.array(slopes), axes=1)
-        for step in _ellipsoid_ends(covariance)
-    )
-    radii = [_worst_pole(coupling, gains, loop) for coupling in couplings]
+    steps = _ellipsoid_ends(covariance).astype(np.float32)
     aligned = float(pole_radius(gains, leak=loop.leak, delay_frames=loop.delay_frames).max())
-    stable = _verdict(max(radii), aligned, max(bound, (1.0 + aligned) / 2), len(radii))
+    bound = max(bound, (1.0 + aligned) / 2)
+    worst = _worst_pole(centre, np.array(slopes), steps, gains, loop, min(bound, 1.0))
+    stable = _verdict(worst, aligned, bound, 1 + 2 * len(steps))
     if loop.outer is None or not stable.accepted:
         return stable
     motion_m = edge_motion_m(
@@ -142,22 +153,76 @@ def _moving(
 
 
 def _worst_pole(
-    coupling: NDArray[np.float32], gains: NDArray[np.float32], loop: LoopSettings
+    centre: Coupling,
+    slopes: Coupling,
+    steps: Coupling,
+    gains: Coupling,
+    loop: LoopSettings,
+    limit: float,
 ) -> float:
-    eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
-    radii = pole_radius(eigenvalues, leak=loop.leak, delay_frames=loop.delay_frames)
-    return float(radii.max())
+    """Return the largest pole radius at the centre and at both ends of every step.
+
+    Points are tried in the order of what :func:`_ceilings` says they may reach at most. The rest is
+    left out when none of it can matter: it stays within the limit, and no more than ``NEAR`` above
+    what was found; or one was found beyond the limit.
+    """
+    moves = np.tensordot(steps, slopes, axes=1)
+    ends = [np.zeros_like(centre), *moves, *-moves]
+    ceilings = _ceilings(centre, moves, gains, loop)
+    worst = 0.0
+    for k in np.argsort(-ceilings):
+        if worst > limit or ceilings[k] <= max(worst, min(limit, worst + NEAR)):
+            break
+        eigenvalues = np.linalg.eigvals(gains[:, None] * (centre + ends[k]))
+        radii = pole_radius(eigenvalues, leak=loop.leak, delay_frames=loop.delay_frames)
+        worst = max(worst, float(radii.max()))
+    return worst
+
+
+def _ceilings(
+    centre: Coupling, moves: Coupling, gains: Coupling, loop: LoopSettings
+) -> NDArray[np.float64]:
+    """Return radii that no pole exceeds: at the centre, and at both ends of every move.
+
+    Eigenvalues of ``g R D`` are those of ``B = √g R D √g``. They lie in a rectangle about its
+    numerical range: real parts between the extreme eigenvalues of ``(B + B^T) / 2``, imaginary
+    ones within the norm of ``(B - B^T) / 2``; of a sum of two it is at most the sum of both. The
+    largest pole of a region lies on its border, for a spectral radius is subharmonic.
+    """
+    if gains.min() < 0.0:
+        return np.full(1 + 2 * len(moves), np.inf)
+    root = np.sqrt(gains)
+    own, *parts = (_extent(root[:, None] * part * root) for part in (centre, *moves))
+    extents = [own, *(own + part for part in parts)]
+    extents += [own + np.array([-high, -low, turn]) for low, high, turn in parts]
+    return np.array([_largest_on_border(extent, loop) for extent in extents])
+
+
+def _extent(matrix: Coupling) -> NDArray[np.float64]:
+    """Return least and largest real part and largest imaginary part of the numerical range."""
+    even, odd = (matrix + matrix.T) / 2, (matrix - matrix.T) / 2
+    real = np.linalg.eigvalsh(even)
+    turn = np.sqrt(np.maximum(np.linalg.eigvalsh(odd.T @ odd)[-1], 0.0))
+    slack = ROUNDING * max(abs(real[0]), abs(real[-1]), turn)
+    return np.array([real[0] - slack, real[-1] + slack, turn + slack], dtype=np.float64)
+
+
+def _largest_on_border(extent: NDArray[np.float64], loop: LoopSettings) -> float:
+    low, high, turn = extent
+    along, up = np.linspace(low, high, _BORDER), np.linspace(0.0, turn, _BORDER)
+    border = np.concatenate([along + 1j * turn, low + 1j * up, high + 1j * up])
+    radii = pole_radius(border, leak=loop.leak, delay_frames=loop.delay_frames)
+    return float(radii.max()) + ROUNDING
 
 
 def _ellipsoid_ends(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the centre and the ends of the 3σ axes, ``(9, 4)``.
+    """Return one end of each of the 3σ axes, ``(4, 4)``; the other is its negative.
 
     The axes are those of the correlation matrix, so that units play no part.
     """
     sigma = np.sqrt(np.diag(covariance))
     power, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
-    ends = 3.0 * (axes * np.sqrt(np.maximum(power, 0.0))).T * sigma
-    return np.vstack([np.zeros(len(sigma)), ends, -ends])
+    return np.asarray(3.0 * (axes * np.sqrt(np.maximum(power, 0.0))).T * sigma)
 
 
 def _verdict(worst: float, aligned: float, bound: float, n_points: int) -> GateVerdict:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.control.edge import FORGIVING_LEAK, HELD_LIMIT_M, LIMIT_M, Outer
-from service.control.gate import LoopSettings, judge
+from service.control.gate import NEAR, LoopSettings, judge
 from service.control.reconstructor import invert
 from service.control.stability import pole_radius
 from service.model.misregistration import Misregistration
@@ -271,3 +271,51 @@ class TestHolding:
         refused = verdict(truth=turned(30.0), loop=calm)
         assert not refused.accepted
         assert "pole radius" in refused.reason
+
+
+# --- what is left out cannot matter
+
+
+def every_radius(matrix, truth, covariance, loop):
+    """The pole radii at all nine points, one after the other."""
+    n = len(matrix)
+    sigma = np.sqrt(np.diag(covariance))
+    power, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    ends = 3.0 * (axes * np.sqrt(np.maximum(power, 0.0))).T * sigma
+    gains = loop.gains * loop.optical_gain
+    radii = []
+    for step in [np.zeros(4), *ends, *-ends]:
+        there = small_linearisation().matrix_at(Misregistration.from_vector(truth.vector + step))
+        eigenvalues = np.linalg.eigvals(gains[:, None] * (matrix @ there[:, :n]).astype(float))
+        radii.append(pole_radius(eigenvalues, leak=loop.leak, delay_frames=loop.delay_frames).max())
+    return np.array(radii)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_whatever_is_left_out_the_word_is_that_of_all_nine_points(seed):
+    rng = np.random.default_rng(seed)
+    away = rng.normal(0.0, [0.1, 0.1, 0.08, 0.01])
+    truth = Misregistration.from_vector(Misregistration().vector + away)
+    sigma = SIGMA * rng.uniform(0.2, 12.0)
+    gains = rng.uniform(0.05, 0.9) * rng.uniform(0.6, 1.0, N_CONTROLLED)
+    loop = LoopSettings(
+        gains=gains, leak=rng.uniform(0.98, 1.0), delay_frames=rng.uniform(1.0, 2.5)
+    )
+    matrix = reconstructor_for(Misregistration())
+    found = judge(matrix, small_linearisation(), truth, np.diag(sigma**2), loop, bound=BOUND)
+    radii = every_radius(matrix, truth, np.diag(sigma**2), loop)
+    assert found.accepted == (radii.max() <= found.bound and radii.max() < 1.0)
+    assert found.worst_pole_radius <= radii.max() + 1e-3
+    if found.accepted:
+        assert found.worst_pole_radius >= radii.max() - NEAR
+
+
+def test_a_fresh_matrix_is_judged_at_few_points(monkeypatch):
+    """Each costs a tenth of a second with 400 modes, and the bounds of all as much as one."""
+    tried = []
+    eigenvalues = np.linalg.eigvals
+    monkeypatch.setattr(
+        np.linalg, "eigvals", lambda a: (a.ndim == 2 and tried.append(a)) or eigenvalues(a)
+    )
+    assert verdict(made_for=SOMEWHERE, truth=SOMEWHERE).accepted
+    assert 1 <= len(tried) <= 3

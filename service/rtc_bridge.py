@@ -98,8 +98,7 @@ class Bridge:
     def open(self) -> None:
         """Open the zenoh session and say that the service is there.
 
-        The queryables are declared before the liveliness token, so that an RTC that sees the token
-        can ask.
+        The queryables come before the liveliness token: an RTC that sees the token can ask.
 
         Raises
         ------
@@ -123,14 +122,19 @@ class Bridge:
     def close(self) -> None:
         """Leave the network; the process can exit. Closing twice does nothing."""
         self._closed = True
-        session, self._session = self._session, None
-        self._publishers.clear()
-        self._standby.leave()
-        self._held.clear()
         self._intake.set_wakeup(None)
+        if self._leave():
+            self._log.info("link.closed")
+
+    def _leave(self) -> bool:
+        """Give up what is declared, and the session; return whether there was one."""
+        session, self._session = self._session, None
+        self._standby.leave()
+        self._publishers.clear()
+        self._held.clear()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
-            self._log.info("link.closed")
+        return session is not None
 
     def reopen(self) -> None:
         """Close the session and open another, unless the link is closed: every RTC connects anew.
@@ -140,11 +144,7 @@ class Bridge:
         LinkError
             If the port has been taken meanwhile, or no router answers: then it is closed.
         """
-        session, self._session = self._session, None
-        self._publishers.clear()
-        self._held.clear()
-        if session is not None:
-            session.close()  # type: ignore[no-untyped-call]
+        self._leave()
         self._intake.liveliness(alive=False)
         if not self._closed:
             self._open()
@@ -291,12 +291,11 @@ class Bridge:
         return callback
 
     def _on_frames(self, sample: zenoh.Sample) -> None:
-        session = self._session
-        payload, attachment = sample.payload, sample.attachment
+        session, attachment = self._session, sample.attachment
         if session is None:
             return
         self._intake.frames(
-            link.bytes_of(payload, BATCH_LIMIT, "a frame batch"),
+            link.bytes_of(sample.payload, BATCH_LIMIT, "a frame batch"),
             None
             if attachment is None
             else link.bytes_of(attachment, ATTACHMENT_LIMIT, "an attachment"),
@@ -318,8 +317,7 @@ class Bridge:
 
     def _on_measured(self, sample: zenoh.Sample) -> None:
         data = link.bytes_of(sample.payload, CHUNK_LIMIT, "a measured matrix")
-        event = self._measured.take(str(sample.key_expr), data)
-        if event is not None:
+        if (event := self._measured.take(str(sample.key_expr), data)) is not None:
             self._intake.event(event)
 
     def _on_alive(self, token: tuple[str, bool]) -> None:
@@ -328,8 +326,7 @@ class Bridge:
     def _answer(self, query: zenoh.Query) -> None:
         """Answer a query for a reconstructor; a text says why there is none."""
         with query:
-            key = str(query.key_expr)
-            part = query.parameters.get("chunk")
+            key, part = str(query.key_expr), query.parameters.get("chunk")
             try:
                 if key == self._keys.current:
                     data, encoding = self._outbox.current_commit(), Encodings.COMMIT
@@ -365,11 +362,10 @@ class Bridge:
     def _publish(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         session = self._driven()
         offer = self._prepare(manifest, matrix)
+        keys, name = self._keys, manifest.id
         for index, part in enumerate(offer.parts):
-            key = self._keys.chunk(manifest.id, index)
-            link.put(session, key, part, Encodings.BYTES, urgent=False)
-        key = self._keys.commit(manifest.id)
-        link.put(session, key, offer.commit, Encodings.COMMIT, urgent=True)
+            link.put(session, keys.chunk(name, index), part, Encodings.BYTES, urgent=False)
+        link.put(session, keys.commit(name), offer.commit, Encodings.COMMIT, urgent=True)
         self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
 
     def _command(self, command: Command) -> Reply:

@@ -525,6 +525,13 @@ def test_a_service_that_holds_only_the_contracts_token_was_first_if_it_was_there
             assert drives(late, rtc, "l-2")
 
 
+def test_a_service_that_opens_its_link_anew_is_there_again_and_drives(bridge, rtc):
+    bridge.reopen()
+    wait_until(lambda: tokens(rtc.zenoh, rtc.keys.alive(Role.SERVICE)), 5.0)
+    wait_until(lambda: drives(bridge, rtc, f"l-{time.monotonic_ns()}"), 10.0)
+    assert rtc.fetch(rtc.keys.current) == "nothing to offer"
+
+
 def test_a_later_service_that_gives_no_name_is_known_by_its_state(bridge, rtc):
     state = StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use=None)
     rtc.send_bytes(rtc.keys.state, encode_state(state))

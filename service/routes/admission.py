@@ -105,9 +105,12 @@ class Admission:
             return await problem(request, status, kind, detail)(scope, receive, send)
         if (request.method, request.url.path) != STREAMED:
             try:
-                receive = _again(await _whole(request, receive), receive)
+                body = await _whole(request, receive)
             except PyrcalError as error:
                 return await known_problem(request, error)(scope, receive, send)
+            if body is None:
+                return None
+            receive = _again(body, receive)
         return await self._app(scope, receive, send)
 
     def _stranger(self, request: Request) -> tuple[HTTPStatus, str, str] | None:
@@ -143,8 +146,8 @@ def _same(origin: str, host: str) -> bool:
     return port is not None and authority.removesuffix(port) == host.removesuffix(port)
 
 
-async def _whole(request: Request, receive: Receive) -> bytes:
-    """Return the body of a request.
+async def _whole(request: Request, receive: Receive) -> bytes | None:
+    """Return the body of a request; None: the client went away before it was whole.
 
     Raises
     ------
@@ -159,6 +162,8 @@ async def _whole(request: Request, receive: Receive) -> bytes:
         async with asyncio.timeout(BODY_S):
             while True:
                 message = await receive()
+                if message["type"] == "http.disconnect":
+                    return None
                 body += message.get("body", b"")
                 if len(body) > MOST_BODY_BYTES:
                     raise _too_large("more")

@@ -199,8 +199,13 @@ class Recorder:
                 records, entries = dict(self._records), tuple(self._entries)
                 lost = self._lost
             told = _told(lost) if lost else ()
-            if records or entries:
-                self._archive.record(tuple(records.values()), (*entries, *told))
+            try:
+                if records or entries:
+                    self._archive.record(tuple(records.values()), (*entries, *told))
+            except StorageError:
+                raise
+            except ArchiveError as error:  # a damaged index is a disk that refuses, too
+                raise StorageError(str(error)) from error
             with self._guard:
                 del self._entries[: len(entries)]
                 self._lost -= lost

@@ -287,3 +287,14 @@ async def test_what_is_no_http_is_a_problem_document_too(service):
         assert (status, problem["status"]) == (400, 400)
         assert b"application/problem+json" in head
         writer.close()
+
+
+async def test_half_an_order_is_no_order(service):
+    """Its beginning may be one: what a client leaves behind is not carried out."""
+    async with serving(service) as port:
+        head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+        _, writer = await connected(port, head + b"Content-Length: 100\r\n\r\n{}")
+        await asyncio.sleep(0.2)
+        writer.close()
+        await asyncio.sleep(0.2)
+    assert service.commands == []

@@ -327,6 +327,24 @@ async def test_what_could_not_be_written_is_written_once_it_can_be_and_only_once
     assert told == ["first", "second"]
 
 
+async def test_an_index_that_is_damaged_meanwhile_does_not_end_the_service(
+    supervisor, archive, monkeypatch, impatient
+):
+    def damaged(*_):
+        raise ArchiveError("index.sqlite: damaged: move it away")
+
+    async with running(supervisor):
+        with monkeypatch.context() as patch:
+            patch.setattr(archive, "record", damaged)
+            supervisor._post(ev.Noted(name="note", text="first"))
+            await until(lambda: alarm_of(supervisor, "archive-failed"))
+            with pytest.raises(ArchiveError, match="move it away"):
+                await supervisor.submit(ev.SetMode(mode=Mode.AUTO))
+        await until(lambda: alarm_of(supervisor, "archive-failed") is None)
+        assert supervisor.snapshot().tracker.mode is Mode.HOLD
+    assert ("note", "first") in trail(archive, "service")
+
+
 async def test_a_service_that_ends_while_the_disk_refuses_still_writes_what_waits(
     supervisor, archive
 ):

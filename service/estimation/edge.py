@@ -31,6 +31,9 @@ SUSPECT_FOR_S = 0.5
 LOW_MODES = 30
 """Left out: tip, tilt and their like move the whole mirror by more than any slip."""
 
+LOOK_FRAMES = 50
+"""One of so many frames is looked at, however long a block is."""
+
 _MEMORY_S = 0.25
 """Turbulence of higher modes has forgotten itself after this; a slip has not."""
 
@@ -100,10 +103,21 @@ def edge_watch(
 
 
 def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
-    """Return the health after one more block, of which the last frame is looked at."""
-    command = block.commands_m[-1]
+    """Return the health after one more block, of which a frame now and then is looked at."""
+    start = 0
+    while start < block.n_frames:
+        stop = min(start + LOOK_FRAMES, block.n_frames)
+        lasted_s = (stop - start) * block.dt_ns * 1e-9
+        health = _seen(health, block.commands_m[stop - 1], lasted_s, watch)
+        start = stop
+    return health
+
+
+def _seen(
+    health: EdgeHealth, command: NDArray[np.float32], lasted_s: float, watch: EdgeWatch
+) -> EdgeHealth:
+    """Return the health after a command that stands for so much time."""
     outer, inner = watch.outer @ command, watch.inner @ command
-    lasted_s = block.n_frames * block.dt_ns * 1e-9
     fade = float(np.exp(-lasted_s / _MEMORY_S))
     position = (1.0 - fade) * outer
     if health.position is not None:

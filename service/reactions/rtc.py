@@ -10,7 +10,7 @@ from service.reactions.alarms import OTHER_SUM, SECOND_SERVICE, STANDING_BY
 from service.reactions.dither import follow_status, found_again
 from service.reactions.dither_unwanted import gone
 from service.reactions.evidence import over, pointed, voided
-from service.reactions.journal import logged, with_alarm, without_alarm
+from service.reactions.journal import counted, logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS
 from service.reactions.shelf import known_record, with_in_use, with_state
 from service.reactions.verdicts import same_loop
@@ -49,7 +49,7 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
         state = replace(state, making_since_ns_utc=None)
         text = f"no reconstructor came within {COMPUTE_WITHIN_S:.0f} s"
         state = logged(state, "reconstructor.lost", text, now_ns, Level.WARNING)
-    return state
+    return counted(state, now_ns)
 
 
 def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pydantic import Field
+
 from service.routes.acquisition_views import AcquisitionView
 from service.routes.dither_views import DitheringView
 from service.routes.registration_views import AlphaView, PointingView, WatchdogView
@@ -113,6 +115,8 @@ class LogEntryView(View):
     """Machine-readable, like ``reconstructor.applied``."""
 
     text: str
+    n_times: int = Field(validation_alias="times")
+    """How often so far: a line that repeats is told once a minute, with a count."""
 
 
 class EventsView(View):

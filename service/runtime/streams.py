@@ -53,6 +53,9 @@ class Streams:
     in_loop: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     """Modes it moves by itself; empty: it is open."""
 
+    still: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    """Controlled modes that have no gain."""
+
     lock_in: LockIn | None = None
     """None while no sine is dithered."""
 
@@ -124,7 +127,8 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     in_loop = np.array(rtc.in_loop, dtype=np.intp)
     # an RTC of another instrument may have more
     known = in_loop[in_loop < streams.description.n_modes]
-    streams = replace(streams, in_loop=known)
+    still = np.setdiff1d(np.arange(rtc.n_controlled), known)
+    streams = replace(streams, in_loop=known, still=still)
     streams = _watching_the_edge(streams, rtc)
     # frames that are on their way may have been made by the loop as it was
     streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None)
@@ -308,8 +312,7 @@ def _moving(streams: Streams, block: FrameBlock) -> FrameBlock:
 
     An integrator without leak keeps it for ever; a mode that never moves tells nothing.
     """
-    n_controlled = streams.rtc.n_controlled if streams.rtc is not None else 0
-    still = np.setdiff1d(np.arange(n_controlled), streams.in_loop)
+    still = streams.still
     if not len(still):
         return block
     commands = block.commands_m.copy()

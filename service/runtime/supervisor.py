@@ -38,8 +38,11 @@ from service.tracker import step
 from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, Workbench
 
-POLL_S = 0.05
+POLL_S = 0.1
 """Longest time telemetry waits to be taken in: frames held for a hole ring no bell."""
+
+GATHER_S = 0.08
+"""Between two visits to the link: each costs two milliseconds, whatever there is."""
 
 WATCH_INTERVAL_S = 4.0
 """Between two looks of the passive watchdog: a jump is to be seen within 5 s."""
@@ -208,8 +211,7 @@ class Supervisor:
                     self._post(event)
                     self._check_shape()
             self._feed()
-            # a bell for every batch would spend the core on waking up
-            await asyncio.sleep(POLL_S / 2)
+            await asyncio.sleep(GATHER_S)
 
     def _feed(self) -> None:
         if self._streams is None:
@@ -395,5 +397,8 @@ class Supervisor:
 
 
 def _new_entries(before: TrackerState, after: TrackerState) -> list[LogEntry]:
-    known = set(before.log)
-    return [entry for entry in after.log if entry not in known]
+    """Return the lines that were added; one that was only counted is not among them."""
+    if after.log is before.log:
+        return []
+    known = {entry.line for entry in before.log}
+    return [entry for entry in after.log if entry.line not in known]

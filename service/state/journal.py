@@ -70,3 +70,14 @@ class LogEntry:
     """Machine-readable, like ``reconstructor.applied``."""
 
     text: str
+
+    times: int = 1
+    """How often: a line that repeats within a minute is told once, and again with this count."""
+
+    last_ns_utc: int = 0
+    """The last time, where it was more than once."""
+
+    @property
+    def line(self) -> tuple[int, str, str]:
+        """What makes it this line and no other, however often it has happened."""
+        return self.t_ns_utc, self.name, self.text

@@ -139,20 +139,20 @@ class _IntoStructlog(logging.Handler):
 
 async def _serve(settings: Settings, instrument: Instrument) -> int:
     """Open everything, run until asked to stop or the service fails, close everything."""
-    listener = _listener(settings.api.host, settings.api.port)
-    archive = Archive(settings.service.data_dir)
-    archive.open()
     system = settings.service.system or instrument.name
     crew = Crew(lambda: start_worker(instrument, _compute(settings)))
-    try:
+    archive = Archive(settings.service.data_dir)
+    with _listener(settings.api.host, settings.api.port) as listener:
+        archive.open()
         with archive, Bridge(_endpoint(settings, system)) as bridge:
             bridge.expect(instrument.basis_id, instrument.config_id)
             supervisor = _supervisor(settings, instrument, system, bridge, crew, archive)
             desk = _desk(settings, instrument)
             hosts = Hosts(bound=settings.api.host, allowed=settings.api.allowed_hosts)
-            return await _until_stopped(supervisor, desk, listener, hosts)
-    finally:
-        crew.dismiss()
+            try:
+                return await _until_stopped(supervisor, desk, listener, hosts)
+            finally:
+                crew.dismiss()
 
 
 async def _until_stopped(

@@ -47,8 +47,15 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "transport/link/tx/lease": round(1000 * endpoint.lease_s),
         "transport/shared_memory/enabled": False,
     }
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
+    try:
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+    except zenoh.ZError as error:
+        found = ", ".join(map(repr, endpoint.connect if client else endpoint.listen))
+        raise LinkError(
+            f"zenoh.{'connect' if client else 'listen'}: found {found}, expected endpoints like "
+            "tcp/127.0.0.1:7447"
+        ) from error
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

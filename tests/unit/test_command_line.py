@@ -89,6 +89,30 @@ def test_a_busy_port_is_said_before_anything_starts(capsys, tmp_path):
     assert not (tmp_path / "var").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--listen", "foo"], "foo"),
+        (["--listen", "tcp/127.0.0.1:99999"], "99999"),
+        (["--listen", "tcp/nowhere.invalid:7447"], "nowhere.invalid"),
+        (["--listen", "carrier-pigeon/127.0.0.1:7447"], "carrier-pigeon"),
+        (["--listen", ""], "listen"),
+        (["--connect", "foo"], "foo"),
+        (["--data-dir", "/dev/null/data"], "/dev/null/data"),
+        (["--data-dir", "file"], "file"),
+        (["--config", "."], "."),
+        (["--config", "file"], "file"),
+        (["--instrument", "."], "."),
+        (["--instrument", ""], "instrument"),
+        (["--instrument", "file"], "file"),
+        (["--host", "nowhere.invalid"], "nowhere.invalid"),
+    ],
+)
+def test_what_run_cannot_use_is_named_in_one_line(capsys, tmp_path, words, named):
+    (tmp_path / "file").write_bytes(b"\xff\x00 = [")
+    assert named in refused(capsys, "run", "--port", "0", *words)
+
+
 def test_a_host_that_is_not_ours_is_refused_in_one_line(capsys):
     assert "192.0.2.1" in refused(capsys, "run", "--host", "192.0.2.1", "--port", "0")
 

@@ -75,6 +75,14 @@ def counted(state: TrackerState, now_ns: int) -> TrackerState:
     return state
 
 
+def new_lines(before: TrackerState, after: TrackerState) -> list[LogEntry]:
+    """Return the lines that were added; one that was only counted is not among them."""
+    if after.log is before.log:
+        return []
+    known = {entry.line for entry in before.log}
+    return [entry for entry in after.log if entry.line not in known]
+
+
 def with_alarm(state: TrackerState, name: str, text: str, now_ns: int) -> TrackerState:
     """Return the state with this alarm raised; one already raised keeps its beginning."""
     before = next((a for a in state.alarms if a.name == name), None)

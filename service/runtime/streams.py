@@ -33,6 +33,9 @@ WINDOW_SAMPLES = 5
 VERDICTS = 2
 """On the loop's law that must agree that something is otherwise than told."""
 
+AT_EASE_S = 0.8
+"""A loop that was just found to do as it is told to is not asked again before."""
+
 MATRICES_KEPT = 2
 """The reconstructor in use, and the one before: frames of it may still come."""
 
@@ -90,6 +93,9 @@ class Streams:
     """Reconstructors by id, oldest first, bounded."""
 
     check: LoopCheck = field(default_factory=LoopCheck)
+    obeyed_seq: int = 0
+    """Up to here the commands were found to obey the loop."""
+
     off: Obedience | None = None
     """How the commands fail to obey the loop; None: they obey, or nobody knows."""
 
@@ -131,7 +137,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     streams = replace(streams, in_loop=known, still=still)
     streams = _watching_the_edge(streams, rtc)
     # frames that are on their way may have been made by the loop as it was
-    streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None)
+    streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None, obeyed_seq=0)
     memory = Passive(
         n_modes=rtc.n_controlled,
         memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz,
@@ -222,8 +228,11 @@ def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:
     law, found = looplaw.judged(streams.law, terms, rtc.seq)
     if found is None:
         return replace(streams, law=law)
-    unlawful = (*streams.unlawful, found.wrong)[-VERDICTS:] if found.wrong else ()
-    return replace(streams, law=law, unlawful=unlawful)
+    if found.wrong:
+        unlawful = (*streams.unlawful, found.wrong)[-VERDICTS:]
+        return replace(streams, law=law, unlawful=unlawful)
+    law = replace(law, judged_seq=law.judged_seq + round(AT_EASE_S * rtc.frame_rate_hz))
+    return replace(streams, law=law, unlawful=())
 
 
 def _much_the_same_loop(before: RtcView, after: RtcView) -> bool:
@@ -238,11 +247,15 @@ def _much_the_same_loop(before: RtcView, after: RtcView) -> bool:
 
 def _confirmed(streams: Streams, rtc: RtcView) -> Streams:
     """Judge the frames up to a status that shows the same loop as the one before."""
+    if streams.off is None and rtc.seq < streams.obeyed_seq + AT_EASE_S * rtc.frame_rate_hz:
+        return streams
     span, terms = loopcheck.last_samples(streams.check, rtc.seq), _terms(streams, rtc.cm_id)
     if span is None or terms is None:
         return streams
     check, found = loopcheck.obedience(streams.check, terms, *span)
-    return replace(streams, check=check, off=None if found is None or found.holds else found)
+    if found is None or found.holds:
+        return replace(streams, check=check, off=None, obeyed_seq=rtc.seq)
+    return replace(streams, check=check, off=found)
 
 
 def with_dither(streams: Streams, dither: DitherView | None, window_s: float) -> Streams:

@@ -20,6 +20,7 @@ from service.estimation.lockin import Spectra, WindowRefused
 from service.estimation.randomdither import Correlated
 from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
+from service.reactions.journal import new_lines
 from service.reactions.policy import Policy
 from service.routes.service import Snapshot
 from service.rtc_bridge import Bridge
@@ -33,7 +34,7 @@ from service.runtime.recording import Recorder
 from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, waiting_for
 from service.runtime.windows import Backlog, fitted, listened, watched
-from service.state import Level, LogEntry, MeasureState, TrackerState, Waiting
+from service.state import Level, MeasureState, TrackerState, Waiting
 from service.tracker import step
 from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, Workbench
@@ -390,15 +391,7 @@ class Supervisor:
 
     def _tell(self, before: TrackerState) -> None:
         """Log what is new in the state's log, at its level, and have it recorded."""
-        entries = _new_entries(before, self._state)
+        entries = new_lines(before, self._state)
         for entry in entries:
             getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text)
         self._recorder.changed(before, self._state, entries)
-
-
-def _new_entries(before: TrackerState, after: TrackerState) -> list[LogEntry]:
-    """Return the lines that were added; one that was only counted is not among them."""
-    if after.log is before.log:
-        return []
-    known = {entry.line for entry in before.log}
-    return [entry for entry in after.log if entry.line not in known]

@@ -181,11 +181,17 @@ def _cut(streams: Streams, rtc: RtcView) -> Streams:
 
 def _same_loop(before: RtcView, after: RtcView) -> bool:
     return (
-        before.session == after.session
-        and before.loop == after.loop
+        _same_run(before, after)
         and before.gains == after.gains
         and before.leak == after.leak
         and before.delay_frames == after.delay_frames
+    )
+
+
+def _same_run(before: RtcView, after: RtcView) -> bool:
+    return (
+        before.session == after.session
+        and before.loop == after.loop
         and before.frame_rate_hz == after.frame_rate_hz
         and before.n_controlled == after.n_controlled
     )
@@ -220,7 +226,7 @@ def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:
 
     Gains may follow the seeing meanwhile.
     """
-    if before is None or not _much_the_same_loop(before, rtc):
+    if before is None or not (_same_run(before, rtc) and same_loop(before, rtc)):
         return replace(streams, law=LoopLaw(from_seq=rtc.seq + 1), unlawful=())
     terms = _terms(streams, rtc.cm_id)
     if terms is None or streams.law.cm_id != rtc.cm_id:
@@ -233,16 +239,6 @@ def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:
         return replace(streams, law=law, unlawful=unlawful)
     law = replace(law, judged_seq=law.judged_seq + round(AT_EASE_S * rtc.frame_rate_hz))
     return replace(streams, law=law, unlawful=())
-
-
-def _much_the_same_loop(before: RtcView, after: RtcView) -> bool:
-    return (
-        before.session == after.session
-        and before.loop == after.loop
-        and before.frame_rate_hz == after.frame_rate_hz
-        and before.n_controlled == after.n_controlled
-        and same_loop(before, after)
-    )
 
 
 def _confirmed(streams: Streams, rtc: RtcView) -> Streams:

@@ -24,6 +24,9 @@ MAX_ERROR_IN_SIGMA = 4.0
 LONG_S = 5.0
 """What has been missing for so long is missing."""
 
+MODEL = "model"
+"""Name of what the service waits for until its model is prepared."""
+
 REAL_TIME = 0.9
 """A simulator below this share of real time is called slow."""
 
@@ -154,8 +157,9 @@ def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
     """Yield what may have kept the service from its job."""
     if state is None:
         return
-    if not state["ready"]:
-        yield f"the service was not ready: {state['ready_reason']}"
+    waited_for = waits(state)
+    if MODEL in waited_for:
+        yield f"the service was not ready: {waited_for[MODEL]}"
         return
     if circumstances.untold_s > LONG_S:
         yield f"the simulator has made nothing for {circumstances.untold_s:.0f} s"
@@ -164,7 +168,15 @@ def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
     if circumstances.pace is not None and circumstances.pace < REAL_TIME:
         yield f"too slow: the simulator made {circumstances.pace:.2f} s of telemetry a second"
     yield from _of_windows(state, circumstances.refusal)
-    yield from (f"waiting for {text}" for text in state.get("waiting_for", ()))
+    told = {alarm["name"] for alarm in state["alarms"]}
+    yield from (f"waiting: {text}" for name, text in waited_for.items() if name not in told)
+
+
+def waits(state: View) -> dict[str, str]:
+    """Return what the service waits for, and whom, by name."""
+    return {
+        wait["name"]: f"for the {wait['party']}: {wait['text']}" for wait in state["waiting_for"]
+    }
 
 
 def _of_frames(state: View, frameless_s: float) -> Iterator[str]:

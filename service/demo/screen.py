@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.demo.report import REAL_TIME, Report, Stage
+from service.demo.report import MODEL, REAL_TIME, Report, Stage, waits
 from service.demo.truth import Line
 from service.model.misregistration import PARAMETERS
 
@@ -50,8 +50,8 @@ def awaited(state: dict[str, Any] | None) -> str:
     """Return what keeps the clock from starting."""
     if state is None:
         return "the service is starting"
-    if not state["ready"]:
-        return str(state["ready_reason"])
+    if MODEL in (waited_for := waits(state)):
+        return waited_for[MODEL]
     return "the simulated telescope is being prepared"
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 
 from service.demo.children import Child
-from service.demo.report import Circumstances, Report, make_report
+from service.demo.report import MODEL, Circumstances, Report, make_report, waits
 from service.demo.screen import HEADING, awaited, live_line, slow_line
 from service.demo.truth import TruthFile
 
@@ -174,7 +174,7 @@ class Watch:
             last = self._truth.last
             if self._endings():
                 return False
-            if last is not None and self._state is not None and self._state["ready"]:
+            if last is not None and self._state is not None and MODEL not in waits(self._state):
                 self._ready_s = waited_s
                 self._frames_grown_s = time.monotonic()
                 self._stopwatch = Stopwatch(self._frames_grown_s, last["t_ns_utc"])

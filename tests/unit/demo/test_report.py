@@ -49,6 +49,7 @@ def service_state(alarms=(), **error):
     return {
         "ready": True,
         "ready_reason": "ready",
+        "waiting_for": [],
         "uptime_s": 70.0,
         "windows_accepted": 30,
         "windows_refused": 2,
@@ -213,12 +214,19 @@ def test_a_simulator_that_is_slow_or_silent_is_the_reason(truth):
 
 
 def test_a_service_that_was_never_ready_says_what_it_waited_for(truth):
-    reasons = failed(truth, ready=False, ready_reason="the optical model is being prepared")
-    assert reasons == ["the service was not ready: the optical model is being prepared"]
+    reasons = failed(truth, waiting_for=[waiting("model", "worker", "the model is prepared")])
+    assert reasons == ["the service was not ready: for the worker: the model is prepared"]
 
 
-def test_what_the_service_waits_for_is_passed_on(truth):
-    assert "waiting for the RTC's status" in failed(truth, waiting_for=["the RTC's status"])
+def waiting(name, party, text):
+    return {"name": name, "party": party, "text": text, "hinders": True}
+
+
+def test_what_the_service_waits_for_is_passed_on_once(truth):
+    waits = [waiting("status", "rtc", "no status"), waiting("margin", "operator", "approve")]
+    reasons = failed(truth, waiting_for=waits, alarms=[{"name": "margin", "text": "approve"}])
+    assert "waiting: for the rtc: no status" in reasons
+    assert not any("approve" in reason for reason in reasons)
 
 
 def test_a_process_that_ended_is_named_with_its_last_words(truth):

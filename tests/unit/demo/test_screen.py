@@ -99,6 +99,6 @@ def test_a_slow_machine_is_said_to_be_slow_and_a_slow_telescope_is_not_its_fault
 
 def test_while_it_prepares_the_demo_says_what_it_waits_for():
     assert awaited(None) == "the service is starting"
-    preparing = {"ready": False, "ready_reason": "the optical model is being prepared"}
-    assert awaited(preparing) == "the optical model is being prepared"
-    assert "telescope" in awaited({"ready": True})
+    wait = {"name": "model", "party": "worker", "text": "it is being prepared", "hinders": True}
+    assert awaited({"waiting_for": [wait]}) == "for the worker: it is being prepared"
+    assert "telescope" in awaited({"waiting_for": []})

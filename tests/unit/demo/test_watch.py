@@ -7,7 +7,7 @@ import pytest
 from service.demo.children import Child
 from service.demo.truth import TruthFile
 from service.demo.watch import HOLD_S, STRETCH, Promise, Stopwatch, Watch
-from tests.unit.demo.test_report import TRUE, service_state, shelf
+from tests.unit.demo.test_report import TRUE, service_state, shelf, waiting
 
 SECOND_NS = 1_000_000_000
 
@@ -89,7 +89,9 @@ class Scene:
         records = shelf() if self.right else shelf()[:1]
         if request.url.path == "/v1/reconstructors":
             return httpx.Response(200, json={"reconstructors": records})
-        state = service_state(self.alarms) | {"ready": self.now_s >= self.ready_at_s}
+        state = service_state(self.alarms)
+        if self.now_s < self.ready_at_s:
+            state["waiting_for"] = [waiting("model", "worker", "the model is being prepared")]
         state["rtc"], state["in_use"], state["margin"] = {"n_controlled": 400}, "initial", None
         state["link"] = {"frames_received": round(1000 * self.now_s), "frames_lost": 0}
         if not self.right:

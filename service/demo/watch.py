@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 
 from service.demo.children import Child
-from service.demo.report import MODEL, Circumstances, Report, make_report, waits
+from service.demo.report import MODEL, REAL_TIME, Circumstances, Report, make_report, waits
 from service.demo.screen import HEADING, awaited, live_line, slow_line
 from service.demo.truth import TruthFile
 
@@ -34,6 +34,9 @@ SILENCE_S = 5.0
 
 STRETCH = 6.0
 """A machine that does not keep real time may take so many times longer than asked for."""
+
+SLOW_STRETCH = 2.0
+"""... and so many times the telemetry: where the simulator is slow, the service is."""
 
 WORKER_BEHIND = "worker-behind"
 """The alarm that says so: the estimate may come late, and the demo waits for it."""
@@ -193,9 +196,15 @@ class Watch:
         right_s = 0.0 if self._right_since_s is None else clock.spent_s - self._right_since_s
         if self._endings() or (right_s >= HOLD_S and not promise.whole):
             return True
-        longest_s = STRETCH * promise.seconds
-        slow = self._behind and self._right_since_s is None
-        return clock.wall_s >= longest_s or (clock.spent_s >= promise.seconds and not slow)
+        patience = 1.0 if self._right_since_s is not None else self._patience(clock)
+        over = clock.spent_s >= patience * promise.seconds
+        return over or clock.wall_s >= STRETCH * promise.seconds
+
+    def _patience(self, clock: Stopwatch) -> float:
+        """Return how many times the seconds asked for a slow machine is given, of telemetry."""
+        if self._behind:
+            return STRETCH
+        return SLOW_STRETCH if clock.pace is not None and clock.pace < REAL_TIME else 1.0
 
     def _look(self) -> None:
         self._truth.read()

@@ -205,18 +205,19 @@ def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, told: Slo
     seen = solution.projection
     values = np.concatenate([np.zeros(4), solution.nuisances])
     regions = pupil_regions(target.valid)[target.rows]
+    by_mode = np.sqrt(
+        np.sum(seen.residual**2, axis=0) / np.sum(target.matrix[target.rows] ** 2, axis=0)
+    )
+    alpha = Misregistration.from_vector(solution.vector)
+    residual_fraction = float(np.sqrt(np.mean(by_mode**2)))
     sure = uncertainty(
         seen,
         values,
         prior_of(found.nuisances.sigma),
         regions,
         shift_subap=float(np.hypot(*solution.vector[:2])),
+        residual_fraction=residual_fraction,
     )
-    by_mode = np.sqrt(
-        np.sum(seen.residual**2, axis=0) / np.sum(target.matrix[target.rows] ** 2, axis=0)
-    )
-    alpha = Misregistration.from_vector(solution.vector)
-    residual_fraction = float(np.sqrt(np.mean(by_mode**2)))
     evidence = Evidence(
         alpha=alpha,
         converged=solution.converged,

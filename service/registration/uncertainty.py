@@ -16,12 +16,17 @@ from service.registration.projection import Projection
 
 Array = NDArray[np.float64]
 
-MODEL_FLOOR = np.array([8e-5, 8e-5, np.deg2rad(6e-4), 1.5e-4])
-"""1 σ that no matrix is free of: what a mirror of another kind does to a noise-free one."""
+MODEL_FLOOR = np.array([3e-4, 3e-4, np.deg2rad(6e-4), 1.5e-4])
+"""1 σ that no matrix is free of. Noise-free ones of other codes, of the same mirror at 0.3 to 1.1
+subapertures, were read off by 0.017 to 0.038 % of one (RMS of a shift)."""
 
 SHIFT_SHARE = 0.002
 """1 σ of the shifts over the shift itself: far off, a mirror of another kind parts from the model
 at the border. Telescopes at 0.92 subapertures were read off by 0.08 to 0.30 % of one."""
+
+STRANGE_RESIDUAL = 0.095
+"""Share of the signal that a mirror of another kind leaves over. Less has no room for one: the
+share of the shift is less in proportion, as with other codes, which leave a hundredth."""
 
 REGIONAL_SHARE = np.array([0.53, 0.53, 0.165, 1.43])
 """Error of the registration over the scatter of the regions of the pupil, by parameter: what pulls
@@ -83,6 +88,7 @@ def uncertainty(
     regions: NDArray[np.intp],
     *,
     shift_subap: float,
+    residual_fraction: float,
 ) -> Uncertainty:
     """Return how sure the first four unknowns of a projection at its solution are.
 
@@ -99,6 +105,8 @@ def uncertainty(
         ``(n_rows,)`` region of the pupil of each slope.
     shift_subap
         Length of the shift at the solution: part of the model's error grows with it.
+    residual_fraction
+        RMS of what is left over RMS of the measurement: so far the mirror may be another.
     """
     n_modes = len(projection.gains)
     n_sets = min(MOST_SETS, n_modes // LEAST_PER_SET)
@@ -112,7 +120,8 @@ def uncertainty(
     regional = _sandwich(spread, _regional_scores(projection, regions))
     few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
     share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
-    far = SHIFT_SHARE * shift_subap * np.array([1.0, 1.0, 0.0, 0.0])
+    strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)
+    far = strange * SHIFT_SHARE * shift_subap * np.array([1.0, 1.0, 0.0, 0.0])
     from_model = np.diag(share**2 + MODEL_FLOOR**2 + far**2)
     pull = prior * noise * values
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)

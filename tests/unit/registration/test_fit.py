@@ -9,7 +9,7 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
 from service.registration.options import FitOptions, Method
-from service.registration.uncertainty import SHIFT_SHARE
+from service.registration.uncertainty import SHIFT_SHARE, STRANGE_RESIDUAL
 from tests.numerics import small_basis
 from tests.unit.registration.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, matrix
 
@@ -40,13 +40,24 @@ def test_errors_of_noisy_matrices_are_those_that_sigma_says():
     assert 0.8 < np.mean(chi) < 7.6
 
 
-def test_far_shifts_are_said_to_be_less_sure_by_a_share_of_themselves():
+def test_far_shifts_are_less_sure_by_a_share_of_themselves_where_the_mirror_may_be_another():
     """The errors of a model whose mirror is of another kind grow with the shift."""
     far = replace(ELSEWHERE, shift_x_subap=0.9, shift_y_subap=0.3)
     near = replace(ELSEWHERE, shift_x_subap=0.0, shift_y_subap=0.0)
-    sigma = [np.sqrt(fit(matrix(alpha)).covariance[0, 0]) for alpha in (near, far)]
+    strange = 1.2 * STRANGE_RESIDUAL
+    sigma = [np.sqrt(fit(matrix(alpha, noise=strange)).covariance[0, 0]) for alpha in (near, far)]
     assert sigma[1] > SHIFT_SHARE * np.hypot(0.9, 0.3)
     assert sigma[0] < sigma[1]
+
+
+def test_a_far_shift_of_a_mirror_that_is_no_other_is_as_sure_as_it_is_right():
+    """A matrix of the very modes of the file, as other codes make them, leaves next to nothing."""
+    far = replace(ELSEWHERE, shift_x_subap=0.9, shift_y_subap=0.3)
+    found = fit(matrix(far))
+    assert found.residual_fraction < STRANGE_RESIDUAL / 5.0
+    sigma = np.sqrt(found.covariance[0, 0])
+    assert abs(error(found, far)[0]) < 2.0 * sigma
+    assert sigma < 0.5 * SHIFT_SHARE * np.hypot(0.9, 0.3)
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1, 1), (1, -1, -1, 1), (-1, 1, 1, -1), (-1, -1, -1, -1)])

@@ -24,6 +24,9 @@ MAX_ERROR_IN_SIGMA = 4.0
 LONG_S = 5.0
 """What has been missing for so long is missing."""
 
+WORKER_BEHIND = "worker-behind"
+"""The alarm that says so: the estimate may come late, and the demo waits for it."""
+
 MODEL = "model"
 """Name of what the service waits for until its model is prepared."""
 
@@ -165,6 +168,9 @@ def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
         yield f"the simulator has made nothing for {circumstances.untold_s:.0f} s"
     if circumstances.unanswered_s <= LONG_S:
         yield from _of_frames(state, circumstances.frameless_s)
+    for alarm in state["alarms"]:
+        if alarm["name"] == WORKER_BEHIND:
+            yield f"too slow: {alarm['text']}"
     if circumstances.pace is not None and circumstances.pace < REAL_TIME:
         yield f"too slow: the simulator made {circumstances.pace:.2f} s of telemetry a second"
     yield from _of_windows(state, circumstances.refusal)
@@ -243,14 +249,14 @@ def _judge(report: Report) -> None:
     fail = report.failures.append
     report.failures += _estimate_failures(report)
     start, first, target = report.start, report.first_update, report.target_modes
-    if not _less(first.worst_pole_radius, start.worst_pole_radius):
+    if not _recovered(start.worst_pole_radius, first.worst_pole_radius):
         fail("the stability margin has not recovered")
     if not _less(target.wavefront_error_nm, start.wavefront_error_nm):
         fail("the wavefront error with more modes is not below that of the start")
     for swap in report.swaps:
         if swap["frames_skipped"]:
             fail(f"{swap['frames_skipped']} frames skipped at the swap to {swap['cm_id']}")
-    report.failures += [f"alarm {alarm}" for alarm in report.alarms]
+    report.failures += [f"alarm {text}" for text in report.alarms if not _is_slowness(text)]
 
 
 def _estimate_failures(report: Report) -> list[str]:
@@ -265,6 +271,19 @@ def _estimate_failures(report: Report) -> list[str]:
         if abs(report.error_in_sigma[name]) > MAX_ERROR_IN_SIGMA:
             failures.append(f"{name} is off by {report.error_in_sigma[name]:+.1f} sigma")
     return failures
+
+
+def _is_slowness(alarm: str) -> bool:
+    """Return whether an alarm only says that the machine is slow: that is told, and no failure."""
+    return alarm.startswith(f"{WORKER_BEHIND}: ")
+
+
+def _recovered(start: float | None, first: float | None) -> bool:
+    """Return whether an update has the better margin.
+
+    A worker without time never judges the matrix it replaces; the gate has judged the update.
+    """
+    return first is not None and (start is None or _less(first, start))
 
 
 def _less(value: float | None, limit: float | None) -> bool:

@@ -135,5 +135,5 @@ def _stage_row(label: str, stage: Stage) -> str:
     return (
         f"  {label:28} {stage.n_modes:5d}   "
         f"{'-' if error is None else f'{error:8.1f} nm':>15}   "
-        f"{'-' if radius is None else f'{radius:.3f}':>17}"
+        f"{'not judged' if radius is None else f'{radius:.3f}':>17}"
     )

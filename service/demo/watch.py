@@ -10,7 +10,15 @@ from typing import Any
 import httpx
 
 from service.demo.children import Child
-from service.demo.report import MODEL, REAL_TIME, Circumstances, Report, make_report, waits
+from service.demo.report import (
+    MODEL,
+    REAL_TIME,
+    WORKER_BEHIND,
+    Circumstances,
+    Report,
+    make_report,
+    waits,
+)
 from service.demo.screen import HEADING, awaited, live_line, slow_line
 from service.demo.truth import TruthFile
 
@@ -37,9 +45,6 @@ STRETCH = 6.0
 
 SLOW_STRETCH = 2.0
 """... and so many times the telemetry: where the simulator is slow, the service is."""
-
-WORKER_BEHIND = "worker-behind"
-"""The alarm that says so: the estimate may come late, and the demo waits for it."""
 
 _LINE_S = 0.5
 """Loop time between two lines of the truth: one more than the wall clock allows may be there."""

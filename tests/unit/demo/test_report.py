@@ -3,6 +3,7 @@ import json
 import pytest
 
 from service.demo.report import Circumstances, make_report
+from service.demo.screen import table
 from service.demo.truth import TruthFile
 
 TRUE = {"shift_x_subap": 0.1, "shift_y_subap": 0.0, "rotation_deg": 0.2, "magnification": 1.003}
@@ -118,6 +119,22 @@ def test_an_estimate_within_its_tolerance_but_surer_than_it_may_be_fails(truth):
 def test_a_margin_that_did_not_recover_fails(truth):
     report = make_report(service_state(), shelf(cm_400={"gate": gate(0.94)}), truth, WELL)
     assert report.failures == ["the stability margin has not recovered"]
+
+
+def test_a_matrix_that_nobody_had_time_to_judge_is_no_margin_that_did_not_recover(truth):
+    report = make_report(service_state(), shelf(initial={"gate": None}), truth, WELL)
+    assert report.good
+    assert "not judged" in table(report)
+    unknown = make_report(service_state(), shelf(cm_400={"gate": None}), truth, WELL)
+    assert unknown.failures == ["the stability margin has not recovered"]
+
+
+def test_a_worker_that_is_behind_is_told_and_fails_nothing_by_itself(truth):
+    report = make_report(service_state(alarms=["worker-behind"]), shelf(), truth, WELL)
+    assert report.good
+    assert report.alarms == ["worker-behind: found"]
+    behind = [{"name": "worker-behind", "text": "busy all the time"}]
+    assert "too slow: busy all the time" in failed(truth, alarms=behind)
 
 
 def test_more_modes_that_do_not_lower_the_wavefront_error_fail(truth):

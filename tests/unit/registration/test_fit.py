@@ -9,7 +9,7 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
 from service.registration.options import FitOptions, Method
-from service.registration.uncertainty import SHIFT_SHARE, STRANGE_RESIDUAL
+from service.registration.uncertainty import FAR_SHARE, STRANGE_RESIDUAL
 from tests.numerics import small_basis
 from tests.unit.registration.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, matrix
 
@@ -46,7 +46,7 @@ def test_far_shifts_are_less_sure_by_a_share_of_themselves_where_the_mirror_may_
     near = replace(ELSEWHERE, shift_x_subap=0.0, shift_y_subap=0.0)
     strange = 1.2 * STRANGE_RESIDUAL
     sigma = [np.sqrt(fit(matrix(alpha, noise=strange)).covariance[0, 0]) for alpha in (near, far)]
-    assert sigma[1] > SHIFT_SHARE * np.hypot(0.9, 0.3)
+    assert sigma[1] > FAR_SHARE[0] * np.hypot(0.9, 0.3)
     assert sigma[0] < sigma[1]
 
 
@@ -57,7 +57,7 @@ def test_a_far_shift_of_a_mirror_that_is_no_other_is_as_sure_as_it_is_right():
     assert found.residual_fraction < STRANGE_RESIDUAL / 5.0
     sigma = np.sqrt(found.covariance[0, 0])
     assert abs(error(found, far)[0]) < 2.0 * sigma
-    assert sigma < 0.5 * SHIFT_SHARE * np.hypot(0.9, 0.3)
+    assert sigma < 0.5 * FAR_SHARE[0] * np.hypot(0.9, 0.3)
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1, 1), (1, -1, -1, 1), (-1, 1, 1, -1), (-1, -1, -1, -1)])

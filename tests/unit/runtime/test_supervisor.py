@@ -378,6 +378,33 @@ async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
     assert sent == ["cm-1"]
 
 
+async def test_a_matrix_that_cannot_be_stored_is_never_heard_of_and_the_disk_is_named(
+    supervisor, archive, monkeypatch, impatient
+):
+    """A line still fits on the disk, a matrix does not: the alarm lasts until one does."""
+    matrix = np.zeros((300, 4000), np.float32)
+    made = record("cm-9", n_modes=300)
+
+    async def make(_effect, _state):
+        await asyncio.to_thread(archive.store, made, matrix, None, {})
+        return ev.MatrixMade(record=made, wanted=False)
+
+    monkeypatch.setattr(supervisor._deeds, "carry_out", make)
+    async with running(supervisor):
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, limits[1]))
+        try:
+            await supervisor._do(ev.MakeMatrix(n_modes=300, why="test"), supervisor._state)
+            assert "cm-9.h5: cannot be written" in alarm_of(supervisor, "archive-failed").text
+            await asyncio.sleep(0.3)
+            assert alarm_of(supervisor, "archive-failed") is not None
+            assert supervisor.snapshot().tracker.reconstructor("cm-9") is None
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        await until(lambda: alarm_of(supervisor, "archive-failed") is None)
+    assert not list(archive._products.iterdir())
+
+
 async def test_a_refused_order_is_audited_with_the_reason(supervisor, archive):
     async with running(supervisor):
         with pytest.raises(CommandError):

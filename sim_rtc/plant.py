@@ -105,7 +105,8 @@ class Optics:
     def terms(self, reconstructor: Array32, gains: Array32, leak: float) -> LoopTerms:
         """Return the terms of a loop around the interaction matrix."""
         return LoopTerms(
-            reconstructor=reconstructor,
+            # in columns, as the product with rows of slopes reads it
+            reconstructor=np.asfortranarray(reconstructor),
             slopes_per_command=self.slopes_per_command,
             modal_response=reconstructor @ self.slopes_per_command,
             gains=gains,
@@ -237,7 +238,7 @@ class LinearPlant:
         return Optics(
             alpha=alpha,
             slopes_per_phase=jacobian,
-            slopes_per_command=matrix * (self._gain * self._passes),
+            slopes_per_command=np.asfortranarray(matrix * (self._gain * self._passes)),
             opd_per_command=modes * self._passes,
             images=response.images / light,
             stuck_opd_m=stuck_opd_m * self._passes if stuck_opd_m.any() else None,

@@ -79,7 +79,7 @@ def lines_of(frame_rate_hz: float, window_s: float, most: int) -> tuple[float, .
             tuple(np.linspace(low, high, n_lines + 1)[:-1].tolist()),
             (),
             clearance_hz=CLEARANCE_HZ,
-            step_hz=1.0 / window_s,
+            step_hz=frame_rate_hz / round(window_s * frame_rate_hz),
             range_hz=(low, high),
         )
         if found is not None:

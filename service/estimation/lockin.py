@@ -22,6 +22,10 @@ SIDE_OFFSETS_HZ = np.concatenate([np.arange(-20.0, -2.0), np.arange(3.0, 21.0)])
 CHUNK_FRAMES = 512
 """Frames multiplied at once: the sums, 2 MB, are read from memory once for all of them."""
 
+CUT_PERIODS = 0.01
+"""Of a line, by which a window may be too long or too short: a rate of the RTC's that differs by
+parts per million. The Hann window keeps what that costs below 1e-4 of the amplitude."""
+
 MIN_AMPLITUDE_RATIO = 0.5
 MAX_AMPLITUDE_RATIO = 1.5
 """A dither weaker or stronger than these shares of its request was not applied as asked."""
@@ -66,7 +70,7 @@ class LockInPlan:
                 f"{edge} and {self.frame_rate_hz / 2 - edge} Hz, room for the side bins"
             )
         periods = lines * self.n_frames / self.frame_rate_hz
-        if np.abs(periods - np.round(periods)).max() > 1e-6:
+        if np.abs(periods - np.round(periods)).max() > CUT_PERIODS:
             raise ModelError(
                 f"lock-in: {self.n_frames} frames cut a period of {lines} Hz; expected whole ones"
             )

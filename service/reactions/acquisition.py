@@ -126,6 +126,8 @@ def _ended_by(state: TrackerState, event: Event, now_ns: int) -> Step | None:
             return again(state, "the RTC began a new session", now_ns)
         case ev.DitherMeasured(id=loud, text=text) if loud == state.dithering.loud_id and text:
             return fail(state, text, now_ns)
+        case ev.Noted(name="dither.unusable", text=text):
+            return fail(state, f"its dither cannot be read: {text}", now_ns)
         case ev.Tick() if _late(acquisition, now_ns):
             return again(state, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s", now_ns)
         case _:

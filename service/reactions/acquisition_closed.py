@@ -134,7 +134,7 @@ def _make(
 ) -> Step:
     """Ask for a reconstructor of so many modes, or fewer but more than ``at_least``."""
     found = state.acquisition.found
-    if state.making_since_ns_utc is not None or found is None or now_ns < state.retry_ns_utc:
+    if state.making_since_ns_utc is not None or found is None or now_ns < state.retries.make_ns_utc:
         return state, ()
     effect = ev.MakeMatrix(
         n_modes=n_modes,

@@ -99,11 +99,12 @@ def _dithered(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) ->
     if rtc.dither_id is not None:
         stopping = rtc.dither_id == state.dithering.stopped_id
         since_s = (now_ns - state.acquisition.since_ns_utc) / SECOND_NS
-        if now_ns < state.retry_ns_utc or (stopping and since_s < STOPS_WITHIN_S):
+        if now_ns < state.retries.dither_ns_utc or (stopping and since_s < STOPS_WITHIN_S):
             return state, ()
         retry_ns = now_ns + round(STOPS_WITHIN_S * SECOND_NS)
-        return replace(state, retry_ns_utc=retry_ns), (ev.AskNoDither(),)
-    if now_ns < state.retry_ns_utc:
+        retries = state.retries.later(dither_ns_utc=retry_ns)
+        return replace(state, retries=retries), (ev.AskNoDither(),)
+    if now_ns < state.retries.dither_ns_utc:
         return state, ()
     dither = far_dither(state.acquisition.stage, rtc, policy, now_ns)
     if isinstance(dither, str):

@@ -37,7 +37,8 @@ def on_dither(state: TrackerState, event: ev.DitherAnswered, now_ns: int) -> Tra
         )
         text = f"{event.id} starts at frame {event.start_seq}"
         return logged(without_alarm(state, "dither", now_ns), "dither.started", text, now_ns)
-    state = replace(state, dither=None, retry_ns_utc=now_ns + 10 * SECOND_NS)
+    retries = state.retries.later(dither_ns_utc=now_ns + 10 * SECOND_NS)
+    state = replace(state, dither=None, retries=retries)
     return with_alarm(state, "dither", f"the RTC refused the dither: {event.reason}", now_ns)
 
 
@@ -73,7 +74,8 @@ def follow_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerStat
         return logged(state, "dither.ended", f"{dither.id} has ended", now_ns)
     text = f"the RTC's status shows no {dither.id} although it was accepted: it is asked for again"
     wait_s = 0.0 if state.dither_losses == 0 else _patience_s(state)
-    state = replace(state, retry_ns_utc=max(state.retry_ns_utc, now_ns + round(wait_s * SECOND_NS)))
+    retries = state.retries.later(dither_ns_utc=now_ns + round(wait_s * SECOND_NS))
+    state = replace(state, retries=retries)
     return _lost(state, dither, text, now_ns)
 
 

@@ -94,11 +94,11 @@ def _begun(state: TrackerState, rtc: RtcView, policy: Policy, wish: Wish, now_ns
     """Ask for a dither if it is time, and nothing left behind is in its way."""
     if now_ns < calm_ns_utc(state):
         return _shown(state, DitherPhase.OFF, "the RTC has played the last one too strong"), ()
-    if now_ns < state.retry_ns_utc:
+    if now_ns < state.retries.dither_ns_utc:
         return state, ()
     if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
         # left behind by this service: its window of another length, or to stop
-        state = replace(state, retry_ns_utc=now_ns + 2 * SECOND_NS)
+        state = put_off(state, now_ns + 2 * SECOND_NS)
         return stopped(state, rtc.dither_id, now_ns), (AskNoDither(),)
     if now_ns < wish.next_ns_utc or _awaits_a_result(state, wish, now_ns):
         return state, ()
@@ -120,6 +120,11 @@ def learnt(
     mean = forgetting_mean(None if known is None else known.ratio, n_windows, ratio)
     precision = Precision(ratio=mean, n_windows=n_windows + 1)
     return replace(after, dithering=replace(after.dithering, precision=precision))
+
+
+def put_off(state: TrackerState, until_ns_utc: int) -> TrackerState:
+    """Return the state in which no dither is asked for by itself before then."""
+    return replace(state, retries=state.retries.later(dither_ns_utc=until_ns_utc))
 
 
 def _accounted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState:
@@ -183,7 +188,7 @@ def _running(state: TrackerState, dither: DitherView, wish: Wish, now_ns: int) -
     text = f"{dither.id}: {wish.reason}" if done else f"{dither.id} is too weak: {wish.reason}"
     state = replace(stopped(state, dither.id, now_ns), dither=None)
     # the next one must not overtake the command to stop
-    state = replace(state, retry_ns_utc=max(state.retry_ns_utc, now_ns + SECOND_NS))
+    state = put_off(state, now_ns + SECOND_NS)
     return logged(state, "dither.stopped", text, now_ns), (AskNoDither(),)
 
 
@@ -220,8 +225,11 @@ def _ask(state: TrackerState, rtc: RtcView, policy: Policy, wish: Wish, now_ns: 
     dither = plan_dither(rtc, policy, now_ns, choice=wish.choice)
     reason = why_unusable(dither, rtc, policy)
     if reason is not None:
-        state = replace(state, retry_ns_utc=now_ns + 60 * SECOND_NS)
-        return with_alarm(state, "dither", f"no usable dither: {reason}", now_ns), ()
+        text = (
+            f"no usable dither: {reason}; random signs need no lines, and α can be measured with "
+            'them: POST /v1/dither with kind "binary"'
+        )
+        return with_alarm(put_off(state, now_ns + 60 * SECOND_NS), "dither", text, now_ns), ()
     shaken = on_vibrations(dither, wish.choice.avoid_hz)
     if shaken and dither.frequency_hz != state.dithering.lines_hz:
         text = f"lines at {shaken} Hz are on vibrations: there is no room, or the settings fix them"

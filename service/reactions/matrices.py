@@ -320,7 +320,7 @@ def on_fetched(state: TrackerState, record: ReconstructorRecord, now_ns: int) ->
     if known is not None and state.in_use == record.id:
         return state
     state = state if known is not None else with_record(state, record)
-    state = replace(with_in_use(state, record.id), retry_ns_utc=0)
+    state = with_in_use(state, record.id)
     text = f"the RTC uses {record.id}, {record.n_modes} modes"
     return logged(state, "reconstructor.adopted", text, now_ns)
 

@@ -125,7 +125,9 @@ def _give_up(state: TrackerState, measurement_id: str, now_ns: int) -> Step:
         return close_again(replace(state, close_since_ns_utc=now_ns), now_ns)
     lasts_ns = round((record.duration_s or 0.0) * SECOND_NS)
     until_ns = (record.asked_ns_utc or now_ns) + lasts_ns
-    return replace(state, retry_ns_utc=max(state.retry_ns_utc, until_ns)), ()
+    # the RTC has no hand free for a dither, nor can windows tell of α
+    retries = state.retries.later(dither_ns_utc=until_ns, make_ns_utc=until_ns)
+    return replace(state, retries=retries), ()
 
 
 def _planned(command: ev.Measure, rtc: RtcView, policy: Policy, now_ns: int) -> MeasurementRecord:

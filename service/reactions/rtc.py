@@ -13,8 +13,8 @@ from service.reactions.evidence import over, pointed, voided
 from service.reactions.journal import counted, logged, with_alarm, without_alarm
 from service.reactions.policy import SECOND_NS
 from service.reactions.shelf import known_record, with_in_use, with_state
-from service.reactions.verdicts import same_loop
-from service.state import AcquisitionStage, Level, MatrixState, RtcView, TrackerState
+from service.state import AcquisitionStage, Level, MatrixState, Retries, RtcView, TrackerState
+from service.state.rtc import same_numbers
 
 ACKNOWLEDGE_WITHIN_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
@@ -55,7 +55,7 @@ def on_tick(state: TrackerState, now_ns: int) -> TrackerState:
 def on_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
     """Take over what the RTC says of itself."""
     state, before = without_alarm(state, "rtc-vanished", now_ns), state.rtc
-    if state.rtc is not None and not same_loop(state.rtc, rtc):
+    if state.rtc is not None and not state.rtc.same_loop(rtc):
         # the margin is not what it was
         state = replace(state, judged_ns_utc=None)
     state = _of_this_loop(state, rtc)
@@ -87,7 +87,7 @@ def _of_this_loop(state: TrackerState, rtc: RtcView) -> TrackerState:
     known = state.registration
     if known is None or known.bias is None or not known.bias.looked_ns_utc:
         return state
-    if known.bias.loop == rtc.loop_numbers:
+    if same_numbers(known.bias.loop, rtc.loop_numbers):
         return state
     return replace(state, registration=replace(known, bias=None))
 
@@ -149,7 +149,7 @@ def on_new_session(state: TrackerState, session: str, now_ns: int) -> TrackerSta
         assessment=None,
         judged_ns_utc=None,
         loop_command=state.loop_command and replace(state.loop_command, lasts_s=0.0),
-        retry_ns_utc=0,
+        retries=Retries(),
         registration=registration and replace(registration, n_windows=0),
     )
     state = without_alarm(gone(found_again(state, now_ns), now_ns), OTHER_SUM, now_ns)
@@ -186,9 +186,11 @@ def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> T
     later = now_ns + 5 * SECOND_NS
     match effect:
         case ev.MakeMatrix() | ev.CopyMatrix():
-            state = replace(state, making_since_ns_utc=None, retry_ns_utc=later)
+            retries = state.retries.later(make_ns_utc=later)
+            state = replace(state, making_since_ns_utc=None, retries=retries)
         case ev.AskDither():
-            state = replace(state, dither=None, retry_ns_utc=later)
+            retries = state.retries.later(dither_ns_utc=later)
+            state = replace(state, dither=None, retries=retries)
         case ev.AskNoDither():
             pass  # it is asked again while it must be; nothing else has to wait for that
         case ev.FetchMatrix():
@@ -196,7 +198,7 @@ def on_failure(state: TrackerState, effect: Effect, text: str, now_ns: int) -> T
         case ev.SendMatrix(id=matrix_id):
             state = with_state(state, matrix_id, MatrixState.FAILED, text)
         case _:
-            state = replace(state, retry_ns_utc=later)
+            state = replace(state, retries=state.retries.later(make_ns_utc=later))
     return logged(state, "job.failed", text, now_ns, Level.WARNING)
 
 

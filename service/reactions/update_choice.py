@@ -66,7 +66,8 @@ def choose_update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
         return state, ()
     if forbidding(state, Act.SEND_NEW) is not None:
         return state, ()
-    if _busy(state) or now_ns < max(_next_attempt_ns(state, rtc, policy), state.retry_ns_utc):
+    first_ns = max(_next_attempt_ns(state, rtc, policy), state.retries.make_ns_utc)
+    if _busy(state) or now_ns < first_ns:
         return state, ()
     in_use = state.reconstructor(state.in_use) if state.in_use else None
     if in_use is None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.state import Judged, Registration, RtcView, TrackerState
+from service.state import Judged, Registration, TrackerState
+from service.state.rtc import SAME_DELAY, SAME_LEAK, same_gains
 
 MIN_WINDOWS = 2
 """Windows that must agree before anything is made from them."""
@@ -12,28 +13,6 @@ MIN_WINDOWS = 2
 REACH = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
 """Half of what 594 modes tolerate without loss (Heritier et al. 2018): a verdict is as good so far
 beyond α ± 3σ (numeric units)."""
-
-SAME_GAIN = 0.05
-"""Relative: an RTC may follow the seeing with its gains once a second, and the gate judges with the
-largest optical gains there may be, which are a tenth above those measured."""
-
-SAME_DELAY = 0.05
-"""Frames."""
-
-SAME_LEAK = 1e-6
-
-
-def same_loop(one: RtcView, other: RtcView) -> bool:
-    """Return whether a verdict on one of them is as good for the other."""
-    return (
-        abs(one.leak - other.leak) <= SAME_LEAK
-        and abs(one.delay_frames - other.delay_frames) <= SAME_DELAY
-        and _same_gains(one.gains, other.gains)
-    )
-
-
-def _same_gains(some: tuple[float, ...], others: tuple[float, ...]) -> bool:
-    return len(some) == len(others) and np.allclose(some, others, rtol=SAME_GAIN)
 
 
 def settled(known: Registration) -> bool:
@@ -87,5 +66,5 @@ def why_of_another_loop(
         return f"the leak was {judged.leak:g}, it is {rtc.leak:g}"
     if abs(judged.delay_frames - rtc.delay_frames) > SAME_DELAY:
         return f"the delay was {judged.delay_frames:g} frames, it is {rtc.delay_frames:g}"
-    same = rtc.loop == "open" or _same_gains(gains, judged.gains)
+    same = rtc.loop == "open" or same_gains(gains, judged.gains)
     return None if same else "the gains have changed"

@@ -36,6 +36,7 @@ from service.state import (
     TrackerState,
     Watchdog,
 )
+from service.state.rtc import same_numbers
 
 Array = NDArray[np.float64]
 
@@ -97,7 +98,8 @@ def fit_begins_at(state: TrackerState) -> Misregistration | None:
 
 def _why_useless(state: TrackerState, event: ev.Watched) -> str | None:
     """Return why a look says nothing of the telescope as it is, or None."""
-    if event.loop and state.rtc is not None and event.loop != state.rtc.loop_numbers:
+    of_loop = () if state.rtc is None else state.rtc.loop_numbers
+    if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
     return why_no_measurement(state, taken(event.began_ns_utc, event.t_ns_utc))
 

@@ -10,6 +10,7 @@ from service.control.gate import LoopSettings
 from service.reactions.alarms import Act, forbidding
 from service.reactions.gain_tables import table_of
 from service.state import Judged, Registration, RtcView, TrackerState
+from service.state.rtc import same_gains
 
 GAIN_SAFETY = 1.1
 """Above a mean optical gain that nobody says which modes it is of."""
@@ -50,7 +51,7 @@ def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None
     if rtc is None or rtc.loop == "open" or forbidding(state, Act.MEASURE) is not None:
         return None
     n_modes = rtc.n_controlled
-    return n_modes if gains[:n_modes] == rtc.gains[:n_modes] else None
+    return n_modes if same_gains(gains[:n_modes], rtc.gains[:n_modes]) else None
 
 
 def timing(rtc: RtcView, n_controlled: int, registration: Registration) -> Timing:

@@ -21,8 +21,8 @@ from service.estimation.randomdither import Correlated, RandomDither
 from service.estimation.vibration import Hearing, heard, hearing
 from service.reactions.dither_choice import SETTLING_S, asked_of, lock_in_plan
 from service.reactions.random_dither import random_plan
-from service.reactions.verdicts import same_loop
 from service.state import DitherKind, DitherView, RtcView
+from service.state.rtc import same_rate
 from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0
@@ -52,6 +52,9 @@ class Streams:
 
     heard_ns_utc: int = 0
     """End of the last frame that came, the RTC's clock; 0: none has."""
+
+    loop: RtcView | None = None
+    """As it was when the open window, or the sums of ordinary telemetry, began."""
 
     in_loop: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     """Modes it moves by itself; empty: it is open."""
@@ -114,6 +117,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     if rtc is None:
         return replace(
             streams,
+            loop=None,
             hearing=None,
             passive=None,
             lock_in=None,
@@ -128,8 +132,9 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     if before is not None and before.session != rtc.session:
         streams = replace(streams, health=LoopHealth())
     streams = _lawful(streams, before, rtc)
-    if before is not None and _same_loop(before, rtc):
+    if streams.loop is not None and before is not None and streams.loop.same_loop(rtc):
         return streams if before.seq == rtc.seq else _confirmed(streams, rtc)
+    streams = replace(streams, loop=rtc)
     in_loop = np.array(rtc.in_loop, dtype=np.intp)
     # an RTC of another instrument may have more
     known = in_loop[in_loop < streams.description.n_modes]
@@ -144,7 +149,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
         delay_frames=rtc.delay_frames,
         since_ns_utc=streams.heard_ns_utc,
     )
-    if before is None or before.frame_rate_hz != rtc.frame_rate_hz:
+    if before is None or not same_rate(before.frame_rate_hz, rtc.frame_rate_hz):
         ears = hearing(rtc.n_slopes)
         streams = replace(streams, lock_in=None, random=None, dither=None)
         return replace(streams, hearing=ears, passive=memory)
@@ -179,24 +184,6 @@ def _cut(streams: Streams, rtc: RtcView) -> Streams:
     return streams
 
 
-def _same_loop(before: RtcView, after: RtcView) -> bool:
-    return (
-        _same_run(before, after)
-        and before.gains == after.gains
-        and before.leak == after.leak
-        and before.delay_frames == after.delay_frames
-    )
-
-
-def _same_run(before: RtcView, after: RtcView) -> bool:
-    return (
-        before.session == after.session
-        and before.loop == after.loop
-        and before.frame_rate_hz == after.frame_rate_hz
-        and before.n_controlled == after.n_controlled
-    )
-
-
 def with_matrix(streams: Streams, cm_id: str, matrix: NDArray[np.float32]) -> Streams:
     """Know the numbers of one more reconstructor."""
     others = tuple(known for known in streams.matrices if known[0] != cm_id)
@@ -226,7 +213,7 @@ def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:
 
     Gains may follow the seeing meanwhile.
     """
-    if before is None or not (_same_run(before, rtc) and same_loop(before, rtc)):
+    if before is None or not before.same_loop(rtc):
         return replace(streams, law=LoopLaw(from_seq=rtc.seq + 1), unlawful=())
     terms = _terms(streams, rtc.cm_id)
     if terms is None or streams.law.cm_id != rtc.cm_id:
@@ -299,6 +286,8 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
         streams = replace(streams, check=check, law=looplaw.follow(streams.law, block, terms))
     streams = _listening(streams, rtc, block)
     streams, ended = _dithered(streams, rtc, block)
+    if ended:
+        streams = replace(streams, loop=rtc)  # the next one begins with the gains of now
     windows = [_obeying(streams, window) for window in ended]
     if streams.hearing is not None and len(streams.in_loop):
         lines = () if streams.dither is None else streams.dither.frequency_hz
@@ -372,7 +361,9 @@ def taken(streams: Streams) -> tuple[Streams, Passive | str]:
         n_effective=0.0,
         since_ns_utc=streams.heard_ns_utc - waiting_ns,
     )
-    return replace(streams, passive=begun), sums
+    # a window that is under way is of the gains with which it began
+    begins = streams.lock_in is None and streams.random is None
+    return replace(streams, passive=begun, loop=rtc if begins else streams.loop), sums
 
 
 def _beyond_the_dither(streams: Streams, rtc: RtcView, reading: LockIn | RandomDither) -> bool:

@@ -22,7 +22,7 @@ from service.state.registration import (
 )
 from service.state.rtc import CommandState, DitherKind, DitherView, LoopCommand, RtcView
 from service.state.saved import Orders, Saved
-from service.state.tracker import Mode, TrackerState
+from service.state.tracker import Mode, Retries, TrackerState
 from service.state.updates import Assessment, ModeLimit
 
 __all__ = [
@@ -63,6 +63,7 @@ __all__ = [
     "Precision",
     "ReconstructorRecord",
     "Registration",
+    "Retries",
     "RtcView",
     "Saved",
     "Seen",

@@ -2,10 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+import numpy as np
+
 from service.state.pointing import Pointing
+
+SAME_GAIN = 0.05
+"""Relative: an RTC may follow the seeing with its gains once a second, and the gate judges with the
+largest optical gains there may be, which are a tenth above those measured."""
+
+SAME_DELAY = 0.05
+"""Frames."""
+
+SAME_LEAK = 1e-6
+
+SAME_RATE = 1e-5
+"""Relative: a rate that is measured, and not nominal, is told differently every time."""
+
+
+def same_gains(some: Sequence[float], others: Sequence[float]) -> bool:
+    """Return whether these are the gains of one loop."""
+    return len(some) == len(others) and np.allclose(some, others, rtol=SAME_GAIN, atol=0.0)
+
+
+def same_rate(one_hz: float, other_hz: float) -> bool:
+    """Return whether these are one frame rate."""
+    return abs(one_hz - other_hz) <= SAME_RATE * one_hz
+
+
+def same_numbers(some: tuple[float, ...], others: tuple[float, ...]) -> bool:
+    """Return whether two ``RtcView.loop_numbers`` are of one loop: the only definition of it."""
+    if len(some) != len(others) or not some:
+        return some == others
+    modes, leak, delay, rate, *gains = some
+    n_modes, other_leak, other_delay, other_rate, *other_gains = others
+    return (
+        modes == n_modes
+        and abs(leak - other_leak) <= SAME_LEAK
+        and abs(delay - other_delay) <= SAME_DELAY
+        and same_rate(rate, other_rate)
+        and same_gains(gains, other_gains)
+    )
 
 
 class DitherKind(StrEnum):
@@ -101,6 +141,17 @@ class RtcView:
     def why_open(self) -> str:
         """What to tell of a loop with no mode in it."""
         return "the loop is open" if self.loop == "open" else "all gains of the loop are 0"
+
+    def same_loop(self, other: RtcView) -> bool:
+        """Return whether telemetry and verdicts of the other are of this loop as well.
+
+        Its gains may follow the seeing; one that enters or leaves 0 makes it another.
+        """
+        return (
+            self.session == other.session
+            and self.loop == other.loop
+            and same_numbers(self.loop_numbers, other.loop_numbers)
+        )
 
     @property
     def loop_numbers(self) -> tuple[float, ...]:

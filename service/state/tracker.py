@@ -31,6 +31,22 @@ class Mode(StrEnum):
     """Estimate only: nothing is computed or published unless asked for."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Retries:
+    """Before when nothing of a kind is tried again: what cannot be had holds up nothing else."""
+
+    dither_ns_utc: int = 0
+    make_ns_utc: int = 0
+    """A reconstructor."""
+
+    def later(self, *, dither_ns_utc: int = 0, make_ns_utc: int = 0) -> Retries:
+        """Return them with what is named put off until then at least."""
+        return Retries(
+            dither_ns_utc=max(self.dither_ns_utc, dither_ns_utc),
+            make_ns_utc=max(self.make_ns_utc, make_ns_utc),
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackerState:
     """Everything the service knows; ``service.tracker.step`` makes the next one."""
@@ -120,8 +136,8 @@ class TrackerState:
     judged_ns_utc: int | None = None
     """When ``margin`` was last asked for."""
 
-    retry_ns_utc: int = 0
-    """Nothing is asked of the RTC or computed by itself before this time."""
+    retries: Retries = Retries()
+    """Before when what could not be had is not tried again by itself."""
 
     dither_due_since_ns_utc: int | None = None
     """Since when a dithered window is wanted before anything else is believed; None: it is not."""

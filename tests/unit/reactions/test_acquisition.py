@@ -19,6 +19,7 @@ from service.reactions.acquisition_plan import (
     OUT_OF_HAND_S,
     far_dither,
 )
+from service.reactions.dither_choice import lock_in_plan
 from service.reactions.mode_ladder import fewer_than
 from service.state import AcquisitionStage, MatrixState, Mode
 from tests.unit.reactions.situations import POLICY, Story, estimate, moved, rtc, verdict
@@ -552,3 +553,45 @@ def test_the_far_dither_is_as_strong_as_settings_and_rtc_allow():
     assert set(dither.amplitude_m) == {2e-8}
     dither = far_dither(AcquisitionStage.COARSE, rtc(), ACQUIRES, 0)
     assert set(dither.amplitude_m) == {5e-8}
+
+
+@pytest.mark.parametrize("rate_hz", [300.0, 300.00003, 499.99, 999.9993, 1000.0, 2000.017])
+@pytest.mark.parametrize("stage", [AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING])
+def test_its_dithers_can_be_read_at_any_frame_rate(rate_hz, stage):
+    view = rtc(frame_rate_hz=rate_hz)
+    dither = far_dither(stage, view, POLICY, 0)
+    assert lock_in_plan(dither, view, 2.0).n_frames == round(2.0 * rate_hz)
+
+
+def test_a_status_whose_rate_differs_by_parts_per_million_reads_the_dither_all_the_same():
+    dither = far_dither(AcquisitionStage.COARSE, rtc(frame_rate_hz=300.0), POLICY, 0)
+    assert lock_in_plan(dither, rtc(frame_rate_hz=300.0007), 2.0)
+
+
+def test_one_whose_dither_cannot_be_read_ends_and_says_why():
+    story = Acquiring()
+    story.tell(ev.Acquire())
+    story.open()
+    story.tell(ev.Noted(name="dither.unusable", text="600 frames cut a period"))
+    assert story.stage is AcquisitionStage.FAILED
+    assert "600 frames cut a period" in story.text
+
+
+def test_one_in_whose_dithers_no_window_ever_ends_comes_to_an_end():
+    story = Acquiring()
+    story.tell(ev.Acquire())
+    story.open()
+    for _ in range(1200):
+        dither = story.state.dither
+        if story.stage is AcquisitionStage.FAILED:
+            break
+        if story.stage is AcquisitionStage.OPENING:
+            story.still_open()
+        if dither is not None and dither.start_seq is None:
+            story.tell(
+                ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=story.now_ns)
+            )
+        story.still_open()
+        story.tell(ev.Tick(), 1.0)
+    assert story.stage is AcquisitionStage.FAILED
+    assert len(story.far_dithers) < 60

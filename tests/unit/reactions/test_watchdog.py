@@ -308,3 +308,18 @@ def test_a_bias_of_which_nothing_was_learnt_is_of_no_loop(story):
     before = story.state.registration.bias
     story.tell(ev.StatusSeen(rtc=rtc(300, t_ns_utc=story.now_ns)))
     assert story.state.registration.bias is before
+
+
+def test_gains_that_follow_the_seeing_by_a_percent_unteach_no_bias(story):
+    learnt(story)
+    before = story.state.registration.bias
+    gains = (0.4 * 1.01,) * 400 + (0.0,) * 194
+    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns, gains=gains)))
+    assert story.state.registration.bias is before
+    late = ev.Watched(
+        estimate=watched(moved(shift_x_subap=0.06)),
+        t_ns_utc=story.now_ns + 4 * SECOND,
+        loop=rtc().loop_numbers,
+    )
+    story.tell(late, 4.0)
+    assert story.state.unwatched == ""

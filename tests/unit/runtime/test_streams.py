@@ -527,3 +527,42 @@ class TestStrengthOfTheDither:
         quiet = replace(quiet, dither_m=np.zeros_like(quiet.dither_m))
         streams, _ = fed(streams, quiet)
         assert streams.dither_silent_s == pytest.approx(0.1)
+
+
+class TestGainsThatFollowTheSeeing:
+    """A percent a second is the same loop, for windows as for verdicts and for the bias."""
+
+    def windows(self, gain_of, window_s, seconds=20, **changes):
+        """Windows, and how often the sums of ordinary telemetry began anew."""
+        streams = with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), DITHER, window_s)
+        found, resets = 0, 0
+        for t in range(seconds):
+            gains = tuple(gain * gain_of(t) for gain in RTC.gains)
+            rtc_now = replace(RTC, gains=gains, seq=1000 * t)
+            for name, change in changes.items():
+                rtc_now = replace(rtc_now, **{name: change(t)})
+            before = streams.passive
+            streams = with_dither(with_rtc(streams, rtc_now), DITHER, window_s)
+            resets += streams.passive is not before
+            streams, ended = play(streams, 1000 * t, 10)
+            found += sum(isinstance(window, Spectra) for window in ended)
+        return found, resets
+
+    @pytest.mark.parametrize("step", [0.0, 0.01, 0.04])
+    def test_to_and_fro_it_costs_nothing(self, step):
+        assert self.windows(lambda t: 1.0 + step * (t % 2), 2.0) == (9, 0)
+
+    def test_on_and_on_it_costs_a_window_now_and_then_at_the_most(self):
+        found, resets = self.windows(lambda t: 1.01**t, 2.0)
+        assert found >= 8
+        assert resets <= 4
+
+    def test_a_change_that_an_operator_makes_cuts_as_ever(self):
+        found, resets = self.windows(lambda t: 1.0 if t < 10 else 1.3, 2.0)
+        assert resets == 1
+        assert found == 8
+
+    def test_a_rate_that_is_measured_and_not_nominal_is_the_same_rate(self):
+        rate_hz = 1000.0
+        jitter = {"frame_rate_hz": lambda t: rate_hz * (1.0 + 1e-6 * (-1) ** t)}
+        assert self.windows(lambda t: 1.0, 2.0, **jitter) == (9, 0)

@@ -252,7 +252,7 @@ class Night:
                 )
                 return ev.MatrixMade(record=made, wanted=isinstance(asked, ev.CopyMatrix))
             case ev.FetchMatrix(id=matrix_id):
-                return ev.MatrixFetched(record=foreign(matrix_id))
+                return ev.MatrixFetched(record=foreign(matrix_id or "initial"))
             case ev.JudgeMatrix(id=matrix_id):
                 return ev.MarginJudged(id=matrix_id, verdict=verdict(accepted=how == "done"))
             case ev.JudgeProposal(id=matrix_id, gains=gains):

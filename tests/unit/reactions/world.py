@@ -209,7 +209,7 @@ class World(Story):
                 wanted = isinstance(asked, ev.CopyMatrix)
                 yield ev.MatrixMade(record=made, wanted=wanted)
             case ev.FetchMatrix(id=name):
-                yield ev.MatrixFetched(record=foreign(name))
+                yield ev.MatrixFetched(record=foreign(name or self.cm_id))
             case ev.JudgeMatrix(id=name):
                 yield ev.MarginJudged(id=name, verdict=verdict())
             case ev.JudgeProposal(id=name, gains=gains, wanted=wanted):

@@ -9,6 +9,7 @@ Run: ``python -m benchmarks.verdicts``.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument
+from service.config import load_instrument, load_settings
+from service.config.policy import policy_of
 from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
 from service.control.recipe import Recipe, reconstruct
@@ -28,8 +30,11 @@ from service.estimation.lockin import SIDE_OFFSETS_HZ, LockInPlan, Spectra
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
+from service.prepared import usual_folder
 from service.reactions.update_choice import JUDGE_INTERVAL_S
+from service.state import Mode
 from service.worker import Compute, Workbench
+from studies.campaign.observatory import Observatory
 
 N_MODES = 594
 CONTROLLED = (400, N_MODES)
@@ -44,6 +49,10 @@ ALPHA = Misregistration(shift_x_subap=0.05, shift_y_subap=-0.03, rotation_rad=2e
 """Where the mirror is while a matrix for ``IN_USE`` is in use."""
 
 BOUND = 0.95
+
+TELESCOPE = "--plant linear --seed 3 --alpha 0.1,-0.08,0.1,1.002 --mag 8"
+SETTLING_S = 25.0
+"""First windows, the first matrix, more modes: seconds that are no steady tracking."""
 
 Array = NDArray[Any]
 
@@ -61,6 +70,9 @@ class Job:
 def main() -> None:
     """Print a line for each job."""
     given = _arguments()
+    if given.steady is not None:
+        _print_steady(given.steady, given.words)
+        return
     with threadpool_limits(1):
         instrument = load_instrument("flao-lbt")
         bench = Workbench(instrument, Compute(threads=1))
@@ -88,7 +100,33 @@ def main() -> None:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.verdicts")
     parser.add_argument("--repeats", type=int, default=3, help="the fastest counts (default: 3)")
+    parser.add_argument("--steady", type=float, metavar="SECONDS", help="of tracking, simulated")
+    parser.add_argument(
+        "--words", default=TELESCOPE, help=f"of the simulated RTC (default: {TELESCOPE})"
+    )
     return parser.parse_args()
+
+
+def _print_steady(seconds: float, words: str) -> None:
+    """Print what each kind of job costs per second of telemetry, once everything has settled."""
+    settings = load_settings(None, {}, {})
+    with threadpool_limits(1):
+        bench = Workbench(
+            load_instrument("flao-lbt"), Compute(threads=1, cache=usual_folder(os.environ))
+        )
+        night = Observatory(words.split(), policy_of(settings), Mode.AUTO, bench, with_poles=False)
+        night.advance(SETTLING_S)
+        before = night.worker_cpu_s
+        night.advance(seconds)
+        after = night.worker_cpu_s
+    rates = {name: (after[name] - before.get(name, 0.0)) / seconds for name in after}
+    sys.stdout.write("| job | before, s | then, s per second of telemetry |\n|---|---|---|\n")
+    for name, rate in sorted(rates.items(), key=lambda item: -item[1]):
+        sys.stdout.write(f"| {name} | {before.get(name, 0.0):.2f} | {rate:.4f} |\n")
+    sys.stdout.write(f"| all | {sum(before.values()):.2f} | {sum(rates.values()):.4f} |\n")
+    sys.stdout.write(
+        f"\n{len(night.swaps)} matrices swapped in; alarms: {night.glances[-1].alarms}\n"
+    )
 
 
 def _jobs(

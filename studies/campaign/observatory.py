@@ -155,6 +155,11 @@ class Observatory:
         """Seconds since the night began."""
         return self.dome.time_s
 
+    @property
+    def worker_cpu_s(self) -> dict[str, float]:
+        """Processor time the worker's jobs have taken, seconds, by name."""
+        return dict(self._crew.cpu_s)
+
     def advance(self, seconds: float) -> None:
         """Let so much time pass.
 

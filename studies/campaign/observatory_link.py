@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
@@ -104,12 +105,15 @@ class OwnHands(Crew):
         self, job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """Run a method of the workbench now; what goes wrong is said as the worker would."""
+        before_s = time.process_time()
         try:
             return job(self._workbench, *args, **kwargs)
         except PyrcalError:
             raise
         except Exception as error:
             raise WorkerError(f"{job.__name__} failed in the worker: {error!r}") from error
+        finally:
+            self.cpu_s[job.__name__] += time.process_time() - before_s
 
 
 class Shelf(Archive):

@@ -24,7 +24,7 @@ STAYED = np.array([5e-3, 5e-3, 1.7e-4, 5e-4])
 SHARE_OF_SIGMA = 0.5
 """So much of σ is no move either."""
 
-SIGMA_RATIOS = (0.5, 1.25)
+SIGMA_RATIOS = (0.3, 1.25)
 """σ over that of the answer: much smaller deserves a better one, larger is not covered by it."""
 
 SAME_GAIN = 0.05

@@ -84,7 +84,7 @@ def test_what_creeps_is_looked_at_again_from_where_it_was_last(bench, looks, que
 MOVED = {
     "alpha": lambda q: replace(q, alpha=Misregistration(shift_x_subap=0.08, rotation_rad=0.002)),
     "a larger sigma": lambda q: replace(q, covariance=1.7 * q.covariance),
-    "a much smaller sigma": lambda q: replace(q, covariance=0.2 * q.covariance),
+    "a much smaller sigma": lambda q: replace(q, covariance=0.05 * q.covariance),
     "gains": lambda q: replace(q, loop=replace(q.loop, gains=1.1 * q.loop.gains)),
     "one gain": lambda q: replace(
         q, loop=replace(q.loop, gains=q.loop.gains * (1 + np.eye(N_CONTROLLED)[3]))

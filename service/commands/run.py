@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO, cast
 
 import structlog
 import uvicorn
@@ -113,9 +114,26 @@ def log_to_the_terminal() -> None:
                 colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
             ),
         ],
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        logger_factory=structlog.PrintLoggerFactory(cast(TextIO, _Forgiving(sys.stderr))),
     )
     logging.getLogger().handlers = [_IntoStructlog()]
+
+
+class _Forgiving:
+    """A file for the log: a disk that refuses it must not end what is logged."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, text: str) -> None:
+        """Write it if that can be."""
+        with contextlib.suppress(OSError):
+            self._file.write(text)
+
+    def flush(self) -> None:
+        """Have it on the disk if that can be."""
+        with contextlib.suppress(OSError):
+            self._file.flush()
 
 
 def _harmless(_logger: object, _method: str, event: EventDict) -> EventDict:

@@ -1,5 +1,6 @@
 """What strangers have written never reaches a terminal as it is."""
 
+import contextlib
 import logging
 
 import h5py
@@ -84,3 +85,12 @@ def test_what_libraries_log_goes_the_same_way(logged):
     told = logged(lambda: logging.getLogger("uvicorn.error").error("request to %s", EVIL))
     assert "request to" in told
     assert harmless(told)
+
+
+def test_a_log_on_a_full_disk_does_not_stop_what_is_logged(monkeypatch, logged):
+    with open("/dev/full", "w", encoding="utf-8", buffering=1) as full:
+        monkeypatch.setattr("sys.stderr", full)
+        logged(lambda: structlog.get_logger().warning("archive-failed", text="disk full"))
+        monkeypatch.undo()
+        with contextlib.suppress(OSError):
+            full.close()

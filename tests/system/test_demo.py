@@ -108,7 +108,7 @@ def test_an_rtc_that_sends_nothing_is_named_as_the_reason(night):
 
 
 def test_a_worker_that_stands_still_is_named_as_the_reason(night):
-    process = demo(night, "--seconds", "15")
+    process = demo(night, "--seconds", "12")
     children = both_children(process)
     _, theirs = running(process, children)
     for pid in theirs:

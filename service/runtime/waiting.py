@@ -252,12 +252,15 @@ _ALARMS: Final = {
     "dither": Party.RTC,
     "dither-lost": Party.RTC,
     "dither-not-stopped": Party.RTC,
+    "dither-over-budget": Party.RTC,
+    "dither-not-as-asked": Party.RTC,
     "no-acknowledgement": Party.RTC,
     "wrong-matrix": Party.RTC,
     "standing-by": Party.SERVICE,
     "acquisition": Party.OPERATOR,
     "loop-open": Party.OPERATOR,
     "worker-behind": Party.WORKER,
+    "worker-lost": Party.WORKER,
 }
 """Alarms whose end is waited for though they may forbid nothing, and by whom it comes."""
 

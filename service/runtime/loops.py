@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
+from service.estimation.loopcheck import LoopTerms
 from service.reactions.alarms import Act, forbidding
 from service.reactions.gain_tables import table_of
 from service.state import Judged, Registration, RtcView, TrackerState
@@ -52,6 +53,21 @@ def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None
         return None
     n_modes = rtc.n_controlled
     return n_modes if same_gains(gains[:n_modes], rtc.gains[:n_modes]) else None
+
+
+def terms_of(rtc: RtcView, cm_id: str, matrix: NDArray[np.float32]) -> LoopTerms | None:
+    """Return the loop that a reconstructor closes; None: it is open, or another's."""
+    fits = matrix.shape[1] == rtc.n_slopes and len(matrix) <= rtc.n_modes
+    if rtc.loop == "open" or not fits:
+        return None
+    return LoopTerms(
+        cm_id=cm_id,
+        reconstructor=matrix,
+        gains=np.array(rtc.gains[: len(matrix)], np.float32),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        frame_rate_hz=rtc.frame_rate_hz,
+    )
 
 
 def timing(rtc: RtcView, n_controlled: int, registration: Registration) -> Timing:

@@ -21,6 +21,7 @@ from service.estimation.randomdither import Correlated, RandomDither
 from service.estimation.vibration import Hearing, heard, hearing
 from service.reactions.dither_choice import SETTLING_S, asked_of, lock_in_plan
 from service.reactions.random_dither import random_plan
+from service.runtime.loops import terms_of
 from service.state import DitherKind, DitherView, RtcView
 from service.state.rtc import same_rate
 from service.worker import Description
@@ -192,20 +193,10 @@ def with_matrix(streams: Streams, cm_id: str, matrix: NDArray[np.float32]) -> St
 
 def _terms(streams: Streams, cm_id: str | None) -> LoopTerms | None:
     """Return the loop that a reconstructor closes; None: it is open, or not known."""
-    rtc = streams.rtc
     matrix = next((matrix for known, matrix in streams.matrices if known == cm_id), None)
-    if rtc is None or cm_id is None or matrix is None or rtc.loop == "open":
+    if streams.rtc is None or cm_id is None or matrix is None:
         return None
-    if matrix.shape[1] != rtc.n_slopes or len(matrix) > rtc.n_modes:
-        return None
-    return LoopTerms(
-        cm_id=cm_id,
-        reconstructor=matrix,
-        gains=np.array(rtc.gains[: len(matrix)], np.float32),
-        leak=rtc.leak,
-        delay_frames=rtc.delay_frames,
-        frame_rate_hz=rtc.frame_rate_hz,
-    )
+    return terms_of(streams.rtc, cm_id, matrix)
 
 
 def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:
@@ -251,8 +242,8 @@ def with_dither(streams: Streams, dither: DitherView | None, window_s: float) ->
     """
     rtc = streams.rtc
     if dither is None or dither.start_seq is None or rtc is None:
-        streams = replace(streams, lock_in=None, random=None, dither=None, dither_silent_s=0.0)
-        return replace(streams, meter=None, played=None)
+        streams = replace(streams, dither=None, dither_silent_s=0.0, meter=None, played=None)
+        return replace(streams, lock_in=None, random=None)
     dither = replace(dither, asked_ns_utc=0)
     if dither == streams.dither:
         return streams
@@ -362,8 +353,8 @@ def taken(streams: Streams) -> tuple[Streams, Passive | str]:
         since_ns_utc=streams.heard_ns_utc - waiting_ns,
     )
     # a window that is under way is of the gains with which it began
-    begins = streams.lock_in is None and streams.random is None
-    return replace(streams, passive=begun, loop=rtc if begins else streams.loop), sums
+    dithered = streams.lock_in is not None or streams.random is not None
+    return replace(streams, passive=begun, loop=streams.loop if dithered else rtc), sums
 
 
 def _beyond_the_dither(streams: Streams, rtc: RtcView, reading: LockIn | RandomDither) -> bool:

@@ -28,7 +28,7 @@ from sim_rtc.faults import Fault, FaultKind, FaultPlan
 from sim_rtc.reconstructors import Outcome, Reconstructor, Staging, Verdict
 from sim_rtc.record import Kind, Recorder
 
-_POLL_S: Final = 0.02
+_POLL_S: Final = 0.05
 _QUERY_TIMEOUT_S: Final = 2.0
 _MOST_EVENTS: Final = 256
 """Events that wait for the thread; a burst beyond it is dropped, its chunks are asked for again."""

@@ -39,7 +39,7 @@ from service.worker import InUse, Workbench
 UNKNOWN_PARENT = "unknown"
 """Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""
 
-MATRICES_KEPT = 16
+MATRICES_KEPT = 6
 """In memory; older ones come from the archive."""
 
 

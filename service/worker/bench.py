@@ -34,16 +34,10 @@ from service.registration.target import oriented
 from service.worker.instruments import actuators_of, check_controllable, outer_of
 from service.worker.margin import InUse, Margin
 from service.worker.records import Compute, Description, Made
-from service.worker.sensor import FLAW, SETTLED, Sensor
+from service.worker.sensor import REACH, Sensor, length, near_enough
 
 MAX_APPROACHES = 5
 """Steps of the coarse model; from the edge of the capture range three are enough."""
-
-REACH = 4.0
-"""A step this long, in units of ``SETTLED``, ends well within one of them."""
-
-UNSEEN = 0.1
-"""Of an estimate's σ: a linearisation's error up to this is not worth another linearisation."""
 
 CONTRACTION = 0.5
 """A step longer than this share of the last one is not Newton's any more: the fit has failed."""
@@ -198,15 +192,15 @@ class Workbench:
     ) -> WindowEstimate | None:
         """Return the fit about a linearisation that is near enough to it; None: there is none."""
         estimate = fit_window(spectra, self._sensor.near(start), loop)
-        if _length(estimate) > REACH:
+        if length(estimate.step) > REACH:
             near = self._approach(spectra, loop, estimate, start)
             if near is None:
                 return None
             estimate = fit_window(spectra, self._sensor.linearise(near), loop)
-        if not _settled(estimate):
+        if not near_enough(estimate.step, estimate.covariance):
             # near enough; or the coarse model's bias, flat as it is, was more than what settles
             estimate = fit_window(spectra, self._sensor.linearise(estimate.alpha), loop)
-        return estimate if _settled(estimate) else None
+        return estimate if near_enough(estimate.step, estimate.covariance) else None
 
     def find(
         self, spectra: Spectra, start: Misregistration | None, flux: bytes | None
@@ -244,7 +238,7 @@ class Workbench:
             for _ in range(MAX_APPROACHES):
                 if isinstance(estimate, WindowRefused):
                     return estimate
-                if _settled(estimate):
+                if near_enough(estimate.step, estimate.covariance):
                     ratio = self._sensor.ratio()[list(estimate.modes)]
                     return replace(
                         estimate,
@@ -287,11 +281,11 @@ class Workbench:
         for _ in range(MAX_APPROACHES):
             if np.any(np.abs(estimate.alpha.vector - start.vector) > FIT_RANGE):
                 return None
-            before = _length(estimate)
+            before = length(estimate.step)
             estimate = fit_window(spectra, self._coarse.linearise(estimate.alpha), loop)
-            if _length(estimate) <= REACH:
+            if length(estimate.step) <= REACH:
                 return estimate.alpha
-            if _length(estimate) > CONTRACTION * before:
+            if length(estimate.step) > CONTRACTION * before:
                 return None
         return None
 
@@ -428,18 +422,6 @@ def _most(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -
     if found is None:
         return asked
     return replace(found, why_fewer=f"{len(refused.matrix)} modes: {refused.gate.reason}")
-
-
-def _length(estimate: WindowEstimate | RandomEstimate) -> float:
-    """Return the length of a step, in units of what counts as settled."""
-    return float(np.abs(estimate.step / SETTLED).max())
-
-
-def _settled(estimate: WindowEstimate | RandomEstimate) -> bool:
-    """Return whether the linearisation is near enough: its error is nothing beside the noise's."""
-    sigma = np.sqrt(np.diag(estimate.covariance))
-    borne = float((UNSEEN * sigma / FLAW).min())
-    return _length(estimate) <= min(float(np.sqrt(max(1.0, borne))), REACH)
 
 
 def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:

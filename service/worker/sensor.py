@@ -29,6 +29,12 @@ FLAW = np.array([2.5e-4, 2.5e-4, 1.5e-5, 3e-5])
 """What such a step of all four leaves at most, on FLAO with any set of modes (numeric units); it
 grows as the square of the step. A fifteenth of the floor of a flat model."""
 
+REACH = 4.0
+"""A step this long, in units of ``SETTLED``, ends well within one of them."""
+
+UNSEEN = 0.1
+"""Of an estimate's σ: a linearisation's error up to this is not worth another linearisation."""
+
 FOLLOWED = 0.04
 """Gains that differ from the model's by more than this, as a logarithm, move the working point:
 0.02 % in magnification. Less is not worth another linearisation."""
@@ -143,3 +149,14 @@ class Sensor:
             sampling=self._sampling,
         )
         return self._model_of(halo)
+
+
+def length(step: Array) -> float:
+    """Return the length of a step ``(4,)`` of α, in units of what counts as settled."""
+    return float(np.abs(step / SETTLED).max())
+
+
+def near_enough(step: Array, covariance: Array) -> bool:
+    """Return whether a fit that made this step may stay: its linearisation is lost in the noise."""
+    borne = float((UNSEEN * np.sqrt(np.diag(covariance)) / FLAW).min())
+    return length(step) <= min(float(np.sqrt(max(1.0, borne))), REACH)

@@ -1,0 +1,149 @@
+"""What strangers send to a real service over HTTP, and what a disk that refuses costs."""
+
+import contextlib
+import io
+import os
+import resource
+import signal
+import socket
+import sqlite3
+import time
+
+import h5py
+import httpx
+import pytest
+
+from tests.system.night import a_night, wait_for
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+
+
+@pytest.fixture
+def night(tmp_path):
+    with a_night(tmp_path) as night:
+        night.service("hold")
+        yield night
+
+
+@contextlib.contextmanager
+def no_file_may_grow(process):
+    """A disk that refuses, of this process alone, without the rights to make a real one."""
+    limits = resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (1, limits[1]))
+    try:
+        yield
+    finally:
+        resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, limits)
+
+
+def audit_of(night):
+    index = night.directory / "data" / "index.sqlite"
+    with contextlib.closing(sqlite3.connect(f"file:{index}?mode=ro", uri=True)) as connection:
+        return connection.execute("SELECT name, text FROM audit WHERE who = 'operator'").fetchall()
+
+
+def test_on_a_disk_that_refuses_nothing_is_ordered_and_afterwards_all_is_on_record(night):
+    (process,) = night.processes
+    with no_file_may_grow(process):
+        refused = night.client.put("/v1/mode", json={"mode": "auto"})
+        assert refused.status_code == httpx.codes.INSUFFICIENT_STORAGE, refused.text
+        assert "index.sqlite" in refused.json()["detail"]
+        assert night.state["mode"] == "hold"
+        wait_for(lambda: "archive-failed" in night.alarms, 5.0, "the alarm")
+        assert night.metrics["pyrcal_archive_failures_total"] > 0
+        assert night.client.get("/healthz").status_code == httpx.codes.OK
+    wait_for(lambda: "archive-failed" not in night.alarms, 10.0, "the end of the alarm")
+    assert night.client.put("/v1/mode", json={"mode": "auto"}).status_code == httpx.codes.ACCEPTED
+    unknown = night.client.post("/v1/reconstructors/cm-7/approve")
+    assert unknown.status_code == httpx.codes.NOT_FOUND
+    wait_for(lambda: len(audit_of(night)) == 5, 5.0, "the refusal in the audit trail")
+    names = [name for name, _ in audit_of(night)]
+    assert names == ["SetMode", "SetMode.refused", "SetMode", "Approve", "Approve.refused"]
+    process.send(signal.SIGTERM)
+    assert process.popen.wait(30.0) == 0, process.log
+
+
+def resident_mb(pid):
+    with open(f"/proc/{pid}/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def a_bomb():
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        shape, chunks = (22_000, 24_000), (22, 24_000)
+        file.create_dataset("interaction_matrix", shape, "f8", chunks=chunks)
+    return buffer.getvalue()
+
+
+def a_thief(path):
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        file["interaction_matrix"] = h5py.ExternalLink(str(path), "/interaction_matrix")
+    return buffer.getvalue()
+
+
+def fate(night, content):
+    link = night.client.post("/v1/fits", content=content).json()["links"]["fit"]
+
+    def answer():
+        found = night.client.get(link)
+        return found if found.status_code != httpx.codes.ACCEPTED else None
+
+    found = wait_for(answer, 60.0, "the end of the fit")
+    assert found.status_code == httpx.codes.UNPROCESSABLE_ENTITY, found.text
+    return found.json()["detail"]
+
+
+def test_an_upload_reaches_no_file_of_the_server_and_claims_no_memory(night):
+    secret = night.directory / "secret.h5"
+    with h5py.File(secret, "w") as file:
+        file["interaction_matrix"] = [[1.0]]
+    assert f"found a link to another file, {secret}" in fate(night, a_thief(secret))
+    assert "of 0 bytes in the file" in fate(night, a_bomb())
+
+
+def endless():
+    while True:
+        yield b" " * 1_000_000
+
+
+def test_endless_bodies_and_half_open_requests_cost_next_to_nothing(night):
+    (process,) = night.processes
+    before_mb = resident_mb(process.popen.pid)
+    for _ in range(5):
+        with contextlib.suppress(httpx.TransportError):  # it may be cut before the answer is read
+            answer = night.client.post("/v1/refit", content=endless())
+            assert answer.status_code == httpx.codes.REQUEST_ENTITY_TOO_LARGE
+    held = []
+    for _ in range(500):
+        held.append(socket.create_connection(("127.0.0.1", night.port), timeout=10.0))
+        held[-1].sendall(b"GET /v1/state HTTP/1.1\r\n")
+    began_s = time.monotonic()
+    assert night.client.get("/healthz").status_code == httpx.codes.OK
+    assert time.monotonic() - began_s < 5.0
+    wait_for(lambda: n_sockets(process.popen.pid) < 150, 5.0, "most connections to be ended")
+    wait_for(lambda: n_sockets(process.popen.pid) < 50, 15.0, "all of them to be ended")
+    assert resident_mb(process.popen.pid) - before_mb < 30.0
+    for line in held:
+        line.close()
+
+
+def n_sockets(pid):
+    n_found, folder = 0, f"/proc/{pid}/fd"
+    for name in os.listdir(folder):
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+            n_found += os.readlink(os.path.join(folder, name)).startswith("socket:")
+    return n_found
+
+
+def test_a_page_from_elsewhere_and_a_foreign_name_give_no_orders(night):
+    for headers, status in (
+        ({"Origin": "http://evil.example"}, httpx.codes.FORBIDDEN),
+        ({"Host": "evil.example"}, httpx.codes.MISDIRECTED_REQUEST),
+    ):
+        headers |= {"Content-Type": "text/plain"}
+        answer = night.client.post("/v1/dither", headers=headers)
+        assert answer.status_code == status
+        assert answer.headers["content-type"] == "application/problem+json"
+    assert audit_of(night) == []

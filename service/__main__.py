@@ -61,7 +61,16 @@ def _leave_when_asked(words: Sequence[str]) -> None:
     """
     status = 0 if words[:1] == ["run"] else 130
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: os._exit(status))
+        signal.signal(number, lambda *_: _leave(status))
+
+
+def _leave(status: int) -> None:
+    """End at once, and with it a worker that was started ahead: a stopped one would not notice."""
+    processes = sys.modules.get("multiprocessing")
+    if processes is not None:
+        for child in processes.active_children():
+            child.kill()
+    os._exit(status)
 
 
 def _understood(

@@ -60,6 +60,7 @@ def test_a_whole_turn_is_no_turn(alpha):
     assert np.linalg.norm(difference) < 1e-5 * np.linalg.norm(matrix)
 
 
+@settings(deadline=None)
 @given(registrations)
 def test_a_linearisation_moves_linearly(alpha):
     """Half-way between two registrations lies the mean of their matrices."""

@@ -97,6 +97,9 @@ class Admission:
         """Answer a request that may not be made; hand on every other."""
         if scope["type"] != "http":
             return await self._app(scope, receive, send)
+        return await _to_its_end(self._admit, scope, receive, send)
+
+    async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
         request = Request(scope)
         stranger = self._stranger(request)
         if stranger is not None:
@@ -138,6 +141,25 @@ class Admission:
             structlog.get_logger().warning(
                 "api.stranger", kind=kind, client=client, path=request.url.path, text=detail
             )
+
+
+async def _to_its_end(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+    """Run a request; one that is still at work when the service ends is told so, if it can be."""
+    begun = False
+
+    async def noted(message: Message) -> None:
+        nonlocal begun
+        begun = True
+        await send(message)
+
+    try:
+        await app(scope, receive, noted)
+    except asyncio.CancelledError:
+        if not begun:
+            detail = "the service ends: ask the next one again"
+            status = HTTPStatus.SERVICE_UNAVAILABLE
+            headers = {"Retry-After": str(RETRY_S)}
+            await problem(Request(scope), status, "ending", detail, headers)(scope, receive, send)
 
 
 def _same(origin: str, host: str) -> bool:

@@ -86,7 +86,7 @@ def ended_within(seconds, process, children):
 def running(process, children):
     """Wait until the service has received frames; return the processes the service has started."""
     wait_for(lambda: "the clock starts" in process.log, 150.0, f"ready; {process.log_path}")
-    (service,) = [child for child in children if b"service" in command_of(child)]
+    (service,) = [child for child in children if b"\0service\0" in command_of(child)]
     return service, [member for member in session_members(service) if member != service]
 
 
@@ -98,7 +98,7 @@ def test_an_rtc_that_sends_nothing_is_named_as_the_reason(night):
     process = demo(night, "--seconds", "12")
     children = both_children(process)
     running(process, children)
-    (simulator,) = [child for child in children if b"sim_rtc" in command_of(child)]
+    (simulator,) = [child for child in children if b"\0sim_rtc\0" in command_of(child)]
     os.kill(simulator, signal.SIGSTOP)
     wait_for(lambda: "FAILED" in process.log, 40.0, f"a verdict; {process.log_path}")
     ended_within(5.0, process, children)

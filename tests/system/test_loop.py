@@ -45,7 +45,7 @@ def test_the_loop_is_opened_closed_and_tuned_and_a_ramp_picks_its_gains(night):
     night.post("/v1/loop/ramp", ramp)
     second = night.client.post("/v1/loop/ramp", json=ramp)
     assert second.status_code == httpx.codes.CONFLICT, second.text
-    assert "the RTC refused: busy" in second.json()["detail"]
+    assert "is under way; wait for it" in second.json()["detail"]
     wait_for(lambda: {gain_of(night, m) for m in (0, 2, N_START - 1)} <= tried, 15.0, "the end")
     time.sleep(1.0)
     assert {gain_of(night, m) for m in range(N_START)} <= tried

@@ -27,7 +27,7 @@ ENOUGH_S = 20.0
 LATE_WINDOWS = 3
 """Windows that came before the worker had a hand free for the one before them, to be behind;"""
 
-FULLY_BUSY, AT_EASE = 0.9, 0.75
+FULLY_BUSY, AT_EASE = 0.8, 0.65
 """and the share of the time in which it has a job: above the first it is behind, and below the
 second, or with no late window in a minute, it is not any more."""
 

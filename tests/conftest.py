@@ -5,6 +5,7 @@ import signal
 import tempfile
 
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
 # Two shared cores and several processes per test: nested BLAS threads make everything slower.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -18,11 +19,16 @@ os.environ.setdefault(
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def pytest_collection_modifyitems(items):
-    """Keep together what two workers must not share out: a module, and all real processes.
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Hand out whole modules, and all that runs in real time to one worker.
 
-    System tests run in real time, one after the other; the other worker is a busy loop beside them.
+    System tests run one after the other; the other worker is a busy loop beside them.
     """
-    for item in items:
-        alone = item.get_closest_marker("system") is not None
-        item.add_marker(pytest.mark.xdist_group("system" if alone else item.nodeid.split("::")[0]))
+
+    class ByModule(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            module = nodeid.split("::")[0]
+            return "tests/system" if module.startswith("tests/system/") else module
+
+    return ByModule(config, log)

@@ -5,6 +5,7 @@ import signal
 import tempfile
 
 import pytest
+import structlog
 from xdist.scheduler import LoadScopeScheduling
 
 # Two shared cores and several processes per test: nested BLAS threads make everything slower.
@@ -17,6 +18,13 @@ os.environ.setdefault(
 # A shell's background job inherits SIGINT as ignored, and would hand it on to the programs that the
 # system tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def log_of_its_own():
+    """Leave no log behind that writes where the test before has looked."""
+    yield
+    structlog.reset_defaults()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from service.control.expected_gain import ExpectedGain, Timing
 from service.control.gate import GateVerdict, LoopSettings
 from service.model.misregistration import Misregistration
+from service.state.rtc import SAME_GAIN
 
 Array = NDArray[np.float64]
 
@@ -26,9 +27,6 @@ SHARE_OF_SIGMA = 0.5
 
 SIGMA_RATIOS = (0.3, 1.25)
 """σ over that of the answer: much smaller deserves a better one, larger is not covered by it."""
-
-SAME_GAIN = 0.05
-"""Relative, as of a verdict that something is sent on."""
 
 SAME_MAGNITUDE = 0.1
 

@@ -262,9 +262,11 @@ def told(story, n_windows):
 @contextlib.contextmanager
 def full_disk(archive):
     """SQLite may grow no further, and no file may become longer than it is."""
-    connection = archive._index._connection
-    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    connection.execute("PRAGMA max_page_count = 1")
+    index = archive._index
+    connection = index._connection
+    with index._lock:  # the supervisor's recorder writes through the same connection
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        connection.execute("PRAGMA max_page_count = 1")
     for length in (4000, 400, 40, 1, 1):
         with contextlib.suppress(ArchiveError):
             while True:
@@ -275,7 +277,8 @@ def full_disk(archive):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        connection.execute("PRAGMA max_page_count = 1000000")
+        with index._lock:
+            connection.execute("PRAGMA max_page_count = 1000000")
 
 
 def trail(archive, who):

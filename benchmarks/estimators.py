@@ -20,16 +20,16 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.estimation import lockin, loopcheck, passive, randomdither, vibration
-from service.estimation.edge import Actuators, EdgeHealth, EdgeWatch, edge_watch, observe_edge
-from service.estimation.frames import FrameBlock
-from service.estimation.health import LoopHealth, observe
-from service.estimation.lockin import LockIn, LockInPlan
-from service.estimation.loopcheck import LoopCheck, LoopTerms
-from service.estimation.passive import Passive
-from service.estimation.randomdither import RandomDither, RandomPlan
 from service.model.instrument import Mirror
 from service.model.modes import karhunen_loeve_basis
+from service.telemetry import lockin, loopcheck, passive, randomdither, vibration
+from service.telemetry.edge import Actuators, EdgeHealth, EdgeWatch, edge_watch, observe_edge
+from service.telemetry.frames import FrameBlock
+from service.telemetry.health import LoopHealth, observe
+from service.telemetry.lockin import LockIn, LockInPlan
+from service.telemetry.loopcheck import LoopCheck, LoopTerms
+from service.telemetry.passive import Passive
+from service.telemetry.randomdither import RandomDither, RandomPlan
 
 N_SLOPES, N_MODES, N_CONTROLLED = 1408, 594, 400
 RATE_HZ = 1000.0

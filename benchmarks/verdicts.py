@@ -25,14 +25,14 @@ from service.config.policy import policy_of
 from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
 from service.control.recipe import Recipe, reconstruct
-from service.estimation.instrumental import Loop, fit_window
-from service.estimation.lockin import SIDE_OFFSETS_HZ, LockInPlan, Spectra
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.prepared import usual_folder
 from service.reactions.update_choice import JUDGE_INTERVAL_S
 from service.state import Mode
+from service.telemetry.instrumental import Loop, fit_window
+from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan, Spectra
 from service.worker import Compute, Workbench
 from studies.campaign.observatory import Observatory
 

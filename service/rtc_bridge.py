@@ -18,7 +18,6 @@ import structlog
 from numpy.typing import NDArray
 
 from service.errors import LinkError, UnknownIdError, WireError
-from service.estimation.frames import FrameBlock
 from service.link import requests
 from service.link import session as link
 from service.link.endpoint import Endpoint
@@ -28,6 +27,7 @@ from service.link.measured import MeasuredIntake
 from service.link.outbox import Offer, Outbox
 from service.link.standby import Standby
 from service.link.statistics import LinkStatistics
+from service.telemetry.frames import FrameBlock
 from service.wire import (
     ATTACHMENT_LIMIT,
     BATCH_LIMIT,

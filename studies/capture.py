@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
+from service.fit.bench import Bench
+from service.fit.fit import fit_matrix
+from service.fit.options import Fit, FitOptions
+from service.fit.reference import Reference
+from service.fit.search import SAME, land
+from service.fit.target import Target, oriented, target_of
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pyramid import Mapper
 from service.model.slopes import Orientation, SlopeOrder
-from service.registration.bench import Bench
-from service.registration.fit import fit_matrix
-from service.registration.options import Fit, FitOptions
-from service.registration.reference import Reference
-from service.registration.search import SAME, land
-from service.registration.target import Target, oriented, target_of
 from sim_rtc.imperfections import SETS
 from studies.fit_coverage import FIRST_SEED, N_MODES, measured
 

@@ -22,12 +22,12 @@ from service.config import load_instrument
 from service.control.edge import Outer, edge_motion_m
 from service.control.reconstructor import invert
 from service.control.stability import pole_radius
-from service.estimation.edge import Actuators, EdgeHealth, edge_watch, observe_edge
-from service.estimation.frames import FrameBlock
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
+from service.telemetry.edge import Actuators, EdgeHealth, edge_watch, observe_edge
+from service.telemetry.frames import FrameBlock
 from sim_rtc.assembly import build_telescope
 from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.loop import ModalLoop

@@ -23,14 +23,14 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
+from service.fit.fit import fit_matrix
+from service.fit.options import FitOptions
+from service.fit.reference import Reference
 from service.model.instrument import Instrument
 from service.model.interaction import reference_slopes
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import Basis, ModalBasis, karhunen_loeve_basis
 from service.model.pyramid import Mapper
-from service.registration.fit import fit_matrix
-from service.registration.options import FitOptions
-from service.registration.reference import Reference
 from sim_rtc.detector import Camera
 from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.imperfections import SETS

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config.layouts import grid
+from service.fit.fit import fit_matrix
+from service.fit.reference import Reference
 from service.model.instrument import (
     FrameWindows,
     Instrument,
@@ -29,8 +31,6 @@ from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Normalisation, SlopeRecipe
 from service.model.windows import frame_windows, slopes_from_frames, slopes_per_unit
-from service.registration.fit import fit_matrix
-from service.registration.reference import Reference
 from sim_rtc.diffractive import DiffractivePyramid, centred_pupil
 
 Array = NDArray[np.float64]

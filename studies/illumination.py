@@ -17,12 +17,12 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.control.noise import noise_of_counts
+from service.fit.flux import CannotTell, find_pupil
+from service.fit.illumination import measured_illumination
 from service.model.interaction import InteractionModel, valid_subapertures
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import Illumination
-from service.registration.flux import CannotTell, find_pupil
-from service.registration.illumination import measured_illumination
 from studies.registered import PASSES, STROKE_M, Array, measured_by_day, registered
 
 N_FRAMES = 100

@@ -20,14 +20,14 @@ from threadpoolctl import threadpool_limits
 
 from service.archive.noisy import NoisyArchive
 from service.config import load_instrument
-from service.estimation import randomdither
-from service.estimation.noisymatrix import RandomEstimate, noisy_matrix
-from service.estimation.randomdither import Correlated, RandomDither, RandomPlan, joined
-from service.estimation.span import WindowRefused
-from service.fits.figures.noisy import draw
+from service.files.figures.noisy import draw
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.noisy import finished, work_out
 from service.state import NoisyRecord, NoisyState
+from service.telemetry import randomdither
+from service.telemetry.noisymatrix import RandomEstimate, noisy_matrix
+from service.telemetry.randomdither import Correlated, RandomDither, RandomPlan, joined
+from service.telemetry.span import WindowRefused
 from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, Workbench
 from sim_rtc.assembly import Telescope, build_telescope

@@ -19,15 +19,15 @@ from scipy.ndimage import distance_transform_edt
 from threadpoolctl import threadpool_limits
 
 from service.config.instrument import load_instrument
+from service.fit.fit import fit_matrix
+from service.fit.options import Fit
+from service.fit.reference import Reference
 from service.model.filling import filled
 from service.model.instrument import Instrument, Stop, TabulatedModes
 from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
 from service.model.pyramid import Mapper
-from service.registration.fit import fit_matrix
-from service.registration.options import Fit
-from service.registration.reference import Reference
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

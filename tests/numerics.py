@@ -13,9 +13,6 @@ from scipy.signal import lfilter
 from service.config.instrument import load_instrument
 from service.config.layouts import rings
 from service.control.reconstructor import invert
-from service.estimation.frames import FrameBlock
-from service.estimation.instrumental import Loop
-from service.estimation.lockin import LockInPlan
 from service.model.instrument import (
     Influence,
     Instrument,
@@ -27,6 +24,9 @@ from service.model.instrument import (
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
+from service.telemetry.frames import FrameBlock
+from service.telemetry.instrumental import Loop
+from service.telemetry.lockin import LockInPlan
 
 Array = NDArray[Any]
 

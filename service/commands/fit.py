@@ -13,17 +13,17 @@ from service.archive.product import write_whole
 from service.commands.terminal import check_folder, parsed_by, say, show_progress
 from service.config import load_instrument
 from service.errors import ConfigurationError
-from service.fits.figures.sheet import check_plots, write_sheet
-from service.fits.light import Light, read_light
-from service.fits.product import fill_fit
-from service.fits.recorded import DATASET
-from service.fits.report import document
-from service.fits.request import parse_alpha, parse_arms, parse_count, parse_modes
-from service.fits.run import fit_file
-from service.fits.table import table
+from service.files.figures.sheet import check_plots, write_sheet
+from service.files.light import Light, read_light
+from service.files.product import fill_fit
+from service.files.recorded import DATASET
+from service.files.report import document
+from service.files.request import parse_alpha, parse_arms, parse_count, parse_modes
+from service.files.run import fit_file
+from service.files.table import table
+from service.fit.options import FitOptions, Method
+from service.fit.turned_light import Arms
 from service.model.instrument import Instrument
-from service.registration.options import FitOptions, Method
-from service.registration.turned_light import Arms
 
 ACCEPTED, REFUSED = 0, 1
 

@@ -22,13 +22,13 @@ from service.control.recipe import Method, Provenance, Recipe, Source, reconstru
 from service.control.reconstructor import MAX_CONDITION
 from service.control.regularised import Prior
 from service.errors import ConfigurationError, MatrixError
-from service.fits.fingerprint import instrument_sha256
-from service.fits.light import read_light
-from service.fits.product import KnownFit, read_fit
-from service.fits.reconstructor import Reconstructor, fill_reconstructor
-from service.fits.recorded import file_sha256
-from service.fits.report import orientation_words
-from service.fits.request import parse_alpha, parse_count
+from service.files.fingerprint import instrument_sha256
+from service.files.light import read_light
+from service.files.product import KnownFit, read_fit
+from service.files.reconstructor import Reconstructor, fill_reconstructor
+from service.files.recorded import file_sha256
+from service.files.report import orientation_words
+from service.files.request import parse_alpha, parse_count
 from service.model.instrument import Instrument
 from service.model.modes import modal_basis
 from service.model.rtc import RtcInteractionModel

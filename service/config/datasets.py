@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.config.strict import refuse
 from service.errors import ConfigurationError, MatrixError
-from service.fits.container import Container, StoredArray, opened
+from service.files.container import Container, StoredArray, opened
 
 _HDF5 = re.compile(r"(?P<path>.+):/(?P<name>.+)")
 _FITS = re.compile(r"(?P<path>.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::/?(?P<name>.+))?", re.IGNORECASE)

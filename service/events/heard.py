@@ -6,11 +6,6 @@ from dataclasses import dataclass
 
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
-from service.estimation.faraway import FarEstimate
-from service.estimation.instrumental import WindowEstimate
-from service.estimation.lockin import WindowRefused
-from service.estimation.noisymatrix import RandomEstimate
-from service.estimation.passive import PassiveEstimate
 from service.events.commands import Command
 from service.events.effects import Effect
 from service.model.misregistration import Misregistration
@@ -23,6 +18,11 @@ from service.state import (
     ReconstructorRecord,
     RtcView,
 )
+from service.telemetry.faraway import FarEstimate
+from service.telemetry.instrumental import WindowEstimate
+from service.telemetry.lockin import WindowRefused
+from service.telemetry.noisymatrix import RandomEstimate
+from service.telemetry.passive import PassiveEstimate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

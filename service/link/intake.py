@@ -11,7 +11,6 @@ from statistics import median
 from typing import Final
 
 from service.errors import WireError
-from service.estimation.frames import FrameBlock
 from service.link.endpoint import Endpoint
 from service.link.events import (
     AcknowledgementReceived,
@@ -31,6 +30,7 @@ from service.link.ring import LEAP, FrameCounts, FrameRing
 from service.link.sessions import SessionWatch
 from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
 from service.link.wakeup import Wakeup
+from service.telemetry.frames import FrameBlock
 from service.wire import (
     FRAMES_PER_BATCH,
     Acknowledgement,

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.frames import FrameBlock
+from service.telemetry.frames import FrameBlock
 from service.wire import FrameBatch, FrameHeader
 
 MISSING: Final = 0

@@ -13,7 +13,6 @@ from dataclasses import replace
 
 from service import events as ev
 from service.errors import CommandError
-from service.estimation.faraway import NOT_FOUND
 from service.events import Event
 from service.reactions.acquisition_closed import closed_stage, on_made
 from service.reactions.acquisition_ends import abort, again, fail, without_dither
@@ -29,6 +28,7 @@ from service.reactions.mode_ladder import half_of, limited
 from service.reactions.noisy import cut_off
 from service.reactions.policy import SECOND_NS, Policy
 from service.state import Acquisition, AcquisitionStage, Mode, TrackerState
+from service.telemetry.faraway import NOT_FOUND
 
 PATIENCE_S = 180.0
 """In one stage: a simulated RTC may be ten times slower than its timestamps."""

@@ -9,10 +9,10 @@ import numpy as np
 from service.control.dither_modes import SPAN, most_telling
 from service.control.dithering import clear_of
 from service.errors import ModelError
-from service.estimation.lockin import SIDE_OFFSETS_HZ, LockInPlan
-from service.estimation.played import Asked
 from service.reactions.policy import Policy
 from service.state import DitherKind, DitherView, RtcView
+from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan
+from service.telemetry.played import Asked
 
 LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
 """Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""

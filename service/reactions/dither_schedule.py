@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from service.control.precision import forgetting_mean, measured_ratio
-from service.estimation.instrumental import WindowEstimate
-from service.estimation.noisymatrix import RandomEstimate
 from service.events import AskDither, AskNoDither
 from service.reactions.alarms import Act, forbidding
 from service.reactions.dither_choice import (
@@ -44,6 +42,8 @@ from service.state import (
     RtcView,
     TrackerState,
 )
+from service.telemetry.instrumental import WindowEstimate
+from service.telemetry.noisymatrix import RandomEstimate
 
 RESULT_WITHIN_S = 10.0
 """For the estimate of a window whose dither has ended."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.wind import Drift, Joint, begin_joint, predicted
 from service.model.misregistration import Misregistration
 from service.reactions.evidence import CLOCK_SET_BACK_S, Taken, pointing_at, precedes
 from service.reactions.journal import without_alarm
@@ -24,6 +23,7 @@ from service.state import (
     Source,
     TrackerState,
 )
+from service.telemetry.wind import Drift, Joint, begin_joint, predicted
 
 HISTORY_LENGTH = 5000
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.errors import CommandError
-from service.estimation.randomdither import FRAMES_PER_MODE, RandomPlan
 from service.reactions.dither_choice import SETTLING_S, SPARE_S
 from service.reactions.policy import Policy
 from service.state import DitherKind, DitherView, ModeSet, RtcView
+from service.telemetry.randomdither import FRAMES_PER_MODE, RandomPlan
 
 RANDOM_TOTAL_M = 5e-9
 """RMS of all modes together where none is asked for, within the budget."""

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.passive import BIAS_FLOOR
-from service.estimation.wind import JUMP_THRESHOLD, Joint
 from service.model.misregistration import Misregistration
 from service.reactions.evidence import CLOCK_SET_BACK_S
 from service.reactions.policy import SECOND_NS, Policy
 from service.reactions.validity import flexure
 from service.state import Earlier, Pointing, Registration, Seen
+from service.telemetry.passive import BIAS_FLOOR
+from service.telemetry.wind import JUMP_THRESHOLD, Joint
 
 STEADY_S = 60.0
 """The drift of a minute is what the settings tell: over less it is that share of it."""

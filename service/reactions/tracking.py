@@ -11,13 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.estimation.wind import (
-    Joint,
-    begin_joint,
-    dithered_innovation,
-    widened,
-    with_dithered,
-)
 from service.model.misregistration import BOUNDARY_SCALE
 from service.reactions.estimate import (
     SUSPECTED,
@@ -42,6 +35,13 @@ from service.reactions.surprise import (
 )
 from service.reactions.validity import aged, with_dither_due
 from service.state import Candidate, Level, Registration, Seen, TrackerState
+from service.telemetry.wind import (
+    Joint,
+    begin_joint,
+    dithered_innovation,
+    widened,
+    with_dithered,
+)
 
 TOO_EARLY = (
     "it began before α came into doubt and agrees with what was known then: only one taken since "

@@ -11,15 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import events as ev
-from service.estimation.passive import PassiveEstimate
-from service.estimation.wind import (
-    JUMP_THRESHOLD,
-    Joint,
-    allowing,
-    forgotten,
-    passive_innovation,
-    with_passive,
-)
 from service.model.misregistration import Misregistration
 from service.reactions.estimate import DISAGREES, bias_of, brought_forward, joint_of, remembered
 from service.reactions.evidence import pointing_at, precedes, taken
@@ -37,6 +28,15 @@ from service.state import (
     Watchdog,
 )
 from service.state.rtc import same_numbers
+from service.telemetry.passive import PassiveEstimate
+from service.telemetry.wind import (
+    JUMP_THRESHOLD,
+    Joint,
+    allowing,
+    forgotten,
+    passive_innovation,
+    with_passive,
+)
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimator import DitheredEstimate, model_error
-from service.estimation.instrumental import MAX_LAG_FRAMES
-from service.estimation.noisymatrix import RandomEstimate
 from service.events import WindowFitted
 from service.reactions.acquisition_plan import missed
 from service.reactions.alarms import RULES, WRONG_ANSWER, Act, forbidding
@@ -23,6 +20,9 @@ from service.reactions.policy import Policy
 from service.reactions.tracking import with_window
 from service.reactions.validity import USELESS_SIGMA
 from service.state import Level, Registration, Source, TrackerState
+from service.telemetry.estimator import DitheredEstimate, model_error
+from service.telemetry.instrumental import MAX_LAG_FRAMES
+from service.telemetry.noisymatrix import RandomEstimate
 
 Array = NDArray[Any]
 

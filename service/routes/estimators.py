@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from service.estimation.estimator import LOCK_IN, PASSIVE, RANDOM, Determines
 from service.routes.problems import INVALID
 from service.routes.views import View
 from service.state import Source
+from service.telemetry.estimator import LOCK_IN, PASSIVE, RANDOM, Determines
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 

@@ -13,9 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from starlette.requests import ClientDisconnect
 
 from service.errors import MatrixError
-from service.fits.jobs import FitAsked, FitJob, FitState
-from service.fits.request import parse_alpha, parse_modes
-from service.registration.options import FitOptions, Method
+from service.files.jobs import FitAsked, FitJob, FitState
+from service.files.request import parse_alpha, parse_modes
+from service.fit.options import FitOptions, Method
 from service.routes.problems import INVALID, UNKNOWN, problem_response
 from service.routes.service import ServiceDep
 from service.routes.views import Number, View

@@ -27,7 +27,7 @@ from service.errors import (
     TooSlowError,
     UnknownIdError,
 )
-from service.fits.jobs import UNFINISHED, UPLOAD, FitAsked, FitJob, FitState
+from service.files.jobs import UNFINISHED, UPLOAD, FitAsked, FitJob, FitState
 from service.runtime.errand import run_apart
 
 FITS_KEPT = 50

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 from service import events as ev
 from service.errors import ModelError
-from service.estimation.played import LOUDER, Finding
 from service.events import Event
 from service.reactions.alarms import OFF_LOOP, WRONG_LOOP, WRONG_UNIT, Act, forbidding
 from service.reactions.dither import SILENT_S
@@ -17,6 +16,7 @@ from service.reactions.dither_unwanted import NOT_AS_ASKED, OVER_BUDGET
 from service.reactions.policy import Policy
 from service.runtime.streams import VERDICTS, Streams, with_dither, with_rtc
 from service.state import Level, RtcView, TrackerState
+from service.telemetry.played import LOUDER, Finding
 from service.worker import Description
 
 

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
-from service.estimation.loopcheck import LoopTerms
 from service.reactions.alarms import Act, forbidding
 from service.reactions.gain_tables import table_of
 from service.state import Judged, Registration, RtcView, TrackerState
 from service.state.rtc import same_gains
+from service.telemetry.loopcheck import LoopTerms
 
 GAIN_SAFETY = 1.1
 """Above a mean optical gain that nobody says which modes it is of."""

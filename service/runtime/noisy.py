@@ -13,18 +13,18 @@ from service import events as ev
 from service.archive import Archive
 from service.archive.noisy import NoisyNumbers
 from service.errors import CommandError, ModelError
-from service.estimation.noisymatrix import RandomEstimate, noisy_matrix
-from service.estimation.randomdither import Correlated, joined
-from service.estimation.span import WindowRefused
 from service.events import Event
-from service.fits.figures.noisy import WHAT, draw
-from service.fits.figures.sheet import check_plots
+from service.files.figures.noisy import WHAT, draw
+from service.files.figures.sheet import check_plots
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.reactions.alarms import Act, forbidding
 from service.runtime.crew import Crew
 from service.runtime.errand import run_apart
 from service.state import NoisyFinding, NoisyRecord, NoisyState, TrackerState
+from service.telemetry.noisymatrix import RandomEstimate, noisy_matrix
+from service.telemetry.randomdither import Correlated, joined
+from service.telemetry.span import WindowRefused
 from service.wire import checksum
 from service.worker import Workbench
 

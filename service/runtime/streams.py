@@ -8,22 +8,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation import lockin, loopcheck, looplaw, passive, randomdither
-from service.estimation.edge import EdgeHealth, EdgeWatch, edge_watch, observe_edge
-from service.estimation.frames import FrameBlock
-from service.estimation.health import LoopHealth, observe
-from service.estimation.lockin import LockIn, Spectra, WindowRefused
-from service.estimation.loopcheck import LoopCheck, LoopTerms, Obedience
-from service.estimation.looplaw import LoopLaw
-from service.estimation.passive import Passive
-from service.estimation.played import Finding, Meter, measured
-from service.estimation.randomdither import Correlated, RandomDither
-from service.estimation.vibration import Hearing, heard, hearing
 from service.reactions.dither_choice import SETTLING_S, asked_of, lock_in_plan
 from service.reactions.random_dither import random_plan
 from service.runtime.loops import terms_of
 from service.state import DitherKind, DitherView, RtcView
 from service.state.rtc import same_rate
+from service.telemetry import lockin, loopcheck, looplaw, passive, randomdither
+from service.telemetry.edge import EdgeHealth, EdgeWatch, edge_watch, observe_edge
+from service.telemetry.frames import FrameBlock
+from service.telemetry.health import LoopHealth, observe
+from service.telemetry.lockin import LockIn, Spectra, WindowRefused
+from service.telemetry.loopcheck import LoopCheck, LoopTerms, Obedience
+from service.telemetry.looplaw import LoopLaw
+from service.telemetry.passive import Passive
+from service.telemetry.played import Finding, Meter, measured
+from service.telemetry.randomdither import Correlated, RandomDither
+from service.telemetry.vibration import Hearing, heard, hearing
 from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0

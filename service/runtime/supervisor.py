@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from service import events as ev
 from service.archive import Archive
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
-from service.estimation.lockin import Spectra, WindowRefused
-from service.estimation.randomdither import Correlated
 from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
 from service.reactions.journal import new_lines
@@ -35,6 +33,8 @@ from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, waiting_for
 from service.runtime.windows import Backlog, fitted, listened, watched
 from service.state import Level, MeasureState, TrackerState, Waiting
+from service.telemetry.lockin import Spectra, WindowRefused
+from service.telemetry.randomdither import Correlated
 from service.tracker import step
 from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, Workbench

@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 
 from service import events as ev
 from service.errors import PyrcalError, UnknownIdError
-from service.estimation import lockin, randomdither
-from service.estimation.estimator import Window
-from service.estimation.instrumental import Loop
-from service.estimation.lockin import Spectra, WindowRefused
-from service.estimation.passive import Passive
-from service.estimation.randomdither import Correlated
 from service.events import Event
+from service.fit.dialect import setting_written
 from service.reactions.alarms import WRONG_MATRIX
 from service.reactions.watchdog import fit_begins_at
-from service.registration.dialect import setting_written
 from service.runtime.crew import Crew
 from service.runtime.deeds import Deeds
 from service.state import Level, ReconstructorRecord, RtcView, TrackerState
+from service.telemetry import lockin, randomdither
+from service.telemetry.estimator import Window
+from service.telemetry.instrumental import Loop
+from service.telemetry.lockin import Spectra, WindowRefused
+from service.telemetry.passive import Passive
+from service.telemetry.randomdither import Correlated
 from service.worker import Workbench, run_job
 
 LONGEST_S = 30.0

@@ -15,22 +15,22 @@ from service.control.gate import GateVerdict, LoopSettings, judge
 from service.control.noise import noise_of_star
 from service.control.recipe import Method, Recipe, reconstruct
 from service.control.regularised import Prior
-from service.estimation import passive
-from service.estimation.faraway import NOT_FOUND, FarEstimate, Search, find
-from service.estimation.instrumental import Loop, WindowEstimate, fit_window
-from service.estimation.lockin import Spectra, WindowRefused
-from service.estimation.noisymatrix import RandomEstimate, fit_random
-from service.estimation.randomdither import Correlated
+from service.fit.dialect import LIKELY, Dialect, of_answer, of_reconstructor
+from service.fit.orientation import Setting
+from service.fit.start import far_starts
+from service.fit.target import oriented
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo
 from service.prepared import Prepared
-from service.registration.dialect import LIKELY, Dialect, of_answer, of_reconstructor
-from service.registration.orientation import Setting
-from service.registration.start import far_starts
-from service.registration.target import oriented
+from service.telemetry import passive
+from service.telemetry.faraway import NOT_FOUND, FarEstimate, Search, find
+from service.telemetry.instrumental import Loop, WindowEstimate, fit_window
+from service.telemetry.lockin import Spectra, WindowRefused
+from service.telemetry.noisymatrix import RandomEstimate, fit_random
+from service.telemetry.randomdither import Correlated
 from service.worker.instruments import actuators_of, check_controllable, outer_of
 from service.worker.margin import InUse, Margin
 from service.worker.records import Compute, Description, Made

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from service.control.edge import Outer
 from service.errors import ModelError
-from service.estimation.edge import Actuators
 from service.model.instrument import Influence, Instrument, Mirror
 from service.model.modes import ModalBasis
 from service.model.rtc import RtcInteractionModel
+from service.telemetry.edge import Actuators
 
 
 def actuators_of(model: RtcInteractionModel) -> Actuators | None:

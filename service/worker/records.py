@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from service.control.gate import GateVerdict
 from service.control.recipe import Method
 from service.control.reconstructor import MAX_CONDITION
-from service.estimation.edge import Actuators
 from service.model.misregistration import Misregistration
+from service.telemetry.edge import Actuators
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.estimation.instrumental import Loop, WindowEstimate
-from service.estimation.lockin import Spectra, WindowRefused
-from service.estimation.noisymatrix import RandomEstimate
-from service.estimation.passive import Passive, PassiveEstimate
-from service.estimation.randomdither import Correlated
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.telemetry.instrumental import Loop, WindowEstimate
+from service.telemetry.lockin import Spectra, WindowRefused
+from service.telemetry.noisymatrix import RandomEstimate
+from service.telemetry.passive import Passive, PassiveEstimate
+from service.telemetry.randomdither import Correlated
 from service.worker import Compute, Workbench
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.feed import Ahead

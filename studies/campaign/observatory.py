@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from service import events as ev
 from service.errors import PyrcalError
-from service.estimation.lockin import WindowRefused
 from service.events import Command, Effect, Event
 from service.link import events as heard
 from service.reactions.policy import SECOND_NS, Policy
@@ -31,6 +30,7 @@ from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.supervisor import WATCH_INTERVAL_S
 from service.runtime.windows import fitted, listened, lost, watched
 from service.state import Mode, TrackerState
+from service.telemetry.lockin import WindowRefused
 from service.tracker import step
 from service.wire import CHUNK_LIMIT, Manifest
 from service.worker import Workbench

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.estimation import lockin
-from service.estimation.lockin import LockIn, LockInPlan, Spectra, WindowRefused
-from service.estimation.passive import Passive, accumulate
-from service.estimation.wind import (
+from service.model.misregistration import Misregistration
+from service.runtime.streams import PASSIVE_MEMORY_S
+from service.telemetry import lockin
+from service.telemetry.lockin import LockIn, LockInPlan, Spectra, WindowRefused
+from service.telemetry.passive import Passive, accumulate
+from service.telemetry.wind import (
     Drift,
     Joint,
     allowing,
@@ -23,8 +25,6 @@ from service.estimation.wind import (
     with_dithered,
     with_passive,
 )
-from service.model.misregistration import Misregistration
-from service.runtime.streams import PASSIVE_MEMORY_S
 from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, Workbench
 from sim_rtc.assembly import Telescope

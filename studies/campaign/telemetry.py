@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from service.estimation import lockin, passive, randomdither
-from service.estimation.frames import FrameBlock
-from service.estimation.lockin import LockIn, LockInPlan, Spectra, WindowRefused
-from service.estimation.passive import Passive
-from service.estimation.randomdither import Correlated, RandomDither, RandomPlan
+from service.telemetry import lockin, passive, randomdither
+from service.telemetry.frames import FrameBlock
+from service.telemetry.lockin import LockIn, LockInPlan, Spectra, WindowRefused
+from service.telemetry.passive import Passive
+from service.telemetry.randomdither import Correlated, RandomDither, RandomPlan
 from service.wire import DitherAction, DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer import RealTimeComputer

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.fit.reference import Reference
 from service.model.misregistration import Misregistration
-from service.registration.reference import Reference
 from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.readback import Regression
 from sim_rtc.strokes import PushPull, frames_per_shape, modal

@@ -7,8 +7,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from service.fit.options import Method
 from service.model.misregistration import Misregistration
-from service.registration.options import Method
 from studies.heritier2018.calibration import Measurement
 from studies.heritier2018.loops import LoopRun
 from studies.heritier2018.reconstructors import (

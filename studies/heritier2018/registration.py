@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import PyrcalError
+from service.fit.fit import fit_matrix
+from service.fit.options import Fit, FitOptions, Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.slopes import Orientation
-from service.registration.fit import fit_matrix
-from service.registration.options import Fit, FitOptions, Method
 from studies.heritier2018 import telescope
 from studies.heritier2018.calibration import Measurement
 from studies.heritier2018.store import Record, Store, Task

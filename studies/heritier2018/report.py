@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 import service
+from service.fit.options import Method
 from service.model.misregistration import PARAMETERS
-from service.registration.options import Method
 from studies.heritier2018 import closed, curves, influence, matrices, page, paper, scans
 from studies.heritier2018.calibration import MeasuredPart
 from studies.heritier2018.loops import LoopRun

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from service.fit.options import Method
+from service.fit.paper import N_LEFT_OUT
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.registration.options import Method
-from service.registration.paper import N_LEFT_OUT
 from studies.heritier2018 import page, paper, telescope
 from studies.heritier2018.plan import (
     IDEAL,

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation import lockin, wind
-from service.estimation.health import LoopHealth, observe
+from service.telemetry import lockin, wind
+from service.telemetry.health import LoopHealth, observe
 from tests.numerics import block_of, part, sines
 
 PLAN = lockin.LockInPlan(

@@ -8,7 +8,6 @@ from hypothesis import HealthCheck, given, settings
 
 from service import events as ev
 from service.errors import CommandError
-from service.estimation.lockin import WindowRefused
 from service.reactions.dither_choice import total_m
 from service.reactions.estimate import HISTORY_LENGTH
 from service.reactions.journal import LOG_LENGTH
@@ -22,6 +21,7 @@ from service.state import (
     Mode,
     TrackerState,
 )
+from service.telemetry.lockin import WindowRefused
 from service.tracker import step
 from tests.unit.reactions.situations import (
     ALPHA,

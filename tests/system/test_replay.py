@@ -8,9 +8,6 @@ import pytest
 
 from service import events as ev
 from service.config import load_instrument
-from service.estimation.instrumental import Loop as FitLoop
-from service.estimation.instrumental import WindowEstimate
-from service.estimation.lockin import Spectra
 from service.link.endpoint import Endpoint
 from service.link.intake import Intake
 from service.model.misregistration import PARAMETERS, Misregistration
@@ -18,6 +15,9 @@ from service.reactions.policy import Policy
 from service.runtime import translate
 from service.runtime.streams import Streams, fed, with_dither, with_rtc
 from service.state import Mode, TrackerState
+from service.telemetry.instrumental import Loop as FitLoop
+from service.telemetry.instrumental import WindowEstimate
+from service.telemetry.lockin import Spectra
 from service.tracker import step
 from service.wire import decode_manifest
 from service.worker import Compute, Workbench

@@ -8,10 +8,10 @@ import pytest
 
 from service.api import create_app
 from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
-from service.fits.jobs import FitJob, FitState
-from service.fits.report import document
-from service.registration.options import Method
-from tests.unit.fits.made import a_report
+from service.files.jobs import FitJob, FitState
+from service.files.report import document
+from service.fit.options import Method
+from tests.unit.files.made import a_report
 
 JOB = FitJob(id="fit-1", state=FitState.WAITING, asked_ns_utc=7, n_bytes=4, sha256="ab")
 

@@ -9,7 +9,7 @@ import pytest
 from service.archive import Archive
 from service.archive.noisy import NoisyNumbers, record_from_json, record_to_json
 from service.errors import ArchiveError, UnknownIdError, WireError
-from service.fits.recorded import read_recorded
+from service.files.recorded import read_recorded
 from service.model.misregistration import Misregistration
 from service.state import NoisyFinding, NoisyRecord, NoisyState
 from service.wire import checksum

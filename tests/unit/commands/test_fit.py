@@ -7,7 +7,7 @@ import pytest
 
 from service.__main__ import main
 from tests.data.tiny.make import ALPHA
-from tests.unit.fits.test_report import KEYS
+from tests.unit.files.test_report import KEYS
 
 DATA = Path(__file__).parents[2] / "data" / "tiny"
 TINY, MATRIX = str(DATA / "tiny.toml"), str(DATA / "tiny.h5")

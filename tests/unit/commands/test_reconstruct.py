@@ -11,14 +11,14 @@ from service.commands.reconstruct import SAMPLING, add_reconstruct_arguments, ru
 from service.commands.terminal import with_negative_numbers
 from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError
-from service.fits.fingerprint import instrument_sha256
-from service.fits.product import fill_fit
-from service.fits.report import document
+from service.files.fingerprint import instrument_sha256
+from service.files.product import fill_fit
+from service.files.report import document
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Orientation, SlopeOrder, rtc_mask, to_conventions
-from tests.unit.fits.made import a_fit, a_report
+from tests.unit.files.made import a_fit, a_report
 
 TINY = Path(__file__).parents[2] / "data" / "tiny" / "tiny.toml"
 WORDS = "-0.31,0.17,64.2,0.985"

@@ -6,9 +6,9 @@ import numpy as np
 
 from service import events as ev
 from service.control.precision import tabulated
-from service.estimation.passive import PassiveEstimate
 from service.reactions.dither_choice import SETTLING_S, total_m
 from service.state import Mode
+from service.telemetry.passive import PassiveEstimate
 from tests.unit.reactions.situations import ALPHA, Story, estimate, moved, rtc
 
 STEP_S = 0.5

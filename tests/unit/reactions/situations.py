@@ -6,11 +6,11 @@ import numpy as np
 
 from service import events as ev
 from service.control.gate import GateVerdict
-from service.estimation.instrumental import WindowEstimate
 from service.model.misregistration import Misregistration
 from service.reactions.matrices import commanded_gains
 from service.reactions.policy import Policy
 from service.state import Judged, MatrixState, Mode, ReconstructorRecord, RtcView, TrackerState
+from service.telemetry.instrumental import WindowEstimate
 from service.tracker import step
 
 SECOND = 1_000_000_000

@@ -7,8 +7,6 @@ import pytest
 
 from service import events as ev
 from service.errors import CommandError
-from service.estimation.faraway import FarEstimate
-from service.estimation.lockin import WindowRefused
 from service.model.misregistration import Misregistration
 from service.reactions.acquisition import PATIENCE_S
 from service.reactions.acquisition_ends import MOST_ATTEMPTS
@@ -22,6 +20,8 @@ from service.reactions.acquisition_plan import (
 from service.reactions.dither_choice import lock_in_plan
 from service.reactions.mode_ladder import fewer_than
 from service.state import AcquisitionStage, MatrixState, Mode
+from service.telemetry.faraway import FarEstimate
+from service.telemetry.lockin import WindowRefused
 from tests.unit.reactions.situations import POLICY, Story, estimate, moved, rtc, verdict
 
 ACQUIRES = replace(POLICY, acquires=True)

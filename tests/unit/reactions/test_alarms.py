@@ -6,9 +6,9 @@ import pytest
 
 from service import events as ev
 from service.errors import CommandError
-from service.estimation.lockin import WindowRefused
 from service.reactions.alarms import RULES, Act, Rule
 from service.state import MatrixState, Mode
+from service.telemetry.lockin import WindowRefused
 from tests.unit.reactions.situations import Story, judged, of_kind, record
 
 STRANGERS = ["second-rtc", "basis-mismatch", "instrument-mismatch"]

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 
 from service import events as ev
 from service.errors import CommandError
-from service.estimation.faraway import FarEstimate
 from service.state import MatrixState, Mode, Pointing, Validity
+from service.telemetry.faraway import FarEstimate
 from tests.unit.reactions.situations import (
     ALPHA,
     SECOND,

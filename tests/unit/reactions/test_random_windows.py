@@ -7,9 +7,9 @@ import pytest
 
 from service import events as ev
 from service.errors import CommandError
-from service.estimation.noisymatrix import RandomEstimate
 from service.reactions.dither_choice import total_m
 from service.state import DitherKind, ModeSet, Source
+from service.telemetry.noisymatrix import RandomEstimate
 from tests.unit.reactions.situations import ALPHA, POLICY, PRECISE, Story, moved, of_kind
 
 

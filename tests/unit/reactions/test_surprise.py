@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from service import events as ev
-from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.state import Mode
+from service.telemetry.passive import PassiveEstimate
 from tests.unit.reactions.situations import ALPHA, POLICY, SECOND, Story, estimate, rtc
 
 PER_MINUTE = np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005])

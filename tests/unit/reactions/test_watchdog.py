@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from service import events as ev
-from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.reactions.watchdog import fit_begins_at
 from service.state import Mode, Source, TrackerState, Validity
+from service.telemetry.passive import PassiveEstimate
 from tests.unit.reactions.situations import (
     ALPHA,
     POLICY,

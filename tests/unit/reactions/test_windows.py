@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from service import events as ev
-from service.estimation.estimator import MODEL_ERROR
-from service.estimation.lockin import WindowRefused
 from service.model.misregistration import Misregistration
 from service.reactions.estimate import HISTORY_LENGTH
 from service.state import Level, Mode
+from service.telemetry.estimator import MODEL_ERROR
+from service.telemetry.lockin import WindowRefused
 from tests.unit.reactions.situations import (
     ALPHA,
     POLICY,

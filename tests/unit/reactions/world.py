@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 from service import events as ev
-from service.estimation.faraway import FarEstimate
 from service.state import (
     MatrixState,
     MeasureState,
@@ -11,6 +10,7 @@ from service.state import (
     NoisyFinding,
     NoisyState,
 )
+from service.telemetry.faraway import FarEstimate
 from tests.unit.reactions.situations import (
     ALPHA,
     N_MODES,

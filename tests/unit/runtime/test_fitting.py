@@ -15,8 +15,8 @@ from service.errors import (
     TooSlowError,
     UnknownIdError,
 )
-from service.fits.jobs import FitAsked, FitState
-from service.registration.options import FitOptions
+from service.files.jobs import FitAsked, FitState
+from service.fit.options import FitOptions
 from service.runtime import fitting
 from service.runtime.fitting import FitDesk, FitLimits
 

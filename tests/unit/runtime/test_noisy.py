@@ -9,14 +9,14 @@ import pytest
 from service import events as ev
 from service.archive import Archive
 from service.errors import CommandError, UnknownIdError
-from service.estimation.frames import FrameBlock
-from service.estimation.randomdither import RandomDither, RandomPlan, accumulate
-from service.fits.figures.noisy import Pair
+from service.files.figures.noisy import Pair
 from service.model.misregistration import Misregistration
 from service.reactions.journal import with_alarm
 from service.runtime.deeds import Deeds, Publishing
 from service.runtime.noisy import NoisyDesk
 from service.state import NoisyRecord, NoisyState, TrackerState
+from service.telemetry.frames import FrameBlock
+from service.telemetry.randomdither import RandomDither, RandomPlan, accumulate
 from service.worker import Workbench
 from tests.unit.reactions.situations import rtc
 from tests.unit.runtime.small import COMPUTE, small_instrument

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError, ModelError
-from service.estimation.frames import FrameBlock
-from service.estimation.lockin import WindowRefused
-from service.estimation.randomdither import Correlated
 from service.reactions.random_dither import Asked, plan_random
 from service.runtime.streams import Streams, fed, with_dither, with_rtc
 from service.state import DitherKind, DitherView, ModeSet
+from service.telemetry.frames import FrameBlock
+from service.telemetry.lockin import WindowRefused
+from service.telemetry.randomdither import Correlated
 from service.worker import Description
 from tests.unit.reactions.situations import POLICY, rtc
 

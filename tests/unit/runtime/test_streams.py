@@ -5,9 +5,6 @@ import pytest
 
 from service import events as ev
 from service.errors import ModelError
-from service.estimation.edge import LOW_MODES, Actuators
-from service.estimation.frames import FrameBlock
-from service.estimation.lockin import Spectra, WindowRefused
 from service.runtime.following import news, shape_mismatch, troubles
 from service.runtime.streams import (
     Streams,
@@ -18,9 +15,12 @@ from service.runtime.streams import (
     with_rtc,
 )
 from service.state import DitherView, TrackerState
+from service.telemetry.edge import LOW_MODES, Actuators
+from service.telemetry.frames import FrameBlock
+from service.telemetry.lockin import Spectra, WindowRefused
 from service.worker import Description
-from tests.unit.estimation import test_loopcheck as loops
 from tests.unit.reactions.situations import rtc
+from tests.unit.telemetry import test_loopcheck as loops
 
 N_SLOPES, N_MODES = 6, 8
 DESCRIPTION = Description(

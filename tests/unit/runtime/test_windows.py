@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from service import events as ev
-from service.estimation import passive
 from service.runtime.windows import Backlog, watched
 from service.state import Mode
+from service.telemetry import passive
 from service.worker import Workbench
 from tests.numerics import block_of
-from tests.unit.estimation.test_lockin import run, telemetry
 from tests.unit.reactions.situations import ALPHA, Story
 from tests.unit.reactions.test_watchdog import watched as look
+from tests.unit.telemetry.test_lockin import run, telemetry
 
 
 class Worker:

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation import passive
-from service.estimation.frames import FrameBlock
-from service.estimation.instrumental import Loop
-from service.estimation.lockin import LockIn, LockInPlan, Spectra, WindowRefused, accumulate
 from service.model.misregistration import Misregistration
 from service.model.rtc import RtcInteractionModel
+from service.telemetry import passive
+from service.telemetry.frames import FrameBlock
+from service.telemetry.instrumental import Loop
+from service.telemetry.lockin import LockIn, LockInPlan, Spectra, WindowRefused, accumulate
 from service.worker import Workbench, run_job
 from tests.unit.runtime.small import (
     COMPUTE,

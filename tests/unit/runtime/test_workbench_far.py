@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from service.control.continuation import FINER, SMOOTH, lines_of, modes_of
-from service.estimation.faraway import FarEstimate
-from service.estimation.frames import FrameBlock
-from service.estimation.lockin import LockIn, LockInPlan, accumulate
-from service.estimation.span import WindowRefused
 from service.model.misregistration import Misregistration
+from service.telemetry.faraway import FarEstimate
+from service.telemetry.frames import FrameBlock
+from service.telemetry.lockin import LockIn, LockInPlan, accumulate
+from service.telemetry.span import WindowRefused
 from service.worker import Workbench
-from tests.unit.registration.lamps import counts_of
+from tests.unit.fit.lamps import counts_of
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 FAR = Misregistration(

@@ -1,0 +1,286 @@
+"""From a measured interaction matrix to the registration it was measured at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.fit.bench import Bench
+from service.fit.hypotheses import SUSPICIOUS, rivals
+from service.fit.joint import Solution, prior_of
+from service.fit.nuisance import Nuisances, nuisances_of
+from service.fit.options import Fit, FitOptions, Method, ScanStep
+from service.fit.orientation import LEAST_CORRELATION, find_orientation
+from service.fit.paper import scan
+from service.fit.reference import Checked, Reference, checked
+from service.fit.remarks import remarks
+from service.fit.search import Landing, land, settle, settle_at
+from service.fit.sensitivity import project_on_sensitivities
+from service.fit.target import Target, oriented, target_of
+from service.fit.uncertainty import pupil_regions, uncertainty
+from service.fit.verdict import Evidence, judged
+from service.model.instrument import Instrument
+from service.model.interaction import rtc_valid_subapertures
+from service.model.misregistration import Misregistration
+from service.model.modes import Basis, modal_basis
+from service.model.pyramid import Mapper
+from service.model.slopes import Orientation, SlopeOrder
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+
+def fit_matrix(
+    instrument: Instrument,
+    reference: Reference,
+    options: FitOptions | None = None,
+    *,
+    basis: Basis | None = None,
+    mapper: Mapper = map,
+    progress: Progress | None = None,
+) -> Fit:
+    """Return the registration at which this matrix was measured, and whether to believe it.
+
+    Parameters
+    ----------
+    instrument
+        Whose matrix it is.
+    reference
+        The matrix as it was measured.
+    options
+        What is asked of the fit.
+    basis
+        The instrument's modes, when they are at hand; None: made here, which takes seconds.
+    mapper
+        Like ``map``; an executor's spreads the work over threads.
+    progress
+        Told in a few words what begins.
+
+    Raises
+    ------
+    MatrixError
+        If the matrix is another instrument's, transposed, in another unit or empty.
+    ModelError
+        If a mode that is to be used was not measured, or the instrument cannot be modelled.
+    """
+    options = options or FitOptions()
+    tell = progress or _silent
+    if basis is None:
+        tell("modes")
+        basis = modal_basis(instrument)
+    usable = checked(
+        _selected(reference, options.modes),
+        n_slopes=2 * int(rtc_valid_subapertures(instrument).sum()),
+        n_modes=basis.n_modes,
+        wavelength_m=instrument.wfs.wavelength_m,
+        stroke_known=instrument.mirror.stroke_known,
+    )
+    used = basis.subset(usable.reference.columns)
+    tell("orientation")
+    instrument, told = _masked(instrument), instrument.slopes.order
+    axes = _axes(instrument, usable, used, options, mapper)
+    instrument = oriented(instrument, axes.order, axes.orientation)
+    target = target_of(usable.reference, instrument)
+    bench = Bench(
+        instrument=instrument, basis=used, illumination=options.illumination, mapper=mapper
+    )
+    tell("fit")
+    if options.start is not None:
+        start = options.start.vector
+    else:
+        start = instrument.start.vector
+        start[2] = axes.rotation_rad if axes.rotation_rad is not None else start[2]
+    found = _found(bench, target, start, options)
+    tell("verdict")
+    return _answer(bench, found, usable, axes, told)
+
+
+def _silent(_: str) -> None:
+    return None
+
+
+def _masked(instrument: Instrument) -> Instrument:
+    """Return the instrument with its mask worked out: every model of the fit asks for it."""
+    mask = rtc_valid_subapertures(instrument)
+    return replace(instrument, wfs=replace(instrument.wfs, valid_subapertures=mask))
+
+
+def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference:
+    """Return only the columns of these modes.
+
+    Raises
+    ------
+    ModelError
+        If one of them was not measured.
+    """
+    if modes is None:
+        return reference
+    place = {int(mode): column for column, mode in enumerate(reference.columns)}
+    missing = [int(mode) for mode in modes if int(mode) not in place]
+    if missing:
+        raise ModelError(
+            f"modes: {missing[0]} is asked for and was not measured; expected some of the "
+            f"{len(place)} that were ({min(place)} to {max(place)})"
+        )
+    columns = np.array([place[int(mode)] for mode in modes], dtype=np.intp)
+    return replace(
+        reference,
+        matrix=reference.matrix[:, columns],
+        modes=reference.columns[columns],
+        noise=None if reference.noise is None else reference.noise[columns],
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Axes:
+    """Order, axes and signs of the slopes, and the rough rotation that came with them."""
+
+    order: SlopeOrder
+    orientation: Orientation
+    rotation_rad: float | None
+    """None: not looked for."""
+
+    refusal: str = ""
+    """Why they cannot be told."""
+
+
+def _axes(
+    instrument: Instrument, usable: Checked, basis: Basis, options: FitOptions, mapper: Mapper
+) -> _Axes:
+    """Return the axes that are stated, or found where they are not.
+
+    The search also tells the rotation, so it is spared only when a start is given too.
+    """
+    stated = options.orientation or instrument.slopes.orientation
+    order = instrument.slopes.order
+    if stated is not None and options.start is not None:
+        return _Axes(order=order, orientation=stated, rotation_rad=None)
+    known = replace(instrument, slopes=replace(instrument.slopes, orientation=stated))
+    search = find_orientation(known, usable.reference, basis, mapper=mapper)
+    best = search.best
+    sure = best.correlation >= LEAST_CORRELATION
+    return _Axes(
+        order=best.order,
+        orientation=best.orientation,
+        rotation_rad=best.rotation_rad if sure else None,
+        refusal=search.refusal if stated is None else "",
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found:
+    """What one of the methods came to."""
+
+    solution: Solution
+    target: Target
+    """Without the slopes of unknown surface."""
+
+    nuisances: Nuisances
+    landing: Landing | None = None
+    table: tuple[ScanStep, ...] | None = None
+
+
+def _found(bench: Bench, target: Target, start: Array, options: FitOptions) -> _Found:
+    nuisances = nuisances_of(options, target.valid)
+    match options.method:
+        case Method.JOINT:
+            landing = land(bench, target, start)
+            solution, seen = settle(bench, target, landing.best.vector, nuisances)
+            return _Found(solution=solution, target=seen, nuisances=nuisances, landing=landing)
+        case Method.SENSITIVITY:
+            solution, seen = project_on_sensitivities(bench, target, start, nuisances)
+            return _Found(solution=solution, target=seen, nuisances=nuisances)
+        case Method.PAPER:
+            vector, table = scan(bench, target, start)
+            solution, seen = settle_at(bench, target, vector, nuisances)
+            return _Found(solution=solution, target=seen, nuisances=nuisances, table=table)
+
+
+def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, told: SlopeOrder) -> Fit:
+    solution, target = found.solution, found.target
+    seen = solution.projection
+    values = np.concatenate([np.zeros(4), solution.nuisances])
+    regions = pupil_regions(target.valid)[target.rows]
+    by_mode = np.sqrt(
+        np.sum(seen.residual**2, axis=0) / np.sum(target.matrix[target.rows] ** 2, axis=0)
+    )
+    alpha = Misregistration.from_vector(solution.vector)
+    residual_fraction = float(np.sqrt(np.mean(by_mode**2)))
+    sure = uncertainty(
+        seen,
+        values,
+        prior_of(found.nuisances.sigma),
+        regions,
+        shift_subap=float(np.hypot(*solution.vector[:2])),
+        residual_fraction=residual_fraction,
+    )
+    evidence = Evidence(
+        alpha=alpha,
+        converged=solution.converged,
+        residual_fraction=residual_fraction,
+        gains=seen.gains,
+        uncertainty=sure,
+        landing=found.landing,
+        others=rivals(bench, target, solution, found.nuisances)
+        if residual_fraction > SUSPICIOUS
+        else (),
+        axes=axes.refusal,
+        passes=usable.reference.passes,
+        stroke_known=bench.instrument.mirror.stroke_known,
+    )
+    accepted, verdict = judged(evidence)
+    return Fit(
+        alpha=alpha,
+        covariance=sure.covariance,
+        gains=seen.gains,
+        residual_fraction=residual_fraction,
+        residual_map=_residual_map(found),
+        residual_by_mode=by_mode,
+        condition_number=_condition_number(solution.matrix),
+        modes=target.modes,
+        orientation=axes.orientation,
+        order=axes.order,
+        subset_scatter=sure.subset_scatter,
+        accepted=accepted,
+        converged=solution.converged,
+        verdict=verdict,
+        remarks=remarks(evidence, solution, target, told=told, found=axes.order),
+        left_out=usable.left_out + _rows_left_out(target),
+        n_evaluations=bench.counter.n,
+        synthetic=solution.matrix,
+        measured=target.matrix,
+        valid=target.valid,
+        gain_map=found.nuisances.gain_map(solution.nuisances, target.valid),
+        anamorphosis=found.nuisances.stretches(solution.nuisances),
+        paper_table=found.table,
+    )
+
+
+def _rows_left_out(target: Target) -> tuple[str, ...]:
+    n = int(np.sum(~target.rows))
+    if not n:
+        return ()
+    return (f"{n} of {len(target.rows)} slopes: silent, or seen against unknown surface",)
+
+
+def _residual_map(found: _Found) -> Array:
+    """Return the RMS residual of every slope over the RMS of all, modes counted alike."""
+    target, seen = found.target, found.solution.projection
+    scale = np.sqrt(target.weights)
+    typical = np.sqrt(np.mean((target.matrix[target.rows] * scale) ** 2))
+    by_slope = np.full(len(target.rows), np.nan)
+    by_slope[target.rows] = np.sqrt(np.mean((seen.residual * scale) ** 2, axis=1)) / typical
+    maps = np.full((2, *target.valid.shape), np.nan)
+    maps[:, target.valid] = by_slope.reshape(2, -1)
+    return maps
+
+
+def _condition_number(matrix: NDArray[np.float32]) -> float:
+    """Return the ratio of the extreme singular values, from the Gram matrix: ample below 1e6."""
+    columns = matrix.astype(np.float64)
+    power = np.linalg.eigvalsh(columns.T @ columns)
+    return float(np.sqrt(power[-1] / power[0])) if power[0] > 0.0 else float("inf")

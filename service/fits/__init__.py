@@ -1,4 +1,0 @@
-"""The edge of a fit: measured matrices read from files, what was found as JSON, text and figures.
-
-The fit itself is ``service.registration``; nothing here decides anything about it.
-"""

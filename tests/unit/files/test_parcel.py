@@ -1,0 +1,143 @@
+import io
+import zipfile
+
+import h5py
+import pytest
+
+from service.errors import ConfigurationError, MatrixError
+from service.files.parcel import MOST_FILES, opened_parcel
+
+TOML = '[wfs]\nvalid_subapertures = "mask.h5:/mask"\n[mirror]\nmodes = "modes.fits"\n'
+
+
+@pytest.fixture
+def unpacked(tmp_path):
+    folder = tmp_path / "unpacked"
+    folder.mkdir()
+    return folder
+
+
+def zipped(tmp_path, **contents):
+    path = tmp_path / "upload"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in contents.items():
+            archive.writestr(name.replace("__", "/").replace("_dot_", "."), content)
+    return path
+
+
+def refused(path, folder, reference=None, most=1_000_000):
+    with pytest.raises((MatrixError, ConfigurationError)) as error:
+        opened_parcel(path, folder, reference, most)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_a_file_alone_is_the_measured_one(tmp_path, unpacked):
+    path = tmp_path / "upload"
+    with h5py.File(path, "w") as file:
+        file["D"] = [1.0]
+    parcel = opened_parcel(path, unpacked, None, 100)
+    assert parcel.reference == path
+    assert parcel.instrument is None
+
+
+def test_in_an_archive_what_the_instrument_refers_to_is_not_the_measured_file(tmp_path, unpacked):
+    path = zipped(
+        tmp_path, my_dot_toml=TOML, mask_dot_h5="m", modes_dot_fits="c", night_dot_h5="measured"
+    )
+    parcel = opened_parcel(path, unpacked, None, 1_000_000)
+    assert parcel.instrument == unpacked / "my.toml"
+    assert parcel.reference.read_text() == "measured"
+
+
+def test_where_several_could_be_it_the_measured_file_is_named(tmp_path, unpacked):
+    path = zipped(tmp_path, a_dot_toml="", b_dot_h5="b", c_dot_h5="c")
+    text = refused(path, unpacked)
+    assert "b.h5, c.h5" in text
+    assert "reference=" in text
+    (again := unpacked / "again").mkdir()
+    assert opened_parcel(path, again, "c.h5", 1_000_000).reference.read_text() == "c"
+
+
+def test_a_name_that_is_not_in_the_archive_is_refused(tmp_path, unpacked):
+    path = zipped(tmp_path, a_dot_toml="", b_dot_h5="b")
+    assert "found ../b.h5" in refused(path, unpacked, "../b.h5")
+
+
+def test_an_instrument_must_not_refer_to_the_servers_own_files(tmp_path, unpacked):
+    toml = '[mirror]\nmodes = "/srv/secret.h5:/modes"\n'
+    path = zipped(tmp_path, a_dot_toml=toml, b_dot_h5="b")
+    assert "refers to /srv/secret.h5" in refused(path, unpacked)
+
+
+@pytest.mark.parametrize("name", ["folder__im_dot_h5", "..__im_dot_h5", "__etc__im_dot_h5"])
+def test_an_archive_has_no_folders(tmp_path, unpacked, name):
+    assert "without folders" in refused(zipped(tmp_path, a_dot_toml="", **{name: "b"}), unpacked)
+
+
+def test_an_archive_that_swells_is_refused_before_it_does(tmp_path, unpacked):
+    path = zipped(tmp_path, a_dot_toml="", b_dot_h5="0" * 2_000_000)
+    assert path.stat().st_size < 10_000
+    assert "2 MB" in refused(path, unpacked)
+    assert not list(unpacked.iterdir())
+
+
+def test_an_archive_of_many_files_is_refused(tmp_path, unpacked):
+    path = zipped(tmp_path, **{f"f{k}": "" for k in range(MOST_FILES + 1)})
+    assert f"found {MOST_FILES + 1} files" in refused(path, unpacked)
+
+
+@pytest.mark.parametrize("n_tomls", [0, 2])
+def test_an_archive_has_one_instrument(tmp_path, unpacked, n_tomls):
+    path = zipped(tmp_path, b_dot_h5="b", **{f"i{k}_dot_toml": "" for k in range(n_tomls)})
+    assert f"found {n_tomls} .toml files" in refused(path, unpacked)
+
+
+def test_a_damaged_archive_is_refused(tmp_path, unpacked):
+    whole = zipped(tmp_path, a_dot_toml="", b_dot_h5="b" * 1000).read_bytes()
+    path = tmp_path / "upload"
+    path.write_bytes(whole[: len(whole) // 2])
+    assert "damaged" in refused(path, unpacked)
+
+
+def test_a_locked_archive_is_refused(tmp_path, unpacked):
+    content = bytearray(zipped(tmp_path, a_dot_toml="x = 1").read_bytes())
+    with zipfile.ZipFile(io.BytesIO(bytes(content))) as archive:
+        place = archive.start_dir + 8
+    content[6] |= 1
+    content[place] |= 1
+    path = tmp_path / "upload"
+    path.write_bytes(bytes(content))
+    assert "encrypted" in refused(path, unpacked)
+
+
+def reaching(path):
+    with h5py.File(path, "w") as file:
+        file["mask"] = h5py.ExternalLink("/srv/secret.h5", "/mask")
+    return path.read_bytes()
+
+
+def test_a_matrix_that_is_a_link_to_the_servers_own_files_is_refused(tmp_path, unpacked):
+    path = tmp_path / "upload"
+    reaching(path)
+    assert "/mask: found a link to another file, /srv/secret.h5" in refused(path, unpacked)
+
+
+def test_so_is_a_mask_of_an_archive(tmp_path, unpacked):
+    mask = reaching(tmp_path / "made.h5")
+    path = zipped(tmp_path, my_dot_toml=TOML, mask_dot_h5=mask, modes_dot_fits="c", im_dot_h5="m")
+    text = refused(path, unpacked)
+    assert "mask.h5:/mask: found a link to another file" in text
+
+
+@pytest.mark.parametrize(
+    "toml",
+    [
+        '[mirror]\nmodes = ["/srv/secret.h5:/modes"]\n',
+        '[mirror.more]\nmodes = "/srv/secret.h5:/modes"\n',
+        'modes = "../../secret.h5:/modes"\n',
+    ],
+)
+def test_a_reference_is_found_wherever_it_stands_in_the_instrument_file(tmp_path, unpacked, toml):
+    path = zipped(tmp_path, a_dot_toml=toml, b_dot_h5="b")
+    assert "secret.h5" in refused(path, unpacked)

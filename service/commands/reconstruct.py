@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.archive.product import write_whole
-from service.commands.terminal import check_folder, parsed_by, say, show_progress
+from service.commands.terminal import check_folder, say, show_progress
 from service.config import load_instrument
 from service.control.modal_gains import CalibrationGains
 from service.control.recipe import Method, Provenance, Recipe, Source, reconstruct
-from service.control.reconstructor import MAX_CONDITION
 from service.control.regularised import Prior
 from service.errors import ConfigurationError, MatrixError
 from service.files.fingerprint import instrument_sha256
@@ -28,7 +27,7 @@ from service.files.product import KnownFit, read_fit
 from service.files.reconstructor import Reconstructor, fill_reconstructor
 from service.files.recorded import file_sha256
 from service.files.report import orientation_words
-from service.files.request import parse_alpha, parse_count
+from service.files.request import parse_alpha
 from service.model.instrument import Instrument
 from service.model.modes import modal_basis
 from service.model.rtc import RtcInteractionModel
@@ -37,70 +36,8 @@ SAMPLING = 4
 """Pupil points per subaperture, and detector nodes: the finest of the design's table that takes
 seconds; D is then good to 0.5 %."""
 
-_DESCRIPTION = """
-Compute the noise-free interaction matrix for a registration, invert it, and write both with
-everything they were made of. As many modes as the basis has may be controlled, however few were
-measured.
-"""
 
-
-def add_reconstruct_arguments(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> None:
-    """Declare ``pyrcal reconstruct``; ``commands`` is argparse's collection of sub-commands."""
-    make = commands.add_parser(
-        "reconstruct",
-        help="a reconstructor for a known registration",
-        description=_DESCRIPTION,
-        epilog="Exit status: 0 written, 2 input that cannot be used.",
-    )
-    make.add_argument("instrument", metavar="INSTRUMENT", help="TOML file, or a packaged name")
-    make.add_argument(
-        "alpha",
-        metavar="ALPHA",
-        help="X,Y,ROT,MAG (subapertures, degrees, ratio), or a file that pyrcal fit wrote with "
-        "--json or --output",
-    )
-    make.add_argument(
-        "--modes",
-        type=parsed_by(parse_count),
-        required=True,
-        metavar="N",
-        help="the first N modes",
-    )
-    make.add_argument("--output", type=Path, required=True, metavar="FILE.h5")
-    make.add_argument(
-        "--method",
-        type=Method,
-        choices=list(Method),
-        default=Method.SVD,
-        help="svd: least squares, weak singular values left out (default); map: with noise and "
-        "turbulence as priors",
-    )
-    make.add_argument(
-        "--max-condition", type=float, default=MAX_CONDITION, help="of svd, default %(default)g"
-    )
-    make.add_argument(
-        "--slope-noise",
-        type=float,
-        default=0.05,
-        metavar="RMS",
-        help="of map: 1 sigma of one slope in one frame, default %(default)g",
-    )
-    make.add_argument(
-        "--no-gains",
-        action="store_true",
-        help="leave the columns as the model has them; by default they take the gains of the fit",
-    )
-    make.add_argument(
-        "--flux-map", type=Path, metavar="FILE", help="as of pyrcal fit: the model is lit like it"
-    )
-    make.add_argument(
-        "--reference", type=Path, metavar="FILE", help="the measured matrix, for its checksum"
-    )
-
-
-def run_reconstruct(options: argparse.Namespace) -> int:
+def main(options: argparse.Namespace) -> int:
     """Compute, write, and return the exit status.
 
     Raises
@@ -232,15 +169,15 @@ def _made(
 
 
 def _recipe(options: argparse.Namespace, model: RtcInteractionModel) -> Recipe:
-    prior = None
-    if options.method is Method.MAP:
+    prior, method = None, Method(options.method)
+    if method is Method.MAP:
         prior = Prior(
             variance_m2=model.basis.variance_m2,
             slope_noise=np.full(model.n_slopes, options.slope_noise),
         )
     return Recipe(
         n_modes=options.modes,
-        method=options.method,
+        method=method,
         max_condition=options.max_condition,
         prior=prior,
     )

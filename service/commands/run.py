@@ -14,7 +14,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TextIO, cast
 
 import structlog
@@ -64,25 +63,7 @@ END_WITHIN_S = 4.5
 and process managers wait."""
 
 
-def add_run_arguments(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare ``pyrcal run``; ``commands`` is argparse's collection of sub-commands."""
-    run = commands.add_parser(
-        "run",
-        help="the service",
-        description="Run the service. Precedence: command line > environment "
-        "(PYRCAL_<SECTION>__<KEY>) > TOML file > defaults.",
-    )
-    run.add_argument("--config", type=Path, metavar="FILE", help="settings, TOML")
-    run.add_argument("--instrument", metavar="NAME|FILE", help="packaged name or TOML file")
-    run.add_argument("--mode", choices=["auto", "propose", "hold"], help="default: propose")
-    run.add_argument("--data-dir", metavar="DIR", help="products, index, audit trail; default var")
-    run.add_argument("--listen", metavar="ENDPOINT", help="zenoh, default tcp/127.0.0.1:7447")
-    run.add_argument("--connect", metavar="ENDPOINT", help="an observatory's own zenoh router")
-    run.add_argument("--host", help="of the REST API, default 127.0.0.1")
-    run.add_argument("--port", type=int, help="of the REST API, default 8080")
-
-
-def run_service(options: argparse.Namespace) -> int:
+def main(options: argparse.Namespace) -> int:
     """Run the service until it is asked to stop; return the exit status."""
     given = {
         key: getattr(options, option)

@@ -5,15 +5,13 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import NoReturn
 
 from typing_extensions import override
 
 from service.errors import ConfigurationError, shown
-
-Value = TypeVar("Value")
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -45,18 +43,6 @@ def show_progress(step: str) -> None:
     """Tell somebody who watches how far it is; a log needs no such lines."""
     if sys.stderr.isatty():
         say(f"... {step}")
-
-
-def parsed_by(parse: Callable[[str], Value]) -> Callable[[str], Value]:
-    """Return a parser whose refusal argparse prints as it is."""
-
-    def parsed(text: str) -> Value:
-        try:
-            return parse(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from error
-
-    return parsed
 
 
 def check_folder(path: Path | None) -> None:

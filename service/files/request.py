@@ -45,19 +45,6 @@ def parse_modes(text: str) -> NDArray[np.intp]:
     return np.array(indices, dtype=np.intp)
 
 
-def parse_count(text: str) -> int:
-    """Return a whole number above 0.
-
-    Raises
-    ------
-    ValueError
-        If the text means something else.
-    """
-    if not text.isdecimal() or int(text) == 0:
-        raise ValueError(f"found {text!r}, expected a whole number above 0")
-    return int(text)
-
-
 def parse_alpha(text: str) -> Misregistration:
     """Return the registration ``X,Y,ROT,MAG``: subapertures, degrees, ratio.
 

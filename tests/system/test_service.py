@@ -70,6 +70,9 @@ def test_in_auto_the_registration_is_found_and_the_loop_served_first_its_modes_t
     assert all(record["applied_frame_seq"] > 0 for record in own[:2])
     assert state["link"]["frames_lost"] == 0
     assert set(night.alarms) <= {"watchdog"}
+    status = night.start("status", ["service", "status", "--url", str(night.client.base_url)])
+    assert status.popen.wait(patience(20.0)) in {0, 1}, status.log
+    assert f"loop closed at 1000 Hz, {N_TARGET} of 90 modes" in status.log
 
     assert len(session_members(service.popen.pid)) > 1
     began = time.monotonic()

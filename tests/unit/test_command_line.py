@@ -8,6 +8,12 @@ import pytest
 
 from service import __version__
 from service.__main__ import main
+from service.commands.arguments import command_line
+from service.control.recipe import Method as MakeMethod
+from service.control.recipe import Recipe
+from service.fit.options import FitOptions
+from service.fit.options import Method as FitMethod
+from service.state import Mode
 
 ROOT = Path(__file__).parents[2]
 
@@ -43,7 +49,7 @@ def test_a_command_line_that_makes_no_sense_is_refused(capsys, words):
     assert "pyrcal" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["demo", "--help"]])
+@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["status", "--help"]])
 def test_help_explains_the_commands(capsys, words):
     with pytest.raises(SystemExit) as end:
         main(words)
@@ -117,56 +123,15 @@ def test_a_host_that_is_not_ours_is_refused_in_one_line(capsys):
     assert "192.0.2.1" in refused(capsys, "run", "--host", "192.0.2.1", "--port", "0")
 
 
-@pytest.mark.parametrize("option", ["--port", "--zenoh-port"])
-def test_the_demo_refuses_a_busy_port_instead_of_watching_another_service(capsys, tmp_path, option):
-    with socket.create_server(("127.0.0.1", 0)) as busy:
-        port = str(busy.getsockname()[1])
-        line = refused(capsys, "demo", option, port, "--dir", str(tmp_path / "demo"))
-    assert f"{option} {port}" in line
-    assert not (tmp_path / "demo").exists()
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("--seconds", "-3"),
-        ("--seconds", "0"),
-        ("--seconds", "nan"),
-        ("--seconds", "soon"),
-        ("--seed", "-1"),
-        ("--port", "70000"),
-        ("--alpha", "1,2"),
-        ("--mag", "x"),
-        ("--jump", "30"),
-        ("--json", "nowhere/figures.json"),
-        ("--nonsense", "1"),
-    ],
-)
-def test_the_demo_refuses_an_argument_in_one_line_before_it_starts_anything(
-    capsys, tmp_path, monkeypatch, option, value
-):
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    monkeypatch.setattr("service.demo.run.children", None)  # whoever starts something fails
-    words = ["demo", "--dir", str(tmp_path / "demo"), option, value]
-    try:
-        status = main(words)
-    except SystemExit as end:
-        status = end.code
-    lines = capsys.readouterr().err.splitlines()
-    assert status == 2
-    assert len(lines) == 1
-    assert option in lines[0]
-    assert not (tmp_path / "demo").exists()
-
-
 @pytest.mark.parametrize(
     ("words", "begins"),
     [
         (["sim", "--alpha", "nonsense"], "sim_rtc: "),
         (["campaign", "--plant", "nonsense"], "usage: pyrcal campaign"),
+        (["demo", "--seconds", "nan"], "pyrcal demo: "),
     ],
 )
-def test_simulator_and_campaigns_are_reached_through_the_same_program(words, begins):
+def test_simulator_campaigns_and_demo_are_reached_through_the_same_program(words, begins):
     found = subprocess.run(
         [sys.executable, "-m", "service", *words],
         capture_output=True,
@@ -177,6 +142,57 @@ def test_simulator_and_campaigns_are_reached_through_the_same_program(words, beg
     )
     assert found.returncode == 2
     assert found.stderr.startswith(begins)
+
+
+def processor_s(*words):
+    """Return the processor time of a whole run of the program, the best of three, and its end."""
+    spent, status = [], 0
+    for _ in range(3):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "service", *words],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        spent.append(usage.ru_utime + usage.ru_stime)
+    return min(spent), process.returncode
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        (["--version"], 0),
+        (["--help"], 0),
+        (["run", "--help"], 0),
+        (["fit", "--help"], 0),
+        (["fly"], 2),
+        (["run", "--prot", "1"], 2),
+        (["reconstruct", "flao-lbt", "0,0,0,1"], 2),
+        (["status", "--url", "http://127.0.0.1:1"], 2),
+    ],
+)
+def test_what_needs_no_mathematics_comes_at_once(words, status):
+    """0.3 s on the machine of docs/operating.md; a slower one may take twice as long."""
+    spent_s, found = processor_s(*words)
+    assert found == status
+    assert spent_s < 0.6
+
+
+def test_the_command_line_offers_what_the_program_has():
+    def default_of(name, *words):
+        return getattr(command_line().parse_args(words), name)
+
+    fit, make = ("fit", "a", "b"), ("reconstruct", "a", "0,0,0,1", "--modes", "1", "--output", "c")
+    assert default_of("method", *fit) == FitOptions().method
+    assert default_of("method", *make) == Recipe(n_modes=1).method
+    assert default_of("max_condition", *make) == Recipe(n_modes=1).max_condition
+    for words, methods in ((fit, FitMethod), (make, MakeMethod)):
+        for method in methods:
+            assert default_of("method", *words, "--method", method.value) == method
+    for mode in Mode:
+        assert default_of("mode", "run", "--mode", mode.value) == mode
 
 
 def test_a_start_imports_no_more_than_it_needs():

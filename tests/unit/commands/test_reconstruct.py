@@ -1,4 +1,3 @@
-import argparse
 import json
 from pathlib import Path
 
@@ -7,7 +6,8 @@ import numpy as np
 import pytest
 
 from service.archive.product import write_whole
-from service.commands.reconstruct import SAMPLING, add_reconstruct_arguments, run_reconstruct
+from service.commands.arguments import command_line
+from service.commands.reconstruct import SAMPLING, main
 from service.commands.terminal import with_negative_numbers
 from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError
@@ -39,10 +39,8 @@ def empty_folder(monkeypatch, tmp_path):
 
 
 def made(alpha, *more, modes="50"):
-    parser = argparse.ArgumentParser()
-    add_reconstruct_arguments(parser.add_subparsers())
     given = ["reconstruct", str(TINY), alpha, "--modes", modes, "--output", "cm.h5", *more]
-    assert run_reconstruct(parser.parse_args(with_negative_numbers(given))) == 0
+    assert main(command_line().parse_args(with_negative_numbers(given))) == 0
     return h5py.File("cm.h5", "r")
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from service.files.request import parse_alpha, parse_arms, parse_count, parse_modes
+from service.files.request import parse_alpha, parse_arms, parse_modes
 
 
 @pytest.mark.parametrize(
@@ -35,13 +35,6 @@ def test_a_start_is_in_subapertures_degrees_and_ratio():
 def test_another_start_is_refused(text):
     with pytest.raises(ValueError, match="expected X,Y,ROT,MAG"):
         parse_alpha(text)
-
-
-def test_a_count_is_above_zero():
-    assert parse_count("3") == 3
-    for text in ("0", "-1", "1.5", "x", ""):
-        with pytest.raises(ValueError, match="above 0"):
-            parse_count(text)
 
 
 def test_arms_are_a_width_and_angles():

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from service.demo.children import GRACE_S, children, interrupted_by_any_end
+from studies.demo.children import GRACE_S, children, interrupted_by_any_end
 from tests.system.night import session_members, wait_for
 
 WITH_A_CHILD = """

@@ -9,8 +9,8 @@ from typing import Any
 
 import httpx
 
-from service.demo.children import Child
-from service.demo.report import (
+from studies.demo.children import Child
+from studies.demo.report import (
     MODEL,
     REAL_TIME,
     WORKER_BEHIND,
@@ -19,8 +19,8 @@ from service.demo.report import (
     make_report,
     waits,
 )
-from service.demo.screen import HEADING, awaited, live_line, slow_line
-from service.demo.truth import TruthFile
+from studies.demo.screen import HEADING, awaited, live_line, slow_line
+from studies.demo.truth import TruthFile
 
 POLL_S = 0.5
 LINE_S = 2.0

@@ -1,7 +1,7 @@
 import re
 
-from service.demo.report import Report, Stage
-from service.demo.screen import HEADING, awaited, live_line, slow_line, table
+from studies.demo.report import Report, Stage
+from studies.demo.screen import HEADING, awaited, live_line, slow_line, table
 
 STATE = {
     "ready": True,

@@ -4,7 +4,3 @@ Starts the service and, as another process, a simulated RTC with a mis-registrat
 does not know; shows what an operator would see over REST; at the end compares with the truth,
 which the simulator wrote to a file and never sent.
 """
-
-from service.demo.run import add_demo_arguments, run_demo
-
-__all__ = ["add_demo_arguments", "run_demo"]

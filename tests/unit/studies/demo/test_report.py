@@ -2,9 +2,9 @@ import json
 
 import pytest
 
-from service.demo.report import Circumstances, make_report
-from service.demo.screen import table
-from service.demo.truth import TruthFile
+from studies.demo.report import Circumstances, make_report
+from studies.demo.screen import table
+from studies.demo.truth import TruthFile
 
 TRUE = {"shift_x_subap": 0.1, "shift_y_subap": 0.0, "rotation_deg": 0.2, "magnification": 1.003}
 SIGMA = {

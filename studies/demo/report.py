@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from service.demo.truth import TruthFile
 from service.model.misregistration import PARAMETERS
+from studies.demo.truth import TruthFile
 
 TOLERANCE = {
     "shift_x_subap": 0.02,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.demo.report import MODEL, REAL_TIME, Report, Stage, waits
-from service.demo.truth import Line
 from service.model.misregistration import PARAMETERS
+from studies.demo.report import MODEL, REAL_TIME, Report, Stage, waits
+from studies.demo.truth import Line
 
 HEADING = (
     "   time   frames  lost |  shift x        shift y        rotation         magnification    |"

@@ -4,10 +4,10 @@ import time
 import httpx
 import pytest
 
-from service.demo.children import Child
-from service.demo.truth import TruthFile
-from service.demo.watch import HOLD_S, STRETCH, Promise, Stopwatch, Watch
-from tests.unit.demo.test_report import TRUE, service_state, shelf, waiting
+from studies.demo.children import Child
+from studies.demo.truth import TruthFile
+from studies.demo.watch import HOLD_S, STRETCH, Promise, Stopwatch, Watch
+from tests.unit.studies.demo.test_report import TRUE, service_state, shelf, waiting
 
 SECOND_NS = 1_000_000_000
 

@@ -1,16 +1,19 @@
-import argparse
+import socket
+from pathlib import Path
 
 import pytest
 
-from service.demo.run import _commands, _emptied, _say, add_demo_arguments
 from service.errors import ConfigurationError
 from sim_rtc.options import parse_options
+from studies.demo.__main__ import main
+from studies.demo.arguments import demo_parser
+from studies.demo.run import _commands, _emptied, _say
+
+ROOT = Path(__file__).parents[4]
 
 
 def options(*words):
-    parser = argparse.ArgumentParser()
-    add_demo_arguments(parser.add_subparsers())
-    return parser.parse_args(["demo", *words])
+    return demo_parser().parse_args(words)
 
 
 def test_the_simulator_gets_what_is_meant_for_it_and_understands_it():
@@ -57,3 +60,52 @@ def test_a_new_directory_is_made(tmp_path):
 def test_what_the_service_tells_of_others_is_harmless_on_the_screen(capsys):
     _say("two lines\nof \x1b[2J an \u202ealarm")
     assert capsys.readouterr().out == "two lines\nof \\x1b[2J an \\u202ealarm\n"
+
+
+def refused(capsys, *words):
+    assert main(list(words)) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+@pytest.mark.parametrize("option", ["--port", "--zenoh-port"])
+def test_the_demo_refuses_a_busy_port_instead_of_watching_another_service(capsys, tmp_path, option):
+    with socket.create_server(("127.0.0.1", 0)) as busy:
+        port = str(busy.getsockname()[1])
+        line = refused(capsys, option, port, "--dir", str(tmp_path / "demo"))
+    assert f"{option} {port}" in line
+    assert not (tmp_path / "demo").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--seconds", "-3"),
+        ("--seconds", "0"),
+        ("--seconds", "nan"),
+        ("--seconds", "soon"),
+        ("--seed", "-1"),
+        ("--port", "70000"),
+        ("--alpha", "1,2"),
+        ("--mag", "x"),
+        ("--jump", "30"),
+        ("--json", "nowhere/figures.json"),
+        ("--nonsense", "1"),
+    ],
+)
+def test_the_demo_refuses_an_argument_in_one_line_before_it_starts_anything(
+    capsys, tmp_path, monkeypatch, option, value
+):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("studies.demo.run.children", None)  # whoever starts something fails
+    words = ["--dir", str(tmp_path / "demo"), option, value]
+    try:
+        status = main(words)
+    except SystemExit as end:
+        status = end.code
+    lines = capsys.readouterr().err.splitlines()
+    assert status == 2
+    assert len(lines) == 1
+    assert option in lines[0]
+    assert not (tmp_path / "demo").exists()

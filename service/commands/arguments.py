@@ -1,0 +1,216 @@
+"""What every command understands. Nothing here takes long to import: help and errors come at once.
+
+What the program calls methods, data sets and limits stands here as text; a test compares it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+from service import __version__
+from service.commands.terminal import OneLineParser
+
+OTHER_PROGRAMS = {
+    "demo": ("studies.demo", "the main job, end to end, on a simulated telescope"),
+    "sim": ("sim_rtc", "the simulated RTC"),
+    "campaign": ("studies.campaign", "many simulated nights"),
+}
+"""Module and purpose of what is run in this program's place, with options of its own."""
+
+
+def command_line() -> argparse.ArgumentParser:
+    """Return what reads ``pyrcal``'s command line; ``command`` names the command that is meant."""
+    parser = OneLineParser(
+        prog="pyrcal", description="Calibration service of an adaptive telescope."
+    )
+    parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True)
+    _describe_run(commands.add_parser("run", help="the service"))
+    _describe_status(commands.add_parser("status", help="what a running service is doing"))
+    _describe_fit(commands.add_parser("fit", help="the registration in a measured matrix"))
+    _describe_reconstruct(
+        commands.add_parser("reconstruct", help="a reconstructor for a known registration")
+    )
+    for name, (_, purpose) in OTHER_PROGRAMS.items():
+        commands.add_parser(name, help=f"{purpose}: pyrcal {name} --help", add_help=False)
+    return parser
+
+
+def _describe_run(run: argparse.ArgumentParser) -> None:
+    run.description = (
+        "Run the service. Precedence: command line > environment (PYRCAL_<SECTION>__<KEY>) > "
+        "TOML file > defaults."
+    )
+    run.add_argument("--config", type=Path, metavar="FILE", help="settings, TOML")
+    run.add_argument("--instrument", metavar="NAME|FILE", help="packaged name or TOML file")
+    run.add_argument("--mode", choices=["auto", "propose", "hold"], help="default: propose")
+    run.add_argument("--data-dir", metavar="DIR", help="products, index, audit trail; default var")
+    run.add_argument("--listen", metavar="ENDPOINT", help="zenoh, default tcp/127.0.0.1:7447")
+    run.add_argument("--connect", metavar="ENDPOINT", help="an observatory's own zenoh router")
+    run.add_argument("--host", help="of the REST API, default 127.0.0.1")
+    run.add_argument("--port", type=int, help="of the REST API, default 8080")
+
+
+def _describe_status(status: argparse.ArgumentParser) -> None:
+    status.description = "Ask a running service what it does, and say it on one screen."
+    status.epilog = "Exit status: 0 all is well, 1 not ready or an alarm, 2 nothing answers."
+    status.add_argument(
+        "--url",
+        default="http://127.0.0.1:8080",
+        metavar="URL",
+        help="of the service's REST API, default %(default)s",
+    )
+    status.add_argument("--json", action="store_true", help="print all that the service tells")
+
+
+_FIT = """
+Find where the mirror lies on the sensor from a measured interaction matrix: shift, rotation and
+magnification with 1 sigma, the gain of every mode, what is left over, and whether to believe it.
+"""
+
+_FIT_EPILOG = """
+REFERENCE holds (n_slopes, n_modes), slope per metre of OPD, in the RTC's own order and axes, as
+the array 'interaction_matrix' or the one that --dataset names. What is printed on standard output
+is the answer; progress goes to standard error. Exit status: 0 accepted, 1 fitted but refused (the
+verdict says why), 2 input that cannot be used. docs/fitting.md explains format, orientation and
+verdicts.
+"""
+
+_RECONSTRUCT = """
+Compute the noise-free interaction matrix for a registration, invert it, and write both with
+everything they were made of. As many modes as the basis has may be controlled, however few were
+measured.
+"""
+
+
+def _describe_fit(fit: argparse.ArgumentParser) -> None:
+    fit.description, fit.epilog = _FIT, _FIT_EPILOG
+    fit.add_argument("instrument", metavar="INSTRUMENT", help="TOML file, or a packaged name")
+    fit.add_argument("reference", metavar="REFERENCE", type=Path, help="HDF5 or FITS file")
+    fit.add_argument("--dataset", metavar="NAME", help="of the matrix, default interaction_matrix")
+    fit.add_argument(
+        "--method",
+        choices=("joint", "paper", "sensitivity"),
+        default="joint",
+        help="joint: all four together (default); paper: one at a time, with parabolas; "
+        "sensitivity: projection on sensitivity matrices",
+    )
+    fit.add_argument(
+        "--modes",
+        type=_read_by("parse_modes"),
+        metavar="FIRST:END",
+        help="basis indices to use, like 0:400 (400 is not) or 3,5,9; default all",
+    )
+    fit.add_argument(
+        "--start",
+        type=_read_by("parse_alpha"),
+        metavar="X,Y,ROT,MAG",
+        help="where to begin: subapertures, degrees, ratio",
+    )
+    fit.add_argument(
+        "--flux-map",
+        type=Path,
+        metavar="FILE",
+        help="mean counts of the four pupil images, array flux (4, n, n): the model is lit as it "
+        "says",
+    )
+    turned = fit.add_mutually_exclusive_group()
+    turned.add_argument(
+        "--flux-reference",
+        type=Path,
+        metavar="FILE",
+        help="a flux map of another day: by how much the light is turned since is told",
+    )
+    turned.add_argument(
+        "--arms",
+        type=_read_by("parse_arms"),
+        metavar="WIDTH:DEG,DEG...",
+        help="the spider's arms at rotation 0: the rotation is told that their shadows in the "
+        "flux map have",
+    )
+    fit.add_argument("--gain-map", action="store_true", help="fit a gain over the pupil, too")
+    fit.add_argument("--anamorphosis", action="store_true", help="fit a stretched image, too")
+    fit.add_argument("--json", action="store_true", help="print one JSON object, not a table")
+    fit.add_argument("--plot", type=Path, metavar="FILE.png", help="write the paper's figures")
+    fit.add_argument("--output", type=Path, metavar="FILE.h5", help="write all that was found")
+    fit.add_argument(
+        "--threads",
+        type=_count,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="default: one for every core",
+    )
+
+
+def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
+    make.description = _RECONSTRUCT
+    make.epilog = "Exit status: 0 written, 2 input that cannot be used."
+    make.add_argument("instrument", metavar="INSTRUMENT", help="TOML file, or a packaged name")
+    make.add_argument(
+        "alpha",
+        metavar="ALPHA",
+        help="X,Y,ROT,MAG (subapertures, degrees, ratio), or a file that pyrcal fit wrote with "
+        "--json or --output",
+    )
+    make.add_argument(
+        "--modes",
+        type=_count,
+        required=True,
+        metavar="N",
+        help="the first N modes",
+    )
+    make.add_argument("--output", type=Path, required=True, metavar="FILE.h5")
+    make.add_argument(
+        "--method",
+        choices=("svd", "map"),
+        default="svd",
+        help="svd: least squares, weak singular values left out (default); map: with noise and "
+        "turbulence as priors",
+    )
+    make.add_argument(
+        "--max-condition", type=float, default=100.0, help="of svd, default %(default)g"
+    )
+    make.add_argument(
+        "--slope-noise",
+        type=float,
+        default=0.05,
+        metavar="RMS",
+        help="of map: 1 sigma of one slope in one frame, default %(default)g",
+    )
+    make.add_argument(
+        "--no-gains",
+        action="store_true",
+        help="leave the columns as the model has them; by default they take the gains of the fit",
+    )
+    make.add_argument(
+        "--flux-map", type=Path, metavar="FILE", help="as of pyrcal fit: the model is lit like it"
+    )
+    make.add_argument(
+        "--reference", type=Path, metavar="FILE", help="the measured matrix, for its checksum"
+    )
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number above 0")
+    return int(text)
+
+
+def _read_by(name: str) -> Callable[[str], object]:
+    """Return a function of ``service.files.request``, imported when there is something to read.
+
+    What it refuses argparse prints as it is.
+    """
+
+    def read(text: str) -> object:
+        parse = getattr(import_module("service.files.request"), name)
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return read

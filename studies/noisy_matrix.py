@@ -22,7 +22,7 @@ from service.archive.noisy import NoisyArchive
 from service.config import load_instrument
 from service.files.figures.noisy import draw
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.runtime.noisy import finished, work_out
+from service.runtime.estimates import finished, work_out
 from service.state import NoisyRecord, NoisyState
 from service.telemetry import randomdither
 from service.telemetry.noisymatrix import RandomEstimate, noisy_matrix

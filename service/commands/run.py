@@ -35,11 +35,11 @@ from service.reactions.noisy import NOISY_KEPT
 from service.reactions.shelf import restored
 from service.routes.admission import Hosts, server_config
 from service.rtc_bridge import Bridge, Endpoint
-from service.runtime.crew import Crew
-from service.runtime.deeds import Deeds, Publishing
-from service.runtime.fitting import FitDesk, FitLimits
-from service.runtime.resuming import taken_up
+from service.runtime.actions import Actions, Publishing
+from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
+from service.runtime.uploads import FitLimits, FitQueue
+from service.runtime.workers import WorkerPool
 from service.state import TrackerState
 from service.worker import Compute, start_worker
 
@@ -139,23 +139,23 @@ class _IntoStructlog(logging.Handler):
 async def _serve(settings: Settings, instrument: Instrument) -> int:
     """Open everything, run until asked to stop or the service fails, close everything."""
     system = settings.service.system or instrument.name
-    crew = Crew(lambda: start_worker(instrument, _compute(settings)))
+    workers = WorkerPool(lambda: start_worker(instrument, _compute(settings)))
     archive = Archive(settings.service.data_dir)
     with _listener(settings.api.host, settings.api.port) as listener:
         archive.open()
         with archive, Bridge(_endpoint(settings, system)) as bridge:
             bridge.expect(instrument.basis_id, instrument.config_id)
-            supervisor = _supervisor(settings, instrument, system, bridge, crew, archive)
+            supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
             desk = _desk(settings, instrument)
             hosts = Hosts(bound=settings.api.host, allowed=settings.api.allowed_hosts)
             try:
                 return await _until_stopped(supervisor, desk, listener, hosts)
             finally:
-                crew.dismiss()
+                workers.close()
 
 
 async def _until_stopped(
-    supervisor: Supervisor, desk: FitDesk, listener: socket.socket, hosts: Hosts
+    supervisor: Supervisor, desk: FitQueue, listener: socket.socket, hosts: Hosts
 ) -> int:
     desk.open()
     app = create_app(supervisor, desk, hosts=hosts)
@@ -257,12 +257,12 @@ def _supervisor(
     instrument: Instrument,
     system: str,
     bridge: Bridge,
-    crew: Crew,
+    workers: WorkerPool,
     archive: Archive,
 ) -> Supervisor:
-    deeds = Deeds(
+    actions = Actions(
         bridge=bridge,
-        crew=crew,
+        workers=workers,
         archive=archive,
         instrument=instrument,
         publishing=Publishing(
@@ -286,16 +286,16 @@ def _supervisor(
         state=taken_up(archive, state, policy, time.time_ns()),
         policy=policy,
         bridge=bridge,
-        crew=crew,
+        workers=workers,
         archive=archive,
-        deeds=deeds,
+        actions=actions,
     )
 
 
-def _desk(settings: Settings, instrument: Instrument) -> FitDesk:
+def _desk(settings: Settings, instrument: Instrument) -> FitQueue:
     """Return the desk for fits of uploads; an uploaded instrument is read like any other."""
     most_bytes = settings.fits.upload_limit_mb * 1_000_000
-    return FitDesk(
+    return FitQueue(
         folder=settings.service.data_dir / "uploads",
         fit=UploadFitter(
             own=instrument,

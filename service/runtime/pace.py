@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from service import events as ev
 from service.routes.service import Pace
-from service.runtime.crew import Crew
+from service.runtime.workers import WorkerPool
 from service.state import TrackerState
 
 WORKER_LOST = "worker-lost"
@@ -52,8 +52,8 @@ class _Mark:
 class PaceMeter:
     """Counts what the work costs; ``look`` at it once a second."""
 
-    def __init__(self, crew: Crew) -> None:
-        self._crew = crew
+    def __init__(self, workers: WorkerPool) -> None:
+        self._workers = workers
         self._telemetry_s = 0.0
         self._late = self._fitted = 0
         self._fitted_s = 0.0
@@ -101,7 +101,7 @@ class PaceMeter:
 
     def news(self, state: TrackerState) -> list[ev.Trouble]:
         """Return which alarms of the worker come or go."""
-        lost = self._crew.trouble
+        lost = self._workers.trouble
         if lost:
             lost = f"{lost}; another one takes over, what it was at is lost. If it comes again: is "
             lost += "there memory enough, and does the machine get to run it?"
@@ -145,9 +145,9 @@ class PaceMeter:
         return _Mark(
             clock=time.monotonic(),
             service=time.process_time(),
-            busy=self._crew.busy_s,
+            busy=self._workers.busy_s,
             telemetry=self._telemetry_s,
-            jobs=dict(self._crew.cpu_s),
+            jobs=dict(self._workers.cpu_s),
             late=self._late,
             fitted=self._fitted,
             fitted_s=self._fitted_s,

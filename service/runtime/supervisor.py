@@ -23,19 +23,17 @@ from service.reactions.policy import Policy
 from service.routes.service import Snapshot
 from service.rtc_bridge import Bridge
 from service.runtime import translate
+from service.runtime.actions import Actions
 from service.runtime.asking import why_not
-from service.runtime.crew import Crew
-from service.runtime.deeds import Deeds
-from service.runtime.following import followed, news, shape_news
+from service.runtime.engine import Engine
+from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.pace import PaceMeter
 from service.runtime.recording import Recorder
-from service.runtime.streams import Streams, Window, fed, taken, with_matrix
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, waiting_for
-from service.runtime.windows import Backlog, fitted, listened, watched
+from service.runtime.workers import WorkerPool
 from service.state import Level, MeasureState, TrackerState, Waiting
-from service.telemetry.lockin import Spectra, WindowRefused
+from service.telemetry.lockin import Spectra
 from service.telemetry.randomdither import Correlated
-from service.tracker import step
 from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, Workbench
 
@@ -63,29 +61,27 @@ class Supervisor:
         state: TrackerState,
         policy: Policy,
         bridge: Bridge,
-        crew: Crew,
+        workers: WorkerPool,
         archive: Archive,
-        deeds: Deeds,
+        actions: Actions,
     ) -> None:
-        self._state = state
-        self._policy = policy
+        self._engine = Engine(state, policy, self)
         self._bridge = bridge
-        self._crew = crew
+        self._workers = workers
         self._archive = archive
-        self._recorder = Recorder(archive, lambda: self._state, self._post)
-        self._deeds = deeds
-        self._streams: Streams | None = None
+        self._recorder = Recorder(archive, lambda: self._engine.state, self._post)
+        self._actions = actions
         self._backlog = Backlog()
-        self._meter = PaceMeter(crew)
+        self._meter = PaceMeter(workers)
         self._running: set[asyncio.Task[None]] = set()
         self._started_ns = time.time_ns()
         self._log = structlog.get_logger().bind(system=state.system)
 
     def snapshot(self) -> Snapshot:
         """Return what is known now."""
-        known, waiting = self._state.registration, self._waiting()
+        known, waiting = self._engine.state.registration, self._waiting()
         return Snapshot(
-            tracker=self._state,
+            tracker=self._engine.state,
             link=self._bridge.statistics(),
             now_ns=time.time_ns(),
             started_ns=self._started_ns,
@@ -101,10 +97,10 @@ class Supervisor:
     def _waiting(self) -> tuple[Waiting, ...]:
         """Return whom the service waits for now."""
         facts = Facts(
-            state=self._state,
+            state=self._engine.state,
             link=self._bridge.statistics(),
-            preparing=self._streams is None,
-            worker_trouble=self._crew.trouble,
+            preparing=self._engine.streams is None,
+            worker_trouble=self._workers.trouble,
         )
         return waiting_for(facts)
 
@@ -132,14 +128,14 @@ class Supervisor:
             asked = self._running - running
             if asked:
                 await asyncio.wait(asked)
-            refusal = why_not(effects, self._state)
+            refusal = why_not(effects, self._engine.state)
             if refusal is not None:
                 raise refusal
         return effects
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)``."""
-        return self._deeds.matrix(matrix_id)
+        return self._actions.matrix(matrix_id)
 
     def measured_matrix(self, measurement_id: str) -> NDArray[np.float32]:
         """Return a measured interaction matrix ``(n_slopes, n_modes)``."""
@@ -155,16 +151,16 @@ class Supervisor:
 
     async def noisy_picture(self, noisy_id: str) -> bytes:
         """Return a PNG of a noisy interaction matrix beside the synthetic one."""
-        return await self._deeds.noisy.picture(noisy_id)
+        return await self._actions.noisy.picture(noisy_id)
 
     async def run(self) -> None:
         """Work until cancelled: prepare the model, then listen, tick, fit, watch and record."""
-        self._tell(replace(self._state, log=()))
+        self._tell(replace(self._engine.state, log=()))
         try:
             await self._work()
         finally:
-            for deed in self._running:
-                deed.cancel()
+            for action in self._running:
+                action.cancel()
             await asyncio.gather(*self._running, return_exceptions=True)
             self._recorder.close()
 
@@ -173,12 +169,7 @@ class Supervisor:
             group.create_task(self._recorder.run())
             group.create_task(self._recorder.save())
             description = await self._described()
-            self._streams = Streams(description=description)
-            self._policy = replace(
-                self._policy,
-                mode_information=description.mode_information,
-                start=description.start,
-            )
+            self._engine.prepared(description)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"
             self._post(ev.Noted(name="service.ready", text=text))
             for work in (self._listen, self._tick, self._fit, self._watch):
@@ -188,10 +179,10 @@ class Supervisor:
         """Return what the model expects of telemetry; a worker that dies is replaced."""
         for _ in range(DESCRIBE_ATTEMPTS - 1):
             try:
-                return await self._crew.call(Workbench.describe)
+                return await self._workers.call(Workbench.describe)
             except WorkerError as error:
                 self._note("worker.lost", str(error), Level.WARNING)
-        return await self._crew.call(Workbench.describe)
+        return await self._workers.call(Workbench.describe)
 
     async def _listen(self) -> None:
         """Take in what the link has: events first, for frames mean nothing without them."""
@@ -207,31 +198,22 @@ class Supervisor:
             for heard in self._bridge.events():
                 if isinstance(heard, MeasuredMatrix):
                     self._start(self._keep_measured(heard))
-                event = translate.event_of(heard)
-                if event is not None:
-                    self._post(event)
-                    self._check_shape()
+                self._engine.hear(heard)
             self._feed()
             await asyncio.sleep(GATHER_S)
 
     def _feed(self) -> None:
-        if self._streams is None:
+        if self._engine.streams is None:
             return
-        was_silent_s = self._streams.dither_silent_s
-        for block in self._bridge.drain():
+        blocks = tuple(self._bridge.drain())
+        for block in blocks:
             self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
-            self._streams, windows = fed(self._streams, block)
-            for window in windows:
-                self._take(window)
-        for event in news(was_silent_s, self._streams, self._state):
-            self._post(event)
+        self._engine.feed(blocks)
 
-    def _take(self, window: Window) -> None:
-        if isinstance(window, WindowRefused):
-            self._post(ev.WindowLost(refused=window))
-            return
+    def fit(self, window: Spectra | Correlated) -> None:
+        """Put a window where the worker finds it."""
         if isinstance(window, Correlated):
-            self._deeds.noisy.take(window, self._state)
+            self._actions.noisy.take(window, self._engine.state)
         if self._backlog.waits:
             self._meter.was_late()
         given_up = self._backlog.put(window)
@@ -246,20 +228,20 @@ class Supervisor:
                 await self._reopen_link()
             self._post(ev.Tick())
             self._meter.look()
-            for trouble in self._meter.news(self._state):
+            for trouble in self._meter.news(self._engine.state):
                 self._post(trouble)
             now_ns = time.time_ns()
-            for event in news_of_link(self._bridge.statistics(), self._state, now_ns):
+            for event in news_of_link(self._bridge.statistics(), self._engine.state, now_ns):
                 self._post(event)
             waiting = self._waiting()
-            for text in told.news(waiting, self._state.alarms, now_ns):
+            for text in told.news(waiting, self._engine.state.alarms, now_ns):
                 self._note("waiting", text, Level.INFO)
-            self._bridge.publish_state(translate.state_message(self._state, now_ns, waiting))
-            raised = frozenset((a.name, a.text) for a in self._state.alarms)
+            self._bridge.publish_state(translate.state_message(self._engine.state, now_ns, waiting))
+            raised = frozenset((a.name, a.text) for a in self._engine.state.alarms)
             for name, text in raised ^ alarms:
                 self._bridge.publish_alarm(
                     AlarmMessage(
-                        system=self._state.system,
+                        system=self._engine.state.system,
                         t_ns=now_ns,
                         name=name,
                         active=(name, text) in raised,
@@ -285,102 +267,93 @@ class Supervisor:
     async def _fit(self) -> None:
         while True:
             await self._backlog.some()
-            async with self._crew.turn("fit"):
+            async with self._workers.turn("fit"):
                 window = self._backlog.take()
                 if window is None:
                     continue
                 if isinstance(window, Spectra):
                     self._meter.fitted(window.window_s)
-                event = await fitted(window, self._state, self._crew, self._deeds)
+                event = await fitted(
+                    window, self._engine.state, self._workers, self._actions.matrix
+                )
             self._post(event)
 
     async def _watch(self) -> None:
         while True:
             await asyncio.sleep(WATCH_INTERVAL_S)
-            if self._streams is None:
-                continue
-            async with self._crew.turn("watch"):
-                self._streams, sums = taken(self._streams)
-                event = await watched(sums, self._state, self._crew)
+            async with self._workers.turn("watch"):
+                sums = self._engine.take_sums()
+                event = await watched(sums, self._engine.state, self._workers)
             if event is not None:
                 self._post(event)
 
-    def _check_shape(self) -> None:
-        if self._streams is None:
-            return
-        event = shape_news(self._streams, self._state)
-        if event is not None:
-            self._post(event)
-
     def _post(self, event: Event) -> tuple[Effect, ...]:
-        """Let the tracker decide, replace the state, and set what it wants in motion."""
-        before = self._state
-        self._state, effects = step(before, event, self._policy, time.time_ns())
-        self._tell(before)
-        self._follow()
-        for effect in effects:
-            self._start(self._do(effect, self._state))
-        if self._state.in_use != before.in_use:
-            self._start(self._offer())
-        return effects
+        return self._engine.post(event)
 
-    def _start(self, deed: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(deed)
+    def now_ns(self) -> int:
+        """Return the time, nanoseconds UTC."""
+        return time.time_ns()
+
+    def stepped(self, before: TrackerState, event: Event) -> None:
+        """Log what is new in the state's log, at its level, and have it recorded."""
+        self._tell(before)
+
+    def perform(self, effect: Effect) -> None:
+        """Begin what the tracker wants done, as a task."""
+        self._start(self._do(effect, self._engine.state))
+
+    def swapped(self, in_use: str | None) -> None:
+        """Offer the matrix in use, and watch what it does."""
+        self._start(self._offer(in_use))
+
+    def _start(self, action: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(action)
         self._running.add(task)
         task.add_done_callback(self._running.discard)
 
-    async def _offer(self) -> None:
+    async def _offer(self, in_use: str | None) -> None:
         """Offer the matrix in use to an RTC that comes late or asks again; watch what it does."""
-        in_use = self._state.in_use
         try:
-            await asyncio.to_thread(self._deeds.offer, self._state)
-            if in_use is not None and self._streams is not None:
-                matrix = await asyncio.to_thread(self._deeds.matrix, in_use)
-                self._streams = with_matrix(self._streams, in_use, matrix)
+            await asyncio.to_thread(self._actions.offer, self._engine.state)
+            if in_use is not None and self._engine.streams is not None:
+                matrix = await asyncio.to_thread(self._actions.matrix, in_use)
+                self._engine.learn(in_use, matrix)
                 await self._hear_out(in_use, matrix)
         except PyrcalError as error:
             self._note("reconstructor.not-offered", str(error), Level.WARNING)
 
     async def _hear_out(self, in_use: str, matrix: NDArray[np.float32]) -> None:
         """Learn from the matrix in use how the RTC lists its slopes and counts its commands."""
-        record = self._state.reconstructor(in_use)
+        record = self._engine.state.reconstructor(in_use)
         if record is None:
             return
-        for event in await listened(record, matrix, self._state, self._crew):
-            if self._state.in_use == in_use:
+        for event in await listened(record, matrix, self._engine.state, self._workers):
+            if self._engine.state.in_use == in_use:
                 self._post(event)
-
-    def _follow(self) -> None:
-        """Keep the streaming estimators in step with the RTC and the dither."""
-        if self._streams is None:
-            return
-        self._streams, note = followed(self._streams, self._state, self._policy)
-        if note is not None:
-            self._post(note)
 
     async def _do(self, effect: Effect, state: TrackerState) -> None:
         try:
             await self._recorder.before(effect)
-            event = await self._deeds.carry_out(effect, state)
+            event = await self._actions.perform(effect, state)
         except StorageError as error:
             self._recorder.failed(error)
             event = ev.JobFailed(effect=effect, text=str(error))
         except PyrcalError as error:
             event = ev.JobFailed(effect=effect, text=str(error))
-        except Exception as error:  # noqa: BLE001 - a bug in one deed must not end the service
-            self._log.exception("deed.broken", effect=type(effect).__name__)
+        except Exception as error:  # noqa: BLE001 - a bug in one action must not end the service
+            self._log.exception("action.broken", effect=type(effect).__name__)
             event = ev.JobFailed(effect=effect, text=f"internal error: {error!r}")
         if event is not None:
             self._post(event)
 
     async def _keep_measured(self, heard: MeasuredMatrix) -> None:
-        known = self._state.measurement(heard.manifest.id)
+        known = self._engine.state.measurement(heard.manifest.id)
         if known is not None and known.state is MeasureState.GIVEN_UP:
             text = f"{known.id} came after it had been given up: it is not kept"
             self._note("measurement.ignored", text, Level.INFO)
             return
         try:
-            self._post(await self._deeds.keep_measured(heard))
+            self._post(await self._actions.keep_measured(heard))
         except PyrcalError as error:
             if isinstance(error, StorageError):
                 self._recorder.failed(error)
@@ -391,7 +364,7 @@ class Supervisor:
 
     def _tell(self, before: TrackerState) -> None:
         """Log what is new in the state's log, at its level, and have it recorded."""
-        entries = new_lines(before, self._state)
+        entries = new_lines(before, self._engine.state)
         for entry in entries:
             getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text)
-        self._recorder.changed(before, self._state, entries)
+        self._recorder.changed(before, self._engine.state, entries)

@@ -1,6 +1,6 @@
 """The whole service against a simulated telescope, in simulated time: no network, no processes.
 
-What the service does is the service's own code: streams, worker, tracker, deeds, translation of
+What the service does is the service's own code: streams, worker, tracker, actions, translation of
 the wire. Only what waits is replaced: an agenda says when each thing is over, by the frames' time,
 so a night takes as long as it computes and is the same every time.
 """
@@ -11,7 +11,7 @@ import asyncio
 import heapq
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -23,15 +23,13 @@ from service.errors import PyrcalError
 from service.events import Command, Effect, Event
 from service.link import events as heard
 from service.reactions.policy import SECOND_NS, Policy
-from service.runtime import translate
-from service.runtime.deeds import Deeds, Publishing
-from service.runtime.following import followed, news, shape_news
-from service.runtime.streams import Streams, Window, fed, taken, with_matrix
+from service.runtime.actions import Actions, Publishing
+from service.runtime.engine import Engine
+from service.runtime.estimates import fitted, listened, lost, watched
 from service.runtime.supervisor import WATCH_INTERVAL_S
-from service.runtime.windows import fitted, listened, lost, watched
 from service.state import Mode, TrackerState
-from service.telemetry.lockin import WindowRefused
-from service.tracker import step
+from service.telemetry.lockin import Spectra
+from service.telemetry.randomdither import Correlated
 from service.wire import CHUNK_LIMIT, Manifest
 from service.worker import Workbench
 from studies.campaign.observatory_checks import Publication, Swap, published, true_radius
@@ -117,24 +115,20 @@ class Observatory:
         ``dome`` and ``link`` are another telescope and the way to it.
         """
         self.dome = dome or Dome(options)
-        description = workbench.describe()
-        self.policy = replace(
-            policy, mode_information=description.mode_information, start=description.start
-        )
         self.latencies = latencies or Latencies()
         system = self.dome.computer.identity.system
-        self.state = TrackerState(system=system, mode=mode)
-        self.streams = Streams(description=description)
+        self._engine = Engine(TrackerState(system=system, mode=mode), policy, self)
+        self._engine.prepared(workbench.describe())
         self.glances: list[Glance] = []
         self.swaps: list[Swap] = []
         self.events: list[tuple[float, Event]] = []
         """All that the tracker heard and when, status and ticks left out."""
 
         self._link = link(self.dome)
-        self._crew = OwnHands(workbench)
-        self._deeds = Deeds(
+        self._workers = OwnHands(workbench)
+        self._actions = Actions(
             bridge=self._link,
-            crew=self._crew,
+            workers=self._workers,
             archive=Shelf(),
             instrument=self.dome.instrument,
             publishing=Publishing(
@@ -147,8 +141,13 @@ class Observatory:
         self._with_poles = with_poles
         self._worker_free_ns = 0
         self._fitting = False
-        self._waiting: Window | None = None
+        self._waiting: Spectra | Correlated | None = None
         self._begin()
+
+    @property
+    def state(self) -> TrackerState:
+        """What the service knows now."""
+        return self._engine.state
 
     @property
     def time_s(self) -> float:
@@ -158,7 +157,7 @@ class Observatory:
     @property
     def worker_cpu_s(self) -> dict[str, float]:
         """Processor time the worker's jobs have taken, seconds, by name."""
-        return dict(self._crew.cpu_s)
+        return dict(self._workers.cpu_s)
 
     def advance(self, seconds: float) -> None:
         """Let so much time pass.
@@ -172,13 +171,7 @@ class Observatory:
         while self.time_s < until_s - 1e-9:
             blocks = self.dome.play()
             self._happen()
-            was_silent_s = self.streams.dither_silent_s
-            for block in blocks:
-                self.streams, windows = fed(self.streams, block)
-                for window in windows:
-                    self._take(window)
-            for event in news(was_silent_s, self.streams, self.state):
-                self._post(event)
+            self._engine.feed(blocks)
             self._acknowledged()
             self._look()
 
@@ -188,7 +181,7 @@ class Observatory:
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return one of the last reconstructors ``(n_modes, n_slopes)``."""
-        return self._deeds.matrix(matrix_id)
+        return self._actions.matrix(matrix_id)
 
     def publications(self) -> list[Publication]:
         """Return what has come of every matrix that was swapped in, so far."""
@@ -241,12 +234,7 @@ class Observatory:
             heapq.heappop(self._agenda).happen()
 
     def _hear(self, event: heard.LinkEvent) -> None:
-        meant = translate.event_of(event)
-        if meant is not None:
-            self._post(meant)
-            mismatch = shape_news(self.streams, self.state)
-            if mismatch is not None:
-                self._post(mismatch)
+        self._engine.hear(event)
 
     def _hear_status(self) -> None:
         self._hear(heard.StatusReceived(status=self.dome.status()))
@@ -282,23 +270,19 @@ class Observatory:
             )
         )
 
-    def _take(self, window: Window) -> None:
-        if isinstance(window, WindowRefused):
-            self._post(ev.WindowLost(refused=window))
-            return
+    def fit(self, window: Spectra | Correlated) -> None:
+        """Fit a window at once if the worker has a hand free, else after the one under way."""
         if not self._fitting:
             self._fit(window)
             return
-        if self._waiting is not None and not isinstance(self._waiting, WindowRefused):
+        if self._waiting is not None:
             reason = "the worker is too slow for the telemetry: a window was given up"
             self._post(lost(self._waiting, reason))
         self._waiting = window
 
-    def _fit(self, window: Window) -> None:
-        if isinstance(window, WindowRefused):
-            return
+    def _fit(self, window: Spectra | Correlated) -> None:
         self._fitting = True
-        event = asyncio.run(fitted(window, self.state, self._crew, self._deeds))
+        event = asyncio.run(fitted(window, self.state, self._workers, self._actions.matrix))
 
         def done() -> None:
             self._fitting = False
@@ -310,40 +294,46 @@ class Observatory:
         self._at(self._worked(self.latencies.fit_s), done)
 
     def _watch(self) -> None:
-        self.streams, sums = taken(self.streams)
-        found = asyncio.run(watched(sums, self.state, self._crew))
+        sums = self._engine.take_sums()
+        found = asyncio.run(watched(sums, self.state, self._workers))
         if found is not None:
             event = found
             self._at(self._worked(self.latencies.watch_s), lambda: self._post(event))
 
     def _post(self, event: Event) -> None:
-        """Let the tracker decide, replace the state, and set what it wants in motion."""
+        self._engine.post(event)
+
+    def now_ns(self) -> int:
+        """Return the time, nanoseconds UTC."""
+        return self.dome.now_ns
+
+    def stepped(self, before: TrackerState, event: Event) -> None:
+        """Keep what the tracker heard."""
         if not isinstance(event, ev.Tick | ev.StatusSeen):
             self.events.append((self.time_s, event))
-        before = self.state
-        self.state, effects = step(before, event, self.policy, self.dome.now_ns)
-        self.streams, note = followed(self.streams, self.state, self.policy)
-        if note is not None:
-            self._post(note)
-        for effect in effects:
-            self._do(effect, self.state)
-        in_use = self.state.in_use
-        if in_use is not None and in_use != before.in_use:
+
+    def perform(self, effect: Effect) -> None:
+        """Do what the tracker wants done."""
+        self._do(effect, self.state)
+
+    def swapped(self, in_use: str | None) -> None:
+        """Watch what a matrix does that has come into use."""
+        if in_use is not None:
             self._hear_out(in_use)
 
     def _hear_out(self, in_use: str) -> None:
         """Watch what the matrix in use does, and learn from it how the RTC speaks."""
-        matrix, record = self._deeds.matrix(in_use), self.state.reconstructor(in_use)
-        self.streams = with_matrix(self.streams, in_use, matrix)
+        matrix, record = self._actions.matrix(in_use), self.state.reconstructor(in_use)
+        self._engine.learn(in_use, matrix)
         if record is not None:
-            for event in asyncio.run(listened(record, matrix, self.state, self._crew)):
+            for event in asyncio.run(listened(record, matrix, self.state, self._workers)):
                 self._in(self.latencies.listen_s, partial(self._post, event))
 
     def _do(self, effect: Effect, state: TrackerState) -> None:
         """Carry an effect out; what comes of it is heard when it would be."""
         due_ns = self._due(effect)
         try:
-            event = asyncio.run(self._deeds.carry_out(effect, state))
+            event = asyncio.run(self._actions.perform(effect, state))
         except PyrcalError as error:
             event = ev.JobFailed(effect=effect, text=str(error))
         self._at(due_ns, lambda: self._done(event))

@@ -15,7 +15,7 @@ from service.archive import Archive
 from service.archive.product import Provenance
 from service.errors import PyrcalError, UnknownIdError, WorkerError
 from service.rtc_bridge import Bridge, Endpoint
-from service.runtime.crew import Crew
+from service.runtime.workers import WorkerPool
 from service.state import ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
 from service.worker import Workbench, Worker
@@ -93,7 +93,7 @@ class ShortLink(Bridge):
         )
 
 
-class OwnHands(Crew):
+class OwnHands(WorkerPool):
     """A worker that is no process of its own: the workbench itself."""
 
     def __init__(self, workbench: Workbench) -> None:

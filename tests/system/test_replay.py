@@ -13,12 +13,10 @@ from service.link.intake import Intake
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.reactions.policy import Policy
 from service.runtime import translate
-from service.runtime.streams import Streams, fed, with_dither, with_rtc
+from service.runtime.engine import Engine
 from service.state import Mode, TrackerState
 from service.telemetry.instrumental import Loop as FitLoop
 from service.telemetry.instrumental import WindowEstimate
-from service.telemetry.lockin import Spectra
-from service.tracker import step
 from service.wire import decode_manifest
 from service.worker import Compute, Workbench
 from sim_rtc.record import Kind, Recording
@@ -42,8 +40,8 @@ class Tracker:
 
     def __init__(self, instrument):
         self.bench = Workbench(instrument, Compute(threads=1))
-        self.streams = Streams(description=self.bench.describe())
-        self.state = TrackerState(system=instrument.name, mode=Mode.HOLD)
+        self.engine = Engine(TrackerState(system=instrument.name, mode=Mode.HOLD), POLICY, self)
+        self.engine.prepared(self.bench.describe())
         self.now_s = 0.0
         self.intake = Intake(Endpoint(system=instrument.name), clock=lambda: self.now_s)
         self.matrices = {}
@@ -65,21 +63,15 @@ class Tracker:
         manifest = decode_manifest(message.attachment)
         matrix = np.frombuffer(message.payload, "<f4").reshape(manifest.layout.shape)
         self.matrices[manifest.id] = matrix
-        self.post(ev.MatrixFetched(record=translate.record_of(manifest)))
+        self.engine.post(ev.MatrixFetched(record=translate.record_of(manifest)))
 
     def look(self):
         for heard in self.intake.events():
-            event = translate.event_of(heard)
-            if event is not None:
-                self.post(event)
-        for block in self.intake.drain():
-            self.streams, windows = fed(self.streams, block)
-            for window in windows:
-                if isinstance(window, Spectra):
-                    self.fit(window)
+            self.engine.hear(heard)
+        self.engine.feed(self.intake.drain())
 
     def fit(self, window):
-        rtc, known = self.state.rtc, self.state.registration
+        rtc, known = self.engine.state.rtc, self.engine.state.registration
         loop = FitLoop(
             reconstructor=self.matrices[window.cm_id],
             gains=np.array(rtc.gains),
@@ -91,23 +83,27 @@ class Tracker:
         estimate = self.bench.fit(window, loop, start)
         if isinstance(estimate, WindowEstimate):
             self.estimates.append((window.first_seq, *estimate.alpha.vector))
-            self.post(ev.WindowFitted(estimate=estimate))
+            self.engine.post(ev.WindowFitted(estimate=estimate))
 
-    def post(self, event):
-        now_ns = round(1e9 * self.now_s) + 1
-        self.state, effects = step(self.state, event, POLICY, now_ns)
-        self.streams = with_rtc(self.streams, self.state.rtc)
-        self.streams = with_dither(self.streams, self.state.dither, WINDOW_S)
-        for effect in effects:
-            if isinstance(effect, ev.AskDither):
-                self.post(
-                    ev.DitherAnswered(
-                        id=effect.dither.id,
-                        accepted=False,
-                        reason="unsupported: a replay",
-                        start_seq=None,
-                    )
+    def now_ns(self):
+        return round(1e9 * self.now_s) + 1
+
+    def stepped(self, before, event):
+        pass
+
+    def swapped(self, in_use):
+        pass
+
+    def perform(self, effect):
+        if isinstance(effect, ev.AskDither):
+            self.engine.post(
+                ev.DitherAnswered(
+                    id=effect.dither.id,
+                    accepted=False,
+                    reason="unsupported: a replay",
+                    start_seq=None,
                 )
+            )
 
 
 def replayed(path):
@@ -140,13 +136,13 @@ def test_a_recorded_night_gives_the_same_answers_every_time(tmp_path):
     assert len(first.estimates) >= 6
     assert first.estimates == second.estimates
     np.testing.assert_array_equal(
-        first.state.registration.covariance, second.state.registration.covariance
+        first.engine.state.registration.covariance, second.engine.state.registration.covariance
     )
-    assert first.state.registration.alpha == second.state.registration.alpha
-    assert first.state.dither.id.startswith("dither-")
+    assert first.engine.state.registration.alpha == second.engine.state.registration.alpha
+    assert first.engine.state.dither.id.startswith("dither-")
     here = {
         entry.t_ns_utc: [entry.measured.to_boundary()[name] for name in PARAMETERS]
-        for entry in first.state.history
+        for entry in first.engine.state.history
     }
     same = sorted(set(there) & set(here))
     assert len(same) >= 6

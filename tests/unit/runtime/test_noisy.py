@@ -12,8 +12,8 @@ from service.errors import CommandError, UnknownIdError
 from service.files.figures.noisy import Pair
 from service.model.misregistration import Misregistration
 from service.reactions.journal import with_alarm
-from service.runtime.deeds import Deeds, Publishing
-from service.runtime.noisy import NoisyDesk
+from service.runtime.actions import Actions, Publishing
+from service.runtime.estimates import NoisySums
 from service.state import NoisyRecord, NoisyState, TrackerState
 from service.telemetry.frames import FrameBlock
 from service.telemetry.randomdither import RandomDither, RandomPlan, accumulate
@@ -53,7 +53,7 @@ class NearCrew:
 
 
 @pytest.fixture(scope="module")
-def crew():
+def workers():
     return NearCrew()
 
 
@@ -66,14 +66,14 @@ def archive(tmp_path):
 
 
 @pytest.fixture
-def desk(crew, archive):
-    return NoisyDesk(crew=crew, archive=archive, instrument=small_instrument())
+def desk(workers, archive):
+    return NoisySums(workers=workers, archive=archive, instrument=small_instrument())
 
 
-def windows(crew, n=2, *, gain=0.6, noise=3e-3, modes=MODES, session="s1"):
+def windows(workers, n=2, *, gain=0.6, noise=3e-3, modes=MODES, session="s1"):
     """Windows of a sensor that sees random signs on these modes, and noise."""
     rng = np.random.default_rng(7)
-    matrix = crew.bench.response(ALPHA)
+    matrix = workers.bench.response(ALPHA)
     amplitude_m = TOTAL_M / np.sqrt(len(modes))
     dither = np.zeros((n * N_FRAMES, matrix.shape[1]), np.float32)
     dither[:, modes] = amplitude_m * rng.choice([-1.0, 1.0], (len(dither), len(modes)))
@@ -95,14 +95,14 @@ def windows(crew, n=2, *, gain=0.6, noise=3e-3, modes=MODES, session="s1"):
     return found
 
 
-async def finish(desk, crew, **changes):
-    for window in windows(crew, **changes):
+async def finish(desk, workers, **changes):
+    for window in windows(workers, **changes):
         desk.take(window, STATE)
     return await desk.finish(RUNNING, STATE)
 
 
-async def test_windows_become_an_archived_matrix_and_the_registration_in_it(desk, crew, archive):
-    made = await finish(desk, crew)
+async def test_windows_become_an_archived_matrix_and_the_registration_in_it(desk, workers, archive):
+    made = await finish(desk, workers)
     assert isinstance(made, ev.NoisyMade)
     record = made.record
     assert (record.state, record.reason) == (NoisyState.STORED, "")
@@ -114,65 +114,65 @@ async def test_windows_become_an_archived_matrix_and_the_registration_in_it(desk
     assert [r.id for r in archive.noisy.records()] == ["noisy-1"]
 
 
-async def test_what_is_archived_is_the_matrix_within_its_stated_noise(desk, crew, archive):
-    await finish(desk, crew)
+async def test_what_is_archived_is_the_matrix_within_its_stated_noise(desk, workers, archive):
+    await finish(desk, workers)
     with h5py.File(archive.noisy.path("noisy-1")) as file:
         matrix, noise = file["interaction_matrix"][()], file["element_noise"][()]
         synthetic, gain = file["synthetic"][()], file["optical_gain"][()]
-    true = 0.6 * crew.bench.response(ALPHA)[:, list(MODES)]
+    true = 0.6 * workers.bench.response(ALPHA)[:, list(MODES)]
     assert np.sqrt(np.mean(((matrix - true) / noise) ** 2)) == pytest.approx(1.0, abs=0.03)
     # the model at the α found lies within that noise, too
     assert np.linalg.norm(synthetic * gain - true) < 0.1 * np.linalg.norm(matrix - true)
 
 
-async def test_windows_of_another_dither_or_of_a_loop_out_of_hand_do_not_count(desk, crew):
-    (other,) = windows(crew, n=1, modes=MODES[:5])
+async def test_windows_of_another_dither_or_of_a_loop_out_of_hand_do_not_count(desk, workers):
+    (other,) = windows(workers, n=1, modes=MODES[:5])
     desk.take(other, STATE)
-    (window,) = windows(crew, n=1)
+    (window,) = windows(workers, n=1)
     desk.take(window, replace(STATE, noisy=()))
     desk.take(window, with_alarm(STATE, "loop-diverging", "it does", 0))
     with pytest.raises(CommandError, match="no window of its dither was whole"):
         await desk.finish(RUNNING, STATE)
 
 
-async def test_what_came_before_the_rtc_restarted_does_not_count(desk, crew):
-    (before,) = windows(crew, n=1)
+async def test_what_came_before_the_rtc_restarted_does_not_count(desk, workers):
+    (before,) = windows(workers, n=1)
     desk.take(before, STATE)
-    made = await finish(desk, crew, n=1, session="s2")
+    made = await finish(desk, workers, n=1, session="s2")
     assert (made.record.finding.session, made.record.finding.n_frames) == ("s2", 999)
 
 
-async def test_a_matrix_nobody_can_fit_is_kept_and_says_so(desk, crew):
-    made = await finish(desk, crew, gain=0.0)
+async def test_a_matrix_nobody_can_fit_is_kept_and_says_so(desk, workers):
+    made = await finish(desk, workers, gain=0.0)
     assert made.record.finding.alpha is None
     assert "the dither is not seen" in made.record.reason
 
 
-async def test_nothing_that_publishes_finds_one(crew, archive):
-    deeds = Deeds(
+async def test_nothing_that_publishes_finds_one(workers, archive):
+    actions = Actions(
         bridge=None,
-        crew=crew,
+        workers=workers,
         archive=archive,
         instrument=small_instrument(),
         publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
         clock_ns=lambda: 0,
     )
-    await finish(deeds.noisy, crew)
+    await finish(actions.noisy, workers)
     with pytest.raises(UnknownIdError):
-        deeds.matrix("noisy-1")
+        actions.matrix("noisy-1")
     state = replace(STATE, rtc=rtc())
     for effect in (
         ev.SendMatrix(id="noisy-1", n_modes=30, gains=None),
         ev.CopyMatrix(source="noisy-1", why="a mistake"),
     ):
         with pytest.raises(UnknownIdError, match="noisy-1"):
-            await deeds.carry_out(effect, state)
+            await actions.perform(effect, state)
     assert archive.records() == ()
 
 
-async def test_the_picture_shows_measured_beside_synthetic(desk, crew, archive):
+async def test_the_picture_shows_measured_beside_synthetic(desk, workers, archive):
     pytest.importorskip("matplotlib")
-    await finish(desk, crew)
+    await finish(desk, workers)
     image = await desk.picture("noisy-1")
     assert image.startswith(b"\x89PNG")
     pair = Pair.read(archive.noisy.path("noisy-1"), small_instrument())

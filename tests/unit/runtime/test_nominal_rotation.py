@@ -10,9 +10,9 @@ from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import Misregistration
 from service.rtc_bridge import Bridge, Endpoint
-from service.runtime.crew import Crew
-from service.runtime.deeds import Deeds, Publishing
+from service.runtime.actions import Actions, Publishing
 from service.runtime.supervisor import Supervisor
+from service.runtime.workers import WorkerPool
 from service.state import AcquisitionStage, Mode, TrackerState
 from service.worker import Workbench, start_worker
 from studies.campaign.observatory import Observatory
@@ -60,13 +60,13 @@ def test_alpha_is_tracked_and_no_healthy_loop_is_opened(turned):
 @pytest.mark.timeout(60)
 async def test_the_running_service_has_it_from_the_instrument_file(turned, tmp_path):
     instrument = load_instrument(str(turned))
-    crew = Crew(lambda: start_worker(instrument, COMPUTE))
+    workers = WorkerPool(lambda: start_worker(instrument, COMPUTE))
     archive = Archive(tmp_path)
     archive.open()
     with archive, Bridge(Endpoint(system="small", listen=("tcp/127.0.0.1:0",))) as bridge:
-        deeds = Deeds(
+        actions = Actions(
             bridge=bridge,
-            crew=crew,
+            workers=workers,
             archive=archive,
             instrument=instrument,
             publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
@@ -76,9 +76,9 @@ async def test_the_running_service_has_it_from_the_instrument_file(turned, tmp_p
             state=TrackerState(system="small", mode=Mode.HOLD),
             policy=POLICY,
             bridge=bridge,
-            crew=crew,
+            workers=workers,
             archive=archive,
-            deeds=deeds,
+            actions=actions,
         )
         async with running(supervisor):
             supervisor._post(ev.SessionStarted(session="s1"))
@@ -86,5 +86,5 @@ async def test_the_running_service_has_it_from_the_instrument_file(turned, tmp_p
             near = Misregistration(rotation_rad=np.deg2rad(NOMINAL_DEG + 0.2))
             supervisor._post(ev.WindowFitted(estimate=estimate(near)))
             known = supervisor.snapshot().tracker.registration
-    crew.dismiss()
+    workers.close()
     assert known.alpha == near

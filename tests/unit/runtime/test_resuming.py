@@ -11,8 +11,8 @@ from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.reactions.shelf import restored
-from service.runtime.resuming import has_news, is_urgent, leave, taken_up
-from service.runtime.streams import Streams
+from service.runtime.engine import Engine
+from service.runtime.recording import has_news, is_urgent, leave, taken_up
 from service.state import AcquisitionStage, Mode, TrackerState
 from service.worker import Compute, Workbench
 from studies.campaign.acquisition import Start
@@ -134,10 +134,11 @@ class Restartable(Observatory):
         self._agenda.clear()
         self._link.sent.clear()
         self._fitting, self._waiting, self._worker_free_ns = False, None, 0
-        self.streams = Streams(description=bench.describe())
         shelf = restored(old.reconstructors)
         fresh = TrackerState(system=old.system, mode=mode, reconstructors=shelf)
-        self.state = taken_up(archive, fresh, self.policy, now_ns)
+        policy = self._engine.policy
+        self._engine = Engine(taken_up(archive, fresh, policy, now_ns), policy, self)
+        self._engine.prepared(bench.describe())
         self._begin()
 
     def until(self, stage, within_s=30.0):

@@ -14,10 +14,10 @@ from service import events as ev
 from service.archive import Archive
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
-from service.runtime.crew import Crew
-from service.runtime.deeds import Deeds, Publishing
-from service.runtime.resuming import taken_up
+from service.runtime.actions import Actions, Publishing
+from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
+from service.runtime.workers import WorkerPool
 from service.state import Level, LogEntry, Mode, TrackerState
 from service.worker import start_worker
 from tests.system.fake_rtc import client_session
@@ -29,10 +29,10 @@ pytestmark = pytest.mark.timeout(60)
 
 
 @pytest.fixture(scope="module")
-def crew():
-    crew = Crew(lambda: start_worker(small_instrument(), COMPUTE))
-    yield crew
-    crew.dismiss()
+def workers():
+    workers = WorkerPool(lambda: start_worker(small_instrument(), COMPUTE))
+    yield workers
+    workers.close()
 
 
 @pytest.fixture
@@ -53,10 +53,10 @@ def bridge():
 
 
 @pytest.fixture
-def supervisor(crew, archive, bridge):
-    deeds = Deeds(
+def supervisor(workers, archive, bridge):
+    actions = Actions(
         bridge=bridge,
-        crew=crew,
+        workers=workers,
         archive=archive,
         instrument=small_instrument(),
         publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
@@ -66,9 +66,9 @@ def supervisor(crew, archive, bridge):
         state=TrackerState(system="small", mode=Mode.HOLD),
         policy=replace(POLICY),
         bridge=bridge,
-        crew=crew,
+        workers=workers,
         archive=archive,
-        deeds=deeds,
+        actions=actions,
     )
 
 
@@ -172,7 +172,7 @@ async def test_cancelled_in_the_very_moment_a_bell_rings_it_ends(supervisor, bri
 async def test_alpha_outlives_the_service_that_measured_it(supervisor, archive):
     """As __main__ does it: what one has left, the next takes up from the same directory."""
     before = told(Story(Mode.HOLD).meet(), n_windows=3)
-    supervisor._state = replace(supervisor._state, registration=before)
+    know(supervisor, registration=before)
     async with running(supervisor):
         assert archive.tracking.read() is None
     again = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
@@ -199,9 +199,7 @@ async def test_what_is_wrong_in_the_archive_is_on_record_from_the_start(archive)
 
 
 async def test_what_was_restored_is_on_record(supervisor, archive):
-    supervisor._state = replace(
-        supervisor._state, log=(LogEntry(t_ns_utc=1, level=Level.INFO, name="old", text="news"),)
-    )
+    know(supervisor, log=(LogEntry(t_ns_utc=1, level=Level.INFO, name="old", text="news"),))
     async with running(supervisor):
         await until(lambda: any(e.name == "old" for e in archive.audit_trail()))
 
@@ -212,7 +210,7 @@ async def test_it_is_saved_while_the_service_runs_and_not_only_at_its_end(
     monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 0.01)
     async with running(supervisor):
         known = told(Story(Mode.HOLD).meet(), n_windows=1)
-        supervisor._state = replace(supervisor._state, registration=known)
+        know(supervisor, registration=known)
         await until(lambda: archive.tracking.read() is not None)
 
 
@@ -224,12 +222,10 @@ async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
     story = Acquiring()
     story.see(n_windows=3)
     async with running(supervisor):
-        supervisor._state = replace(supervisor._state, registration=story.state.registration)
+        know(supervisor, registration=story.state.registration)
         await until(lambda: archive.tracking.read() is not None)
         story.tell(ev.Acquire())
-        supervisor._state = replace(
-            supervisor._state, registration=None, acquisition=story.state.acquisition
-        )
+        know(supervisor, registration=None, acquisition=story.state.acquisition)
         began = time.monotonic()
         await until(lambda: archive.tracking.read().acquisition is not None)
         assert time.monotonic() - began < 0.5
@@ -241,7 +237,7 @@ async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_for
     monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 1.0)
     async with running(supervisor):
         known = told(Story(Mode.HOLD).meet(), n_windows=1)
-        supervisor._state = replace(supervisor._state, registration=known)
+        know(supervisor, registration=known)
         await until(lambda: archive.tracking.read() is not None)
         began = time.monotonic()
         await supervisor.submit(ev.StopDither())
@@ -279,6 +275,11 @@ def full_disk(archive):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         with index._lock:
             connection.execute("PRAGMA max_page_count = 1000000")
+
+
+def know(supervisor, **known):
+    """Have the service know something that nobody has told it."""
+    supervisor._engine.state = replace(supervisor._engine.state, **known)
 
 
 def trail(archive, who):
@@ -371,7 +372,7 @@ async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
     archive.store(record("cm-1", n_modes=3), matrix, None, {})
     story = Story(Mode.HOLD).meet()
     known = replace(story.state, reconstructors=(record("cm-1", n_modes=3),))
-    supervisor._state = known
+    supervisor._engine.state = known
     effect = ev.SendMatrix(id="cm-1", n_modes=known.rtc.n_controlled, gains=None)
     with full_disk(archive):
         supervisor._post(ev.Noted(name="why", text="it is sent"))
@@ -392,12 +393,12 @@ async def test_a_matrix_that_cannot_be_stored_is_never_heard_of_and_the_disk_is_
         await asyncio.to_thread(archive.store, made, matrix, None, {})
         return ev.MatrixMade(record=made, wanted=False)
 
-    monkeypatch.setattr(supervisor._deeds, "carry_out", make)
+    monkeypatch.setattr(supervisor._actions, "perform", make)
     async with running(supervisor):
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, limits[1]))
         try:
-            await supervisor._do(ev.MakeMatrix(n_modes=300, why="test"), supervisor._state)
+            await supervisor._do(ev.MakeMatrix(n_modes=300, why="test"), supervisor._engine.state)
             assert "cm-9.h5: cannot be written" in alarm_of(supervisor, "archive-failed").text
             await asyncio.sleep(0.3)
             assert alarm_of(supervisor, "archive-failed") is not None
@@ -421,7 +422,7 @@ async def test_a_refused_order_is_audited_with_the_reason(supervisor, archive):
 
 async def test_what_the_rtc_refuses_is_audited_too(supervisor, archive):
     async with running(supervisor):
-        supervisor._state = replace(supervisor._state, rtc=Story(Mode.HOLD).meet().state.rtc)
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
         with pytest.raises(PyrcalError):
             await supervisor.submit(ev.SetLoop(closed=False))
         await until(lambda: len(trail(archive, "operator")) == 2)
@@ -436,7 +437,7 @@ async def test_alpha_that_could_not_be_saved_is_an_alarm_and_saved_later(
     async with running(supervisor):
         part.mkdir()
         known = told(Story(Mode.HOLD).meet(), n_windows=1)
-        supervisor._state = replace(supervisor._state, registration=known)
+        know(supervisor, registration=known)
         await until(lambda: alarm_of(supervisor, "archive-failed"))
         part.rmdir()
         await until(lambda: archive.tracking.read() is not None)

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from tests.unit.runtime.test_deeds import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
 
 from service import events as ev
 from service.archive import Archive
@@ -14,14 +15,13 @@ from service.control.gate import LoopSettings
 from service.errors import CommandError
 from service.model.misregistration import Misregistration
 from service.reactions.mode_ladder import fewer_than
-from service.runtime.crew import Crew
-from service.runtime.deeds import Deeds, Publishing
+from service.runtime.actions import Actions, Publishing
 from service.runtime.loops import GAIN_SAFETY, loop_settings, modes_that_hold, timing
+from service.runtime.workers import WorkerPool
 from service.state import Alarm, MatrixState, ModeGain
 from service.worker import Workbench, start_worker
 from tests.unit.reactions.situations import START_NS, rtc
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
-from tests.unit.runtime.test_deeds import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -32,10 +32,10 @@ MEASURED = tuple(
 
 
 @pytest.fixture(scope="module")
-def crew():
-    crew = Crew(lambda: start_worker(small_instrument(), COMPUTE))
-    yield crew
-    crew.dismiss()
+def workers():
+    workers = WorkerPool(lambda: start_worker(small_instrument(), COMPUTE))
+    yield workers
+    workers.close()
 
 
 @pytest.fixture
@@ -52,14 +52,14 @@ def bridge():
 
 
 @pytest.fixture
-def deeds(bridge, crew, archive):
-    return deeds_with(bridge, crew, archive, 0.95)
+def actions(bridge, workers, archive):
+    return deeds_with(bridge, workers, archive, 0.95)
 
 
-def deeds_with(bridge, crew, archive, bound):
-    return Deeds(
+def deeds_with(bridge, workers, archive, bound):
+    return Actions(
         bridge=bridge,
-        crew=crew,
+        workers=workers,
         archive=archive,
         instrument=small_instrument(),
         publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=bound),
@@ -80,8 +80,8 @@ def unsure(by):
     return replace(REGISTRATION, covariance=np.diag(np.array([by, by, by / 10, by / 10]) ** 2))
 
 
-async def make(deeds, state, n_modes=N_CONTROLLED, fewer=()):
-    return await deeds.carry_out(ev.MakeMatrix(n_modes=n_modes, why="a test", fewer=fewer), state)
+async def make(actions, state, n_modes=N_CONTROLLED, fewer=()):
+    return await actions.perform(ev.MakeMatrix(n_modes=n_modes, why="a test", fewer=fewer), state)
 
 
 def make_in(bench, loop, fewer=()):
@@ -95,26 +95,28 @@ def slip_alarm():
 class TestFewer:
     """What is made where the gate refuses as many modes as were asked for."""
 
-    async def test_as_many_as_asked_for_where_they_pass(self, deeds):
-        made = await make(deeds, STATE, fewer=(30, 20, 10))
+    async def test_as_many_as_asked_for_where_they_pass(self, actions):
+        made = await make(actions, STATE, fewer=(30, 20, 10))
         assert (made.record.n_modes, made.asked_modes, made.why_fewer) == (45, 45, "")
 
-    async def test_the_most_that_pass_where_they_do_not(self, deeds):
+    async def test_the_most_that_pass_where_they_do_not(self, actions):
         state = replace(STATE, registration=unsure(0.3))
-        alone = {n: (await make(deeds, state, n)).record.gate.accepted for n in (45, 30, 20, 10, 5)}
+        alone = {
+            n: (await make(actions, state, n)).record.gate.accepted for n in (45, 30, 20, 10, 5)
+        }
         assert not alone[45]
         assert any(alone.values())
         most = max(n for n, accepted in alone.items() if accepted)
-        made = await make(deeds, state, fewer=(30, 20, 10, 5))
+        made = await make(actions, state, fewer=(30, 20, 10, 5))
         assert made.record.state is MatrixState.PROPOSED
         assert made.record.n_modes == most
         assert made.record.gate.accepted
         assert made.record.id.endswith(f"-{most}")
         assert "pole radius" in made.why_fewer
 
-    async def test_what_was_asked_for_is_refused_where_none_pass(self, deeds):
+    async def test_what_was_asked_for_is_refused_where_none_pass(self, actions):
         state = replace(STATE, rtc=loop_of(1.9))
-        made = await make(deeds, state, fewer=(30, 10))
+        made = await make(actions, state, fewer=(30, 10))
         assert made.record.state is MatrixState.REFUSED
         assert (made.record.n_modes, made.why_fewer) == (45, "")
 
@@ -156,37 +158,37 @@ class TestEdge:
         made = make_in(bench, replace(just_beyond, n_holding=40), (40,))
         assert len(made.matrix) == 40
 
-    async def test_the_one_in_use_is_judged_by_the_same_measure(self, deeds, just_beyond):
+    async def test_the_one_in_use_is_judged_by_the_same_measure(self, actions, just_beyond):
         """Or it would be replaced by its like again and again."""
         gain = float(just_beyond.gains[0])
         known = replace(REGISTRATION, alpha=Misregistration(), optical_gain=None)
         state = replace(STATE, registration=known, rtc=loop_of(gain))
-        made = await make(deeds, state, fewer=fewer_than(N_CONTROLLED))
+        made = await make(actions, state, fewer=fewer_than(N_CONTROLLED))
         assert made.record.n_modes == N_CONTROLLED
         assert LIMIT_M < made.record.gate.edge_motion_m < HELD_LIMIT_M
         state = replace(state, reconstructors=(made.record,))
-        judged = await deeds.carry_out(ev.JudgeMatrix(id=made.record.id), state)
+        judged = await actions.perform(ev.JudgeMatrix(id=made.record.id), state)
         assert judged.verdict.accepted
         slipping = replace(state, alarms=(slip_alarm(),))
-        judged = await deeds.carry_out(ev.JudgeMatrix(id=made.record.id), slipping)
+        judged = await actions.perform(ev.JudgeMatrix(id=made.record.id), slipping)
         assert not judged.verdict.accepted
 
 
 class TestLoss:
     """What the one in use loses against a new one."""
 
-    async def test_the_one_just_made_loses_nothing(self, deeds):
-        made = await make(deeds, STATE)
+    async def test_the_one_just_made_loses_nothing(self, actions):
+        made = await make(actions, STATE)
         state = replace(STATE, reconstructors=(made.record,))
-        judged = await deeds.carry_out(ev.JudgeMatrix(id=made.record.id), state)
+        judged = await actions.perform(ev.JudgeMatrix(id=made.record.id), state)
         assert judged.alpha == REGISTRATION.alpha
         assert judged.expected.loss_m == pytest.approx(0.0, abs=1e-12)
 
-    async def test_one_for_another_registration_loses_wavefront_and_margin(self, deeds):
-        made = await make(deeds, STATE)
+    async def test_one_for_another_registration_loses_wavefront_and_margin(self, actions):
+        made = await make(actions, STATE)
         moved = replace(REGISTRATION.alpha, shift_y_subap=0.25)
         state = replace(STATE, registration=replace(REGISTRATION, alpha=moved))
-        judged = await deeds.carry_out(ev.JudgeMatrix(id=made.record.id), state)
+        judged = await actions.perform(ev.JudgeMatrix(id=made.record.id), state)
         assert judged.expected.loss_m > 1e-11
         assert judged.expected.pole_radius > judged.expected.fresh_pole_radius + 0.02
 
@@ -194,7 +196,7 @@ class TestLoss:
 class TestGains:
     """Optical gains stand beside a matrix and are never part of it."""
 
-    async def test_the_same_bytes_whatever_gains_were_measured_or_are_in_force(self, deeds):
+    async def test_the_same_bytes_whatever_gains_were_measured_or_are_in_force(self, actions):
         found = set()
         for gains in ((), MEASURED, tuple(replace(one, gain=0.3) for one in MEASURED)):
             for gain in (0.1, 0.4):
@@ -203,12 +205,12 @@ class TestGains:
                     rtc=loop_of(gain),
                     registration=replace(REGISTRATION, optical_gains=gains),
                 )
-                found.add((await make(deeds, state)).record.sha256)
+                found.add((await make(actions, state)).record.sha256)
         assert len(found) == 1
 
-    async def test_the_table_is_in_the_file_beside_the_matrix(self, deeds, archive, tmp_path):
+    async def test_the_table_is_in_the_file_beside_the_matrix(self, actions, archive, tmp_path):
         state = replace(STATE, registration=replace(REGISTRATION, optical_gains=MEASURED))
-        made = (await make(deeds, state)).record
+        made = (await make(actions, state)).record
         assert made.optical_gains == MEASURED
         assert archive.records()[-1].optical_gains == MEASURED
         with h5py.File(tmp_path / "reconstructors" / f"{made.id}.h5") as file:
@@ -216,28 +218,28 @@ class TestGains:
             assert file["gains/factor"].shape == (N_CONTROLLED,)
             assert file["gains/factor"][()].mean() == pytest.approx(1.0)
 
-    async def test_gains_by_the_table_are_asked_for_when_the_gate_agrees(self, deeds, bridge):
-        made = await make(deeds, STATE)
+    async def test_gains_by_the_table_are_asked_for_when_the_gate_agrees(self, actions, bridge):
+        made = await make(actions, STATE)
         state = replace(STATE, reconstructors=(made.record,), in_use=made.record.id)
         gains = tuple(np.linspace(0.5, 0.4, N_CONTROLLED)) + (0.0,) * (N_MODES - N_CONTROLLED)
         asked = ev.AskLoop(id="loop-1", gains=gains, judged=True)
-        answer = await deeds.carry_out(asked, state)
+        answer = await actions.perform(asked, state)
         assert answer.accepted
         assert bridge.commands[-1].gains == gains
 
-    async def test_and_never_reach_the_rtc_when_it_does_not(self, deeds, bridge):
-        made = await make(deeds, STATE)
+    async def test_and_never_reach_the_rtc_when_it_does_not(self, actions, bridge):
+        made = await make(actions, STATE)
         state = replace(STATE, reconstructors=(made.record,), in_use=made.record.id)
         gains = (2.5,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED)
-        answer = await deeds.carry_out(ev.AskLoop(id="loop-1", gains=gains, judged=True), state)
+        answer = await actions.perform(ev.AskLoop(id="loop-1", gains=gains, judged=True), state)
         assert not answer.accepted
         assert "unstable" in answer.reason
         assert not bridge.commands
 
-    async def test_nothing_is_judged_for_a_matrix_nobody_knows(self, deeds):
+    async def test_nothing_is_judged_for_a_matrix_nobody_knows(self, actions):
         asked = ev.AskLoop(id="loop-1", gains=(0.1,) * N_MODES, judged=True)
         with pytest.raises(CommandError, match="cannot be judged"):
-            await deeds.carry_out(asked, replace(STATE, in_use=None))
+            await actions.perform(asked, replace(STATE, in_use=None))
 
 
 class TestLoopOfTheGate:

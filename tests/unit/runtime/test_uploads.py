@@ -18,7 +18,7 @@ from service.errors import (
 from service.files.jobs import FitAsked, FitState
 from service.fit.options import FitOptions
 from service.runtime import fitting
-from service.runtime.fitting import FitDesk, FitLimits
+from service.runtime.uploads import FitLimits, FitQueue
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -51,7 +51,7 @@ async def opened(tmp_path):
     desks = []
 
     def make(fit=telling, **limits):
-        desk = FitDesk(
+        desk = FitQueue(
             folder=tmp_path / "uploads",
             fit=fit,
             limits=replace(LIMITS, **limits),

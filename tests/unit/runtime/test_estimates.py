@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service import events as ev
-from service.runtime.windows import Backlog, watched
+from service.runtime.estimates import Backlog, watched
 from service.state import Mode
 from service.telemetry import passive
 from service.worker import Workbench

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.errors import MatrixError, WorkerError
-from service.runtime.errand import run_apart
+from service.runtime.workers import run_in_process
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -45,37 +45,39 @@ async def gone(folder):
 
 
 async def test_every_job_has_a_process_of_its_own():
-    first, second = [await run_apart(process_id, nice=0, limit_s=30.0) for _ in range(2)]
+    first, second = [await run_in_process(process_id, nice=0, limit_s=30.0) for _ in range(2)]
     assert len({first, second, os.getpid()}) == 3
 
 
 async def test_the_process_is_nice():
-    assert await run_apart(niceness, nice=4, limit_s=30.0) == os.nice(0) + 4
+    assert await run_in_process(niceness, nice=4, limit_s=30.0) == os.nice(0) + 4
 
 
 async def test_what_a_job_refuses_is_said_as_it_said_it():
     with pytest.raises(MatrixError, match=r"^transposed$"):
-        await run_apart(refusing, nice=0, limit_s=30.0)
+        await run_in_process(refusing, nice=0, limit_s=30.0)
 
 
 async def test_an_unforeseen_failure_is_a_lost_job():
     with pytest.raises(WorkerError, match="a bug in a job"):
-        await run_apart(failing, nice=0, limit_s=30.0)
+        await run_in_process(failing, nice=0, limit_s=30.0)
 
 
 async def test_a_killed_process_is_a_lost_job():
     with pytest.raises(WorkerError, match="died"):
-        await run_apart(killed, nice=0, limit_s=30.0)
+        await run_in_process(killed, nice=0, limit_s=30.0)
 
 
 async def test_a_job_that_takes_too_long_is_stopped(tmp_path):
     with pytest.raises(WorkerError, match="longer than 3 s"):
-        await run_apart(partial(process_id, tmp_path), nice=0, limit_s=3.0)
+        await run_in_process(partial(process_id, tmp_path), nice=0, limit_s=3.0)
     assert multiprocessing.active_children() == []
 
 
 async def test_a_job_nobody_waits_for_is_stopped(tmp_path):
-    waiting = asyncio.create_task(run_apart(partial(process_id, tmp_path), nice=0, limit_s=60.0))
+    waiting = asyncio.create_task(
+        run_in_process(partial(process_id, tmp_path), nice=0, limit_s=60.0)
+    )
     for _ in range(500):
         await asyncio.sleep(0.05)
         if (tmp_path / "pid").exists():
@@ -96,8 +98,8 @@ def modest():
 
 async def test_a_job_that_needs_more_memory_than_it_may_have_is_told_how_much_that_is():
     with pytest.raises(WorkerError, match="needs more memory than 1500 MB"):
-        await run_apart(hungry, nice=0, limit_s=30.0, memory_mb=1500)
+        await run_in_process(hungry, nice=0, limit_s=30.0, memory_mb=1500)
 
 
 async def test_a_job_within_its_memory_is_done():
-    assert await run_apart(modest, nice=0, limit_s=30.0, memory_mb=1500) == 1e6
+    assert await run_in_process(modest, nice=0, limit_s=30.0, memory_mb=1500) == 1e6

@@ -1,4 +1,4 @@
-"""Carrying out what the tracker has decided; every deed ends in an event, failures too."""
+"""Carrying out what the tracker has decided; every action ends in an event, failures too."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from service.reactions.matrices import commanded_gains, extended_gains
 from service.rtc_bridge import Bridge
 from service.runtime import translate
 from service.runtime.asking import Question, ask
-from service.runtime.crew import Crew
+from service.runtime.estimates import NoisySums
 from service.runtime.loops import judged_now, loop_settings, modes_that_hold, timing
-from service.runtime.noisy import NoisyDesk
+from service.runtime.workers import WorkerPool
 from service.state import (
     MatrixState,
     ReconstructorRecord,
@@ -53,21 +53,21 @@ class Publishing:
     """Largest closed-loop pole radius of a matrix that may be published."""
 
 
-class Deeds:
+class Actions:
     """Everything the service does to the world: RTC, worker, archive."""
 
     def __init__(
         self,
         *,
         bridge: Bridge,
-        crew: Crew,
+        workers: WorkerPool,
         archive: Archive,
         instrument: Instrument,
         publishing: Publishing,
         clock_ns: Callable[[], int],
     ) -> None:
         self._bridge = bridge
-        self._crew = crew
+        self._workers = workers
         self._archive = archive
         self._instrument = instrument
         self._publishing = publishing
@@ -75,10 +75,10 @@ class Deeds:
         self._matrices: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
         self._commanded_modes: int | None = None
         self._judging: set[str] = set()
-        self.noisy = NoisyDesk(crew=crew, archive=archive, instrument=instrument)
+        self.noisy = NoisySums(workers=workers, archive=archive, instrument=instrument)
         """Sums of the noisy interaction matrix under way."""
 
-    async def carry_out(self, effect: Effect, state: TrackerState) -> Event | None:
+    async def perform(self, effect: Effect, state: TrackerState) -> Event | None:
         """Do it and return what came of it; None when the answer comes over the link.
 
         Raises
@@ -159,7 +159,7 @@ class Deeds:
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
         gains = (effect.gains or extended_gains(rtc, effect.n_modes))[: effect.n_modes]
-        made = await self._crew.call(
+        made = await self._workers.call(
             Workbench.make,
             registration.alpha,
             registration.total_covariance,
@@ -240,7 +240,7 @@ class Deeds:
                 timing=timing(rtc, len(matrix), registration),
                 magnitude=rtc.magnitude,
             )
-            margin = await self._crew.call(Workbench.margin, question)
+            margin = await self._workers.call(Workbench.margin, question)
         finally:
             self._judging.discard(effect.id)
         judged = judged_now(rtc, gains, registration)
@@ -260,7 +260,7 @@ class Deeds:
         registration: Registration,
     ) -> GateVerdict:
         n_holding = modes_that_hold(state, gains)
-        return await self._crew.call(
+        return await self._workers.call(
             Workbench.judge,
             matrix,
             registration.alpha,

@@ -1,23 +1,157 @@
-"""What the supervisor makes of streams and state between two events: no clock, no task, no link.
+"""The service without clock, task or network: what an event or a block of telemetry changes.
 
-Apart from the tasks, so that a simulated night runs the very same service.
+The running service and a simulated night drive the same engine; they differ in what they wait for.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from service import events as ev
 from service.errors import ModelError
-from service.events import Event
+from service.events import Effect, Event
+from service.link.events import LinkEvent
 from service.reactions.alarms import OFF_LOOP, WRONG_LOOP, WRONG_UNIT, Act, forbidding
 from service.reactions.dither import SILENT_S
 from service.reactions.dither_unwanted import NOT_AS_ASKED, OVER_BUDGET
 from service.reactions.policy import Policy
-from service.runtime.streams import VERDICTS, Streams, with_dither, with_rtc
+from service.runtime import translate
+from service.runtime.streams import (
+    VERDICTS,
+    Streams,
+    fed,
+    taken,
+    with_dither,
+    with_matrix,
+    with_rtc,
+)
 from service.state import Level, RtcView, TrackerState
+from service.telemetry.frames import FrameBlock
+from service.telemetry.lockin import Spectra, WindowRefused
+from service.telemetry.passive import Passive
 from service.telemetry.played import LOUDER, Finding
+from service.telemetry.randomdither import Correlated
+from service.tracker import step
 from service.worker import Description
+
+
+class Driver(Protocol):
+    """What the engine leaves to whoever drives it, because it takes time."""
+
+    def now_ns(self) -> int:
+        """Return the time, nanoseconds UTC."""
+
+    def stepped(self, before: TrackerState, event: Event) -> None:
+        """Hear that an event has led from this state to another."""
+
+    def perform(self, effect: Effect) -> None:
+        """Begin what the tracker wants done; what comes of it is posted as an event."""
+
+    def fit(self, window: Spectra | Correlated) -> None:
+        """Take a window of telemetry that is to be fitted."""
+
+    def swapped(self, in_use: str | None) -> None:
+        """Hear that the RTC uses another reconstructor, None: nobody knows which."""
+
+
+class Engine:
+    """What the service knows, and the streaming estimators that follow the RTC it knows of.
+
+    Parameters
+    ----------
+    state
+        What is known at the start.
+    policy
+        The user's numbers; ``prepared`` adds the model's.
+    driver
+        Does what takes time.
+    """
+
+    def __init__(self, state: TrackerState, policy: Policy, driver: Driver) -> None:
+        self.state = state
+        self.policy = policy
+        self.streams: Streams | None = None
+        """None until the optical model is prepared."""
+
+        self._driver = driver
+
+    def prepared(self, description: Description) -> None:
+        """Take what the optical model expects of telemetry: estimators begin to listen."""
+        self.streams = Streams(description=description)
+        self.policy = replace(
+            self.policy, mode_information=description.mode_information, start=description.start
+        )
+
+    def post(self, event: Event) -> tuple[Effect, ...]:
+        """Let the tracker react, and set in motion what it wants done.
+
+        Raises
+        ------
+        CommandError
+            If it is an operator's command that cannot be carried out now; the state stands.
+        UnknownIdError
+            If it names a reconstructor nobody has heard of.
+        """
+        before = self.state
+        self.state, effects = step(before, event, self.policy, self._driver.now_ns())
+        self._driver.stepped(before, event)
+        self._follow()
+        for effect in effects:
+            self._driver.perform(effect)
+        if self.state.in_use != before.in_use:
+            self._driver.swapped(self.state.in_use)
+        return effects
+
+    def hear(self, heard: LinkEvent) -> None:
+        """Take in what came over the link besides frames."""
+        event = translate.event_of(heard)
+        if event is None:
+            return
+        self.post(event)
+        if self.streams is not None:
+            mismatch = shape_news(self.streams, self.state)
+            if mismatch is not None:
+                self.post(mismatch)
+
+    def feed(self, blocks: Iterable[FrameBlock]) -> None:
+        """Take in frames; windows that end in them are handed on to be fitted."""
+        if self.streams is None:
+            return
+        was_silent_s = self.streams.dither_silent_s
+        for block in blocks:
+            self.streams, windows = fed(self.streams, block)
+            for window in windows:
+                if isinstance(window, WindowRefused):
+                    self.post(ev.WindowLost(refused=window))
+                else:
+                    self._driver.fit(window)
+        for event in news(was_silent_s, self.streams, self.state):
+            self.post(event)
+
+    def take_sums(self) -> Passive | str:
+        """Return the sums of ordinary telemetry and begin new ones, or why there are none yet."""
+        if self.streams is None:
+            return "no passive estimate: the optical model is being prepared"
+        self.streams, sums = taken(self.streams)
+        return sums
+
+    def learn(self, matrix_id: str, matrix: NDArray[np.float32]) -> None:
+        """Know the numbers of a reconstructor, to compare commands with them."""
+        if self.streams is not None:
+            self.streams = with_matrix(self.streams, matrix_id, matrix)
+
+    def _follow(self) -> None:
+        """Keep the estimators in step with the RTC and the dither."""
+        if self.streams is None:
+            return
+        self.streams, note = followed(self.streams, self.state, self.policy)
+        if note is not None:
+            self.post(note)
 
 
 def followed(

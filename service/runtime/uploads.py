@@ -28,7 +28,7 @@ from service.errors import (
     UnknownIdError,
 )
 from service.files.jobs import UNFINISHED, UPLOAD, FitAsked, FitJob, FitState
-from service.runtime.errand import run_apart
+from service.runtime.workers import run_in_process
 
 FITS_KEPT = 50
 """Finished fits that are remembered."""
@@ -69,7 +69,7 @@ class FitLimits:
     """That its process may allocate."""
 
 
-class FitDesk:
+class FitQueue:
     """Takes uploads in, has them fitted one after the other, and forgets them when it ends.
 
     Belongs to the event loop. ``folder`` is emptied when the desk opens; an upload stays there
@@ -206,7 +206,7 @@ class FitDesk:
             async with self._turn:
                 self._put(replace(self._jobs[fit_id], state=FitState.RUNNING))
                 limits = self._limits
-                found = await run_apart(
+                found = await run_in_process(
                     work, nice=limits.nice, limit_s=limits.seconds, memory_mb=limits.memory_mb
                 )
             self._put(replace(self._jobs[fit_id], state=FitState.DONE, document=found))

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import heapq
 import itertools
+import resource
 import time
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable
@@ -14,7 +15,7 @@ from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
-from service.worker import Done, Workbench, Worker, run_job
+from service.worker import Apart, Done, Workbench, Worker, run_job
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -40,14 +41,14 @@ LOOK_S = 0.5
 """Between two looks at what a worker takes."""
 
 
-class Crew:
-    """Hands jobs to a worker made by ``hire``; a dead or hung one costs one job, not the service.
+class WorkerPool:
+    """Hands jobs to a worker made by ``start``; a dead or hung one costs one job, not the service.
 
     Belongs to the event loop. What is most urgent goes first, see :data:`PATIENCE_S`.
     """
 
-    def __init__(self, hire: Callable[[], Worker]) -> None:
-        self._hire = hire
+    def __init__(self, start: Callable[[], Worker]) -> None:
+        self._start = start
         self._worker: Worker | None = None
         self.first: Callable[[], Done[None]] | None = None
         """What every new worker does before anything else; None: nothing."""
@@ -113,7 +114,7 @@ class Crew:
                 done = await self._done(job.__name__, work)
         return done.result
 
-    def dismiss(self) -> None:
+    def close(self) -> None:
         """End the worker, whatever it is at; the next job finds a new one."""
         worker, self._worker = self._worker, None
         threads, self._threads = self._threads, None
@@ -130,7 +131,7 @@ class Crew:
                 first.set_result(None)
 
     async def _done(self, name: str, work: Callable[[], Done[R]]) -> Done[R]:
-        worker = self._worker or self._hire()
+        worker = self._worker or self._start()
         first, self._worker = (None if worker is self._worker else self.first), worker
         # a thread of its own: one that waited for other threads would look like a hung worker
         self._threads = threads = self._threads or ThreadPoolExecutor(1)
@@ -148,7 +149,7 @@ class Crew:
         except WorkerError as error:
             raise WorkerError(f"{name} {error}") from error
         except asyncio.CancelledError:
-            self.dismiss()  # it would go on with what nobody waits for
+            self.close()  # it would go on with what nobody waits for
             raise
         finally:
             self._busy_s, self._busy_since_s = self.busy_s, None
@@ -183,7 +184,7 @@ class Crew:
 
     def _lost(self, text: str) -> str:
         self.n_lost += 1
-        self.dismiss()
+        self.close()
         self.trouble = text
         return text
 
@@ -194,3 +195,45 @@ def _run(
     if first is not None:
         worker.run(first)
     return worker.run(work)
+
+
+R = TypeVar("R")
+
+
+async def run_in_process(
+    work: Callable[[], R], *, nice: int, limit_s: float, memory_mb: int | None = None
+) -> R:
+    """Run ``work`` in a nice'd process and return its result; it must be picklable, like that.
+
+    ``memory_mb`` bounds what the process may allocate, its program included.
+
+    Raises
+    ------
+    PyrcalError
+        What ``work`` has raised of this kind.
+    WorkerError
+        If it raised anything else, needs more memory, the process died, or ``limit_s`` have passed.
+    """
+    process = Apart(nice=nice)
+    if memory_mb is not None:
+        work = partial(_within, memory_mb, work)
+    try:
+        async with asyncio.timeout(limit_s):
+            return await asyncio.to_thread(process.do, work)
+    except TimeoutError as error:
+        raise WorkerError(f"took longer than {limit_s:g} s and was stopped") from error
+    except EOFError as error:
+        raise WorkerError("the process of the job died; out of memory?") from error
+    finally:
+        process.kill()
+
+
+def _within(memory_mb: int, work: Callable[[], R]) -> R:
+    """Do the work in as much memory; in the process itself."""
+    most_bytes = memory_mb * 1_000_000
+    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
+    try:
+        return work()
+    except MemoryError as error:
+        text = f"needs more memory than {memory_mb} MB, the most it may have"
+        raise WorkerError(text) from error

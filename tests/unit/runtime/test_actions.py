@@ -9,9 +9,9 @@ from service import events as ev
 from service.archive import Archive
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.model.misregistration import Misregistration
-from service.runtime.crew import Crew
-from service.runtime.deeds import Deeds, Publishing
+from service.runtime.actions import Actions, Publishing
 from service.runtime.translate import manifest_of
+from service.runtime.workers import WorkerPool
 from service.state import DitherView, MatrixState, Registration, TrackerState
 from service.wire import DitherAction, Loop, LoopRequest, RampRequest, Reply, checksum, layout_of
 from service.worker import start_worker
@@ -70,10 +70,10 @@ class Clock:
 
 
 @pytest.fixture(scope="module")
-def crew():
-    crew = Crew(lambda: start_worker(small_instrument(), COMPUTE))
-    yield crew
-    crew.dismiss()
+def workers():
+    workers = WorkerPool(lambda: start_worker(small_instrument(), COMPUTE))
+    yield workers
+    workers.close()
 
 
 @pytest.fixture
@@ -90,10 +90,10 @@ def bridge():
 
 
 @pytest.fixture
-def deeds(bridge, crew, archive):
-    return Deeds(
+def actions(bridge, workers, archive):
+    return Actions(
         bridge=bridge,
-        crew=crew,
+        workers=workers,
         archive=archive,
         instrument=small_instrument(),
         publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
@@ -119,15 +119,17 @@ STATE = TrackerState(
 )
 
 
-async def made(deeds, n_modes=N_CONTROLLED, state=STATE):
+async def made(actions, n_modes=N_CONTROLLED, state=STATE):
     """Make a reconstructor; return its record and the state that knows it."""
-    event = await deeds.carry_out(ev.MakeMatrix(n_modes=n_modes, why="a test"), state)
+    event = await actions.perform(ev.MakeMatrix(n_modes=n_modes, why="a test"), state)
     shelf = (*state.reconstructors, event.record)
     return event.record, replace(state, reconstructors=shelf)
 
 
-async def test_a_made_reconstructor_is_archived_before_anybody_hears_of_it(deeds, archive, bridge):
-    found, _ = await made(deeds)
+async def test_a_made_reconstructor_is_archived_before_anybody_hears_of_it(
+    actions, archive, bridge
+):
+    found, _ = await made(actions)
     matrix = archive.matrix(found.id)
     assert matrix.shape == (N_CONTROLLED, N_SLOPES)
     assert (found.state, found.sha256) == (MatrixState.PROPOSED, checksum(matrix))
@@ -138,21 +140,21 @@ async def test_a_made_reconstructor_is_archived_before_anybody_hears_of_it(deeds
     assert not bridge.published
 
 
-async def test_every_reconstructor_has_an_id_of_its_own(deeds):
-    first, _ = await made(deeds)
-    second, _ = await made(deeds)
+async def test_every_reconstructor_has_an_id_of_its_own(actions):
+    first, _ = await made(actions)
+    second, _ = await made(actions)
     assert first.id != second.id
 
 
-async def test_a_loop_that_no_matrix_can_hold_makes_a_refused_record(deeds):
+async def test_a_loop_that_no_matrix_can_hold_makes_a_refused_record(actions):
     wild = replace(RTC, gains=(1.9,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED))
-    found, _ = await made(deeds, state=replace(STATE, rtc=wild))
+    found, _ = await made(actions, state=replace(STATE, rtc=wild))
     assert found.state is MatrixState.REFUSED
     assert "unstable" in found.gate.reason
 
 
-async def test_more_modes_are_judged_with_the_gains_they_would_get(deeds):
-    found, _ = await made(deeds, 60)
+async def test_more_modes_are_judged_with_the_gains_they_would_get(actions):
+    found, _ = await made(actions, 60)
     assert found.n_modes == 60
     assert found.gate.accepted
 
@@ -164,56 +166,56 @@ async def test_more_modes_are_judged_with_the_gains_they_would_get(deeds):
         ({"registration": None}, CommandError, "α is not known"),
     ],
 )
-async def test_what_it_takes_to_make_one_must_be_there(deeds, changes, error, match):
+async def test_what_it_takes_to_make_one_must_be_there(actions, changes, error, match):
     with pytest.raises(error, match=match):
-        await made(deeds, state=replace(STATE, **changes))
+        await made(actions, state=replace(STATE, **changes))
 
 
-async def test_sending_the_same_number_of_modes_needs_no_command(deeds, bridge):
-    found, state = await made(deeds)
+async def test_sending_the_same_number_of_modes_needs_no_command(actions, bridge):
+    found, state = await made(actions)
     effect = ev.SendMatrix(id=found.id, n_modes=N_CONTROLLED, gains=None)
-    assert await deeds.carry_out(effect, state) is None
+    assert await actions.perform(effect, state) is None
     ((manifest, matrix),) = bridge.published
     assert (manifest.id, manifest.layout.shape) == (found.id, (N_CONTROLLED, N_SLOPES))
     assert manifest.layout.sha256 == checksum(matrix) == found.sha256
     assert not bridge.commands
 
 
-async def test_sending_more_modes_tells_the_rtc_first(deeds, bridge):
-    found, state = await made(deeds, 60)
+async def test_sending_more_modes_tells_the_rtc_first(actions, bridge):
+    found, state = await made(actions, 60)
     gains = (0.4,) * 60 + (0.0,) * 30
-    await deeds.carry_out(ev.SendMatrix(id=found.id, n_modes=60, gains=gains), state)
+    await actions.perform(ev.SendMatrix(id=found.id, n_modes=60, gains=gains), state)
     (command,) = bridge.commands
     assert isinstance(command, LoopRequest)
     assert (command.n_controlled, command.gains, command.loop) == (60, gains, None)
     assert len(bridge.published) == 1
 
 
-async def test_an_rtc_that_will_not_control_so_many_modes_gets_no_matrix(deeds, bridge):
-    found, state = await made(deeds, 60)
+async def test_an_rtc_that_will_not_control_so_many_modes_gets_no_matrix(actions, bridge):
+    found, state = await made(actions, 60)
     bridge.refusal = "range: at most 50"
     with pytest.raises(CommandError, match="will not control 60 modes: range: at most 50"):
-        await deeds.carry_out(ev.SendMatrix(id=found.id, n_modes=60, gains=(0.4,) * 90), state)
+        await actions.perform(ev.SendMatrix(id=found.id, n_modes=60, gains=(0.4,) * 90), state)
     assert not bridge.published
 
 
-async def test_after_more_modes_were_commanded_in_vain_fewer_are_commanded_again(deeds, bridge):
-    many, state = await made(deeds, 60)
-    few, state = await made(deeds, N_CONTROLLED, state)
-    await deeds.carry_out(ev.SendMatrix(id=many.id, n_modes=60, gains=(0.4,) * 90), state)
-    await deeds.carry_out(ev.SendMatrix(id=few.id, n_modes=N_CONTROLLED, gains=None), state)
+async def test_after_more_modes_were_commanded_in_vain_fewer_are_commanded_again(actions, bridge):
+    many, state = await made(actions, 60)
+    few, state = await made(actions, N_CONTROLLED, state)
+    await actions.perform(ev.SendMatrix(id=many.id, n_modes=60, gains=(0.4,) * 90), state)
+    await actions.perform(ev.SendMatrix(id=few.id, n_modes=N_CONTROLLED, gains=None), state)
     assert [command.n_controlled for command in bridge.commands] == [60, N_CONTROLLED]
 
 
-async def test_nothing_unknown_is_sent(deeds):
+async def test_nothing_unknown_is_sent(actions):
     with pytest.raises(UnknownIdError, match="cm-9"):
-        await deeds.carry_out(ev.SendMatrix(id="cm-9", n_modes=45, gains=None), STATE)
+        await actions.perform(ev.SendMatrix(id="cm-9", n_modes=45, gains=None), STATE)
 
 
-async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(deeds, archive):
-    source, state = await made(deeds)
+async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(actions, archive):
+    source, state = await made(actions)
     effect = ev.CopyMatrix(source=source.id, why="back")
-    event = await deeds.carry_out(effect, state)
+    event = await actions.perform(effect, state)
     copy = event.record
     assert event.wanted
     assert copy.id != source.id
@@ -230,88 +232,88 @@ async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(deeds, arc
         ({"rtc": replace(RTC, loop="open", gains=(0.0,) * RTC.n_modes)}, "an open loop"),
     ],
 )
-async def test_a_copy_that_cannot_be_judged_says_so(deeds, changes, unknown):
-    source, state = await made(deeds)
+async def test_a_copy_that_cannot_be_judged_says_so(actions, changes, unknown):
+    source, state = await made(actions)
     copied = ev.CopyMatrix(source=source.id, why="back")
-    copy = (await deeds.carry_out(copied, replace(state, **changes))).record
+    copy = (await actions.perform(copied, replace(state, **changes))).record
     assert (copy.gate, copy.state) == (None, MatrixState.PROPOSED)
     assert copy.reason.startswith(f"back; the gate could not judge it: {unknown}")
 
 
-async def test_a_copy_that_would_not_hold_the_loop_any_more_is_refused(deeds):
-    source, state = await made(deeds)
+async def test_a_copy_that_would_not_hold_the_loop_any_more_is_refused(actions):
+    source, state = await made(actions)
     far = replace(REGISTRATION, alpha=Misregistration(rotation_rad=0.5))
-    event = await deeds.carry_out(
+    event = await actions.perform(
         ev.CopyMatrix(source=source.id, why="back"), replace(state, registration=far)
     )
     assert event.record.state is MatrixState.REFUSED
 
 
-async def test_the_margin_is_judged_at_the_registration_of_now(deeds):
-    found, state = await made(deeds)
-    event = await deeds.carry_out(ev.JudgeMatrix(id=found.id), state)
+async def test_the_margin_is_judged_at_the_registration_of_now(actions):
+    found, state = await made(actions)
+    event = await actions.perform(ev.JudgeMatrix(id=found.id), state)
     assert (event.id, event.verdict.accepted) == (found.id, True)
     far = replace(REGISTRATION, alpha=Misregistration(rotation_rad=0.5))
-    event = await deeds.carry_out(ev.JudgeMatrix(id=found.id), replace(state, registration=far))
+    event = await actions.perform(ev.JudgeMatrix(id=found.id), replace(state, registration=far))
     assert not event.verdict.accepted
 
 
-async def test_the_rtcs_own_matrix_is_fetched_and_archived_once(deeds, archive):
+async def test_the_rtcs_own_matrix_is_fetched_and_archived_once(actions, archive):
     for _ in range(2):
-        event = await deeds.carry_out(ev.FetchMatrix(id="initial"), STATE)
+        event = await actions.perform(ev.FetchMatrix(id="initial"), STATE)
         assert (event.record.id, event.record.parent) == ("initial", None)
     np.testing.assert_array_equal(archive.matrix("initial"), BROUGHT)
-    np.testing.assert_array_equal(deeds.matrix("initial"), BROUGHT)
+    np.testing.assert_array_equal(actions.matrix("initial"), BROUGHT)
 
 
-async def test_another_matrix_under_a_known_id_is_not_taken_for_the_same(deeds, bridge):
-    await deeds.carry_out(ev.FetchMatrix(id="initial"), STATE)
+async def test_another_matrix_under_a_known_id_is_not_taken_for_the_same(actions, bridge):
+    await actions.perform(ev.FetchMatrix(id="initial"), STATE)
     other = BROUGHT * 2
     bridge.applied = (manifest_of(foreign(), layout_of(other, 4096), RTC, "small"), other)
     with pytest.raises(LinkError, match="not the one archived under that id"):
-        await deeds.carry_out(ev.FetchMatrix(id="initial"), STATE)
+        await actions.perform(ev.FetchMatrix(id="initial"), STATE)
 
 
-async def test_a_matrix_swapped_while_it_was_asked_for_is_named(deeds):
+async def test_a_matrix_swapped_while_it_was_asked_for_is_named(actions):
     with pytest.raises(LinkError, match="offers initial, its status says it uses cm-1"):
-        await deeds.carry_out(ev.FetchMatrix(id="cm-1"), STATE)
+        await actions.perform(ev.FetchMatrix(id="cm-1"), STATE)
 
 
-async def test_old_matrices_come_from_the_archive(deeds, archive):
+async def test_old_matrices_come_from_the_archive(actions, archive):
     archive.store(record("cm-old", n_modes=N_CONTROLLED, sha256=""), BROUGHT, None, {})
-    np.testing.assert_array_equal(deeds.matrix("cm-old"), BROUGHT)
+    np.testing.assert_array_equal(actions.matrix("cm-old"), BROUGHT)
     with pytest.raises(UnknownIdError):
-        deeds.matrix("cm-never")
+        actions.matrix("cm-never")
 
 
-async def test_the_matrix_in_use_is_offered_to_an_rtc_that_comes_late(deeds, bridge):
-    await deeds.carry_out(ev.FetchMatrix(id="initial"), STATE)
-    deeds.offer(STATE)
+async def test_the_matrix_in_use_is_offered_to_an_rtc_that_comes_late(actions, bridge):
+    await actions.perform(ev.FetchMatrix(id="initial"), STATE)
+    actions.offer(STATE)
     ((manifest, matrix),) = bridge.offered
     assert (manifest.id, bridge.current) == ("initial", "initial")
     np.testing.assert_array_equal(matrix, BROUGHT)
 
 
-async def test_nothing_is_offered_while_none_is_in_use(deeds, bridge):
-    deeds.offer(replace(STATE, in_use=None))
+async def test_nothing_is_offered_while_none_is_in_use(actions, bridge):
+    actions.offer(replace(STATE, in_use=None))
     assert not bridge.offered
 
 
-async def test_the_loop_is_changed_as_asked_and_the_answer_is_the_event(deeds, bridge):
+async def test_the_loop_is_changed_as_asked_and_the_answer_is_the_event(actions, bridge):
     asked = ev.AskLoop(id="loop-1", closed=False, gains=(0.1,) * N_MODES, leak=0.9)
-    event = await deeds.carry_out(asked, STATE)
+    event = await actions.perform(asked, STATE)
     assert event == ev.LoopAnswered(id="loop-1", accepted=True, reason="")
     assert bridge.commands == [
         LoopRequest(id="loop-1", loop=Loop.OPEN, gains=(0.1,) * N_MODES, leak=0.9)
     ]
     bridge.refusal = "busy: im-1"
-    event = await deeds.carry_out(ev.AskLoop(id="loop-2", closed=True), STATE)
+    event = await actions.perform(ev.AskLoop(id="loop-2", closed=True), STATE)
     assert (event.accepted, event.reason) == (False, "busy: im-1")
 
 
-async def test_a_ramp_is_asked_for_as_it_is(deeds, bridge):
+async def test_a_ramp_is_asked_for_as_it_is(actions, bridge):
     ramp = ev.AskRamp(id="ramp-1", groups=((0, 1), (2, 9)), gains=(0.2, 0.4), frames_per_gain=50)
-    event = await deeds.carry_out(ramp, STATE)
+    event = await actions.perform(ramp, STATE)
     assert event == ev.LoopAnswered(id="ramp-1", accepted=True, reason="")
     assert bridge.commands == [
         RampRequest(id="ramp-1", groups=((0, 1), (2, 9)), gains=(0.2, 0.4), frames_per_gain=50)
@@ -329,19 +331,19 @@ class TestDither:
         asked_ns_utc=START_NS,
     )
 
-    async def test_the_answer_of_the_rtc_is_the_event(self, deeds, bridge):
-        event = await deeds.carry_out(ev.AskDither(dither=self.DITHER), STATE)
+    async def test_the_answer_of_the_rtc_is_the_event(self, actions, bridge):
+        event = await actions.perform(ev.AskDither(dither=self.DITHER), STATE)
         assert event == ev.DitherAnswered(id="dither-1", accepted=True, reason="", start_seq=77)
         (request,) = bridge.commands
         assert (request.action, request.modes) == (DitherAction.START, (63, 69))
         assert request.frequency_hz == (211.0, 239.0)
 
-    async def test_a_refusal_is_an_answer_too(self, deeds, bridge):
+    async def test_a_refusal_is_an_answer_too(self, actions, bridge):
         bridge.refusal = "busy: measuring"
-        event = await deeds.carry_out(ev.AskDither(dither=self.DITHER), STATE)
+        event = await actions.perform(ev.AskDither(dither=self.DITHER), STATE)
         assert (event.accepted, event.reason) == (False, "busy: measuring")
 
-    async def test_stopping_needs_only_an_id(self, deeds, bridge):
-        assert await deeds.carry_out(ev.AskNoDither(), STATE) is None
+    async def test_stopping_needs_only_an_id(self, actions, bridge):
+        assert await actions.perform(ev.AskNoDither(), STATE) is None
         (request,) = bridge.commands
         assert (request.action, request.modes) == (DitherAction.STOP, None)

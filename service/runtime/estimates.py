@@ -1,0 +1,389 @@
+"""Having the worker look at telemetry: a window to be fitted, the watchdog's sums."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service import events as ev
+from service.archive import Archive
+from service.archive.noisy import NoisyNumbers
+from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
+from service.events import Event
+from service.files.figures.noisy import WHAT, draw
+from service.files.figures.sheet import check_plots
+from service.fit.dialect import setting_written
+from service.model.instrument import Instrument
+from service.model.misregistration import Misregistration
+from service.reactions.alarms import WRONG_MATRIX, Act, forbidding
+from service.reactions.watchdog import fit_begins_at
+from service.runtime.workers import WorkerPool, run_in_process
+from service.state import (
+    Level,
+    NoisyFinding,
+    NoisyRecord,
+    NoisyState,
+    ReconstructorRecord,
+    RtcView,
+    TrackerState,
+)
+from service.telemetry import lockin, randomdither
+from service.telemetry.estimator import Window
+from service.telemetry.instrumental import Loop
+from service.telemetry.lockin import Spectra, WindowRefused
+from service.telemetry.noisymatrix import RandomEstimate, noisy_matrix
+from service.telemetry.passive import Passive
+from service.telemetry.randomdither import Correlated
+from service.wire import checksum
+from service.worker import Workbench, run_job
+
+MatrixOf = Callable[[str], NDArray[np.float32]]
+"""Returns a reconstructor ``(n_modes, n_slopes)`` by id; UnknownIdError if nobody has it."""
+
+LONGEST_S = 30.0
+"""Later ones are not joined to a window: α moves meanwhile."""
+
+
+class Backlog:
+    """The window that waits for the worker: those that end meanwhile are joined to it.
+
+    So windows grow as long as the worker needs, and what they say is not lost.
+    """
+
+    def __init__(self) -> None:
+        self._window: Spectra | Correlated | None = None
+        self._first_end_ns = 0
+        self._news = asyncio.Event()
+
+    @property
+    def waits(self) -> bool:
+        """Whether a window waits."""
+        return self._window is not None
+
+    def put(self, window: Spectra | Correlated) -> WindowRefused | None:
+        """Add a window; return why the one that waited is given up, where it has to be."""
+        waiting = self._window
+        late = window.t_end_ns_utc - self._first_end_ns > LONGEST_S * 1e9
+        both = None if waiting is None or late else _joined(waiting, window)
+        self._window = both or window
+        self._news.set()
+        if both is not None:
+            return None
+        self._first_end_ns = window.t_end_ns_utc
+        if waiting is None:
+            return None
+        return WindowRefused(
+            reason="the worker had no hand free before the dither, the reconstructor or the "
+            f"session changed, or for {LONGEST_S:.0f} s: the window was given up",
+            t_ns_utc=waiting.t_end_ns_utc,
+        )
+
+    async def some(self) -> None:
+        """Wait until a window is there."""
+        await self._news.wait()
+
+    def take(self) -> Spectra | Correlated | None:
+        """Return the window that waits."""
+        self._news.clear()
+        window, self._window = self._window, None
+        return window
+
+
+def _joined(one: Spectra | Correlated, other: Spectra | Correlated) -> Spectra | Correlated | None:
+    if isinstance(one, Spectra) and isinstance(other, Spectra):
+        return lockin.joined(one, other)
+    if isinstance(one, Correlated) and isinstance(other, Correlated) and _alike(one, other):
+        return randomdither.joined(one, other)
+    return None
+
+
+def _alike(one: Correlated, other: Correlated) -> bool:
+    return (one.session, one.cm_id, replace(one.plan, first_seq=0)) == (
+        other.session,
+        other.cm_id,
+        replace(other.plan, first_seq=0),
+    )
+
+
+async def fitted(
+    window: Spectra | Correlated, state: TrackerState, workers: WorkerPool, matrix_of: MatrixOf
+) -> Event:
+    """Return what becomes of one window: an estimate, or why there is none."""
+    if isinstance(window, Correlated):
+        return await _correlated(window, state, workers)
+    return await _demodulated(window, state, workers, matrix_of)
+
+
+async def _correlated(window: Correlated, state: TrackerState, workers: WorkerPool) -> Event:
+    """Return what a window of random dither says; it needs no reconstructor."""
+    known = state.registration
+    try:
+        start = None if known is None else known.alpha
+        outcome = await workers.call(Workbench.fit_random, window, start)
+    except PyrcalError as error:
+        return lost(window, str(error))
+    if isinstance(outcome, WindowRefused):
+        return ev.WindowLost(refused=outcome)
+    return ev.WindowFitted(estimate=outcome, began_ns_utc=_began_ns(window, state.rtc))
+
+
+async def _demodulated(
+    spectra: Spectra, state: TrackerState, workers: WorkerPool, matrix_of: MatrixOf
+) -> Event:
+    """Return what a window of sines says of the registration."""
+    rtc, known = state.rtc, state.registration
+    if state.acquisition.looks_afar:
+        return await _found(spectra, state, workers)
+    if rtc is None:
+        return lost(spectra, "the RTC is not known")
+    try:
+        matrix = await asyncio.to_thread(_reconstructor, spectra, state, matrix_of)
+        loop = Loop(
+            reconstructor=matrix,
+            gains=np.array(rtc.gains),
+            leak=rtc.leak,
+            delay_frames=rtc.delay_frames,
+            frame_rate_hz=rtc.frame_rate_hz,
+        )
+        start = None if known is None else known.alpha
+        outcome = await workers.call(Workbench.fit, spectra, loop, start)
+    except PyrcalError as error:
+        return lost(spectra, str(error))
+    if isinstance(outcome, WindowRefused):
+        return ev.WindowLost(refused=outcome)
+    return ev.WindowFitted(estimate=outcome, began_ns_utc=_began_ns(spectra, rtc))
+
+
+def _reconstructor(
+    spectra: Spectra, state: TrackerState, matrix_of: MatrixOf
+) -> NDArray[np.float32]:
+    """Return the matrix that made the commands; one that nobody has tells nothing of the loop.
+
+    The fit takes the dither alone for its instrument then, which costs precision and no truth.
+    """
+    unknown = np.zeros((0, spectra.slopes.shape[-1]), np.float32)
+    if spectra.cm_id is None and state.in_use is None:
+        return unknown
+    try:
+        return matrix_of(spectra.cm_id or state.in_use or "")
+    except UnknownIdError:
+        return unknown
+
+
+async def _found(spectra: Spectra, state: TrackerState, workers: WorkerPool) -> Event:
+    """Return where a window with the loop open puts the mirror, or why it does not."""
+    flux = None if state.rtc is None else state.rtc.flux
+    try:
+        outcome = await workers.call(Workbench.find, spectra, state.acquisition.alpha, flux)
+    except PyrcalError as error:
+        return lost(spectra, str(error))
+    if isinstance(outcome, WindowRefused):
+        return ev.WindowLost(refused=outcome)
+    return ev.FarFitted(found=outcome, began_ns_utc=_began_ns(spectra, state.rtc))
+
+
+async def watched(
+    sums: Passive | str, state: TrackerState, workers: WorkerPool
+) -> ev.Watched | ev.Unwatched | ev.Noted | None:
+    """Return what the watchdog makes of ordinary telemetry, or why it can make nothing of it.
+
+    None: there is no more to tell than before.
+    """
+    if isinstance(sums, str):
+        return None if sums == state.unwatched else ev.Unwatched(text=sums)
+    last = sums.tail
+    if last is None:
+        return None
+    end_ns = last.t0_ns_utc + (last.n_frames - 1) * last.dt_ns
+    try:
+        estimate = await workers.call(Workbench.watch, sums, fit_begins_at(state))
+    except PyrcalError as error:
+        return ev.Noted(name="watchdog.failed", text=str(error), level=Level.WARNING)
+    if estimate is None:
+        return None
+    loop = () if state.rtc is None else state.rtc.loop_numbers
+    return ev.Watched(estimate=estimate, t_ns_utc=end_ns, began_ns_utc=sums.since_ns_utc, loop=loop)
+
+
+def _began_ns(window: Spectra | Correlated, rtc: RtcView | None) -> int:
+    """Return when a window began, by the RTC's clock; 0: no RTC tells how long it was."""
+    if rtc is None:
+        return 0
+    n_frames = window.n_windows * window.plan.n_frames
+    return window.t_end_ns_utc - round(n_frames * 1e9 / rtc.frame_rate_hz)
+
+
+async def listened(
+    record: ReconstructorRecord,
+    matrix: NDArray[np.float32],
+    state: TrackerState,
+    workers: WorkerPool,
+) -> list[Event]:
+    """Return what a matrix that the RTC brought tells of its slopes and commands.
+
+    One that the service has made and judged says nothing that it did not know.
+    """
+    if record.judged is not None:
+        return []
+    known = state.registration
+    try:
+        dialect = await workers.call(
+            Workbench.listen, matrix, None if known is None else known.alpha
+        )
+    except PyrcalError as error:
+        return [ev.Noted(name="slopes.unknown", text=str(error), level=Level.WARNING)]
+    events: list[Event] = []
+    if dialect.found is not None and dialect.adopted:
+        workers.first = partial(run_job, Workbench.adopt, dialect.found)
+        text = f'orientation "auto": found {setting_written(dialect.found)} by {record.id}'
+        events.append(ev.Noted(name="slopes.adopted", text=text))
+    raised = any(alarm.name == WRONG_MATRIX for alarm in state.alarms)
+    if dialect.wrong or raised:
+        text = f"{record.id}: {dialect.wrong}" if dialect.wrong else f"{record.id} is as told"
+        events.append(ev.Trouble(name=WRONG_MATRIX, text=text, over=not dialect.wrong))
+    return events
+
+
+def lost(window: Window, reason: str) -> Event:
+    """Return what becomes of a window that cannot be fitted."""
+    refused = WindowRefused(reason=reason, t_ns_utc=window.t_end_ns_utc)
+    return ev.WindowLost(refused=refused)
+
+
+DRAW_WITHIN_S = 120.0
+DRAW_NICE = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Found:
+    """What the worker makes of the sums."""
+
+    numbers: NoisyNumbers
+    estimate: RandomEstimate | None
+    reason: str
+    """Why there is no estimate; empty: there is."""
+
+    snr: float
+
+
+class NoisySums:
+    """Sums the windows of the dither that measures a noisy interaction matrix.
+
+    Belongs to the event loop. Its matrices are none of the actions': nothing here is published.
+    """
+
+    def __init__(self, *, workers: WorkerPool, archive: Archive, instrument: Instrument) -> None:
+        self._workers = workers
+        self._archive = archive
+        self._instrument = instrument
+        self._id: str | None = None
+        self._total: Correlated | None = None
+
+    def take(self, window: Correlated, state: TrackerState) -> None:
+        """Add a window, if it is of the matrix under way and its telemetry can be believed."""
+        record, dither = state.gathering, state.dither
+        if record is None or (dither is not None and dither.id != record.id):
+            return
+        if window.plan.modes != record.modes or forbidding(state, Act.MEASURE) is not None:
+            return
+        total = self._total if self._id == record.id else None
+        self._id = record.id
+        try:
+            self._total = window if total is None else randomdither.joined(total, window)
+        except ModelError:  # the RTC has started anew: what came before is of another loop
+            self._total = window
+
+    async def finish(self, record: NoisyRecord, state: TrackerState) -> Event:
+        """Fit what has been summed, archive it and return what came of it.
+
+        Raises
+        ------
+        CommandError
+            If there is no whole window of it.
+        PyrcalError
+            If it cannot be fitted or archived.
+        """
+        total, known = self._total, state.registration
+        if self._id != record.id or total is None:
+            raise CommandError("no window of its dither was whole: see the log for the reasons")
+        self._id = self._total = None
+        start = None if known is None else known.alpha
+        found = await self._workers.call(work_out, total, start)
+        record = finished(record, total, found)
+        store = self._archive.noisy.store
+        await asyncio.to_thread(store, record, found.numbers, self._instrument.name)
+        return ev.NoisyMade(record=record)
+
+    async def picture(self, noisy_id: str) -> bytes:
+        """Return a PNG of a stored one, drawn in a process of its own.
+
+        Raises
+        ------
+        UnknownIdError, ArchiveError
+            If it is not there, or damaged.
+        ConfigurationError
+            If matplotlib is not installed.
+        """
+        check_plots(WHAT)
+        path = self._archive.noisy.path(noisy_id)
+        work = partial(draw, path, self._instrument)
+        return await run_in_process(work, nice=DRAW_NICE, limit_s=DRAW_WITHIN_S)
+
+
+def work_out(bench: Workbench, total: Correlated, start: Misregistration | None) -> Found:
+    """Return the matrix, its noise, what the model makes of it; runs in the worker."""
+    noisy = noisy_matrix(total)
+    outcome = bench.fit_random(total, start)
+    if isinstance(outcome, WindowRefused):
+        estimate, reason = None, outcome.reason
+    else:
+        estimate, reason = outcome, ""
+    unknown = np.full(len(noisy.modes), np.nan)
+    alpha = start if estimate is None else estimate.alpha
+    return Found(
+        numbers=NoisyNumbers(
+            matrix=_single(noisy.matrix),
+            noise=_single(noisy.noise),
+            synthetic=_single(bench.response(alpha)[:, list(noisy.modes)]),
+            optical_gain=unknown if estimate is None else estimate.optical_gain,
+            gain_sigma=unknown if estimate is None else estimate.gain_sigma,
+            snr=noisy.snr_of_modes,
+        ),
+        estimate=estimate,
+        reason=reason,
+        snr=noisy.snr,
+    )
+
+
+def _single(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values, np.float32)
+
+
+def finished(record: NoisyRecord, total: Correlated, found: Found) -> NoisyRecord:
+    """Return the record of a matrix that is ready for the archive."""
+    estimate = found.estimate
+    finding = NoisyFinding(
+        n_slopes=len(found.numbers.matrix),
+        n_frames=total.sums.n_pairs,
+        n_missing=total.n_missing,
+        snr=found.snr,
+        alpha=None if estimate is None else estimate.alpha,
+        covariance=None if estimate is None else estimate.covariance,
+        optical_gain=None if estimate is None else _mean_gain(estimate),
+        misfit=None if estimate is None else estimate.misfit,
+        cm_id=total.cm_id,
+        session=total.session,
+        created_ns_utc=total.t_end_ns_utc,
+        sha256=checksum(found.numbers.matrix),
+    )
+    reason = f"no registration could be fitted: {found.reason}" if found.reason else ""
+    return replace(record, state=NoisyState.STORED, reason=reason, finding=finding)
+
+
+def _mean_gain(estimate: RandomEstimate) -> float:
+    return float(np.average(estimate.optical_gain, weights=estimate.gain_sigma**-2.0))

@@ -1,0 +1,281 @@
+import asyncio
+import multiprocessing
+import os
+import signal
+import time
+from functools import partial
+
+import pytest
+
+from service.errors import WorkerError
+from service.runtime import workers as crew_module
+from service.runtime.workers import WorkerPool
+from service.worker import Workbench, begin_early, run_job, start_worker
+from tests.unit.runtime.small import COMPUTE, small_instrument
+
+pytestmark = pytest.mark.timeout(60)
+
+
+def process_id(_bench: Workbench) -> int:
+    return os.getpid()
+
+
+def niceness(_bench: Workbench) -> int:
+    return os.nice(0)
+
+
+def interrupted(_bench: Workbench) -> str:
+    """Survive what Ctrl-C sends to the whole process group."""
+    os.kill(os.getpid(), signal.SIGINT)
+    return "still here"
+
+
+def asleep(_bench: Workbench) -> None:
+    time.sleep(60.0)
+
+
+def napping(_bench: Workbench) -> None:
+    time.sleep(1.2)
+
+
+def endless(_bench: Workbench) -> None:
+    while True:
+        pass
+
+
+def killed(_bench: Workbench) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def spinning(_bench: Workbench) -> None:
+    end_s = time.process_time() + 0.2
+    while time.process_time() < end_s:
+        pass
+
+
+def failing(_bench: Workbench) -> None:
+    raise ValueError("a bug in a job")
+
+
+@pytest.fixture
+def hired():
+    return []
+
+
+@pytest.fixture
+def workers(hired):
+    instrument = small_instrument()
+
+    def start():
+        hired.append(start_worker(instrument, COMPUTE))
+        return hired[-1]
+
+    workers = WorkerPool(start)
+    yield workers
+    workers.close()
+
+
+async def test_nobody_is_hired_before_there_is_work(workers, hired):
+    assert not hired
+    assert await workers.call(process_id) != os.getpid()
+    assert len(hired) == 1
+
+
+async def test_jobs_share_one_worker_and_its_workbench(workers):
+    first, second = await asyncio.gather(workers.call(process_id), workers.call(process_id))
+    assert first == second
+    assert (await workers.call(Workbench.describe)).n_modes == 90
+
+
+async def test_a_killed_worker_costs_one_job_and_the_next_one_works(workers, hired):
+    before = await workers.call(process_id)
+    with pytest.raises(WorkerError, match="died during killed"):
+        await workers.call(killed)
+    assert await workers.call(process_id) != before
+    assert (workers.n_lost, len(hired)) == (1, 2)
+
+
+async def test_jobs_that_waited_for_a_killed_worker_are_done_by_the_next(workers, hired):
+    lost, first, second = await asyncio.gather(
+        workers.call(killed),
+        workers.call(process_id),
+        workers.call(process_id),
+        return_exceptions=True,
+    )
+    assert isinstance(lost, WorkerError)
+    assert first == second
+    assert (workers.n_lost, len(hired)) == (1, 2)
+
+
+async def test_a_job_that_raises_keeps_its_worker(workers, hired):
+    before = await workers.call(process_id)
+    with pytest.raises(WorkerError, match=r"failing failed unforeseen.*a bug in a job"):
+        await workers.call(failing)
+    assert await workers.call(process_id) == before
+    assert workers.n_lost == 0
+
+
+async def test_the_worker_tells_the_processor_time_of_every_kind_of_job(workers):
+    for _ in range(2):
+        await workers.call(spinning)
+    await workers.call(process_id)
+    assert set(workers.cpu_s) == {"spinning", "process_id"}
+    assert 0.4 <= workers.cpu_s["spinning"] < 2.0
+
+
+async def test_an_interrupt_from_the_keyboard_is_the_services_business(workers):
+    assert await workers.call(interrupted) == "still here"
+
+
+async def test_a_worker_that_began_early_is_the_first_one_and_as_polite():
+    begin_early()
+    worker = start_worker(small_instrument(), type(COMPUTE)(threads=1, nice=5))
+    early = worker.pid
+    assert early is not None
+    workers = WorkerPool(lambda: worker)
+    try:
+        assert await workers.call(process_id) == early
+        assert await workers.call(niceness) == os.nice(0) + 5
+        other = start_worker(small_instrument(), COMPUTE)
+        assert other.pid is None
+    finally:
+        workers.close()
+
+
+async def test_the_worker_is_polite():
+    workers = WorkerPool(lambda: start_worker(small_instrument(), type(COMPUTE)(threads=1, nice=5)))
+    try:
+        assert await workers.call(niceness) == os.nice(0) + 5
+    finally:
+        workers.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGCONT, signal.SIGSTOP])
+async def test_dismissing_ends_the_worker_whatever_it_is_at(workers, hired, number):
+    await workers.call(process_id)
+    waiting = asyncio.create_task(workers.call(asleep))
+    await asyncio.sleep(0.1)
+    os.kill(hired[0].pid, number)
+    began = time.monotonic()
+    workers.close()
+    assert not multiprocessing.active_children()
+    with pytest.raises(WorkerError, match="died during asleep"):
+        await waiting
+    assert time.monotonic() - began < 1.0
+    workers.close()
+
+
+async def test_what_nobody_waits_for_any_more_is_not_finished(workers, hired):
+    await workers.call(process_id)
+    waiting = asyncio.create_task(workers.call(asleep))
+    await asyncio.sleep(0.1)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    assert not multiprocessing.active_children()
+    assert await workers.call(process_id) == hired[1].pid
+
+
+def remembering(bench: Workbench) -> None:
+    bench.told = "first"
+
+
+def remembered(bench: Workbench) -> str | None:
+    return getattr(bench, "told", None)
+
+
+def test_what_every_worker_must_be_told_is_told_to_one_that_takes_a_dead_ones_place(workers):
+    async def jobs():
+        await workers.call(process_id)
+        workers.first = partial(run_job, remembering)
+        with pytest.raises(WorkerError):
+            await workers.call(killed)
+        return await workers.call(remembered)
+
+    assert asyncio.run(jobs()) == "first"
+
+
+async def test_what_is_urgent_goes_first_and_what_waits_long_has_its_turn(workers, monkeypatch):
+    order = []
+
+    async def job(name):
+        async with workers.turn(name):
+            order.append(name)
+            await asyncio.sleep(0.05)
+
+    first = asyncio.create_task(job("describe"))
+    await asyncio.sleep(0)
+    rest = [asyncio.create_task(job(name)) for name in ("margin", "watch", "make", "fit", "judge")]
+    await asyncio.gather(first, *rest)
+    assert order == ["describe", "fit", "judge", "make", "watch", "margin"]
+
+    order.clear()
+    monkeypatch.setitem(crew_module.PATIENCE_S, "watch", 0.1)
+    tasks = [asyncio.create_task(job("describe")), asyncio.create_task(job("watch"))]
+    for _ in range(8):  # more windows than a look has patience for
+        await asyncio.sleep(0.03)
+        tasks.append(asyncio.create_task(job("fit")))
+    await asyncio.gather(*tasks)
+    assert order.index("watch") < 5
+
+
+async def test_within_a_turn_calls_are_done_at_once(workers):
+    async with workers.turn("fit"):
+        assert await workers.call(process_id)
+    async with asyncio.timeout(5.0):
+        assert await workers.call(process_id)
+
+
+async def test_a_turn_nobody_takes_any_more_is_passed_on(workers):
+    async with workers.turn("fit"):
+        waiting = asyncio.create_task(workers.call(process_id))
+        await asyncio.sleep(0)
+        waiting.cancel()
+    async with asyncio.timeout(20.0):
+        assert await workers.call(process_id)
+
+
+async def test_a_worker_that_stands_still_is_named_then_killed_and_replaced(
+    workers, hired, monkeypatch
+):
+    monkeypatch.setattr("service.runtime.workers.STILL_S", 0.6)
+    monkeypatch.setattr("service.runtime.workers.HUNG_S", 2.0)
+    before = await workers.call(process_id)
+    os.kill(before, signal.SIGSTOP)
+    job = asyncio.create_task(workers.call(process_id))
+    await asyncio.sleep(1.7)
+    assert "has stood still for" in workers.trouble
+    with pytest.raises(WorkerError, match=r"stood still for \d s in process_id and was killed"):
+        await job
+    assert "was killed" in workers.trouble
+    assert await workers.call(process_id) != before
+    assert workers.trouble == ""
+    assert (workers.n_lost, len(hired)) == (1, 2)
+
+
+async def test_a_worker_that_never_comes_to_an_end_is_killed(workers, hired, monkeypatch):
+    await workers.call(process_id)
+    monkeypatch.setattr("service.runtime.workers.UNKNOWN_LIMIT_S", 0.5)
+    with pytest.raises(WorkerError, match="took more than 0 s for endless and was killed"):
+        await workers.call(endless)
+    assert await workers.call(process_id) == hired[1].pid
+
+
+async def test_a_job_that_rightly_takes_long_is_let_finish_in_the_end(workers, monkeypatch):
+    await workers.call(process_id)
+    monkeypatch.setattr("service.runtime.workers.UNKNOWN_LIMIT_S", 0.2)
+    for _ in range(5):
+        try:
+            assert await workers.call(spinning) is None
+            break
+        except WorkerError:
+            continue
+    else:
+        pytest.fail("it never was")
+
+
+async def test_a_job_that_waits_for_the_disk_a_moment_is_not_a_hung_one(workers, monkeypatch):
+    monkeypatch.setattr("service.runtime.workers.STILL_S", 0.6)
+    await workers.call(napping)
+    assert workers.trouble == ""
+    assert workers.n_lost == 0

@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 
 from service.archive.noisy import NoisyArchive
 from service.config import load_instrument
-from service.files.figures.noisy import draw
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.estimates import finished, work_out
 from service.state import NoisyRecord, NoisyState
@@ -36,6 +35,7 @@ from sim_rtc.feed import Ahead
 from sim_rtc.options import parse_options
 from sim_rtc.truth import WavefrontError
 from studies.campaign.telemetry import blocks_of
+from studies.noisy_figure import draw
 
 SETTLING_S = 0.5
 N_BATCHES = 20

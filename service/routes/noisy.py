@@ -6,22 +6,20 @@ None of them can become a reconstructor: no route, and nothing behind one, publi
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from http import HTTPStatus
 from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Path, Response
-from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
 from pydantic import Field
 
-from service.errors import ConfigurationError, UnknownIdError
+from service.errors import UnknownIdError
 from service.events import GiveUpNoisy, MeasureNoisy
 from service.reactions.dither_choice import NOISY_DITHER
 from service.routes.modes import Modes
 from service.routes.operating import AcceptedView, Positive, Request, accepted
-from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
+from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.service import ServiceDep
 from service.routes.views import FourView, Number, View
 from service.state import ModeSet, NoisyFinding, NoisyRecord, NoisyState
@@ -202,32 +200,6 @@ async def noisy_file(service: ServiceDep, noisy_id: NoisyId) -> Response:
         media_type="application/x-hdf5",
         headers={"Content-Disposition": f'attachment; filename="{noisy_id}.h5"'},
     )
-
-
-@router.get(
-    "/noisy-matrix/{id}/comparison.png",
-    response_class=Response,
-    responses={
-        200: {
-            "description": "A few columns beside the synthetic ones, their noise, all elements",
-            "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}},
-        },
-        501: problem_response("matplotlib is not installed"),
-        **UNKNOWN,
-    },
-)
-async def noisy_comparison(
-    request: HttpRequest, service: ServiceDep, noisy_id: NoisyId
-) -> Response:
-    """Return a picture of a noisy interaction matrix beside the synthetic one.
-
-    It is drawn when it is asked for, and needs pyrcal's extra ``plots``.
-    """
-    try:
-        image = await service.noisy_picture(noisy_id)
-    except ConfigurationError as error:
-        return problem(request, HTTPStatus.NOT_IMPLEMENTED, "no-plots", str(error))
-    return Response(image, media_type="image/png")
 
 
 def _view(record: NoisyRecord) -> NoisyView:

@@ -224,17 +224,6 @@ class Service(Protocol):
             If it is missing or damaged.
         """
 
-    async def noisy_picture(self, noisy_id: str) -> bytes:
-        """Return a PNG of a noisy interaction matrix beside the synthetic one.
-
-        Raises
-        ------
-        UnknownIdError, ArchiveError
-            As :meth:`noisy_file`.
-        ConfigurationError
-            If matplotlib is not installed.
-        """
-
 
 def _service_of(request: Request) -> Service:
     service: Service = request.app.state.service

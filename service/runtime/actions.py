@@ -13,19 +13,17 @@ from numpy.typing import NDArray
 
 from service import __version__
 from service import events as ev
-from service.archive import Archive
 from service.control.gate import GateVerdict
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.events import Effect, Event
 from service.link.events import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.reactions.matrices import commanded_gains, extended_gains
-from service.rtc_bridge import Bridge
 from service.runtime import translate
 from service.runtime.asking import Question, ask
 from service.runtime.estimates import NoisySums
 from service.runtime.loops import judged_now, loop_settings, modes_that_hold, timing
-from service.runtime.workers import WorkerPool
+from service.runtime.ports import RtcPort, StorePort, WorkerPort
 from service.state import (
     MatrixState,
     ReconstructorRecord,
@@ -59,9 +57,9 @@ class Actions:
     def __init__(
         self,
         *,
-        bridge: Bridge,
-        workers: WorkerPool,
-        archive: Archive,
+        bridge: RtcPort,
+        workers: WorkerPort,
+        archive: StorePort,
         instrument: Instrument,
         publishing: Publishing,
         clock_ns: Callable[[], int],

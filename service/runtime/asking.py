@@ -8,8 +8,8 @@ from dataclasses import replace
 from service import events as ev
 from service.errors import CommandError, LinkError
 from service.events import Effect, Event
-from service.rtc_bridge import Bridge
 from service.runtime import translate
+from service.runtime.ports import RtcPort
 from service.state import CommandState, MeasureState, TrackerState
 from service.wire import (
     DitherAction,
@@ -23,7 +23,7 @@ from service.wire import (
 Question = ev.AskDither | ev.AskNoDither | ev.AskMeasurement | ev.AskLoop | ev.AskRamp
 
 
-async def ask(bridge: Bridge, question: Question, clock_ns: Callable[[], int]) -> Event | None:
+async def ask(bridge: RtcPort, question: Question, clock_ns: Callable[[], int]) -> Event | None:
     """Send a command and return what the RTC said to it; None: nothing to report.
 
     Raises
@@ -80,7 +80,7 @@ def _refusal(outcome: CommandState, reason: str) -> Exception | None:
             return None
 
 
-async def _dither(bridge: Bridge, question: ev.AskDither) -> Event:
+async def _dither(bridge: RtcPort, question: ev.AskDither) -> Event:
     dither = question.dither
     reply = await bridge.command(
         DitherRequest(
@@ -99,13 +99,13 @@ async def _dither(bridge: Bridge, question: ev.AskDither) -> Event:
     )
 
 
-async def _no_dither(bridge: Bridge, command: str) -> None:
+async def _no_dither(bridge: RtcPort, command: str) -> None:
     reply = await bridge.command(DitherRequest(id=command, action=DitherAction.STOP))
     if not reply.accepted:
         raise CommandError(f"the RTC did not stop the dither: {reply.reason}")
 
 
-async def _loop(bridge: Bridge, question: ev.AskLoop) -> Event:
+async def _loop(bridge: RtcPort, question: ev.AskLoop) -> Event:
     wish = {None: None, True: Loop.CLOSED, False: Loop.OPEN}[question.closed]
     reply = await bridge.command(
         LoopRequest(
@@ -119,7 +119,7 @@ async def _loop(bridge: Bridge, question: ev.AskLoop) -> Event:
     return ev.LoopAnswered(id=question.id, accepted=reply.accepted, reason=reply.reason)
 
 
-async def _ramp(bridge: Bridge, question: ev.AskRamp) -> Event:
+async def _ramp(bridge: RtcPort, question: ev.AskRamp) -> Event:
     reply = await bridge.command(
         RampRequest(
             id=question.id,

@@ -11,18 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import events as ev
-from service.archive import Archive
 from service.archive.noisy import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
 from service.events import Event
-from service.files.figures.noisy import WHAT, draw
-from service.files.figures.sheet import check_plots
 from service.fit.dialect import setting_written
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.reactions.alarms import WRONG_MATRIX, Act, forbidding
 from service.reactions.watchdog import fit_begins_at
-from service.runtime.workers import WorkerPool, run_in_process
+from service.runtime.ports import StorePort, WorkerPort
 from service.state import (
     Level,
     NoisyFinding,
@@ -111,7 +108,7 @@ def _alike(one: Correlated, other: Correlated) -> bool:
 
 
 async def fitted(
-    window: Spectra | Correlated, state: TrackerState, workers: WorkerPool, matrix_of: MatrixOf
+    window: Spectra | Correlated, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
 ) -> Event:
     """Return what becomes of one window: an estimate, or why there is none."""
     if isinstance(window, Correlated):
@@ -119,7 +116,7 @@ async def fitted(
     return await _demodulated(window, state, workers, matrix_of)
 
 
-async def _correlated(window: Correlated, state: TrackerState, workers: WorkerPool) -> Event:
+async def _correlated(window: Correlated, state: TrackerState, workers: WorkerPort) -> Event:
     """Return what a window of random dither says; it needs no reconstructor."""
     known = state.registration
     try:
@@ -133,7 +130,7 @@ async def _correlated(window: Correlated, state: TrackerState, workers: WorkerPo
 
 
 async def _demodulated(
-    spectra: Spectra, state: TrackerState, workers: WorkerPool, matrix_of: MatrixOf
+    spectra: Spectra, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
 ) -> Event:
     """Return what a window of sines says of the registration."""
     rtc, known = state.rtc, state.registration
@@ -175,7 +172,7 @@ def _reconstructor(
         return unknown
 
 
-async def _found(spectra: Spectra, state: TrackerState, workers: WorkerPool) -> Event:
+async def _found(spectra: Spectra, state: TrackerState, workers: WorkerPort) -> Event:
     """Return where a window with the loop open puts the mirror, or why it does not."""
     flux = None if state.rtc is None else state.rtc.flux
     try:
@@ -188,7 +185,7 @@ async def _found(spectra: Spectra, state: TrackerState, workers: WorkerPool) -> 
 
 
 async def watched(
-    sums: Passive | str, state: TrackerState, workers: WorkerPool
+    sums: Passive | str, state: TrackerState, workers: WorkerPort
 ) -> ev.Watched | ev.Unwatched | ev.Noted | None:
     """Return what the watchdog makes of ordinary telemetry, or why it can make nothing of it.
 
@@ -222,7 +219,7 @@ async def listened(
     record: ReconstructorRecord,
     matrix: NDArray[np.float32],
     state: TrackerState,
-    workers: WorkerPool,
+    workers: WorkerPort,
 ) -> list[Event]:
     """Return what a matrix that the RTC brought tells of its slopes and commands.
 
@@ -255,10 +252,6 @@ def lost(window: Window, reason: str) -> Event:
     return ev.WindowLost(refused=refused)
 
 
-DRAW_WITHIN_S = 120.0
-DRAW_NICE = 10
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Found:
     """What the worker makes of the sums."""
@@ -277,7 +270,7 @@ class NoisySums:
     Belongs to the event loop. Its matrices are none of the actions': nothing here is published.
     """
 
-    def __init__(self, *, workers: WorkerPool, archive: Archive, instrument: Instrument) -> None:
+    def __init__(self, *, workers: WorkerPort, archive: StorePort, instrument: Instrument) -> None:
         self._workers = workers
         self._archive = archive
         self._instrument = instrument
@@ -318,21 +311,6 @@ class NoisySums:
         store = self._archive.noisy.store
         await asyncio.to_thread(store, record, found.numbers, self._instrument.name)
         return ev.NoisyMade(record=record)
-
-    async def picture(self, noisy_id: str) -> bytes:
-        """Return a PNG of a stored one, drawn in a process of its own.
-
-        Raises
-        ------
-        UnknownIdError, ArchiveError
-            If it is not there, or damaged.
-        ConfigurationError
-            If matplotlib is not installed.
-        """
-        check_plots(WHAT)
-        path = self._archive.noisy.path(noisy_id)
-        work = partial(draw, path, self._instrument)
-        return await run_in_process(work, nice=DRAW_NICE, limit_s=DRAW_WITHIN_S)
 
 
 def work_out(bench: Workbench, total: Correlated, start: Misregistration | None) -> Found:

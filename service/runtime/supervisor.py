@@ -149,10 +149,6 @@ class Supervisor:
         """Return the HDF5 file of a noisy interaction matrix."""
         return self._archive.noisy.file(noisy_id)
 
-    async def noisy_picture(self, noisy_id: str) -> bytes:
-        """Return a PNG of a noisy interaction matrix beside the synthetic one."""
-        return await self._actions.noisy.picture(noisy_id)
-
     async def run(self) -> None:
         """Work until cancelled: prepare the model, then listen, tick, fit, watch and record."""
         self._tell(replace(self._engine.state, log=()))

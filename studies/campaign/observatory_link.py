@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import override
 
-from service.archive import Archive
+from service.archive.noisy import NoisyNumbers
 from service.archive.product import Provenance
 from service.errors import PyrcalError, UnknownIdError, WorkerError
-from service.rtc_bridge import Bridge, Endpoint
-from service.runtime.workers import WorkerPool
-from service.state import ReconstructorRecord
+from service.state import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
-from service.worker import Workbench, Worker
+from service.worker import Done, Workbench
 from sim_rtc.reconstructors import Outcome, Staging, Verdict
 from studies.campaign.observatory_dome import Dome
 
@@ -26,37 +23,31 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class ShortLink(Bridge):
+class ShortLink:
     """A link without a network: commands are carried out at once, matrices wait to be delivered."""
 
     def __init__(self, dome: Dome) -> None:
-        super().__init__(Endpoint(system=dome.computer.identity.system))
         self._dome = dome
         self._staging = Staging(dome.computer.terms, limit_bytes=dome.computer.largest_matrix_bytes)
         self.sent: list[tuple[Manifest, NDArray[np.float32]]] = []
         """Matrices on their way to the RTC."""
 
-    @override
     async def command(self, command: Command) -> Reply:
         """Return the RTC's answer."""
         return self._dome.order(command)
 
-    @override
     async def publish(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         """Put a matrix on its way; ``deliver`` brings it to the RTC."""
         self.sent.append((manifest, matrix))
 
-    @override
     async def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
         """Return the matrix the RTC uses."""
         active = self._dome.computer.snapshot().reconstructor
         return active.manifest, active.matrix
 
-    @override
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         """Do nothing: the RTC is never late."""
 
-    @override
     def set_current(self, matrix_id: str | None) -> None:
         """Do nothing: the RTC is never late."""
 
@@ -93,14 +84,16 @@ class ShortLink(Bridge):
         )
 
 
-class OwnHands(WorkerPool):
+class OwnHands:
     """A worker that is no process of its own: the workbench itself."""
 
     def __init__(self, workbench: Workbench) -> None:
-        super().__init__(_nobody)
+        self.first: Callable[[], Done[None]] | None = None
+        self.cpu_s: defaultdict[str, float] = defaultdict(float)
+        """Processor time of the jobs, seconds, by name."""
+
         self._workbench = workbench
 
-    @override
     async def call(
         self, job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
@@ -116,14 +109,29 @@ class OwnHands(WorkerPool):
             self.cpu_s[job.__name__] += time.process_time() - before_s
 
 
-class Shelf(Archive):
+class Kept:
+    """Keeps interaction matrices in memory."""
+
+    def __init__(self) -> None:
+        self.records: list[MeasurementRecord | NoisyRecord] = []
+
+    def store(
+        self,
+        record: MeasurementRecord | NoisyRecord,
+        numbers: NDArray[np.float32] | NoisyNumbers,
+        name: str,
+    ) -> None:
+        """Keep what is known of one; nobody asks for its numbers."""
+        self.records.append(record)
+
+
+class Shelf:
     """Keeps reconstructors in memory: a simulated night is over when its program ends."""
 
     def __init__(self) -> None:
-        super().__init__(Path("nowhere"))
+        self.measured, self.noisy = Kept(), Kept()
         self._matrices: dict[str, NDArray[np.float32]] = {}
 
-    @override
     def store(
         self,
         record: ReconstructorRecord,
@@ -134,7 +142,6 @@ class Shelf(Archive):
         """Keep the numbers."""
         self._matrices[record.id] = matrix
 
-    @override
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor, ``(n_modes, n_slopes)``.
 
@@ -146,7 +153,3 @@ class Shelf(Archive):
         if matrix_id not in self._matrices:
             raise UnknownIdError(f"no reconstructor {matrix_id}")
         return self._matrices[matrix_id]
-
-
-def _nobody() -> Worker:
-    raise WorkerError("a simulated night has no worker process")

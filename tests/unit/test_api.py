@@ -844,7 +844,6 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
         "GET /v1/noisy-matrix/{id}",
         "DELETE /v1/noisy-matrix/{id}",
         "GET /v1/noisy-matrix/{id}/file",
-        "GET /v1/noisy-matrix/{id}/comparison.png",
         "GET /v1/measurements",
         "GET /v1/measurements/{id}",
         "GET /v1/measurements/{id}/matrix",

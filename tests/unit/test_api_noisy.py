@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.api import Snapshot, create_app
-from service.errors import CommandError, ConfigurationError, UnknownIdError
+from service.errors import CommandError, UnknownIdError
 from service.events import GiveUpNoisy, MeasureNoisy
 from service.model.misregistration import Misregistration
 from service.routes.rtc_views import GatheringView
@@ -71,15 +71,6 @@ class FakeService:
         if noisy_id != "noisy-1":
             raise UnknownIdError(f"noisy matrix {noisy_id}: no such matrix in the archive")
         return FILE
-
-    async def noisy_picture(self, noisy_id):
-        if self.without_plots:
-            raise ConfigurationError(
-                "the picture of a noisy matrix: needs matplotlib; expected pyrcal installed with "
-                "its extra 'plots'"
-            )
-        self.noisy_file(noisy_id)
-        return IMAGE
 
 
 @pytest.fixture
@@ -176,7 +167,7 @@ async def test_one_under_way_has_found_nothing_yet(client):
     assert (body["state"], body["finding"]) == ("running", None)
 
 
-@pytest.mark.parametrize("path", ["noisy-9", "noisy-9/file", "noisy-9/comparison.png"])
+@pytest.mark.parametrize("path", ["noisy-9", "noisy-9/file"])
 async def test_an_unknown_one_is_not_found(client, path):
     response = await client.get(f"/v1/noisy-matrix/{path}")
     assert response.status_code == 404
@@ -187,18 +178,6 @@ async def test_the_product_leaves_as_it_lies_in_the_archive(client):
     response = await client.get("/v1/noisy-matrix/noisy-1/file")
     assert response.content == FILE
     assert response.headers["content-disposition"] == 'attachment; filename="noisy-1.h5"'
-
-
-async def test_the_picture_is_a_png(client):
-    response = await client.get("/v1/noisy-matrix/noisy-1/comparison.png")
-    assert (response.content, response.headers["content-type"]) == (IMAGE, "image/png")
-
-
-async def test_without_matplotlib_the_picture_says_what_to_install(client, service):
-    service.without_plots = True
-    response = await client.get("/v1/noisy-matrix/noisy-1/comparison.png")
-    assert response.status_code == 501
-    assert "extra 'plots'" in response.json()["detail"]
 
 
 @pytest.mark.parametrize("action", ["approve", "publish", "reject"])

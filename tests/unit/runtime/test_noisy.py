@@ -9,7 +9,6 @@ import pytest
 from service import events as ev
 from service.archive import Archive
 from service.errors import CommandError, UnknownIdError
-from service.files.figures.noisy import Pair
 from service.model.misregistration import Misregistration
 from service.reactions.journal import with_alarm
 from service.runtime.actions import Actions, Publishing
@@ -168,15 +167,3 @@ async def test_nothing_that_publishes_finds_one(workers, archive):
         with pytest.raises(UnknownIdError, match="noisy-1"):
             await actions.perform(effect, state)
     assert archive.records() == ()
-
-
-async def test_the_picture_shows_measured_beside_synthetic(desk, workers, archive):
-    pytest.importorskip("matplotlib")
-    await finish(desk, workers)
-    image = await desk.picture("noisy-1")
-    assert image.startswith(b"\x89PNG")
-    pair = Pair.read(archive.noisy.path("noisy-1"), small_instrument())
-    left = (pair.measured - pair.synthetic) / pair.noise
-    assert np.sqrt(np.mean(left**2)) == pytest.approx(1.0, abs=0.03)
-    with pytest.raises(UnknownIdError):
-        await desk.picture("noisy-9")

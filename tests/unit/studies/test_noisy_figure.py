@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError, MatrixError
-from service.files.figures.noisy import draw, shown_columns
+from studies.noisy_figure import draw, shown_columns
 from tests.numerics import small_instrument
 
 

@@ -1,0 +1,88 @@
+"""What the service's actions need of RTC, worker and archive; a simulated night has others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Concatenate, ParamSpec, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.archive.noisy import NoisyNumbers
+from service.archive.product import Provenance
+from service.state import MeasurementRecord, NoisyRecord, ReconstructorRecord
+from service.wire import Command, Manifest, Reply
+from service.worker import Done, Workbench
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class RtcPort(Protocol):
+    """The RTC as actions see it; :class:`service.rtc_bridge.Bridge` is the real one."""
+
+    async def command(self, command: Command, /) -> Reply:
+        """Send a command and return the RTC's answer, accepted or not."""
+
+    async def publish(self, manifest: Manifest, matrix: NDArray[np.float32], /) -> None:
+        """Send a reconstructor ``(n_modes, n_slopes)`` and the order to use it."""
+
+    async def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
+        """Return the reconstructor the RTC uses."""
+
+    def offer(self, manifest: Manifest, matrix: NDArray[np.float32], /) -> None:
+        """Let an RTC ask for a reconstructor without sending it."""
+
+    def set_current(self, matrix_id: str | None, /) -> None:
+        """Say which offer a late RTC should use; None: none."""
+
+
+class WorkerPort(Protocol):
+    """Whoever computes; :class:`service.runtime.workers.WorkerPool` is the real one."""
+
+    first: Callable[[], Done[None]] | None
+    """What every new worker does before anything else; None: nothing."""
+
+    async def call(
+        self, job: Callable[Concatenate[Workbench, P], R], /, *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """Run a method of the workbench and return its result."""
+
+
+class MeasuredPort(Protocol):
+    """Where measured interaction matrices are kept."""
+
+    def store(self, record: MeasurementRecord, matrix: NDArray[np.float32], name: str, /) -> None:
+        """Keep one ``(n_slopes, n_modes)`` of the instrument of that name."""
+
+
+class NoisyPort(Protocol):
+    """Where noisy interaction matrices are kept."""
+
+    def store(self, record: NoisyRecord, numbers: NoisyNumbers, name: str, /) -> None:
+        """Keep one of the instrument of that name."""
+
+
+class StorePort(Protocol):
+    """Where matrices are kept; :class:`service.archive.Archive` is the real one."""
+
+    @property
+    def measured(self) -> MeasuredPort:
+        """Interaction matrices the RTC has measured."""
+
+    @property
+    def noisy(self) -> NoisyPort:
+        """Noisy interaction matrices of random dithers."""
+
+    def store(
+        self,
+        record: ReconstructorRecord,
+        matrix: NDArray[np.float32],
+        covariance: NDArray[np.float64] | None,
+        provenance: Mapping[str, Provenance],
+        /,
+    ) -> None:
+        """Keep a reconstructor ``(n_modes, n_slopes)`` and what it was made from."""
+
+    def matrix(self, matrix_id: str, /) -> NDArray[np.float32]:
+        """Return a reconstructor that was kept; UnknownIdError if there is none."""

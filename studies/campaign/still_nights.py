@@ -1,0 +1,175 @@
+"""Nights in which the mirror stands still: how often the service says it has jumped.
+
+Run: ``python -m studies.campaign.still_nights --seconds 600 --output var/still.jsonl``; nights that
+are there already are not run again. Every plant under every sky, with a worker at its ease and with
+one that takes four times as long. A jump that is named, by windows or by ordinary telemetry, is one
+too many: it makes α invalid for a while and asks for dither.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+from typing_extensions import override
+
+from service.config import load_instrument, load_settings
+from service.config.policy import policy_of
+from service.events import Event
+from service.reactions.journal import new_lines
+from service.state import Mode, TrackerState
+from service.worker import Compute, Workbench
+from studies.campaign.observatory import Latencies, Observatory
+
+Row = dict[str, Any]
+
+SMALL = "tests/system/small.toml"
+PLANTS = {
+    "small, linear": (f"--instrument={SMALL}", "--plant=linear", "--n-controlled=45"),
+    "small, diffractive": (
+        f"--instrument={SMALL}",
+        "--plant=diffractive",
+        "--n-controlled=45",
+        "--gain=0.6",
+        "--imperfections=realistic",
+    ),
+    "FLAO, linear": ("--instrument=flao-lbt", "--plant=linear"),
+}
+SKIES = {
+    "8 m/s": ("--wind=8,20",),
+    "20 m/s": ("--wind=20,-40",),
+    "three layers": ("--profile=three-layer",),
+    "Paranal, seeing 1.4, L0 12 m": ("--profile=paranal-like", "--seeing=1.4", "--outer-scale=12"),
+}
+WORKERS = {"at ease": 1.0, "loaded": 4.0}
+"""How much longer a job takes than on a machine with nothing else to do."""
+
+NAMED = ("registration.jump", "registration.passive-jump")
+SUSPECTED = "registration.jump-suspected"
+SETTLING_S = 20.0
+"""The night's beginning, with the first matrix and more modes, is not counted."""
+
+_SETTINGS: dict[str, dict[str, object]] = {
+    SMALL: {
+        "dither.budget_m": 40e-9,
+        "dither.amplitude_m": 20e-9,
+        "dither.window_s": 1.0,
+        "dither.longest_window_s": 1.0,
+        "control.n_modes_target": 60,
+        "tracking.floor_rotation_deg": 0.04,
+        "tracking.floor_magnification": 0.0007,
+    },
+    "flao-lbt": {},
+}
+"""Fewer modes of a small telescope must tell as much."""
+
+
+class StillNight(Observatory):
+    """A night that counts what the service says of jumps."""
+
+    def __init__(self, words: Sequence[str], slower: float) -> None:
+        self.said: Counter[str] = Counter()
+        instrument = words[0].removeprefix("--instrument=")
+        settings = load_settings(None, {}, _SETTINGS[instrument])
+        super().__init__(
+            words,
+            policy_of(settings),
+            Mode.AUTO,
+            _workbench(instrument),
+            latencies=Latencies(
+                fit_s=0.5 * slower, make_s=2.0 * slower, judge_s=slower, watch_s=0.5 * slower
+            ),
+            with_poles=False,
+        )
+
+    @override
+    def stepped(self, before: TrackerState, event: Event) -> None:
+        super().stepped(before, event)
+        if self.time_s > SETTLING_S:
+            self.said.update(entry.name for entry in new_lines(before, self.state))
+
+
+def play(plant: str, sky: str, worker: str, seed: int, seconds: float) -> Row:
+    """Run one night and count."""
+    begun = time.process_time()
+    words = (*PLANTS[plant], *SKIES[sky], f"--seed={seed}", "--mag=8")
+    with threadpool_limits(1):
+        night = StillNight(words, WORKERS[worker])
+        night.advance(SETTLING_S + seconds)
+    return {
+        "plant": plant,
+        "sky": sky,
+        "worker": worker,
+        "seed": seed,
+        "seconds": seconds,
+        "named": sum(night.said[name] for name in NAMED),
+        "suspected": night.said[SUSPECTED],
+        "windows": night.state.windows_accepted,
+        "cpu_s": time.process_time() - begun,
+    }
+
+
+@cache
+def _workbench(instrument: str) -> Workbench:
+    return Workbench(load_instrument(instrument), Compute(threads=1))
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return the campaign as a Markdown table, a line for each plant and worker."""
+    lines = [
+        "| plant | worker | skies | hours | jumps named | suspected | windows |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for plant, worker in itertools.product(PLANTS, WORKERS):
+        nights = [row for row in rows if (row["plant"], row["worker"]) == (plant, worker)]
+        if nights:
+            hours = sum(row["seconds"] for row in nights) / 3600
+            counts = (sum(row[key] for row in nights) for key in ("named", "suspected", "windows"))
+            skies = len({row["sky"] for row in nights})
+            cells = (plant, worker, skies, f"{hours:.2f}", *counts)
+            lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """Run what is missing, then print the table."""
+    given = _parser().parse_args()
+    given.output.parent.mkdir(parents=True, exist_ok=True)
+    rows: list[Row] = []
+    if given.output.exists():
+        rows = [json.loads(line) for line in given.output.read_text().splitlines()]
+    done = {(r["plant"], r["sky"], r["worker"], r["seed"], r["seconds"]) for r in rows}
+    with given.output.open("a") as file:
+        for plant, sky, worker in itertools.product(given.plants, SKIES, WORKERS):
+            if (plant, sky, worker, given.seed, given.seconds) in done:
+                continue
+            rows.append(play(plant, sky, worker, given.seed, given.seconds))
+            file.write(json.dumps(rows[-1]) + "\n")
+            file.flush()
+    sys.stdout.write(table(rows))
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.campaign.still_nights",
+        description="Counts the jumps that the service sees in a mirror that stands still.",
+    )
+    parser.add_argument("--output", type=Path, default=Path("var/still.jsonl"), help="resumed")
+    parser.add_argument("--plants", nargs="+", choices=list(PLANTS), default=list(PLANTS))
+    parser.add_argument("--seconds", type=float, default=600.0, metavar="S", help="of each night")
+    parser.add_argument("--seed", type=int, default=1, metavar="N")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

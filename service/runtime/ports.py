@@ -44,7 +44,7 @@ class WorkerPort(Protocol):
     """What every new worker does before anything else; None: nothing."""
 
     async def call(
-        self, job: Callable[Concatenate[Workbench, P], R], /, *args: P.args, **kwargs: P.kwargs
+        self, job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """Run a method of the workbench and return its result."""
 

@@ -197,9 +197,6 @@ def _run(
     return worker.run(work)
 
 
-R = TypeVar("R")
-
-
 async def run_in_process(
     work: Callable[[], R], *, nice: int, limit_s: float, memory_mb: int | None = None
 ) -> R:

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 
 import httpx
 import pytest
-from tests.unit.runtime.test_deeds import REGISTRATION
 
 from service.api import create_app
 from service.events import SetLoop
 from service.state import ModeGain, TrackerState
 from tests.unit.reactions.situations import START_NS, record, rtc
+from tests.unit.runtime.test_actions import REGISTRATION
 
 MEASURED = (
     ModeGain(mode=20, gain=0.5, sigma=0.01, scatter=0.02, t_ns_utc=START_NS),

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from service.runtime.following import shape_mismatch
 from threadpoolctl import threadpool_limits
 
 from service import events as ev
 from service.config import load_settings
 from service.config.policy import policy_of
+from service.runtime.engine import shape_mismatch
 from service.runtime.streams import Streams, fed, taken, with_rtc
 from service.state import Mode, Source
 from service.telemetry.edge import LOW_MODES

@@ -2,10 +2,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from service.runtime.following import news, shape_mismatch, troubles
 
 from service import events as ev
 from service.errors import ModelError
+from service.runtime.engine import news, shape_mismatch, troubles
 from service.runtime.streams import (
     Streams,
     fed,

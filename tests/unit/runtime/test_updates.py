@@ -6,7 +6,6 @@ import h5py
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from tests.unit.runtime.test_deeds import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
 
 from service import events as ev
 from service.archive import Archive
@@ -22,6 +21,7 @@ from service.state import Alarm, MatrixState, ModeGain
 from service.worker import Workbench, start_worker
 from tests.unit.reactions.situations import START_NS, rtc
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
+from tests.unit.runtime.test_actions import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
 
 pytestmark = pytest.mark.timeout(60)
 

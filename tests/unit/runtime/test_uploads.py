@@ -17,7 +17,7 @@ from service.errors import (
 )
 from service.files.jobs import FitAsked, FitState
 from service.fit.options import FitOptions
-from service.runtime import fitting
+from service.runtime import uploads
 from service.runtime.uploads import FitLimits, FitQueue
 
 pytestmark = pytest.mark.timeout(60)
@@ -150,7 +150,7 @@ async def test_a_body_no_matrix_could_be_in_is_refused_at_once(opened, tmp_path,
 
 
 async def test_an_upload_that_stops_is_given_up(opened, tmp_path, monkeypatch):
-    monkeypatch.setattr(fitting, "STALL_S", 0.1)
+    monkeypatch.setattr(uploads, "STALL_S", 0.1)
 
     async def stalled():
         yield HDF5[:1000]
@@ -163,7 +163,7 @@ async def test_an_upload_that_stops_is_given_up(opened, tmp_path, monkeypatch):
 
 
 async def test_an_upload_that_trickles_does_not_hold_its_place(opened, tmp_path, monkeypatch):
-    monkeypatch.setattr(fitting, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(uploads, "PATIENCE_S", 0.3)
 
     async def trickling():
         yield HDF5[:1000]
@@ -181,7 +181,7 @@ async def test_an_upload_that_trickles_does_not_hold_its_place(opened, tmp_path,
 
 async def test_a_disk_that_is_full_is_said_as_such(opened, monkeypatch):
     desk = opened()
-    monkeypatch.setattr(fitting, "UPLOAD", "/dev/full")
+    monkeypatch.setattr(uploads, "UPLOAD", "/dev/full")
     with pytest.raises(StorageError, match="No space left on device"):
         await taken(desk)
     assert not desk.jobs()
@@ -195,7 +195,7 @@ async def test_a_fit_that_takes_too_long_is_stopped(opened, tmp_path):
 
 
 async def test_only_the_last_finished_fits_are_remembered(opened, monkeypatch):
-    monkeypatch.setattr(fitting, "FITS_KEPT", 1)
+    monkeypatch.setattr(uploads, "FITS_KEPT", 1)
     desk = opened()
     jobs = []
     for _ in range(3):

@@ -87,6 +87,12 @@ class Engine:
             self.policy, mode_information=description.mode_information, start=description.start
         )
 
+    def begin_anew(self) -> None:
+        """Give up what the estimators have gathered; they listen from here on."""
+        if self.streams is not None:
+            self.streams = Streams(description=self.streams.description)
+            self._follow()
+
     def post(self, event: Event) -> tuple[Effect, ...]:
         """Let the tracker react, and set in motion what it wants done.
 

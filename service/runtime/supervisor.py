@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -74,6 +74,9 @@ class Supervisor:
         self._backlog = Backlog()
         self._meter = PaceMeter(workers)
         self._running: set[asyncio.Task[None]] = set()
+        self._broken = ""
+        """The last fault that nobody foresaw."""
+
         self._started_ns = time.time_ns()
         self._log = structlog.get_logger().bind(system=state.system)
 
@@ -194,7 +197,8 @@ class Supervisor:
             for heard in self._bridge.events():
                 if isinstance(heard, MeasuredMatrix):
                     self._start(self._keep_measured(heard))
-                self._engine.hear(heard)
+                with self._surviving("an event of the link"):
+                    self._engine.hear(heard)
             self._feed()
             await asyncio.sleep(GATHER_S)
 
@@ -204,7 +208,22 @@ class Supervisor:
         blocks = tuple(self._bridge.drain())
         for block in blocks:
             self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
-        self._engine.feed(blocks)
+        with self._surviving("telemetry", self._engine.begin_anew):
+            self._engine.feed(blocks)
+
+    @contextlib.contextmanager
+    def _surviving(self, what: str, mend: Callable[[], None] | None = None) -> Iterator[None]:
+        """Go on after a fault that nobody foresaw: it is on record, and costs what was at hand."""
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001 - a bug must not end the service
+            text = f"{what} was dropped, internal error: {error!r}; please report it"
+            if text != self._broken:  # its traceback once, not with every batch of frames
+                self._log.exception("internal.error", text=text)
+            self._broken = text
+            self._note("internal.error", text, Level.ALARM)
+            if mend is not None:
+                mend()
 
     def fit(self, window: Spectra | Correlated) -> None:
         """Put a window where the worker finds it."""
@@ -222,7 +241,8 @@ class Supervisor:
         while True:
             if revival.due(self._bridge.statistics(), time.monotonic()):
                 await self._reopen_link()
-            self._post(ev.Tick())
+            with self._surviving("a tick"):
+                self._post(ev.Tick())
             self._meter.look()
             for trouble in self._meter.news(self._engine.state):
                 self._post(trouble)

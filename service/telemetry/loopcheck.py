@@ -84,6 +84,9 @@ class LoopCheck:
     from_seq: int = 0
     """Frames before this may have been made by another loop."""
 
+    cm_id: str | None = None
+    """The reconstructor all samples are of; None: there are none."""
+
     tail: FrameBlock | None = None
     """The last few frames, for those that come."""
 
@@ -166,6 +169,8 @@ def observe(check: LoopCheck, block: FrameBlock, terms: LoopTerms) -> LoopCheck:
     n_delay = int(terms.delay_frames)
     if n_delay > LARGEST_DELAY_FRAMES or block.cm_id != terms.cm_id:
         return replace(check, tail=None)
+    if check.cm_id != terms.cm_id:  # frames of another matrix come before the status that tells it
+        check = LoopCheck(from_seq=check.from_seq, cm_id=terms.cm_id)
     depth = n_delay + _STEPS + _TAPS - 1
     tail = check.tail if check.tail is not None and _follows(check.tail, block) else None
     stride = max(1, round(terms.frame_rate_hz / SAMPLES_PER_S))
@@ -185,11 +190,15 @@ def obedience(
     last_seq: int,
     enough: int = ENOUGH_SAMPLES,
 ) -> tuple[LoopCheck, Obedience | None]:
-    """Return how the modes obeyed in a span of frames, both ends included; None: too few seen.
+    """Return how the modes obeyed in a span of frames, both ends included.
+
+    None: too few of this reconstructor have been seen.
 
     The delay's part of a frame, and a mirror's lag, are fitted to all modes together: a lag is no
     disobedience.
     """
+    if check.cm_id != terms.cm_id:
+        return check, None
     check = _multiplied(check, terms)
     seq = np.concatenate([batch.seq for batch in check.batches] or [np.empty(0, int)])
     chosen = (seq >= first_seq) & (seq <= last_seq)

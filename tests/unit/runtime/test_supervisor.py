@@ -6,6 +6,7 @@ import resource
 import socket
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -250,6 +251,24 @@ async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_for
 def told(story, n_windows):
     story.see(n_windows=n_windows)
     return story.state.registration
+
+
+async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, bridge, monkeypatch):
+    def broken(streams, block):
+        raise ValueError("an inhomogeneous shape")
+
+    async with running(supervisor):
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
+        before = supervisor._engine.streams
+        monkeypatch.setattr("service.runtime.engine.fed", broken)
+        monkeypatch.setattr(bridge, "drain", lambda: [SimpleNamespace(n_frames=50, dt_ns=10**6)])
+        await until(lambda: supervisor._engine.streams is not before)
+        monkeypatch.undo()
+        entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
+        assert "an inhomogeneous shape" in entry.text
+        assert "telemetry was dropped" in entry.text
+        assert supervisor._engine.streams.rtc is not None
+        assert supervisor.snapshot().ready
 
 
 # --- a disk that refuses

@@ -1,5 +1,7 @@
 """Commands off the loop equation, on loops integrated here, frame by frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -237,3 +239,13 @@ def test_memory_is_bounded():
     for block in blocks(telemetry):
         check = observe(check, block, told)
     assert sum(len(batch.seq) for batch in check.batches) <= KEPT_SAMPLES
+
+
+def test_frames_of_another_matrix_begin_another_check():
+    old, new = terms(), replace(terms(gains=GAINS[:12], matrix=INVERSE[:12]), cm_id="cm-2")
+    first, *_ = blocks(closed_loop(), lengths=(300,))  # fewer samples than are multiplied at once
+    check = observe(LoopCheck(), first, old)
+    for block in blocks(closed_loop(matrix=INVERSE[:12], gains=GAINS[:12]), first=300):
+        check = observe(check, replace(block, cm_id="cm-2"), new)
+    assert obedience(check, old, 0, 10**9)[1] is None
+    assert obedience(check, new, 0, 10**9)[1].holds

@@ -71,7 +71,7 @@ def closed_loop(
         seen = commands[k] if played_m else commands[k] + sky[k]
         slopes[k] = RESPONSE @ seen + noise[k]
         decided[k + delay] = np.float32(LEAK) * decided[k + delay - 1]
-        decided[k + delay, :N_CONTROLLED] -= gains * (matrix @ slopes[k])
+        decided[k + delay, : len(gains)] -= gains * (matrix @ slopes[k])
         np.clip(decided[k + delay], -stroke_m, stroke_m, out=decided[k + delay])
     return slopes, commands, dither if dither_m else None
 

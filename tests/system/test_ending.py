@@ -178,7 +178,9 @@ def test_asked_again_and_again(night):
 @pytest.mark.timeout(1200)
 def test_a_hundred_times_at_any_moment(night):
     """From the first milliseconds to tracking, each time a little later."""
+    first = night.service("auto", INSTRUMENT)  # a zenoh client needs someone there to open
     with stranger(night):
+        check_end(night, first, signal.SIGINT)
         for k in range(100):
             service = night.service("auto", INSTRUMENT, wait=False)
             wait_for(lambda service=service: "_struct" in maps_of(service), 20.0, "it imports")

@@ -33,7 +33,7 @@ from sim_rtc.gains import by_group
 from sim_rtc.motion import MovingOptics, background_executor
 from sim_rtc.options import Options
 from sim_rtc.pixels import binned
-from sim_rtc.plant import Plant
+from sim_rtc.plant import Plant, TelescopeOptics
 from sim_rtc.playable import check_playable
 from sim_rtc.reconstructors import Reconstructor
 from sim_rtc.telemetry import Identity, LoopSettings
@@ -113,13 +113,19 @@ def build_telescope(
     basis = binned_basis(instrument, _modes(instrument), binning)
     instrument = binned(instrument, binning)
     plant = build_plant(options, instrument, basis, plant_rng)
+    sky = build_sky(options, instrument, basis, plant, sky_rng)
+
+    def prepare(optics: TelescopeOptics) -> None:
+        for _, response in optics.responses if sky.played is None else ():
+            sky.turbulence.prepare(response)
+
     optics = MovingOptics(
         plant,
         build_schedule(options, instrument, alpha_rng),
         executor or background_executor(),
+        prepare=prepare,
     )
     detector = build_detector(options, instrument, plant, optics.start())
-    sky = build_sky(options, instrument, basis, plant, sky_rng)
     double_pass = options.sky.scene.passes == 2
     identity = replace(identity_of(instrument, plant.valid), double_pass=double_pass)
     return Telescope(

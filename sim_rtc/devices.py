@@ -10,11 +10,12 @@ from service.errors import ConfigurationError
 from service.model.instrument import Instrument, KarhunenLoeve
 from service.model.mirror import mirror_surface
 from service.model.modes import ModalBasis
-from sim_rtc.atmosphere import fried_parameter_m, frozen_layers
+from sim_rtc.atmosphere import fried_parameter_m
 from sim_rtc.detector import Detector
 from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.drive import MirrorDrive
 from sim_rtc.feed import BATCH_FRAMES, Feed, OpenLoopFeed
+from sim_rtc.flow import frozen_layers
 from sim_rtc.influence import read_influence
 from sim_rtc.motion import MovingOptics
 from sim_rtc.options import Options

@@ -124,6 +124,11 @@ class DiffractiveOptics:
         return self.at_rest.images
 
     @property
+    def responses(self) -> tuple[()]:
+        """Nothing is linear in the phase."""
+        return ()
+
+    @property
     def n_slopes(self) -> int:
         """Slopes of a frame."""
         return len(self.at_rest.slopes)

@@ -180,9 +180,9 @@ class OpenLoopFeed:
             time_s = (frame + np.arange(n_frames)) / self._frame_rate_hz
             now = _linear(self._optics.at(float(time_s[0])))
             if now is not optics:
-                optics, source_slopes = now, self._sources.T @ now.slopes_per_phase.T
+                optics, source_slopes = now, now.slopes_of(self._sources).T
                 if now.stuck_opd_m is not None:
-                    source_slopes[-1] += now.slopes_per_phase @ now.stuck_opd_m
+                    source_slopes[-1] += now.slopes_of(now.stuck_opd_m)
             yield self._block(frame, time_s, optics, source_slopes)
             frame += n_frames
 
@@ -204,7 +204,10 @@ class OpenLoopFeed:
         phases = strength[:: self.batch_frames] @ vibrations.phase_per_line.T
         turbulence, played = self._sky.turbulence.at(time_s), self._sky.played
         if played is None:
-            slopes += turbulence.through(optics.slopes_per_phase)
+            for share, response in optics.responses:
+                part = turbulence.through(response)
+                part *= np.float32(share)
+                slopes += part
             phases += turbulence.phases_m(self.batch_frames)
         if optics.stuck_opd_m is not None:
             phases += optics.stuck_opd_m
@@ -213,7 +216,7 @@ class OpenLoopFeed:
             optics=optics,
             slopes=slopes,
             phases_m=phases,
-            played_m=None if played is None else turbulence.through(played.commands_per_phase),
+            played_m=None if played is None else turbulence.through(played.response),
             batch_frames=self.batch_frames,
         )
 

@@ -45,7 +45,8 @@ class LoopTerms(ControlTerms):
     """D ``(n_slopes, n_modes)`` of the plant, slope per metre."""
 
     modal_response: Array32
-    """R D ``(n_controlled, n_modes)``."""
+    """R D ``(n_controlled, n_modes)``, in columns: for two frames at a time a copy of it would cost
+    four times the product."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -179,27 +180,28 @@ class ModalLoop:
         for first in range(0, n_frames, delay):
             commands = applied[first : first + delay]
             commands += integrator[first : first + len(commands)]
-            commands.clip(least, stroke, out=commands)
-            n_limited += self._follow(first, added)
+            np.minimum(commands, stroke, out=commands)
+            np.maximum(commands, least, out=commands)
+            if self._drive is not None:
+                n_limited += self._follow(self._drive, first, added)
             corrections = estimate(first, commands)
             corrections *= terms.gains
             # a slope that is no number would stay in the integrator for ever, at a gain of 0, too
-            if not math.isfinite(corrections.sum()):
+            if not math.isfinite(np.add.reduce(corrections, axis=None)):
                 corrections[~np.isfinite(corrections).all(axis=1)] = 0.0
             for k, correction in enumerate(corrections, first + delay):
                 decided = integrator[k]
                 np.multiply(integrator[k - 1], leak, out=decided)
                 decided[:n_controlled] -= correction
-                decided.clip(least, stroke, out=decided)
+                np.minimum(decided, stroke, out=decided)
+                np.maximum(decided, least, out=decided)
         self._decided = integrator[n_frames:].copy()
         return n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
 
-    def _follow(self, first: int, added: _Added) -> int:
-        """Let the drive, if any, make what it can of the next commands; count its limits."""
-        if self._drive is None:
-            return 0
+    def _follow(self, drive: MirrorDrive, first: int, added: _Added) -> int:
+        """Let the drive make what it can of the next commands; count its limits."""
         return sum(
-            self._drive.follow(added.applied[k], None if added.dither is None else added.dither[k])
+            drive.follow(added.applied[k], None if added.dither is None else added.dither[k])
             for k in range(first, min(first + len(self._decided), len(added.applied)))
         )
 

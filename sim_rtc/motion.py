@@ -10,9 +10,11 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
+from service.model.misregistration import Misregistration
 from sim_rtc.plant import Plant, TelescopeOptics
 from sim_rtc.schedule import Schedule
 
@@ -33,8 +35,16 @@ class _Segment:
 class MovingOptics:
     """The plant's optics at any time of a run, asked for in order."""
 
-    def __init__(self, plant: Plant, schedule: Schedule, executor: Executor) -> None:
+    def __init__(
+        self,
+        plant: Plant,
+        schedule: Schedule,
+        executor: Executor,
+        prepare: Callable[[TelescopeOptics], None] | None = None,
+    ) -> None:
+        """Take what else is to be done with new optics before the loop sees them."""
         self._plant = plant
+        self._prepare = prepare
         self._schedule = schedule
         self._executor = executor
         self._segment: _Segment | None = None
@@ -75,12 +85,18 @@ class MovingOptics:
         schedule = self._schedule
         stop_s = schedule.next_jump_after(start_s)
         if first is None:
-            first = self._plant.optics(schedule.alpha_at(start_s))
+            first = self._optics(schedule.alpha_at(start_s))
         last = first
         if schedule.drifts:
             stop_s = min(stop_s, start_s + schedule.segment_s)
-            last = self._plant.optics(schedule.alpha_before(stop_s))
+            last = self._optics(schedule.alpha_before(stop_s))
         return _Segment(start_s=start_s, stop_s=stop_s, first=first, last=last)
+
+    def _optics(self, alpha: Misregistration) -> TelescopeOptics:
+        optics = self._plant.optics(alpha)
+        if self._prepare is not None:
+            self._prepare(optics)
+        return optics
 
 
 def background_executor() -> ThreadPoolExecutor:

@@ -34,8 +34,8 @@ scenes
 atmosphere
   Screens are extruded row by row from noise that is never used twice: nothing repeats, however
   long the run. Profiles: single (12 m/s), three-layer, paranal-like (five layers); a linear plant
-  works as hard as the sum of their speeds (12, 41, 67 m/s: .3, .5, .75 ms of processor time a
-  frame). Seeing is that at 500 nm for an infinite outer scale; between two --seeing-at it changes
+  works as hard as the sum of their speeds (12, 41, 67 m/s: .12, .21, .28 ms of processor time
+  a frame). Seeing is that at 500 nm for an infinite outer scale; between two --seeing-at it changes
   smoothly, then stays.
 
 imperfections

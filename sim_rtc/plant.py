@@ -25,6 +25,7 @@ from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
 from service.model.pyramid import PyramidOptics
+from sim_rtc.flow import PhaseResponse
 from sim_rtc.imperfections import (
     Imperfections,
     SlopeErrors,
@@ -65,6 +66,10 @@ class TelescopeOptics(Protocol):
         """
 
     @property
+    def responses(self) -> tuple[tuple[float, PhaseResponse], ...]:
+        """What of it is linear in the turbulence's phase."""
+
+    @property
     def n_slopes(self) -> int:
         """Slopes of a frame."""
 
@@ -82,8 +87,8 @@ class Optics:
     alpha: Misregistration
     """Where the mirror truly lies on the sensor."""
 
-    slopes_per_phase: Array32
-    """``(n_slopes, n_points)`` slope per metre of turbulence OPD, optical gain included."""
+    responses: tuple[tuple[float, PhaseResponse], ...]
+    """Slopes per metre of turbulence OPD, optical gain included: shares of exact ones, sum 1."""
 
     slopes_per_command: Array32
     """``(n_slopes, n_modes)`` slope per metre of command, optical gain included."""
@@ -102,13 +107,27 @@ class Optics:
         """Slopes of a frame."""
         return len(self.slopes_per_command)
 
+    @property
+    def slopes_per_phase(self) -> Array32:
+        """``(n_slopes, n_points)`` slope per metre of turbulence OPD, optical gain included."""
+        (share, response), *others = self.responses
+        total = response.matrix if share == 1.0 else np.float32(share) * response.matrix
+        for share, response in others:
+            total = total + np.float32(share) * response.matrix
+        return total
+
+    def slopes_of(self, opd_m: Array32) -> Array32:
+        """Return the slopes ``(n_slopes, ...)`` of wavefronts ``(n_points, ...)``, mirror apart."""
+        parts = [np.float32(share) * (one.matrix @ opd_m) for share, one in self.responses]
+        return np.asarray(sum(parts[1:], parts[0]))
+
     def terms(self, reconstructor: Array32, gains: Array32, leak: float) -> LoopTerms:
         """Return the terms of a loop around the interaction matrix."""
         return LoopTerms(
             # in columns, as the product with rows of slopes reads it
             reconstructor=np.asfortranarray(reconstructor),
             slopes_per_command=self.slopes_per_command,
-            modal_response=reconstructor @ self.slopes_per_command,
+            modal_response=np.asfortranarray(reconstructor @ self.slopes_per_command),
             gains=gains,
             leak=leak,
         )
@@ -126,7 +145,12 @@ class Optics:
             alpha=Misregistration.from_vector(
                 (1.0 - share) * self.alpha.vector + share * other.alpha.vector
             ),
-            slopes_per_phase=blend(self.slopes_per_phase, other.slopes_per_phase),
+            responses=tuple(
+                (weight * part, response)
+                for part, optics in ((1.0 - share, self), (share, other))
+                for weight, response in optics.responses
+                if part > 0.0
+            ),
             slopes_per_command=blend(self.slopes_per_command, other.slopes_per_command),
             opd_per_command=blend(self.opd_per_command, other.opd_per_command),
             images=(1.0 - share) * self.images + share * other.images,
@@ -237,7 +261,7 @@ class LinearPlant:
         jacobian += (matrix * (self._gain - 1.0)) @ self._projection(modes)
         return Optics(
             alpha=alpha,
-            slopes_per_phase=jacobian,
+            responses=((1.0, PhaseResponse(jacobian)),),
             slopes_per_command=np.asfortranarray(matrix * (self._gain * self._passes)),
             opd_per_command=modes * self._passes,
             images=response.images / light,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.model.pupil import PupilGrid
+from sim_rtc.flow import PhaseResponse
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -92,6 +93,7 @@ class PlayedTurbulence:
         projection = np.linalg.solve(gram, weighted.T.astype(np.float64))
         self.commands_per_phase: Array32 = (projection / passes).astype(np.float32)
         """``(n_modes, n_points)`` metres of command per metre of turbulence."""
+        self.response = PhaseResponse(self.commands_per_phase)
 
 
 def _shadow(pupil: PupilGrid, spiders: Spiders, subaperture_m: float) -> Array:

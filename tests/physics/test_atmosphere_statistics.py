@@ -14,7 +14,8 @@ from scipy.signal import welch
 
 from service.model.instrument import KarhunenLoeve
 from service.model.turbulence import von_karman_covariance
-from sim_rtc.atmosphere import ExtrudedScreen, FrozenLayer, Layer
+from sim_rtc.atmosphere import ExtrudedScreen, Layer
+from sim_rtc.flow import FrozenLayer
 from sim_rtc.shapes import FOCUS, TILT, TIP, low_orders
 
 TURBULENCE = KarhunenLoeve(r0_m=0.1, outer_scale_m=10.0)
@@ -49,7 +50,9 @@ def flow():
         rng=np.random.default_rng(5),
     )
     assert layer.steps_per_second == pytest.approx(SPEED_M_S / PITCH_M)
-    return layer.advance(N_STEPS)
+    layer.reach(0, N_STEPS - 1)
+    some = [np.arange(k, k + 400)[:, None] for k in range(0, N_STEPS, 400)]
+    return np.concatenate([layer.phases(step, np.ones_like(step, np.float32)) for step in some])
 
 
 def spectrum_m2(k):

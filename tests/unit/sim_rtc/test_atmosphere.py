@@ -1,16 +1,11 @@
 import numpy as np
 import pytest
 
-from service.errors import ModelError
 from service.model.instrument import KarhunenLoeve
 from service.model.turbulence import von_karman_covariance
 from sim_rtc.atmosphere import (
     ExtrudedScreen,
-    FrozenLayer,
-    Layer,
-    cubic_weights,
     fried_parameter_m,
-    frozen_layers,
 )
 
 TURBULENCE = KarhunenLoeve(r0_m=0.1, outer_scale_m=10.0)
@@ -71,72 +66,6 @@ def test_the_same_seed_gives_the_same_screen():
     assert not np.array_equal(first_row(1), first_row(2))
 
 
-@pytest.mark.parametrize("direction_deg", [0.0, 35.0, 200.0])
-def test_the_flow_is_frozen_and_goes_where_the_wind_goes(direction_deg):
-    angle = np.deg2rad(direction_deg)
-    step_m = PITCH_M * np.array([np.cos(angle), np.sin(angle)])
-    upwind = np.random.default_rng(3).uniform(-2.0, 2.0, (200, 2))
-    layer = FrozenLayer(
-        Layer(fraction=1.0, speed_m_s=12.0, direction_deg=direction_deg),
-        points_m=np.concatenate([upwind, upwind + 3 * step_m]),
-        pitch_m=PITCH_M,
-        turbulence=TURBULENCE,
-        rng=np.random.default_rng(4),
-    )
-    phases = layer.advance(20)
-    earlier, later = phases[:-3, :200], phases[3:, 200:]
-    # Each window has its own piston taken off.
-    difference = later - earlier
-    difference -= difference.mean(axis=1, keepdims=True)
-    assert np.abs(difference).max() < 1e-4 * phases.std()
-    assert layer.steps_per_second == pytest.approx(120.0)
-
-
-def test_cubic_weights_carry_parabolas_through():
-    position = np.linspace(0.0, 1.0, 11)
-    taps = np.arange(-1.0, 3.0)
-    weights = cubic_weights(position)
-    np.testing.assert_allclose(weights.sum(axis=-1), 1.0)
-    np.testing.assert_allclose(weights @ (2 * taps**2 - taps + 3), 2 * position**2 - position + 3)
-
-
 def test_one_arcsecond_is_a_fried_parameter_of_ten_centimetres():
     assert fried_parameter_m(1.0) == pytest.approx(0.101, abs=0.001)
     assert fried_parameter_m(0.5) == pytest.approx(2 * fried_parameter_m(1.0))
-
-
-def test_shares_of_the_layers_are_normalised():
-    points = np.random.default_rng(5).uniform(-2.0, 2.0, (50, 2))
-    layers = tuple(
-        Layer(fraction=2.0, speed_m_s=10.0, direction_deg=angle) for angle in (0.0, 90.0)
-    )
-
-    def phases(chosen):
-        return frozen_layers(
-            chosen,
-            points_m=points,
-            pitch_m=PITCH_M,
-            turbulence=TURBULENCE,
-            rng=np.random.default_rng(6),
-        )[0].advance(5)
-
-    np.testing.assert_allclose(phases(layers), phases(layers[:1]) * np.sqrt(0.5), rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "layers",
-    [
-        (),
-        (Layer(fraction=0.0, speed_m_s=10.0, direction_deg=0.0),),
-        (Layer(fraction=1.0, speed_m_s=0.0, direction_deg=0.0),),
-    ],
-)
-def test_impossible_layers_are_refused(layers):
-    with pytest.raises(ModelError, match="expected shares > 0 and speeds > 0"):
-        frozen_layers(
-            layers,
-            points_m=np.zeros((1, 2)),
-            pitch_m=PITCH_M,
-            turbulence=TURBULENCE,
-            rng=np.random.default_rng(1),
-        )

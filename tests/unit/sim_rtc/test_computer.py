@@ -28,7 +28,7 @@ RESPONSE = np.linalg.qr(np.random.default_rng(1).standard_normal((N_SLOPES, N_MO
 )
 OPTICS = Optics(
     alpha=Misregistration(),
-    slopes_per_phase=np.zeros((N_SLOPES, 5), dtype=np.float32),
+    responses=(),
     slopes_per_command=RESPONSE,
     opd_per_command=np.zeros((5, N_MODES), dtype=np.float32),
     images=np.ones((2, 1, 2, 1)) / 4,

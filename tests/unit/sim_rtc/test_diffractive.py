@@ -14,10 +14,11 @@ from service.model.interaction import (
 )
 from service.model.misregistration import Misregistration
 from service.model.pyramid import PyramidOptics
-from sim_rtc.atmosphere import Layer, frozen_layers
+from sim_rtc.atmosphere import Layer
 from sim_rtc.diffractive import DiffractivePyramid, Quadrature, centred_pupil
 from sim_rtc.diffractive_plant import DiffractivePlant
 from sim_rtc.feed import BATCH_FRAMES
+from sim_rtc.flow import frozen_layers
 from sim_rtc.imperfections import Imperfections
 from sim_rtc.loop import ModalLoop
 from sim_rtc.mirror import MirrorFaults

@@ -6,9 +6,10 @@ import pytest
 
 from service.model.instrument import KarhunenLoeve
 from service.model.misregistration import Misregistration
-from sim_rtc.atmosphere import Layer, frozen_layers
+from sim_rtc.atmosphere import Layer
 from sim_rtc.detector import Detector
 from sim_rtc.feed import BATCH_FRAMES, Ahead, OpenLoopFeed, OpenModes, message_frames
+from sim_rtc.flow import frozen_layers
 from sim_rtc.imperfections import SETS, Imperfections
 from sim_rtc.mirror import MirrorFaults
 from sim_rtc.motion import MovingOptics

@@ -45,7 +45,7 @@ HERE = Circumstances(
 def optics():
     return Optics(
         alpha=Misregistration(),
-        slopes_per_phase=np.zeros((N_SLOPES, 3), dtype=np.float32),
+        responses=(),
         slopes_per_command=RESPONSE,
         opd_per_command=np.zeros((3, N_MODES), dtype=np.float32),
         images=np.ones((2, 1, 2, 1)) / 4,

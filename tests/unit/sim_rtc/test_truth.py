@@ -17,7 +17,7 @@ CLOCK = FrameClock(start_ns_utc=1_000, dt_ns=1_000_000)
 
 OPTICS = Optics(
     alpha=Misregistration(shift_x_subap=0.1),
-    slopes_per_phase=np.zeros((4, N_POINTS), dtype=np.float32),
+    responses=(),
     slopes_per_command=np.zeros((4, 2), dtype=np.float32),
     opd_per_command=np.random.default_rng(1).standard_normal((N_POINTS, 2)).astype(np.float32),
     images=np.ones((2, 1, 2, 1)),

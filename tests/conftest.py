@@ -1,4 +1,4 @@
-"""Settings that must hold before any test module imports numpy."""
+"""Settings that must hold before any test module imports numpy, and the order of the suite."""
 
 import os
 import signal
@@ -7,6 +7,8 @@ import tempfile
 import pytest
 import structlog
 from xdist.scheduler import LoadScopeScheduling
+
+from tests.system.pace import patience
 
 # Two shared cores and several processes per test: nested BLAS threads make everything slower.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -19,6 +21,12 @@ os.environ.setdefault(
 # system tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+ORDER = ("tests/unit/", "tests/properties/", "tests/physics/", "tests/system/")
+"""What is known soonest comes first."""
+
+REAL_TIME = ("tests/system/test_demo.py", "tests/system/test_sim_rtc.py")
+"""The full instrument at 1 kHz: one after the other, on one worker."""
+
 
 @pytest.fixture(autouse=True)
 def log_of_its_own():
@@ -27,16 +35,27 @@ def log_of_its_own():
     structlog.reset_defaults()
 
 
+def pytest_collection_modifyitems(items):
+    """Put them in order, and give system tests the time that they need on this machine."""
+    items.sort(key=lambda item: _place(item.nodeid))
+    for item in items:
+        limit = item.get_closest_marker("timeout")
+        if item.get_closest_marker("system") and limit is not None:
+            item.add_marker(pytest.mark.timeout(patience(limit.args[0])), append=False)
+
+
+def _place(nodeid):
+    folder = next((k for k, name in enumerate(ORDER) if nodeid.startswith(name)), len(ORDER))
+    return folder, not nodeid.startswith(REAL_TIME)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Hand out whole modules, and all that runs in real time to one worker.
-
-    System tests run one after the other; the other worker is a busy loop beside them.
-    """
+    """Hand out whole modules in order, what is to run in real time to one worker."""
 
     class ByModule(LoadScopeScheduling):
         def _split_scope(self, nodeid):
-            module = nodeid.split("::")[0]
-            return "tests/system" if module.startswith("tests/system/") else module
+            return "real time" if nodeid.startswith(REAL_TIME) else nodeid.split("::")[0]
 
+    config.option.loadscopereorder = False
     return ByModule(config, log)

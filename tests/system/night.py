@@ -11,6 +11,8 @@ from pathlib import Path
 
 import httpx
 
+from tests.system.pace import Deadline, patience
+
 ROOT = Path(__file__).parents[2]
 INSTRUMENT = Path(__file__).with_name("small.toml")
 N_START, N_TARGET = 45, 60
@@ -46,13 +48,11 @@ def free_port():
 
 def wait_for(condition, timeout_s=30.0, what=""):
     """Return the first truthy answer; say what was waited for when none comes."""
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
-        found = condition()
-        if found:
-            return found
+    deadline = Deadline(timeout_s)
+    while not (found := condition()):
+        assert not deadline.passed, f"not within {deadline}: {what or condition}"
         time.sleep(0.1)
-    raise AssertionError(f"not within {timeout_s} s: {what or condition}")
+    return found
 
 
 def _processes():
@@ -104,7 +104,11 @@ class Process:
         for member in [member for leader in leaders for member in session_members(leader)]:
             with suppress(ProcessLookupError):
                 os.kill(member, signal.SIGKILL)
-        self.popen.wait(5.0)
+        self.popen.wait(patience(5.0))
+
+
+def client_of(port):
+    return httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=patience(5.0))
 
 
 class Night:
@@ -114,7 +118,7 @@ class Night:
         self.directory = directory
         self.zenoh = f"tcp/127.0.0.1:{free_port()}"
         self.port = free_port()
-        self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=5.0)
+        self.client = client_of(self.port)
         self.settings = directory / "settings.toml"
         self.settings.write_text(SETTINGS, encoding="utf-8")
         self.processes = []
@@ -128,7 +132,7 @@ class Night:
         """Start another service of the same system, a client of the first one's router."""
         other = Night.__new__(Night)
         other.__dict__ |= self.__dict__ | {"port": free_port()}
-        other.client = httpx.Client(base_url=f"http://127.0.0.1:{other.port}", timeout=5.0)
+        other.client = client_of(other.port)
         words = ["service", "run", "--config", str(self.settings), "--instrument", str(INSTRUMENT)]
         words += ["--mode", "auto", "--connect", self.zenoh, "--port", str(other.port)]
         other.start("second", [*words, "--data-dir", str(self.directory / "second")])

@@ -16,6 +16,7 @@ import pytest
 
 from tests.data.tiny.make import ALPHA, HERE, N_MODES
 from tests.system.night import ROOT, a_night, wait_for
+from tests.system.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -31,7 +32,7 @@ def pyrcal(*words, folder):
         [sys.executable, "-m", "service", *map(str, words)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=patience(120.0),
         check=False,
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -123,7 +124,7 @@ def test_the_service_fits_what_is_uploaded_and_keeps_nothing(night):
 
 
 def check_two_gigabytes_are_refused_unread(night):
-    with socket.create_connection(("127.0.0.1", night.port), timeout=10.0) as raw:
+    with socket.create_connection(("127.0.0.1", night.port), timeout=patience(10.0)) as raw:
         raw.sendall(
             b"POST /v1/fits HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2000000000\r\n\r\n"
             + b"\x89HDF\r\n\x1a\n"
@@ -143,5 +144,5 @@ def test_two_gigabytes_are_refused_and_a_running_fit_does_not_delay_the_end(nigh
     posted = night.client.post("/v1/fits?method=paper", content=an_archive())
     assert posted.status_code == httpx.codes.ACCEPTED
     process.send(signal.SIGTERM)
-    assert process.popen.wait(30.0) == 0, process.log
+    assert process.popen.wait(patience(30.0)) == 0, process.log
     assert not (night.directory / "data" / "uploads").exists()

@@ -21,6 +21,7 @@ from service.wire import decode_manifest
 from service.worker import Compute, Workbench
 from sim_rtc.record import Kind, Recording
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
+from tests.system.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 
@@ -130,7 +131,7 @@ def test_a_recorded_night_gives_the_same_answers_every_time(tmp_path):
     with a_night(tmp_path) as night:
         night.service("auto")
         rtc = night.rtc("--record", str(path), "--seconds", "16")
-        assert rtc.popen.wait(60.0) == 0, rtc.log
+        assert rtc.popen.wait(patience(60.0)) == 0, rtc.log
         there = lived(night)
     first, second = replayed(path), replayed(path)
     assert len(first.estimates) >= 6
@@ -157,7 +158,7 @@ def test_a_replay_over_zenoh_is_an_rtc_that_carries_out_nothing(tmp_path):
     with a_night(tmp_path / "recorded") as night:
         night.service("auto")
         rtc = night.rtc("--record", str(path), "--seconds", "14")
-        assert rtc.popen.wait(60.0) == 0, rtc.log
+        assert rtc.popen.wait(patience(60.0)) == 0, rtc.log
         session = night.state["link"]["session"]
         alpha = night.state["registration"]["alpha"]
     (tmp_path / "replayed").mkdir()
@@ -179,7 +180,7 @@ def test_a_replay_over_zenoh_is_an_rtc_that_carries_out_nothing(tmp_path):
         wait_for(lambda: night.ids("rejected"), 10.0, "its refusal")
         (refused,) = [r for r in night.shelf if r["state"] == "rejected"]
         assert refused["reason"] == "unsupported: a replay"
-        assert replay.popen.wait(30.0) == 0, replay.log
+        assert replay.popen.wait(patience(30.0)) == 0, replay.log
 
 
 def test_a_replay_cannot_be_disturbed_or_found_nowhere(tmp_path):
@@ -189,7 +190,7 @@ def test_a_replay_cannot_be_disturbed_or_found_nowhere(tmp_path):
             capture_output=True,
             text=True,
             check=False,
-            timeout=60.0,
+            timeout=patience(60.0),
             cwd=ROOT,
         )
 

@@ -20,6 +20,7 @@ from tests.system.night import (
     session_members,
     wait_for,
 )
+from tests.system.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 
@@ -77,8 +78,8 @@ def test_in_auto_the_registration_is_found_and_the_loop_served_first_its_modes_t
     assert len(session_members(service.popen.pid)) > 1
     began = time.monotonic()
     service.send(signal.SIGINT)
-    assert service.popen.wait(8.0) == 0, service.log
-    assert time.monotonic() - began < 5.0
+    assert service.popen.wait(patience(8.0)) == 0, service.log
+    assert time.monotonic() - began < patience(5.0)
     wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
     assert "Traceback" not in service.log
 
@@ -181,7 +182,7 @@ class TestRefusedAtTheStart:
 
     def refused(self, night, *words):
         process = night.start("service", ["service", "run", *words])
-        assert process.popen.wait(20.0) == 2, process.log
+        assert process.popen.wait(patience(20.0)) == 2, process.log
         lines = [line for line in process.log.splitlines() if line.startswith("pyrcal: ")]
         assert len(lines) == 1, process.log
         assert "Traceback" not in process.log
@@ -305,13 +306,13 @@ def test_it_ends_in_good_order_while_the_model_is_still_being_prepared(night, nu
     wait_for(lambda: "api.listening" in service.log, 20.0, "the first line")
     time.sleep(0.5)
     service.send(number)
-    assert service.popen.wait(8.0) == 0, service.log
+    assert service.popen.wait(patience(8.0)) == 0, service.log
     wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
 
 
 def test_ctrl_c_in_a_terminal_reaches_the_worker_too_and_still_ends_in_good_order(night):
     service = night.service("hold")
     os.killpg(service.popen.pid, signal.SIGINT)
-    assert service.popen.wait(8.0) == 0, service.log
+    assert service.popen.wait(patience(8.0)) == 0, service.log
     wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
     assert "Traceback" not in service.log

@@ -40,6 +40,7 @@ from service.wire import (
 )
 from sim_rtc.session import client_config
 from tests.system.cable import Cable
+from tests.system.pace import Deadline, patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -104,13 +105,11 @@ class Listener:
         self.session.close()
 
     def wait_for(self, condition, timeout_s: float = 30.0):
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
-            found = condition()
-            if found:
-                return found
+        deadline = Deadline(timeout_s)
+        while not (found := condition()):
+            assert not deadline.passed, f"nothing within {deadline}"
             time.sleep(0.02)
-        raise AssertionError(f"nothing within {timeout_s} s")
+        return found
 
     def next_status(self):
         with self.lock:
@@ -135,13 +134,15 @@ class Listener:
         return sorted(chosen, key=lambda batch: batch.header.seq0)
 
     def command(self, kind: CommandKind, command):
-        replies = self.session.get(KEYS.command(kind), payload=encode_command(command), timeout=1.0)
+        replies = self.session.get(
+            KEYS.command(kind), payload=encode_command(command), timeout=patience(1.0)
+        )
         (reply,) = [r.ok.payload.to_bytes() for r in replies if r.ok is not None]
         return decode_reply(reply)
 
     def fetch(self, selector: str) -> bytes:
-        (reply,) = [r.ok.payload.to_bytes() for r in self.session.get(selector, timeout=2.0)]
-        return reply
+        (reply,) = self.session.get(selector, timeout=patience(2.0))
+        return reply.ok.payload.to_bytes()
 
     def applied(self) -> tuple[Manifest, np.ndarray]:
         manifest = decode_manifest(self.fetch(KEYS.applied))
@@ -173,7 +174,7 @@ class Listener:
         self.token = self.session.liveliness().declare_token(KEYS.alive(Role.SERVICE))
 
     def acknowledgement(self, timeout_s: float = 30.0):
-        return self.acknowledgements.get(timeout=timeout_s)
+        return self.acknowledgements.get(timeout=patience(timeout_s))
 
 
 def start_rtc(port: int, *options: str) -> subprocess.Popen:
@@ -187,7 +188,7 @@ def start_rtc(port: int, *options: str) -> subprocess.Popen:
 def stop_rtc(process: subprocess.Popen) -> tuple[int, str]:
     process.send_signal(signal.SIGTERM)
     try:
-        _, text = process.communicate(timeout=15.0)
+        _, text = process.communicate(timeout=patience(15.0))
     finally:
         process.kill()
     return process.returncode, text
@@ -244,7 +245,7 @@ def test_frames_are_contiguous_and_come_in_real_time(rtc):
     first = rtc.seq()
     began = time.monotonic()
     batches = rtc.frames(first, first + 2000)
-    assert time.monotonic() - began == pytest.approx(2.0, abs=0.5)
+    assert time.monotonic() - began == pytest.approx(2.0, abs=patience(0.5))
     starts = [b.header.seq0 for b in batches]
     assert starts == list(range(starts[0], starts[0] + 50 * len(starts), 50))
     header = batches[0].header
@@ -389,7 +390,7 @@ def test_a_reconstructor_is_swapped_between_two_frames_at_the_announced_one(rtc)
     sent = time.monotonic()
     rtc.send_chunks(new, 0.97 * matrix)
     staged, applied = rtc.acknowledgement(), rtc.acknowledgement()
-    assert time.monotonic() - sent < 2.0
+    assert time.monotonic() - sent < patience(2.0)
     assert (staged.state, staged.id, staged.sha256) == ("staged", "swap-1", new.layout.sha256)
     assert (applied.state, applied.id) == ("applied", "swap-1")
     batches = rtc.frames(applied.frame_seq - 200, applied.frame_seq + 200)
@@ -507,7 +508,7 @@ def test_it_waits_for_the_service_outlives_it_and_ends_cleanly():
         time.sleep(8.0)
         listener = Listener(port)
         session = listener.next_status().session
-        assert listener.tokens.get(timeout=5.0) == zenoh.SampleKind.PUT
+        assert listener.tokens.get(timeout=patience(5.0)) == zenoh.SampleKind.PUT
         listener.close()
         listener = Listener(port)
         assert listener.next_status().session == session
@@ -527,7 +528,7 @@ def test_it_waits_for_the_service_outlives_it_and_ends_cleanly():
             ("offered-1", "staged"),
             ("offered-1", "applied"),
         ]
-        assert process.wait(timeout=20.0) == 0
+        assert process.wait(timeout=patience(20.0)) == 0
         listener.close()
     finally:
         process.kill()

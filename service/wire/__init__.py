@@ -6,14 +6,7 @@ breaks the contract with a :class:`~service.errors.WireError`. The refusal's tex
 Nothing here knows zenoh, and nothing is ever unpickled.
 """
 
-from service.wire.chunks import (
-    CHUNK_LIMIT,
-    ChunkAssembler,
-    MatrixLayout,
-    checksum,
-    layout_of,
-    split,
-)
+from service.wire.codec import MESSAGE_LIMIT, TEXT_LIMIT, VERSION
 from service.wire.commands import (
     Command,
     CommandKind,
@@ -33,7 +26,6 @@ from service.wire.commands import (
     encode_command,
     encode_reply,
 )
-from service.wire.fields import MESSAGE_LIMIT, TEXT_LIMIT, VERSION
 from service.wire.frames import (
     ATTACHMENT_LIMIT,
     BATCH_LIMIT,
@@ -44,13 +36,19 @@ from service.wire.frames import (
     encode_frames,
 )
 from service.wire.keys import Encodings, Keys, Role, checked_id, chunk_index
-from service.wire.manifests import (
+from service.wire.matrices import (
+    CHUNK_LIMIT,
+    ChunkAssembler,
     Manifest,
+    MatrixLayout,
     MeasuredManifest,
+    checksum,
     decode_manifest,
     decode_measured_manifest,
     encode_manifest,
     encode_measured_manifest,
+    layout_of,
+    split,
 )
 from service.wire.status import (
     STATUS_LIMIT,

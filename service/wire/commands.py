@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from itertools import pairwise
-from typing import Final, TypeVar
+from typing import Annotated, Any, Final
+
+from msgspec import Meta
 
 from service.errors import WireError
-from service.wire.fields import Fields, pack
+from service.wire.codec import (
+    Count,
+    Id,
+    Positive,
+    Text,
+    above,
+    applicable,
+    checked,
+    integer,
+    number,
+    of_this_version,
+    pack,
+    read,
+    refusal,
+    unpack,
+)
+from service.wire.keys import checked_id
 
-DURATION_LIMIT_S: Final = 86_400.0
 AVERAGE_LIMIT: Final = 10_000
 RAMP_LIMIT: Final = 1_000_000
 """Most frames at one gain of a ramp."""
 
-_T = TypeVar("_T")
+_Duration = Annotated[float, above(0.0, 86_400.0)]
+_Pair = Annotated[tuple[Count, Count], Meta(description="pairs of integers")]
 
 
 class CommandKind(StrEnum):
@@ -70,22 +87,22 @@ class Pattern(StrEnum):
 class DitherRequest:
     """Start or stop a dither; stopping needs nothing but the id and always succeeds."""
 
-    id: str
+    id: Id
     """Of the command: repeated with the same id it is carried out once."""
 
     action: DitherAction
     kind: DitherKind | None = None
-    modes: tuple[int, ...] | None = None
+    modes: tuple[Count, ...] | None = None
     """0-based basis indices."""
 
-    amplitude_m: tuple[float, ...] | None = None
+    amplitude_m: tuple[Positive, ...] | None = None
     """RMS of each mode, metres OPD."""
 
-    frequency_hz: tuple[float, ...] | None = None
+    frequency_hz: tuple[Positive, ...] | None = None
     """Of each mode, below half the frame rate; None: binary."""
 
-    duration_s: float | None = None
-    seed: int | None = None
+    duration_s: _Duration | None = None
+    seed: Count | None = None
     """Of the binary sequence; None: sine."""
 
 
@@ -93,15 +110,15 @@ class DitherRequest:
 class LoopRequest:
     """Change the loop; None leaves a value as it is, opening zeroes the integrator."""
 
-    id: str
+    id: Id
     loop: Loop | None = None
-    gains: tuple[float, ...] | None = None
+    gains: tuple[Annotated[float, number(0.0)], ...] | None = None
     """One per mode of the basis, 0 where uncontrolled."""
 
-    leak: float | None = None
+    leak: Annotated[float, number(0.0, 1.0)] | None = None
     """Per frame, 0..1; 1 forgets nothing."""
 
-    n_controlled: int | None = None
+    n_controlled: Count | None = None
     """Takes effect with the next reconstructor of that many rows."""
 
 
@@ -109,23 +126,23 @@ class LoopRequest:
 class MeasureRequest:
     """Measure an interaction matrix."""
 
-    id: str
+    id: Id
     """Of the command, and of the matrix that follows."""
 
     pattern: Pattern
-    modes: tuple[int, ...]
+    modes: tuple[Count, ...]
     """0-based basis indices."""
 
-    amplitude_m: tuple[float, ...]
+    amplitude_m: tuple[Positive, ...]
     """RMS of each mode's stroke, metres OPD."""
 
-    n_average: int | None = None
+    n_average: Annotated[int, integer(1, AVERAGE_LIMIT)] | None = None
     """Repetitions; None: the pattern has none."""
 
-    frequency_hz: tuple[float, ...] | None = None
+    frequency_hz: tuple[Positive, ...] | None = None
     """Of each mode; None unless the pattern is a sine."""
 
-    duration_s: float | None = None
+    duration_s: _Duration | None = None
     """None unless the pattern is a sine."""
 
 
@@ -137,14 +154,14 @@ class RampRequest:
     status' ``gains`` (Heritier et al. 2018: tip and tilt, then modes to 100, then to 400).
     """
 
-    id: str
-    groups: tuple[tuple[int, int], ...]
+    id: Id
+    groups: tuple[_Pair, ...]
     """First and last mode of each group, 0-based basis indices, both included; none overlap."""
 
-    gains: tuple[float, ...]
+    gains: tuple[Positive, ...]
     """Loop gains, tried in this order on every group."""
 
-    frames_per_gain: int
+    frames_per_gain: Annotated[int, integer(1, RAMP_LIMIT)]
     """Frames each gain is tried for, settling included."""
 
 
@@ -155,34 +172,34 @@ Command = DitherRequest | LoopRequest | MeasureRequest | RampRequest
 class Reply:
     """The RTC's answer to a command."""
 
-    id: str | None
+    id: Id | None
     """The command's; None when the command had none that could be read."""
 
     accepted: bool
-    reason: str
+    reason: Text
     """Empty, or begins with missing, v, id, busy, range or unsupported."""
 
-    start_seq: int | None
+    start_seq: Count | None
     """First frame whose exposure contains what was asked for; None where that means nothing."""
+
+
+_RECORDS: dict[CommandKind, type[Command]] = {
+    CommandKind.DITHER: DitherRequest,
+    CommandKind.LOOP: LoopRequest,
+    CommandKind.MEASURE: MeasureRequest,
+    CommandKind.RAMP: RampRequest,
+}
 
 
 def command_kind(command: Command) -> CommandKind:
     """Return which key a command goes to."""
-    match command:
-        case DitherRequest():
-            return CommandKind.DITHER
-        case LoopRequest():
-            return CommandKind.LOOP
-        case MeasureRequest():
-            return CommandKind.MEASURE
-        case RampRequest():
-            return CommandKind.RAMP
+    return next(kind for kind, record in _RECORDS.items() if isinstance(command, record))
 
 
 def command_id(data: bytes) -> str | None:
     """Return the id of a command, for the reply that refuses the rest of it; None: unreadable."""
     try:
-        return Fields.unpack(data, "a command").identifier("id")
+        return checked_id(unpack(data, "a command").get("id"), "a command")
     except WireError:
         return None
 
@@ -195,9 +212,7 @@ def encode_command(command: Command) -> bytes:
     WireError
         If the record breaks the contract.
     """
-    data = pack(command)
-    decode_command(command_kind(command), data)
-    return data
+    return checked(pack(command), lambda data: decode_command(command_kind(command), data))
 
 
 def decode_command(kind: CommandKind, data: bytes) -> Command:
@@ -210,19 +225,21 @@ def decode_command(kind: CommandKind, data: bytes) -> Command:
     WireError
         If a key is missing or out of range; the text is fit for the reply's ``reason``.
     """
-    message = Fields.unpack(data, f"a {kind} command").of_this_version()
-    match kind:
-        case CommandKind.DITHER:
-            return read_dither(message)
-        case CommandKind.LOOP:
-            return _read_loop(message)
-        case CommandKind.MEASURE:
-            return _read_measure(message)
-        case CommandKind.RAMP:
-            return _read_ramp(message)
+    where = f"a {kind} command"
+    values = of_this_version(unpack(data, where), where)
+    if kind is CommandKind.DITHER:
+        return read_dither(values, where)
+    command = read(values, _RECORDS[kind], where)
+    if isinstance(command, MeasureRequest):
+        sine = command.pattern is Pattern.SINE
+        applicable(command, where, n_average=not sine, frequency_hz=sine, duration_s=sine)
+        _check_modes(command, where)
+    elif isinstance(command, RampRequest):
+        _check_ramp(command, where)
+    return command
 
 
-def read_dither(message: Fields) -> DitherRequest:
+def read_dither(values: dict[str, Any], where: str) -> DitherRequest:
     """Return the dither request a map holds.
 
     Raises
@@ -230,95 +247,39 @@ def read_dither(message: Fields) -> DitherRequest:
     WireError
         If a key is missing or out of range.
     """
-    command = message.identifier("id")
-    action = message.choice("action", DitherAction)
-    if action is DitherAction.STOP:
-        return DitherRequest(id=command, action=action)
-    kind = message.choice("kind", DitherKind)
-    sine = kind is DitherKind.SINE
-    modes = _modes(message)
-    return DitherRequest(
-        id=command,
-        action=action,
-        kind=kind,
-        modes=modes,
-        amplitude_m=_each(message, "amplitude_m", modes),
-        frequency_hz=_where(sine, message, "frequency_hz", lambda key: _each(message, key, modes)),
-        duration_s=_duration(message, "duration_s"),
-        seed=_where(not sine, message, "seed", message.integer),
-    )
+    if values.get("action") == DitherAction.STOP:
+        needed = {"id", "action"}
+        values = {f.name: None for f in fields(DitherRequest) if f.name not in needed} | {
+            key: values[key] for key in needed & values.keys()
+        }
+        return read(values, DitherRequest, where)
+    command = read(values, DitherRequest, where)
+    sine = command.kind is DitherKind.SINE
+    applicable(command, where, kind=True, modes=True, amplitude_m=True, duration_s=True)
+    applicable(command, where, frequency_hz=sine, seed=not sine)
+    _check_modes(command, where)
+    return command
 
 
-def _read_loop(message: Fields) -> LoopRequest:
-    return LoopRequest(
-        id=message.identifier("id"),
-        loop=message.optional("loop", lambda key: message.choice(key, Loop)),
-        gains=message.optional("gains", lambda key: message.numbers(key, low=0.0)),
-        leak=message.optional("leak", lambda key: message.number(key, 0.0, 1.0)),
-        n_controlled=message.optional("n_controlled", message.integer),
-    )
-
-
-def _read_measure(message: Fields) -> MeasureRequest:
-    modes = _modes(message)
-    pattern = message.choice("pattern", Pattern)
-    sine = pattern is Pattern.SINE
-    return MeasureRequest(
-        id=message.identifier("id"),
-        pattern=pattern,
-        modes=modes,
-        amplitude_m=_each(message, "amplitude_m", modes),
-        n_average=_where(
-            not sine, message, "n_average", lambda key: message.integer(key, 1, AVERAGE_LIMIT)
-        ),
-        frequency_hz=_where(sine, message, "frequency_hz", lambda key: _each(message, key, modes)),
-        duration_s=_where(sine, message, "duration_s", lambda key: _duration(message, key)),
-    )
-
-
-def _read_ramp(message: Fields) -> RampRequest:
-    groups, gains = message.pairs("groups"), message.numbers("gains", above=0.0)
-    ordered = sorted(groups)
-    apart = all(before[1] < after[0] for before, after in pairwise(ordered))
-    if not groups or not apart or any(a > b for a, b in groups):
-        expected = "one or more [first, last], first <= last, none overlapping another"
-        raise message.refusal("groups", list(groups), expected)
-    if not gains:
-        raise message.refusal("gains", list(gains), "one or more gains to try")
-    return RampRequest(
-        id=message.identifier("id"),
-        groups=groups,
-        gains=gains,
-        frames_per_gain=message.integer("frames_per_gain", 1, RAMP_LIMIT),
-    )
-
-
-def _where(applies: bool, message: Fields, key: str, read: Callable[[str], _T]) -> _T | None:
-    """Return what ``read`` makes of a key where it applies; elsewhere it must be nil."""
-    if applies:
-        return read(key)
-    value = message.get(key)
-    if value is not None:
-        raise message.refusal(key, value, "nil, it does not apply")
-    return None
-
-
-def _duration(message: Fields, key: str) -> float:
-    return message.number(key, high=DURATION_LIMIT_S, above=0.0)
-
-
-def _modes(message: Fields) -> tuple[int, ...]:
-    modes = message.integers("modes")
+def _check_modes(command: DitherRequest | MeasureRequest, where: str) -> None:
+    """Refuse modes that are none or twice the same, and what is not one for each of them."""
+    modes = command.modes or ()
     if not modes or len(set(modes)) != len(modes):
-        raise message.refusal("modes", list(modes), "at least one mode, none twice")
-    return modes
+        raise refusal("modes", modes, "at least one mode, none twice", where)
+    for key in ("amplitude_m", "frequency_hz"):
+        values = getattr(command, key)
+        if values is not None and len(values) != len(modes):
+            raise refusal(key, values, f"one for each of {len(modes)} modes", where)
 
 
-def _each(message: Fields, key: str, modes: tuple[int, ...]) -> tuple[float, ...]:
-    values = message.numbers(key, above=0.0)
-    if len(values) != len(modes):
-        raise message.refusal(key, list(values), f"one for each of {len(modes)} modes")
-    return values
+def _check_ramp(command: RampRequest, where: str) -> None:
+    groups = sorted(command.groups)
+    apart = all(before[1] < after[0] for before, after in pairwise(groups))
+    if not groups or not apart or any(first > last for first, last in groups):
+        expected = "one or more [first, last], first <= last, none overlapping another"
+        raise refusal("groups", groups, expected, where)
+    if not command.gains:
+        raise refusal("gains", command.gains, "one or more gains to try", where)
 
 
 def encode_reply(reply: Reply) -> bytes:
@@ -329,9 +290,7 @@ def encode_reply(reply: Reply) -> bytes:
     WireError
         If the record breaks the contract.
     """
-    data = pack(reply)
-    decode_reply(data)
-    return data
+    return checked(pack(reply), decode_reply)
 
 
 def decode_reply(data: bytes) -> Reply:
@@ -342,10 +301,7 @@ def decode_reply(data: bytes) -> Reply:
     WireError
         If a key is missing or out of range.
     """
-    message = Fields.unpack(data, "a reply").of_this_version()
-    return Reply(
-        id=message.optional("id", message.identifier),
-        accepted=message.flag("accepted"),
-        reason=message.optional("reason", message.text) or "",
-        start_seq=message.optional("start_seq", message.integer),
-    )
+    values = of_this_version(unpack(data, "a reply"), "a reply")
+    if values.get("reason", "") is None:
+        values["reason"] = ""
+    return read(values, Reply, "a reply")

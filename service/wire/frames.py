@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import WireError
-from service.wire.fields import Fields, pack
+from service.wire.codec import Id, Opaque, integer, of_this_version, pack, read, unpack
 
 BATCH_LIMIT: Final = 4_000_000
 """Bytes: a longer payload is refused unread."""
@@ -28,37 +28,37 @@ WHERE: Final = "the attachment of a frame batch"
 class FrameHeader:
     """What the attachment of a batch says about its rows."""
 
-    session: str
+    session: Opaque
     """New when the RTC starts, or its sequence or integrator starts over."""
 
-    seq0: int
+    seq0: Annotated[int, integer(high=2**62)]
     """Sequence number of row 0; row i is ``seq0 + i``."""
 
-    n: int
+    n: Annotated[int, integer(1, FRAMES_PER_BATCH)]
     """Rows, 1..50."""
 
-    t0_ns: int
+    t0_ns: Annotated[int, integer(high=2**62)]
     """End of exposure of row 0, nanoseconds since the Unix epoch, UTC."""
 
-    dt_ns: int
+    dt_ns: Annotated[int, integer(1, 10**12)]
     """Nominal frame period, nanoseconds."""
 
-    n_slopes: int
+    n_slopes: Annotated[int, integer(1, COLUMN_LIMIT)]
     """Slopes of a row."""
 
-    n_modes: int
+    n_modes: Annotated[int, integer(1, COLUMN_LIMIT)]
     """Commands of a row: the whole basis, controlled or not."""
 
     dither: bool
     """Whether each row ends with the dither's share of its commands."""
 
-    cm_id: str | None
+    cm_id: Id | None
     """The reconstructor that multiplies these slopes; None when the RTC does not know."""
 
-    basis_id: str
+    basis_id: Opaque
     """Of the modal basis; changes with modes, order and scale."""
 
-    config_id: str
+    config_id: Opaque
     """Of the sensor; changes with mask, slope recipe, reference slopes, binning, modulation."""
 
     @property
@@ -154,20 +154,8 @@ def decode_header(attachment: bytes) -> FrameHeader:
     WireError
         If a key is missing or out of range, or the attachment is too long.
     """
-    message = Fields.unpack(attachment, WHERE, ATTACHMENT_LIMIT).of_this_version()
-    return FrameHeader(
-        session=message.opaque("session"),
-        seq0=message.integer("seq0", high=2**62),
-        n=message.integer("n", 1, FRAMES_PER_BATCH),
-        t0_ns=message.integer("t0_ns", high=2**62),
-        dt_ns=message.integer("dt_ns", 1, 10**12),
-        n_slopes=message.integer("n_slopes", 1, COLUMN_LIMIT),
-        n_modes=message.integer("n_modes", 1, COLUMN_LIMIT),
-        dither=message.flag("dither"),
-        cm_id=message.optional("cm_id", message.identifier),
-        basis_id=message.opaque("basis_id"),
-        config_id=message.opaque("config_id"),
-    )
+    values = of_this_version(unpack(attachment, WHERE, ATTACHMENT_LIMIT), WHERE)
+    return read(values, FrameHeader, WHERE)
 
 
 def _check_sizes(payload: bytes, header: FrameHeader) -> None:

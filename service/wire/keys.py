@@ -8,6 +8,7 @@ from enum import StrEnum
 from service.errors import WireError
 
 ID_PATTERN = re.compile(r"[A-Za-z0-9._-]{1,64}")
+ID_EXPECTED = "1 to 64 of A-Z a-z 0-9 . _ -"
 RESERVED_IDS = frozenset({"ack", "current"})
 
 
@@ -20,7 +21,7 @@ def checked_id(value: object, where: str) -> str:
         If it is not 1 to 64 of ``A-Z a-z 0-9 . _ -``, or is a reserved word.
     """
     if not isinstance(value, str) or ID_PATTERN.fullmatch(value) is None:
-        raise WireError(f"id: {value!r:.80} in {where}, expected 1 to 64 of A-Z a-z 0-9 . _ -")
+        raise WireError(f"id: {value!r:.80} in {where}, expected {ID_EXPECTED}")
     if value in RESERVED_IDS:
         raise WireError(f"id: {value!r} in {where} is reserved")
     return value

@@ -4,20 +4,41 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
-from typing import Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import WireError
-from service.model.misregistration import PARAMETERS
+from service.wire.codec import (
+    MESSAGE_LIMIT,
+    Count,
+    Finite,
+    Id,
+    Opaque,
+    Sha256,
+    Text,
+    above,
+    as_map,
+    checked,
+    get,
+    integer,
+    number,
+    of_this_version,
+    pack,
+    read,
+    read_four,
+    refusal,
+    unpack,
+)
 from service.wire.commands import DitherRequest, Loop, read_dither
-from service.wire.fields import MESSAGE_LIMIT, Fields, pack
 
 STATUS_LIMIT: Final = MESSAGE_LIMIT + 16 * 512**2
 """Bytes: a longer status is refused unread; its images come on top of what a message may have."""
+
+WHERE: Final = "a status"
 
 ESSENTIAL: Final = (
     "session",
@@ -32,9 +53,6 @@ ESSENTIAL: Final = (
 )
 """What of a status must not be missed, however soon the next one comes."""
 
-RATE_LIMIT_HZ: Final = 1e6
-DELAY_LIMIT_FRAMES: Final = 100.0
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherStatus:
@@ -43,7 +61,7 @@ class DitherStatus:
     request: DitherRequest
     """What was asked for."""
 
-    start_seq: int
+    start_seq: Count
     """First frame whose exposure contains it."""
 
 
@@ -51,10 +69,10 @@ class DitherStatus:
 class PointingStatus:
     """Where the telescope looks, as far as the RTC knows."""
 
-    elevation_deg: float
+    elevation_deg: Annotated[float, number(-90.0, 90.0)]
     """Above the horizon."""
 
-    azimuth_deg: float
+    azimuth_deg: Annotated[float, number(-720.0, 720.0)]
     """From north over east."""
 
 
@@ -62,40 +80,40 @@ class PointingStatus:
 class Status:
     """The RTC's own account of its loop, a few times a second."""
 
-    session: str
-    seq: int | None
+    session: Opaque
+    seq: Count | None
     """The last frame processed; None: there has been none yet."""
 
-    t_ns: int
+    t_ns: Count
     """Nanoseconds since the Unix epoch, UTC."""
 
     loop: Loop
-    frame_rate_hz: float
-    delay_frames: float
+    frame_rate_hz: Annotated[float, above(0.0, 1e6)]
+    delay_frames: Annotated[float, number(0.0, 100.0)]
     """End to end, from exposure to the command that answers it."""
 
-    gains: tuple[float, ...]
+    gains: tuple[Annotated[float, number(0.0)], ...]
     """One per mode of the basis, 0 where uncontrolled."""
 
-    leak: float
+    leak: Annotated[float, number(0.0, 1.0)]
     """Per frame; 1 forgets nothing."""
 
-    n_slopes: int
-    n_modes: int
-    n_controlled: int
-    cm_id: str | None
+    n_slopes: Annotated[int, integer(1)]
+    n_modes: Annotated[int, integer(1)]
+    n_controlled: Count
+    cm_id: Id | None
     """The reconstructor in use; None when the RTC does not know."""
 
-    basis_id: str
-    config_id: str
+    basis_id: Opaque
+    config_id: Opaque
     dither: DitherStatus | None
-    max_dither_m: float
+    max_dither_m: Annotated[float, number(0.0)]
     """Most the RTC accepts for one mode, metres RMS."""
 
-    max_dither_modes: int
+    max_dither_modes: Count
     """Most modes the RTC dithers at once."""
 
-    magnitude: float | None
+    magnitude: Finite | None
     """Of the guide star."""
 
     flux: bytes | None
@@ -125,18 +143,18 @@ class AckState(StrEnum):
 class Acknowledgement:
     """The RTC's word on one reconstructor."""
 
-    session: str
-    id: str | None
+    session: Opaque
+    id: Id | None
     """None: the commit that is rejected could not be read."""
 
-    sha256: str | None
+    sha256: Sha256 | None
     """Of the matrix meant, 64 lower-case hex digits; None where ``id`` is."""
 
     state: AckState
-    reason: str
+    reason: Text
     """Why it was rejected; empty otherwise."""
 
-    frame_seq: int | None
+    frame_seq: Count | None
     """First frame whose slopes the new matrix multiplies; None unless applied."""
 
 
@@ -144,11 +162,11 @@ class Acknowledgement:
 class StateMessage:
     """What the service knows, for whoever listens; an RTC ignores it."""
 
-    system: str
-    t_ns: int
+    system: Id
+    t_ns: Count
     """When it was said, nanoseconds since the Unix epoch, UTC."""
 
-    mode: str
+    mode: Text
     """How much the service may do by itself: auto, propose or hold."""
 
     alpha: Mapping[str, float] | None
@@ -157,14 +175,14 @@ class StateMessage:
     sigma: Mapping[str, float] | None
     """1 σ of ``alpha``, same names and units."""
 
-    in_use: str | None
+    in_use: Id | None
     """The reconstructor the RTC multiplies with; None: unknown."""
 
-    validity: str | None = None
+    validity: Text | None = None
     """Whether ``alpha`` may be relied on: fresh, ageing, stale or invalid; None: nothing is known,
     or a service of before this key said it."""
 
-    waiting_for: tuple[str, ...] = ()
+    waiting_for: tuple[Text, ...] = ()
     """Whom the service waits for and what they should do."""
 
 
@@ -172,17 +190,17 @@ class StateMessage:
 class AlarmMessage:
     """One alarm that came or went, for whoever listens."""
 
-    system: str
-    t_ns: int
+    system: Id
+    t_ns: Count
     """When it came or went, nanoseconds since the Unix epoch, UTC."""
 
-    name: str
+    name: Opaque
     """Machine-readable."""
 
     active: bool
     """False: it is over."""
 
-    text: str
+    text: Text
     """What was found, and what to do."""
 
 
@@ -197,12 +215,9 @@ def encode_status(status: Status) -> bytes:
     playing = status.dither
     dither = None
     if playing is not None:
-        request = {f.name: getattr(playing.request, f.name) for f in fields(playing.request)}
-        dither = {**request, "start_seq": playing.start_seq}
+        dither = {**asdict(playing.request), "start_seq": playing.start_seq}
     pointing = None if status.pointing is None else asdict(status.pointing)
-    data = pack(status, dither=dither, pointing=pointing)
-    decode_status(data)
-    return data
+    return checked(pack(status, dither=dither, pointing=pointing), decode_status)
 
 
 def decode_status(data: bytes) -> Status:
@@ -213,33 +228,18 @@ def decode_status(data: bytes) -> Status:
     WireError
         If a key is missing or out of range, or the message is too long.
     """
-    message = _checked(data).of_this_version()
-    n_modes = message.integer("n_modes", 1)
-    gains = message.numbers("gains", low=0.0)
-    if len(gains) != n_modes:
-        raise message.refusal("gains", list(gains), f"one for each of {n_modes} modes")
-    return Status(
-        session=message.opaque("session"),
-        seq=message.optional("seq", message.integer),
-        t_ns=message.integer("t_ns"),
-        loop=message.choice("loop", Loop),
-        frame_rate_hz=message.number("frame_rate_hz", above=0.0, high=RATE_LIMIT_HZ),
-        delay_frames=message.number("delay_frames", 0.0, DELAY_LIMIT_FRAMES),
-        gains=gains,
-        leak=message.number("leak", 0.0, 1.0),
-        n_slopes=message.integer("n_slopes", 1),
-        n_modes=n_modes,
-        n_controlled=message.integer("n_controlled", 0, n_modes),
-        cm_id=message.optional("cm_id", message.identifier),
-        basis_id=message.opaque("basis_id"),
-        config_id=message.opaque("config_id"),
-        dither=message.optional("dither", lambda key: _dither(message.child(key))),
-        max_dither_m=message.number("max_dither_m", 0.0),
-        max_dither_modes=message.integer("max_dither_modes"),
-        magnitude=message.optional("magnitude", message.number),
-        flux=message.optional("flux", lambda key: _flux(message, key)),
-        pointing=message.extension("pointing", lambda key: _pointing(message.child(key))),
-    )
+    values = of_this_version(_unpack_status(data), WHERE)
+    playing = get(values, "dither", WHERE)
+    status = read({**values, "dither": None}, Status, WHERE, extensions=("pointing",))
+    if len(status.gains) != status.n_modes:
+        raise refusal("gains", status.gains, f"one for each of {status.n_modes} modes", WHERE)
+    if status.n_controlled > status.n_modes:
+        expected = f"an integer from 0 to {status.n_modes}"
+        raise refusal("n_controlled", status.n_controlled, expected, WHERE)
+    flux = status.flux
+    if flux is not None and 16 * math.isqrt(len(flux) // 16) ** 2 != len(flux):
+        raise refusal("flux", flux, "bytes of four square float32 images", WHERE)
+    return status if playing is None else replace(status, dither=_dither(playing))
 
 
 def essentials(data: bytes) -> tuple[object, ...]:
@@ -250,39 +250,28 @@ def essentials(data: bytes) -> tuple[object, ...]:
     WireError
         If the message is no map, or too long.
     """
-    message = _checked(data)
-    return tuple(message.extension(key, message.get) for key in ESSENTIAL)
+    values = _unpack_status(data)
+    return tuple(values.get(key) for key in ESSENTIAL)
 
 
-def _checked(data: bytes) -> Fields:
+def _unpack_status(data: bytes) -> dict[str, Any]:
     """Return the map of a status that is no longer than its limit, its images left aside."""
-    message = Fields.unpack(data, "a status", STATUS_LIMIT)
-    flux = message.extension("flux", message.get)
+    values = unpack(data, WHERE, STATUS_LIMIT)
+    flux = values.get("flux")
     n_bytes = len(data) - (len(flux) if isinstance(flux, bytes) else 0)
     if n_bytes > MESSAGE_LIMIT:
         raise WireError(
             f"range: a status has {n_bytes} bytes besides its flux, expected at most "
             f"{MESSAGE_LIMIT}"
         )
-    return message
+    return values
 
 
-def _pointing(message: Fields) -> PointingStatus:
-    return PointingStatus(
-        elevation_deg=message.number("elevation_deg", -90.0, 90.0),
-        azimuth_deg=message.number("azimuth_deg", -720.0, 720.0),
-    )
-
-
-def _dither(message: Fields) -> DitherStatus:
-    return DitherStatus(request=read_dither(message), start_seq=message.integer("start_seq"))
-
-
-def _flux(message: Fields, key: str) -> bytes:
-    value = message.get(key)
-    if not isinstance(value, bytes) or 16 * math.isqrt(len(value) // 16) ** 2 != len(value):
-        raise message.refusal(key, value, "bytes of four square float32 images")
-    return value
+def _dither(playing: object) -> DitherStatus:
+    inside = f"'dither' of {WHERE}"
+    values = as_map(playing, inside)
+    request = asdict(read_dither(values, inside))
+    return read({**values, "request": request}, DitherStatus, inside)
 
 
 def encode_acknowledgement(acknowledgement: Acknowledgement) -> bytes:
@@ -293,9 +282,7 @@ def encode_acknowledgement(acknowledgement: Acknowledgement) -> bytes:
     WireError
         If the record breaks the contract.
     """
-    data = pack(acknowledgement)
-    decode_acknowledgement(data)
-    return data
+    return checked(pack(acknowledgement), decode_acknowledgement)
 
 
 def decode_acknowledgement(data: bytes) -> Acknowledgement:
@@ -306,23 +293,16 @@ def decode_acknowledgement(data: bytes) -> Acknowledgement:
     WireError
         If a key is missing or out of range.
     """
-    message = Fields.unpack(data, "an acknowledgement").of_this_version()
-    state = message.choice("state", AckState)
-    frame_seq = message.optional("frame_seq", message.integer)
-    if (frame_seq is not None) != (state is AckState.APPLIED):
-        raise message.refusal("frame_seq", frame_seq, "a number if and only if applied")
-    matrix_id = message.optional("id", message.identifier)
-    sha256 = message.optional("sha256", message.sha256)
-    if state is not AckState.REJECTED and (matrix_id is None or sha256 is None):
-        raise message.refusal("id, sha256", (matrix_id, sha256), "both, unless rejected")
-    return Acknowledgement(
-        session=message.opaque("session"),
-        id=matrix_id,
-        sha256=sha256,
-        state=state,
-        reason=message.optional("reason", message.text) or "",
-        frame_seq=frame_seq,
-    )
+    where = "an acknowledgement"
+    values = of_this_version(unpack(data, where), where)
+    if values.get("reason", "") is None:
+        values["reason"] = ""
+    said = read(values, Acknowledgement, where)
+    if (said.frame_seq is not None) != (said.state is AckState.APPLIED):
+        raise refusal("frame_seq", said.frame_seq, "a number if and only if applied", where)
+    if said.state is not AckState.REJECTED and (said.id is None or said.sha256 is None):
+        raise refusal("id, sha256", (said.id, said.sha256), "both, unless rejected", where)
+    return said
 
 
 def encode_state(message: StateMessage) -> bytes:
@@ -338,17 +318,13 @@ def decode_state(data: bytes) -> StateMessage:
     WireError
         If a key is missing or out of range.
     """
-    message = Fields.unpack(data, "a state message").of_this_version()
-    return StateMessage(
-        system=message.identifier("system"),
-        t_ns=message.integer("t_ns"),
-        mode=message.text("mode"),
-        alpha=message.optional("alpha", lambda key: message.named_numbers(key, PARAMETERS)),
-        sigma=message.optional("sigma", lambda key: message.named_numbers(key, PARAMETERS)),
-        in_use=message.optional("in_use", message.identifier),
-        validity=message.extension("validity", message.text),
-        waiting_for=message.extension("waiting_for", message.texts) or (),
-    )
+    where = "a state message"
+    values = of_this_version(unpack(data, where), where)
+    if values.get("waiting_for") is None:
+        values["waiting_for"] = ()
+    for key in ("alpha", "sigma"):
+        values[key] = read_four(values, key, where)
+    return read(values, StateMessage, where, extensions=("validity",))
 
 
 def encode_alarm(message: AlarmMessage) -> bytes:
@@ -364,11 +340,5 @@ def decode_alarm(data: bytes) -> AlarmMessage:
     WireError
         If a key is missing or out of range.
     """
-    message = Fields.unpack(data, "an alarm message").of_this_version()
-    return AlarmMessage(
-        system=message.identifier("system"),
-        t_ns=message.integer("t_ns"),
-        name=message.text("name", low=1),
-        active=message.flag("active"),
-        text=message.text("text"),
-    )
+    where = "an alarm message"
+    return read(of_this_version(unpack(data, where), where), AlarmMessage, where)

@@ -280,7 +280,7 @@ def test_malformed_batches_are_counted_reported_once_and_survived(bridge, rtc):
 
 
 def _attachment(header):
-    from service.wire.fields import pack
+    from service.wire.codec import pack
 
     return pack(header)
 

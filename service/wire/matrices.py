@@ -1,16 +1,37 @@
-"""Matrices in parts: cutting, checksums, and putting together what arrives in any order."""
+"""Matrices on the wire: manifests, and the parts they travel in, which arrive in any order."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, Final
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from service.errors import WireError
+from service.wire.codec import (
+    SHA256_EXPECTED,
+    Count,
+    Id,
+    Opaque,
+    Positive,
+    Text,
+    applicable,
+    checked,
+    get,
+    integer,
+    of_this_version,
+    pack,
+    read,
+    read_four,
+    refusal,
+    unpack,
+)
+from service.wire.commands import Pattern
 
 CHUNK_LIMIT: Final = 4_000_000
 """Bytes of the largest part."""
@@ -21,22 +42,27 @@ MATRIX_LIMIT: Final = 2**31
 DTYPE: Final = "<f4"
 """Every matrix on the wire: little-endian float32, C order."""
 
+AXIS_LIMIT: Final = 1_000_000
+
+_Axis = Annotated[int, integer(0, AXIS_LIMIT)]
+_AXES: Final = f"two axes, at most {MATRIX_LIMIT} bytes"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatrixLayout:
     """Shape, parts and checksum of a float32 matrix on the wire."""
 
-    shape: tuple[int, int]
+    shape: Annotated[tuple[_Axis, _Axis], Meta(description=_AXES)]
     """Rows and columns, C order, little-endian float32."""
 
-    n_chunks: int
+    n_chunks: Count
     """Parts it travels in; 0: there is no matrix (a measurement that failed)."""
 
-    chunk_bytes: int
+    chunk_bytes: Annotated[int, integer(1, CHUNK_LIMIT)]
     """Bytes of each part but the last, which may be shorter."""
 
-    sha256: str
-    """Of all its bytes, 64 lower-case hex digits."""
+    sha256: Annotated[str, Meta(pattern=r"\A([0-9a-f]{64})?\Z", description=SHA256_EXPECTED)]
+    """Of all its bytes, 64 lower-case hex digits; empty: there is no matrix."""
 
     @property
     def n_bytes(self) -> int:
@@ -46,6 +72,163 @@ class MatrixLayout:
     def size_of(self, index: int) -> int:
         """Return the bytes part ``index`` must have."""
         return min(self.chunk_bytes, self.n_bytes - index * self.chunk_bytes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Manifest:
+    """A reconstructor on its way from the service to the RTC, or the one the RTC uses."""
+
+    id: Id
+    """Never reused."""
+
+    layout: MatrixLayout
+    """Shape ``(n_controlled, n_slopes)``, chunks and checksum; row i commands basis mode i."""
+
+    alpha: Mapping[str, float] | None
+    """Registration it was computed for: shifts in subapertures, rotation in degrees, ratio."""
+
+    sigma: Mapping[str, float] | None
+    """1 σ of ``alpha``, same names and units."""
+
+    im_id: Text | None
+    """Informative: the interaction matrix it inverts."""
+
+    parent: Text | None
+    """Informative: the reconstructor it follows."""
+
+    basis_id: Opaque
+    """Of the modal basis it commands."""
+
+    config_id: Opaque
+    """Of the slopes it multiplies."""
+
+    system: Id
+    """The ``{system}`` of the keys."""
+
+    created_ns: Count
+    """When it was computed, nanoseconds since the Unix epoch, UTC."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredManifest:
+    """An interaction matrix the RTC has measured: slope per metre OPD."""
+
+    id: Id
+    """The command's."""
+
+    layout: MatrixLayout
+    """Shape ``(n_slopes, n_modes_measured)``; no chunks when the measurement failed."""
+
+    reason: Text | None
+    """Why there is no matrix; None when there is one."""
+
+    modes: tuple[_Axis, ...]
+    """0-based basis indices, one per column."""
+
+    amplitude_m: tuple[Positive, ...]
+    """RMS of each mode's stroke, metres OPD."""
+
+    n_average: Annotated[int, integer(1)]
+    """Repetitions averaged."""
+
+    pattern: Pattern
+    """How it was measured."""
+
+    double_pass: bool
+    """Whether the light saw the mirror twice."""
+
+    session: Opaque
+    """The RTC's session."""
+
+    basis_id: Opaque
+    config_id: Opaque
+    system: Id
+    created_ns: Count
+    """When it was measured, nanoseconds since the Unix epoch, UTC."""
+
+
+def encode_manifest(manifest: Manifest) -> bytes:
+    """Return the payload of a ``commit``.
+
+    Raises
+    ------
+    WireError
+        If the record breaks the contract.
+    """
+    return checked(_pack_with_layout(manifest), decode_manifest)
+
+
+def decode_manifest(data: bytes) -> Manifest:
+    """Return the manifest of a reconstructor.
+
+    Raises
+    ------
+    WireError
+        If a key is missing or out of range, or the message is too long.
+    """
+    where = "the manifest of a reconstructor"
+    values = of_this_version(unpack(data, where), where)
+    values = _with_layout(values, where)
+    alpha, sigma = (read_four(values, key, where) for key in ("alpha", "sigma"))
+    if alpha is not None and alpha["magnification"] <= 0.0:
+        inside = f"'alpha' of {where}"
+        raise refusal("magnification", alpha["magnification"], "a finite number > 0", inside)
+    return read({**values, "alpha": alpha, "sigma": sigma}, Manifest, where)
+
+
+def encode_measured_manifest(manifest: MeasuredManifest) -> bytes:
+    """Return the payload of an ``im`` commit.
+
+    Raises
+    ------
+    WireError
+        If the record breaks the contract.
+    """
+    return checked(_pack_with_layout(manifest), decode_measured_manifest)
+
+
+def decode_measured_manifest(data: bytes) -> MeasuredManifest:
+    """Return the manifest of a measured interaction matrix.
+
+    Raises
+    ------
+    WireError
+        If a key is missing or out of range, or the message is too long.
+    """
+    where = "the manifest of a measured matrix"
+    values = of_this_version(unpack(data, where), where)
+    values = _with_layout(values, where, may_fail=True)
+    if values["layout"]["n_chunks"]:
+        values["reason"] = None
+    manifest = read(values, MeasuredManifest, where)
+    layout, n_modes = manifest.layout, len(manifest.modes)
+    applicable(manifest, where, reason=not layout.n_chunks)
+    if len(manifest.amplitude_m) != n_modes or (layout.n_chunks and n_modes != layout.shape[1]):
+        expected = f"one for each of {layout.shape[1]} measured modes"
+        raise refusal("amplitude_m", manifest.amplitude_m, expected, where)
+    return manifest
+
+
+def _pack_with_layout(manifest: Manifest | MeasuredManifest) -> bytes:
+    return pack(manifest, omit=("layout",), dtype=DTYPE, **asdict(manifest.layout))
+
+
+def _with_layout(values: dict[str, Any], where: str, *, may_fail: bool = False) -> dict[str, Any]:
+    """Return the map of a manifest with its layout, whose keys are among its own, below one."""
+    if get(values, "dtype", where) != DTYPE:
+        raise refusal("dtype", values["dtype"], repr(DTYPE), where)
+    failed = may_fail and values.get("n_chunks") == 0
+    if failed:
+        values["sha256"] = ""
+    layout = read(values, MatrixLayout, where)
+    if layout.n_bytes > MATRIX_LIMIT:
+        raise refusal("shape", str(layout.shape), _AXES, where)
+    expected = math.ceil(layout.n_bytes / layout.chunk_bytes)
+    if layout.n_chunks != expected and not failed:
+        raise refusal("n_chunks", layout.n_chunks, f"{expected} for shape {layout.shape}", where)
+    if not layout.sha256 and not failed:
+        raise refusal("sha256", layout.sha256, SHA256_EXPECTED, where)
+    return {**values, "layout": asdict(layout)}
 
 
 def layout_of(matrix: NDArray[np.float32], chunk_bytes: int) -> MatrixLayout:

@@ -1,0 +1,343 @@
+"""Records <-> msgpack maps: each key is present, of its type and in its range.
+
+The types of a record's fields say what its keys may hold; a refusal names the key, what was found
+and what was expected. Here are the types that messages share.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
+
+import msgpack
+import msgspec
+import numpy as np
+from msgspec import Meta, inspect
+
+from service.errors import WireError
+from service.wire.keys import ID_EXPECTED, ID_PATTERN, RESERVED_IDS, checked_id
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+VERSION: Final = 1
+"""The ``v`` of every message."""
+
+MESSAGE_LIMIT: Final = 64 * 1024
+"""Bytes: a longer status, manifest or command is refused unread."""
+
+TEXT_LIMIT: Final = 1024
+"""Characters of the longest text."""
+
+INTEGER_LIMIT: Final = 2**63 - 1
+"""Largest integer on the wire."""
+
+_FINITE: Final = float(np.finfo(np.float64).max)
+
+_T = TypeVar("_T")
+_R = TypeVar("_R", bound="DataclassInstance")
+
+
+def integer(low: int = 0, high: int = INTEGER_LIMIT) -> Meta:
+    """Return what makes an ``int`` one from ``low`` to ``high``."""
+    return Meta(ge=low, le=high, description=f"an integer from {low} to {high}")
+
+
+def number(low: float, high: float = _FINITE) -> Meta:
+    """Return what makes a ``float`` a finite one from ``low`` to ``high``."""
+    span = f" from {low:g}" + ("" if high == _FINITE else f" to {high:g}")
+    return Meta(ge=low, le=high, description=f"a finite number{span}")
+
+
+def above(low: float, high: float = _FINITE) -> Meta:
+    """Return what makes a ``float`` a finite one greater than ``low``, to ``high``."""
+    span = f" > {low:g}" + ("" if high == _FINITE else f" and <= {high:g}")
+    return Meta(gt=low, le=high, description=f"a finite number{span}")
+
+
+Count = Annotated[int, integer()]
+Finite = Annotated[float, Meta(ge=-_FINITE, le=_FINITE, description="a finite number")]
+Positive = Annotated[float, above(0.0)]
+Text = Annotated[
+    str,
+    Meta(
+        pattern=rf"\A[^\0]{{0,{TEXT_LIMIT}}}\Z",
+        description=f"a text of 0 to {TEXT_LIMIT} characters",
+    ),
+]
+Opaque = Annotated[
+    str, Meta(min_length=1, max_length=128, description="1 to 128 printable characters")
+]
+"""A name that only its sender understands."""
+
+_RESERVED = "|".join(sorted(RESERVED_IDS))
+Id = Annotated[
+    str,
+    Meta(pattern=rf"\A(?!({_RESERVED})\Z){ID_PATTERN.pattern}\Z", description=ID_EXPECTED),
+]
+SHA256_EXPECTED: Final = "64 lower-case hex digits"
+Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", description=SHA256_EXPECTED)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FourNumbers:
+    """The four parameters of a registration, or their 1 σ, by their names at every boundary."""
+
+    shift_x_subap: Finite
+    shift_y_subap: Finite
+    rotation_deg: Finite
+    magnification: Finite
+
+
+def pack(record: DataclassInstance, omit: tuple[str, ...] = (), **replaced: object) -> bytes:
+    """Return the msgpack map of a record whose fields are named like the keys, with its ``v``.
+
+    Parameters
+    ----------
+    record
+        The record.
+    omit
+        Fields that are no keys.
+    **replaced
+        Keys that are no fields, or whose field travels in another form.
+    """
+    values = {f.name: getattr(record, f.name) for f in fields(record) if f.name not in omit}
+    data: bytes = msgpack.packb({"v": VERSION, **values, **replaced}, default=_plain)
+    return data
+
+
+def checked(data: bytes, decode: Callable[[bytes], object]) -> bytes:
+    """Return a message that whoever receives it can decode.
+
+    Raises
+    ------
+    WireError
+        If it breaks the contract.
+    """
+    decode(data)
+    return data
+
+
+def _plain(value: object) -> object:
+    """Turn numpy scalars and arrays into what msgpack knows."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise WireError(f"range: {value!r:.80} of type {type(value).__name__} cannot travel")
+
+
+def unpack(data: bytes, where: str, limit: int = MESSAGE_LIMIT) -> dict[str, Any]:
+    """Return the map that a message is.
+
+    Parameters
+    ----------
+    data
+        The bytes.
+    where
+        What the message is, for the text of a refusal.
+    limit
+        Most bytes it may have.
+
+    Raises
+    ------
+    WireError
+        If it is too long or no msgpack map.
+    """
+    if len(data) > limit:
+        raise WireError(f"range: {where} has {len(data)} bytes, expected at most {limit}")
+    try:
+        values = msgpack.unpackb(data)
+    except (ValueError, msgpack.exceptions.UnpackException) as error:
+        raise WireError(f"range: {where} is not msgpack: {error!s:.100}") from error
+    return as_map(values, where)
+
+
+def as_map(values: object, where: str) -> dict[str, Any]:
+    """Return what must be a map.
+
+    Raises
+    ------
+    WireError
+        If it is none.
+    """
+    if not isinstance(values, dict):
+        raise WireError(f"range: {where} is {_show(values)}, expected a map")
+    return values
+
+
+def of_this_version(values: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return a map whose ``v`` is the version this code speaks.
+
+    Raises
+    ------
+    WireError
+        If it is another.
+    """
+    version = get(values, "v", where)
+    if version != VERSION or isinstance(version, bool):
+        raise WireError(f"v: {_show(version)} in {where}, expected {VERSION}")
+    return values
+
+
+def get(values: dict[str, Any], key: str, where: str) -> Any:  # noqa: ANN401  as msgpack made it
+    """Return the value of a key that must be present.
+
+    Raises
+    ------
+    WireError
+        If it is not.
+    """
+    if key not in values:
+        raise WireError(f"missing: key {key!r} in {where}")
+    return values[key]
+
+
+def read(
+    values: dict[str, Any], kind: type[_R], where: str, extensions: tuple[str, ...] = ()
+) -> _R:
+    """Return the record of a map whose keys are named like the fields.
+
+    Parameters
+    ----------
+    values
+        The map; a key that is no field is ignored.
+    kind
+        The record's type.
+    where
+        What the map is, for the text of a refusal.
+    extensions
+        Keys that came after the contract: who does not know them need not send them.
+
+    Raises
+    ------
+    WireError
+        If a key is missing or its value is not what the field's type says.
+    """
+    for field in fields(kind):
+        if field.name not in extensions:
+            get(values, field.name, where)
+    try:
+        record = msgspec.convert(values, kind, builtin_types=(bytes,))
+    except msgspec.ValidationError as error:
+        raise _refused(str(error), values, kind, where) from error
+    for name in _opaque(kind):
+        if not getattr(record, name).isprintable():
+            raise refusal(name, getattr(record, name), expected_of(kind, name), where)
+    return record
+
+
+def read_four(values: dict[str, Any], key: str, where: str) -> dict[str, float] | None:
+    """Return the four numbers of a registration below a key, None where it is nil.
+
+    Raises
+    ------
+    WireError
+        If one of them is missing or not finite.
+    """
+    below = get(values, key, where)
+    if below is None:
+        return None
+    inside = f"{key!r} of {where}"
+    return asdict(read(as_map(below, inside), FourNumbers, inside))
+
+
+def applicable(record: DataclassInstance, where: str, **applies: bool) -> None:
+    """Refuse a field that is None though it applies, or something though it does not.
+
+    Raises
+    ------
+    WireError
+        If one is.
+    """
+    for key, does in applies.items():
+        value = getattr(record, key)
+        if does and value is None:
+            raise refusal(key, value, expected_of(type(record), key), where)
+        if not does and value is not None:
+            raise refusal(key, value, "nil, it does not apply", where)
+
+
+def refusal(key: str, value: object, expected: str, where: str) -> WireError:
+    """Return the error that says what a key held and what it should hold."""
+    return WireError(f"range: {key} is {_show(value)} in {where}, expected {expected}")
+
+
+def expected_of(kind: type[DataclassInstance], key: str) -> str:
+    """Return in words what a field may hold."""
+    return _words(_types(kind)[key])
+
+
+def _refused(text: str, values: Any, kind: type[DataclassInstance], where: str) -> WireError:  # noqa: ANN401
+    """Return the error of a map that is no such record, from msgspec's account of it.
+
+    That says what was expected by type, and at which path: found and expected are looked up there.
+    """
+    account, _, path = text.partition(" - at `$")
+    lacking = re.fullmatch(r"Object missing required field `(\w+)`", account)
+    at: inspect.Type = inspect.type_info(kind)
+    key = ""
+    for name, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):
+        at = _below(at, name)
+        values = values[name or int(index)]
+        if name:
+            where, key = (f"{key!r} of {where}" if key else where), name
+    if lacking is not None:
+        return WireError(f"missing: key {lacking[1]!r} in {key!r} of {where}")
+    if isinstance(_core(at), inspect.DataclassType):
+        return WireError(f"range: {key!r} of {where} is {_show(values)}, expected a map")
+    if _words(at) == ID_EXPECTED:
+        checked_id(values, f"key {key!r} in {where}")
+    return refusal(key, values, _words(at), where)
+
+
+@cache
+def _types(kind: type[DataclassInstance]) -> dict[str, inspect.Type]:
+    info = inspect.type_info(kind)
+    return {field.name: field.type for field in getattr(info, "fields", ())}
+
+
+@cache
+def _opaque(kind: type[DataclassInstance]) -> tuple[str, ...]:
+    printable = Opaque.__metadata__[0].description  # type: ignore[attr-defined]
+    return tuple(name for name, at in _types(kind).items() if _words(at) == printable)
+
+
+def _core(at: inspect.Type) -> inspect.Type:
+    """Return a type without the None that it may be as well."""
+    if isinstance(at, inspect.UnionType):
+        return next(t for t in at.types if not isinstance(t, inspect.NoneType))
+    return at
+
+
+def _below(at: inspect.Type, name: str) -> inspect.Type:
+    """Return the type of a field or, without a name, of the items of a list."""
+    at = _core(at)
+    if isinstance(at, inspect.Metadata):
+        at = at.type
+    if isinstance(at, inspect.DataclassType):
+        return next(field.type for field in at.fields if field.name == name)
+    if isinstance(at, inspect.VarTupleType):
+        return at.item_type
+    return at.item_types[0] if isinstance(at, inspect.TupleType) else at
+
+
+def _words(at: inspect.Type) -> str:
+    at = _core(at)
+    if isinstance(at, inspect.Metadata):
+        return str((at.extra_json_schema or {})["description"])
+    if isinstance(at, inspect.EnumType):
+        return f"one of {', '.join(at.cls)}"
+    if isinstance(at, inspect.VarTupleType):
+        return "a list"
+    return "true or false" if isinstance(at, inspect.BoolType) else "bytes"
+
+
+def _show(value: object) -> str:
+    if isinstance(value, bytes | list | tuple | dict):
+        kind = "list" if isinstance(value, tuple) else type(value).__name__
+        return f"a {kind} of {len(value)}"
+    return f"{value!r:.60} ({type(value).__name__})"

@@ -10,24 +10,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Self
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from service.archive.index import AuditEntry, Index
-from service.archive.measured import MeasuredArchive
-from service.archive.noisy import NoisyArchive
-from service.archive.product import (
-    Provenance,
-    check_whole,
-    read_fate,
-    read_matrix,
-    read_product,
-    swept,
-    write_fate,
-    write_product,
-)
+from service.archive.products import MeasuredArchive, NoisyArchive
+from service.archive.records import COVARIANCE_SCALE, from_json, to_json
+from service.archive.store import DAMAGE, Provenance, Store
 from service.archive.tracking import TrackingFile
 from service.errors import ArchiveError, StorageError, UnknownIdError
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.reactions.gain_tables import table_of
 from service.state import MatrixState, ReconstructorRecord
 from service.wire import checked_id, checksum
 
@@ -51,7 +45,13 @@ class Archive:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
-        self._products = directory / "reconstructors"
+        self._products = Store(
+            directory / "reconstructors",
+            "reconstructor",
+            ReconstructorRecord,
+            "reconstructor",
+            "(n_modes, n_slopes), metres OPD per slope",
+        )
         self._index = Index(directory / "index.sqlite")
         self.measured = MeasuredArchive(directory / "interaction_matrices", self._index)
         """Interaction matrices the RTC has measured."""
@@ -93,9 +93,10 @@ class Archive:
             damaged.
         """
         try:
-            self._products.mkdir(parents=True, exist_ok=True)
+            self._directory.mkdir(parents=True, exist_ok=True)
             self._lock = _locked(self._directory / "lock")
-            told = [*swept(self._products), *self.measured.prepare(), *self.noisy.prepare()]
+            folders = (self._products, self.measured, self.noisy)
+            told = [line for folder in folders for line in folder.prepare()]
         except OSError as error:
             self.close()
             raise ArchiveError(f"{self._directory}: cannot be used: {error}") from error
@@ -145,25 +146,24 @@ class Archive:
             If the id is not one.
         """
         checked_id(record.id, "a reconstructor to be stored")
-        if matrix.ndim != 2 or matrix.shape[0] != record.n_modes:
-            raise ArchiveError(
-                f"reconstructor {record.id}: found a matrix of shape {matrix.shape}, "
-                f"expected ({record.n_modes}, n_slopes)"
-            )
-        if not np.isfinite(matrix).all():
-            raise ArchiveError(f"reconstructor {record.id}: not all of its numbers are finite")
+        n_slopes = matrix.shape[-1]
+        self._products.check_numbers(record.id, "a matrix", matrix, (record.n_modes, n_slopes))
         sha256 = checksum(matrix)
-        if record.sha256 not in {"", sha256}:
-            raise ArchiveError(
-                f"reconstructor {record.id}: found a matrix of checksum {sha256}, "
-                f"expected {record.sha256} of its record"
-            )
+        self._products.check_sum(record.id, matrix, record.sha256 or sha256)
         self._largest_bytes = max(self._largest_bytes, matrix.nbytes)
-        path = self._path(record.id)
-        if path.exists():
-            raise ArchiveError(f"reconstructor {record.id}: already stored, ids are never reused")
-        write_product(path, record, matrix, covariance, provenance)
-        self._index.add(record, sha256)
+
+        def fill(file: h5py.File) -> None:
+            file.attrs.update(_attributes(record))
+            if record.optical_gains:
+                _add_gains(file, record)
+            if covariance is not None:
+                file["covariance"] = covariance * COVARIANCE_SCALE
+                file["covariance"].attrs["parameters"] = PARAMETERS
+            file.create_group("provenance").attrs.update(provenance)
+
+        self._products.write(record, matrix, fill)
+        if not self._index.add(record, sha256):
+            raise self._products.taken(record.id)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor, ``(n_modes, n_slopes)``, its checksum verified.
@@ -175,16 +175,10 @@ class Archive:
         ArchiveError
             If its file is missing, damaged, or holds other numbers than were stored.
         """
-        sha256 = self._index.product_sha256(matrix_id)
+        sha256 = self._index.checksums(ReconstructorRecord).get(matrix_id)
         if sha256 is None:
             raise UnknownIdError(f"reconstructor {matrix_id}: no such matrix in the archive")
-        matrix = read_matrix(self._path(matrix_id))
-        found = checksum(matrix)
-        if found != sha256:
-            raise ArchiveError(
-                f"{self._path(matrix_id)}: damaged: found checksum {found}, expected {sha256}"
-            )
-        return matrix
+        return self._products.matrix(matrix_id, sha256)
 
     def update(self, record: ReconstructorRecord) -> None:
         """Remember where a reconstructor is now, one that is not stored here (the RTC's) too."""
@@ -195,7 +189,7 @@ class Archive:
 
         One whose product was missing or damaged at the start has failed, with the reason.
         """
-        understood, wrong = self._index.records()
+        understood, wrong = self._index.records(ReconstructorRecord)
         known = [*understood, *(r for name, r in self._stand_ins.items() if name in wrong)]
         known.sort(key=lambda record: record.created_ns_utc)
         return tuple(self._judged(record) for record in known)
@@ -213,9 +207,8 @@ class Archive:
             If the disk refuses.
         """
         for record in records:
-            path = self._path(record.id)
-            if path.exists():
-                write_fate(path, record)
+            if self._products.path_of(record.id).exists():
+                self._write_fate(record)
         self._index.record(records, entries)
 
     def probe(self) -> None:
@@ -226,7 +219,7 @@ class Archive:
         StorageError
             If the disk refuses.
         """
-        path = self._products / "probe.part"
+        path = self._products.directory / "probe.part"
         try:
             with path.open("wb") as file:
                 file.write(bytes(self._largest_bytes))
@@ -241,22 +234,19 @@ class Archive:
         """Return the last ``limit`` entries of the audit trail, oldest first."""
         return self._index.audit_trail(limit)
 
-    def _path(self, matrix_id: str) -> Path:
-        return self._products / f"{matrix_id}.h5"
-
     def _adopt(self, anew: bool) -> list[str]:
         """Take in the products that the index, made ``anew`` or not, does not know."""
-        known = self._index.stored_ids()
+        known = self._index.checksums(ReconstructorRecord)
         told, taken = [], 0
-        for path in sorted(self._products.glob("*.h5")):
-            if path.stem in known:
+        for name in self._products.ids():
+            if name in known:
                 continue
             try:
-                record, matrix = read_product(path)
+                record, matrix = self._products.record(name), self._products.matrix(name)
             except ArchiveError as error:
                 told.append(str(error))
                 continue
-            fate = read_fate(path)
+            fate = self._fate(name)
             if fate is None and anew:
                 reason = "what became of it was lost with the index"
                 fate = replace(record, state=MatrixState.DISCARDED, reason=reason)
@@ -270,21 +260,33 @@ class Archive:
 
     def _doubted(self) -> list[str]:
         """Look at every product, and at every record that is not understood."""
-        self._unsound.clear()
+        self._unsound = self._products.unsound(sorted(self._index.checksums(ReconstructorRecord)))
         self._stand_ins.clear()
-        told = []
-        for name in sorted(self._index.stored_ids()):
-            try:
-                check_whole(self._path(name), "reconstructor")
-            except ArchiveError as error:
-                self._unsound[name] = str(error)
-                told.append(str(error))
-        for name, text in self._index.records()[1].items():
+        told = [*self._unsound.values()]
+        for name, text in self._index.records(ReconstructorRecord)[1].items():
             told.append(text)
             with contextlib.suppress(ArchiveError):
-                path = self._path(name)
-                self._stand_ins[name] = read_fate(path) or read_product(path)[0]
+                self._stand_ins[name] = self._fate(name) or self._products.record(name)
         return told
+
+    def _write_fate(self, record: ReconstructorRecord) -> None:
+        """Write beside a product what has become of it, for the day when the index is lost."""
+        path = self._products.path_of(record.id)
+        part = path.with_suffix(".json.part")
+        try:
+            part.write_text(to_json(record), encoding="utf-8")
+            part.replace(path.with_suffix(".json"))
+        except OSError as error:
+            raise StorageError(f"{part}: cannot be written: {error}") from error
+
+    def _fate(self, matrix_id: str) -> ReconstructorRecord | None:
+        """Return what has become of a product; None: nothing is known of it."""
+        path = self._products.path_of(matrix_id).with_suffix(".json")
+        try:
+            record = from_json(path.read_text(encoding="utf-8"), ReconstructorRecord)
+        except DAMAGE:
+            return None
+        return record if record.id == matrix_id else None
 
     def _judged(self, record: ReconstructorRecord) -> ReconstructorRecord:
         wrong = self._unsound.get(record.id)
@@ -292,6 +294,40 @@ class Archive:
             return record
         reason = f"it was {record.state}; {wrong}"
         return replace(record, state=MatrixState.FAILED, reason=reason)
+
+
+def _attributes(record: ReconstructorRecord) -> dict[str, Provenance]:
+    """Return what a person wants to see in the file, each with its unit in its name."""
+    values: dict[str, Provenance] = {
+        "id": record.id,
+        "n_modes": record.n_modes,
+        "created_ns_utc": record.created_ns_utc,
+        "parent": record.parent or "",
+    }
+    if record.alpha is not None:
+        values |= record.alpha.to_boundary()
+    if record.sigma is not None:
+        sigma = record.sigma * BOUNDARY_SCALE
+        values |= {f"sigma_{p}": float(s) for p, s in zip(PARAMETERS, sigma, strict=True)}
+    if record.condition_number is not None:
+        values["condition_number"] = record.condition_number
+    if record.gate is not None:
+        values["worst_pole_radius"] = record.gate.worst_pole_radius
+    return values
+
+
+def _add_gains(file: h5py.File, record: ReconstructorRecord) -> None:
+    """Put the table of loop gains beside the matrix, which knows nothing of it."""
+    table = table_of(record.optical_gains, record.n_modes)
+    group = file.create_group("gains")
+    group.attrs["description"] = "optical gain of every mode; not part of the reconstructor"
+    group.attrs["measured_modes"] = [gain.mode for gain in record.optical_gains]
+    group.attrs["measured_gain"] = [gain.gain for gain in record.optical_gains]
+    group.attrs["measured_sigma"] = [gain.sigma for gain in record.optical_gains]
+    group["optical_gain"] = table.optical_gain
+    group["relative_sigma"] = table.relative_sigma
+    group["factor"] = table.factors
+    group["factor"].attrs["description"] = "multiplies one loop gain for all modes"
 
 
 def _locked(path: Path) -> IO[str]:

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TypeVar
 
-from service.archive.records import (
-    measurement_from_json,
-    measurement_to_json,
-    record_from_json,
-    record_to_json,
-)
+from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError
 from service.state import MeasurementRecord, ReconstructorRecord
 
-_Record = TypeVar("_Record")
+Indexed = TypeVar("Indexed", ReconstructorRecord, MeasurementRecord)
 
 _SCHEMA_VERSION = 2
 
@@ -126,23 +121,20 @@ class Index:
                 self._connection.close()
                 self._connection = None
 
-    def add(self, record: ReconstructorRecord, sha256: str) -> None:
-        """Enter a reconstructor whose product is on the disk.
+    def add(self, record: ReconstructorRecord | MeasurementRecord, sha256: str) -> bool:
+        """Enter what is known of a product that is on the disk.
 
-        Raises
-        ------
-        ArchiveError
-            If one of this id is already there.
+        Return whether there was none of this id.
         """
         with self._use() as connection:
             done = connection.execute(
-                "INSERT INTO reconstructor VALUES (?, ?, ?, ?) ON CONFLICT (id) DO UPDATE SET"
+                f"INSERT INTO {_table(type(record))} VALUES (?, ?, ?, ?)"
+                " ON CONFLICT (id) DO UPDATE SET"
                 " record = excluded.record, product_sha256 = excluded.product_sha256"
                 " WHERE product_sha256 IS NULL",
-                (record.id, record.created_ns_utc, record_to_json(record), sha256),
+                (record.id, record.created_ns_utc or 0, to_json(record), sha256),
             )
-        if done.rowcount == 0:
-            raise ArchiveError(f"reconstructor {record.id}: already stored, ids are never reused")
+        return done.rowcount > 0
 
     def record(self, records: Sequence[ReconstructorRecord], entries: Sequence[AuditEntry]) -> None:
         """Replace what is known of reconstructors and add to the audit trail: all or nothing.
@@ -154,7 +146,7 @@ class Index:
             connection.executemany(
                 "INSERT INTO reconstructor VALUES (?, ?, ?, NULL)"
                 " ON CONFLICT (id) DO UPDATE SET record = excluded.record",
-                [(r.id, r.created_ns_utc, record_to_json(r)) for r in records],
+                [(r.id, r.created_ns_utc, to_json(r)) for r in records],
             )
             connection.executemany(
                 "INSERT INTO audit VALUES (?, ?, ?, ?)",
@@ -162,56 +154,31 @@ class Index:
             )
             connection.execute("COMMIT")
 
-    def product_sha256(self, matrix_id: str) -> str | None:
-        """Return the checksum of a stored reconstructor, None where none is stored."""
-        with self._use() as connection:
-            row = connection.execute(
-                "SELECT product_sha256 FROM reconstructor WHERE id = ?", (matrix_id,)
-            ).fetchone()
-        return None if row is None else row[0]
-
-    def stored_ids(self) -> frozenset[str]:
-        """Return the ids that have a product."""
+    def checksums(self, kind: type[Indexed]) -> dict[str, str]:
+        """Return the checksum of every product of a kind that is stored, by id."""
         with self._use() as connection:
             rows = connection.execute(
-                "SELECT id FROM reconstructor WHERE product_sha256 IS NOT NULL"
+                f"SELECT id, product_sha256 FROM {_table(kind)} WHERE product_sha256 IS NOT NULL"
             ).fetchall()
-        return frozenset(row[0] for row in rows)
+        return dict(rows)
 
-    def records(self) -> tuple[list[ReconstructorRecord], dict[str, str]]:
-        """Return every reconstructor, oldest first, and by id what is wrong with the others.
+    def records(self, kind: type[Indexed]) -> tuple[list[Indexed], dict[str, str]]:
+        """Return every record of a kind, oldest first, and by id what is wrong with the others.
 
         A record that another version has written may not be understood.
         """
-        return self._understood("reconstructor", record_from_json)
-
-    def add_measurement(self, record: MeasurementRecord, sha256: str) -> None:
-        """Enter a measured interaction matrix whose product is on the disk.
-
-        Raises
-        ------
-        ArchiveError
-            If one of this id is already there.
-        """
+        table = _table(kind)
         with self._use() as connection:
-            done = connection.execute(
-                "INSERT INTO measurement VALUES (?, ?, ?, ?) ON CONFLICT (id) DO NOTHING",
-                (record.id, record.created_ns_utc or 0, measurement_to_json(record), sha256),
-            )
-        if done.rowcount == 0:
-            raise ArchiveError(f"measurement {record.id}: already stored, ids are never reused")
-
-    def measurement_sha256(self, measurement_id: str) -> str | None:
-        """Return the checksum of a measured matrix, None where there is none."""
-        with self._use() as connection:
-            row = connection.execute(
-                "SELECT product_sha256 FROM measurement WHERE id = ?", (measurement_id,)
-            ).fetchone()
-        return None if row is None else row[0]
-
-    def measurements(self) -> tuple[list[MeasurementRecord], dict[str, str]]:
-        """Return every measured interaction matrix, as :meth:`records`."""
-        return self._understood("measurement", measurement_from_json)
+            rows = connection.execute(
+                f"SELECT id, record FROM {table} ORDER BY created_ns_utc, rowid"
+            ).fetchall()
+        understood, wrong = [], {}
+        for name, text in rows:
+            try:
+                understood.append(from_json(text, kind))
+            except NOT_UNDERSTOOD as error:
+                wrong[name] = f"{self._path}: record of {table} {name} not understood: {error!r}"
+        return understood, wrong
 
     def audit_trail(self, limit: int) -> tuple[AuditEntry, ...]:
         """Return the last ``limit`` entries, oldest first."""
@@ -223,21 +190,6 @@ class Index:
             AuditEntry(t_ns_utc=t, who=who, name=name, text=text)
             for t, who, name, text in reversed(rows)
         )
-
-    def _understood(
-        self, table: Literal["reconstructor", "measurement"], read: Callable[[str], _Record]
-    ) -> tuple[list[_Record], dict[str, str]]:
-        with self._use() as connection:
-            rows = connection.execute(
-                f"SELECT id, record FROM {table} ORDER BY created_ns_utc, rowid"
-            ).fetchall()
-        understood, wrong = [], {}
-        for name, text in rows:
-            try:
-                understood.append(read(text))
-            except (ValueError, KeyError, TypeError) as error:
-                wrong[name] = f"{self._path}: record of {table} {name} not understood: {error!r}"
-        return understood, wrong
 
     @contextmanager
     def _use(self) -> Iterator[sqlite3.Connection]:
@@ -257,6 +209,10 @@ class Index:
             finally:
                 if self._connection.in_transaction:
                     self._connection.rollback()
+
+
+def _table(kind: type[ReconstructorRecord | MeasurementRecord]) -> str:
+    return "reconstructor" if kind is ReconstructorRecord else "measurement"
 
 
 def _storable(text: str) -> str:

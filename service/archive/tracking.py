@@ -5,33 +5,23 @@ from __future__ import annotations
 import json
 import os
 import threading
-from dataclasses import asdict, fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from service.archive.records import NOT_UNDERSTOOD, plain_numbers, refuse_unknown
 from service.errors import ArchiveError, StorageError
 from service.model.misregistration import Misregistration
-from service.state import (
-    Acquisition,
-    AcquisitionStage,
-    Interruption,
-    LoopFound,
-    Mode,
-    ModeGain,
-    Orders,
-    PassiveBias,
-    Pointing,
-    Registration,
-    Saved,
-)
+from service.state import Registration, Saved
 
 VERSION = 1
 
 _NOT_KEPT = ("grown", "standing", "candidate", "earlier", "restored_ns_utc")
-"""What the next service works out anew."""
+"""Of the registration and its bias: what the next service works out anew."""
 
 _ACQUISITION_KEPT = (
     "stage",
@@ -50,7 +40,7 @@ _ACQUISITION_KEPT = (
 )
 """The rest is of telemetry that the next one will not have."""
 
-_READ_FAILURES = (OSError, ValueError, KeyError, TypeError, AttributeError)
+_ALPHA = tuple(field.name for field in fields(Misregistration))
 
 
 class TrackingFile:
@@ -74,7 +64,7 @@ class TrackingFile:
         part = self._path.with_suffix(".part")
         try:
             with self._lock, part.open("w", encoding="utf-8") as file:
-                json.dump(_to_json(saved), file)
+                json.dump(_kept(saved), file)
                 file.flush()
                 os.fsync(file.fileno())
                 part.replace(self._path)
@@ -93,8 +83,8 @@ class TrackingFile:
         if not self._path.exists():
             return None
         try:
-            return _from_json(json.loads(self._path.read_text(encoding="utf-8")))
-        except _READ_FAILURES as error:
+            return _read(json.loads(self._path.read_text(encoding="utf-8")))
+        except (OSError, AttributeError, *NOT_UNDERSTOOD) as error:
             aside = self._path.with_suffix(".damaged")
             self._path.replace(aside)
             raise ArchiveError(
@@ -103,139 +93,58 @@ class TrackingFile:
             ) from error
 
 
-def _to_json(saved: Saved) -> dict[str, Any]:
-    return {
-        "version": VERSION,
-        **{f.name: _plain(getattr(saved, f.name)) for f in fields(saved)},
-    }
+def _kept(saved: Saved) -> dict[str, Any]:
+    values = msgspec.to_builtins(saved, enc_hook=plain_numbers)
+    known, acquisition = values["registration"], values["acquisition"]
+    if known is not None:
+        known["alpha"] = [known["alpha"][name] for name in _ALPHA]
+        for record in (known, known["bias"] or {}):
+            for name in _NOT_KEPT:
+                record.pop(name, None)
+    if acquisition is not None:
+        values["acquisition"] = {name: acquisition[name] for name in _ACQUISITION_KEPT}
+    return {"version": VERSION, **values}
 
 
-def _plain(value: object) -> object:
-    match value:
-        case np.ndarray():
-            return value.tolist()
-        case Misregistration():
-            return value.vector.tolist()
-        case Registration() | PassiveBias():
-            kept = (f.name for f in fields(value) if f.name not in _NOT_KEPT)
-            return {name: _plain(getattr(value, name)) for name in kept}
-        case Acquisition():
-            return {name: _plain(getattr(value, name)) for name in _ACQUISITION_KEPT}
-        case Pointing() | ModeGain() | LoopFound() | Interruption() | Orders():
-            return asdict(value)
-        case tuple():
-            return [_plain(entry) for entry in value]
-        case _:
-            return value
-
-
-def _from_json(values: dict[str, Any]) -> Saved:
+def _read(values: dict[str, Any]) -> Saved:
     if values.pop("version") != VERSION:
         raise ValueError(f"expected version {VERSION}")
-    known, acquisition = values["registration"], values.get("acquisition")
-    orders = values.get("orders")
-    if known is None and acquisition is None and orders is None:
+    known = values["registration"]
+    if known is not None:
+        known["alpha"] = dict(zip(_ALPHA, known["alpha"], strict=True))
+    saved = msgspec.convert(values, Saved, dec_hook=_array)
+    refuse_unknown(values, saved)
+    if saved.registration is None and saved.acquisition is None and saved.orders is None:
         raise ValueError("neither an α nor an acquisition nor an order")
-    return Saved(
-        **{
-            **values,
-            "pointing": _pointing(values["pointing"]),
-            "registration": None if known is None else _registration(known),
-            "acquisition": None if acquisition is None else _acquisition(acquisition),
-            "orders": None if orders is None else _orders(orders),
-        }
-    )
+    if saved.registration is not None:
+        _check(saved.registration)
+    found = None if saved.acquisition is None else saved.acquisition.found
+    if found is not None and not np.isfinite(found.gains).all():
+        raise ValueError("a gain is not finite")
+    orders = saved.orders
+    if orders is not None and (orders.mode is None) is not (orders.settings_mode is None):
+        raise ValueError(f"mode is {orders.mode!r} and of the settings {orders.settings_mode!r}")
+    return saved
 
 
-def _orders(values: dict[str, Any]) -> Orders:
-    orders = Orders(**values)
-    if type(orders.dither_stopped) is not bool:
-        raise TypeError(f"dither_stopped is {orders.dither_stopped!r}, expected true or false")
-    mode, of_settings = orders.mode, orders.settings_mode
-    if (mode is None) is not (of_settings is None):
-        raise ValueError(f"mode is {mode!r} and that of the settings {of_settings!r}")
-    if mode is None or of_settings is None:
-        return orders
-    return replace(orders, mode=Mode(mode), settings_mode=Mode(of_settings))
-
-
-def _registration(known: dict[str, Any]) -> Registration:
-    floor = _numbers(known["floor"], (4,))
-    registration = Registration(
-        **{
-            **known,
-            "alpha": Misregistration.from_vector(_numbers(known["alpha"], (4,))),
-            "covariance": _covariance(known["covariance"]),
-            "floor": floor,
-            "optical_gains": tuple(ModeGain(**gain) for gain in known["optical_gains"]),
-            "bias": None if known["bias"] is None else _bias(known["bias"]),
-            "pointing": _pointing(known["pointing"]),
-            "window_pointing": _pointing(known["window_pointing"]),
-        }
-    )
-    _check(registration)
-    return registration
-
-
-def _acquisition(values: dict[str, Any]) -> Acquisition:
-    stage = AcquisitionStage(values["stage"])
-    found, interruption = values["found"], values["interruption"]
-    for name in ("started_ns_utc", "since_ns_utc", "attempt", "n_modes"):
-        if type(values[name]) is not int:
-            raise TypeError(f"{name} is {values[name]!r}, expected an integer")
-    return Acquisition(
-        **{
-            **values,
-            "stage": stage,
-            "found": None if found is None else _loop_found(found),
-            "interruption": None if interruption is None else Interruption(**interruption),
-        }
-    )
-
-
-def _loop_found(values: dict[str, Any]) -> LoopFound:
-    gains = _numbers(values["gains"], (len(values["gains"]),))
-    return LoopFound(**{**values, "gains": tuple(gains.tolist())})
+def _array(_kind: type, value: object) -> NDArray[np.float64]:
+    return np.array(value, dtype=np.float64)
 
 
 def _check(known: Registration) -> None:
     """Refuse what no service has written: α and its bias must be a joint normal distribution."""
+    arrays = [(known.covariance, (4, 4)), (known.floor, (4,))]
     bias = known.bias
     if bias is not None:
-        joint = np.block([[known.covariance, bias.shared.T], [bias.shared, bias.covariance]])
-        _covariance(joint.tolist())
-    for name in ("t_ns_utc", "arrived_ns_utc", "n_windows", "window_ns_utc"):
-        if type(getattr(known, name)) is not int:
-            raise TypeError(f"{name} is {getattr(known, name)!r}, expected an integer")
-
-
-def _pointing(values: dict[str, float] | None) -> Pointing | None:
-    return None if values is None else Pointing(**values)
-
-
-def _bias(values: dict[str, Any]) -> PassiveBias:
-    loop = values.get("loop", [])
-    return PassiveBias(
-        offset=_numbers(values["offset"], (4,)),
-        covariance=_covariance(values["covariance"]),
-        shared=_numbers(values["shared"], (4, 4)),
-        looked_ns_utc=int(values["looked_ns_utc"]),
-        excess=_numbers(values.get("excess", [0.0] * 4), (4,)),
-        loop=tuple(_numbers(loop, (len(loop),)).tolist()),
-    )
-
-
-def _covariance(values: list[list[float]]) -> NDArray[np.float64]:
-    found = _numbers(values, (len(values), len(values)))
-    power = np.linalg.eigvalsh(found)
+        arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, 4))]
+        arrays += [(bias.excess, (4,)), (np.array(bias.loop), (len(bias.loop),))]
+    for values, shape in arrays:
+        if values.shape != shape or not np.isfinite(values).all():
+            raise ValueError(f"found numbers of shape {values.shape}, expected {shape} finite ones")
+    covariance = known.covariance
+    if bias is not None:
+        covariance = np.block([[covariance, bias.shared.T], [bias.shared, bias.covariance]])
+    power = np.linalg.eigvalsh(covariance)
     # parameters of different units: rounding is relative to the largest
-    if not np.allclose(found, found.T) or power[0] < -1e-9 * power[-1]:
+    if not np.allclose(covariance, covariance.T) or power[0] < -1e-9 * power[-1]:
         raise ValueError("a covariance is not one")
-    return found
-
-
-def _numbers(values: object, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    found = np.array(values, dtype=np.float64)
-    if found.shape != shape or not np.isfinite(found).all():
-        raise ValueError(f"found numbers of shape {found.shape}, expected {shape} finite ones")
-    return found

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from service.archive.product import write_whole
+from service.archive.store import write_whole
 from service.commands.terminal import check_folder, say, show_progress
 from service.config import load_instrument
 from service.errors import ConfigurationError

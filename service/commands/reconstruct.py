@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.archive.product import write_whole
+from service.archive.store import write_whole
 from service.commands.terminal import check_folder, say, show_progress
 from service.config import load_instrument
 from service.control.modal_gains import CalibrationGains

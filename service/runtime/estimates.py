@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import events as ev
-from service.archive.noisy import NoisyNumbers
+from service.archive.products import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
 from service.events import Event
 from service.fit.dialect import setting_written

@@ -8,8 +8,8 @@ from typing import Concatenate, ParamSpec, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.archive.noisy import NoisyNumbers
-from service.archive.product import Provenance
+from service.archive.products import NoisyNumbers
+from service.archive.store import Provenance
 from service.state import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import Command, Manifest, Reply
 from service.worker import Done, Workbench

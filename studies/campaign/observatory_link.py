@@ -10,8 +10,8 @@ from typing import Concatenate, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.archive.noisy import NoisyNumbers
-from service.archive.product import Provenance
+from service.archive.products import NoisyNumbers
+from service.archive.store import Provenance
 from service.errors import PyrcalError, UnknownIdError, WorkerError
 from service.state import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split

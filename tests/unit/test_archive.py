@@ -67,7 +67,7 @@ def archive(tmp_path):
 
 
 def product(archive, matrix_id="cm-1"):
-    return archive._products / f"{matrix_id}.h5"
+    return archive._products.path_of(matrix_id)
 
 
 def damage(path):
@@ -177,7 +177,11 @@ def test_a_record_may_be_known_before_its_matrix_is_stored(archive):
 @pytest.mark.parametrize(
     ("record", "matrix", "expected"),
     [
-        (record_of(n_modes=5), MATRIX, r"found a matrix of shape \(3, 4\), expected \(5, n_slopes"),
+        (
+            record_of(n_modes=5),
+            MATRIX,
+            r"shape \(3, 4\), expected a finite one of \(5, 4",
+        ),
         (record_of(), MATRIX[0], r"shape \(4,\)"),
         (record_of(), np.full((3, 4), np.nan, np.float32), "finite"),
         (record_of(sha256="0" * 64), MATRIX, f"expected {'0' * 64}"),
@@ -501,7 +505,7 @@ DIE = "import os, signal\ndie = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\
 @pytest.mark.parametrize(
     ("death", "found"),
     [
-        ("import service.archive.product as p; p._flush = die\n", []),
+        ("import service.archive.store as s; s._flush = die\n", []),
         ("import service.archive.index as i; i.Index.add = die\n", ["cm-000000"]),
         ("import service.archive.index as i; i.Index.record = die\n", ["cm-000000"]),
     ],

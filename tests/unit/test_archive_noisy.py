@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from service.archive import Archive
-from service.archive.noisy import NoisyNumbers, record_from_json, record_to_json
+from service.archive.products import NoisyNumbers
+from service.archive.records import from_json, to_json
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.files.recorded import read_recorded
 from service.model.misregistration import Misregistration
@@ -69,16 +70,16 @@ def product(tmp_path, name="noisy-1"):
 
 
 def same(one, other):
-    return record_to_json(one) == record_to_json(other)
+    return to_json(one) == to_json(other)
 
 
 def test_a_record_survives_its_json():
-    again = record_from_json(record_to_json(record_of()))
+    again = from_json(to_json(record_of()), NoisyRecord)
     np.testing.assert_allclose(again.finding.covariance, record_of().finding.covariance)
     np.testing.assert_allclose(again.finding.alpha.vector, record_of().finding.alpha.vector)
     assert (again.modes, again.state, again.seed) == ((0, 7, 3), NoisyState.STORED, 77)
     without = record_of(finding=replace(record_of().finding, alpha=None, covariance=None))
-    assert record_from_json(record_to_json(without)).finding.alpha is None
+    assert from_json(to_json(without), NoisyRecord).finding.alpha is None
 
 
 def test_the_file_says_how_it_was_measured_and_what_it_says(archive, tmp_path):

@@ -5,7 +5,7 @@ import h5py
 import numpy as np
 import pytest
 
-from service.archive.product import write_whole
+from service.archive.store import write_whole
 from service.commands.arguments import command_line
 from service.commands.reconstruct import SAMPLING, main
 from service.commands.terminal import with_negative_numbers

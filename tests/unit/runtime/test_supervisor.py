@@ -425,7 +425,7 @@ async def test_a_matrix_that_cannot_be_stored_is_never_heard_of_and_the_disk_is_
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         await until(lambda: alarm_of(supervisor, "archive-failed") is None)
-    assert not list(archive._products.iterdir())
+    assert not list(archive._products.directory.iterdir())
 
 
 async def test_a_refused_order_is_audited_with_the_reason(supervisor, archive):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import shift, spline_filter
 from scipy.sparse import csr_array
 
-from service.config.datasets import read_dataset
+from service.config.sources import read_dataset
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.config.layouts import grid
+from service.config.mirrors import grid
 from service.fit.fit import fit_matrix
 from service.fit.reference import Reference
 from service.model.instrument import (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from service.config.instrument import load_instrument
-from service.config.layouts import rings
+from service.config.mirrors import rings
 from service.control.reconstructor import invert
 from service.model.instrument import (
     Influence,

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config.datasets import read_dataset
 from service.config.instrument_schema import (
     Centres,
     InstrumentFile,
@@ -19,7 +18,7 @@ from service.config.instrument_schema import (
     WfsTable,
 )
 from service.config.mirrors import MirrorFile, own_modes, read_mirror
-from service.config.strict import Place, in_file, read_toml, refuse, validated
+from service.config.sources import Place, in_file, read_dataset, read_toml, refuse, validated
 from service.errors import ConfigurationError, ModelError
 from service.model.instrument import (
     FrameWindows,

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import layouts
-from service.config.datasets import read_dataset
 from service.config.instrument_schema import MirrorTable
-from service.config.strict import Place, refuse
+from service.config.sources import Place, read_dataset, refuse
 from service.errors import ConfigurationError
 from service.model.filling import known_samples
 from service.model.instrument import BasisKind, Influence, Mirror, TabulatedModes
@@ -39,6 +37,9 @@ _FOREIGN = {
     "influence_functions": _ANALYTIC,
 }
 """Keys that mean nothing to a mirror of each kind."""
+
+_CHUNK = 256
+"""Actuators compared with all others at once."""
 
 _LARGEST_TABLE = 5.0
 """Width of a table in pupil diameters, beyond which its pitch is in another unit."""
@@ -133,7 +134,7 @@ def _analytic(file: MirrorFile) -> Mirror:
     table = file.table
     _check_layout_keys(file)
     positions = _LAYOUTS[str(table.layout)](file)
-    pair = layouts.coincident(positions)
+    pair = coincident(positions)
     if pair is not None:
         refuse(
             file.place(("mirror",)),
@@ -142,7 +143,7 @@ def _analytic(file: MirrorFile) -> Mirror:
         )
     return Mirror(
         positions_m=positions,
-        pitch_m=table.pitch_m or layouts.typical_pitch(positions),
+        pitch_m=table.pitch_m or typical_pitch(positions),
         influence=Influence(table.influence),
         coupling=table.coupling,
         basis=BasisKind(table.basis),
@@ -175,14 +176,14 @@ def _rings(file: MirrorFile) -> NDArray[np.float64]:
             str(table.last_ring),
             f"at least first_ring = {table.first_ring}",
         )
-    positions = layouts.rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
+    positions = rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
     _check_number(len(positions), file.place(("mirror",)))
     return positions
 
 
 def _grid(file: MirrorFile) -> NDArray[np.float64]:
     n_across, pitch_m, diameter_m = _mandatory(file, ("n_across", "pitch_m", "diameter_m"))
-    positions = layouts.grid(n_across, pitch_m, diameter_m)
+    positions = grid(n_across, pitch_m, diameter_m)
     _check_number(len(positions), file.place(("mirror",)))
     return positions
 
@@ -235,6 +236,69 @@ def _mode_to_actuator(file: MirrorFile, n_actuators: int) -> NDArray[np.float64]
     if values.shape[1] == 0 or not np.isfinite(values).all():
         refuse(where, "no mode, or strokes that are not finite", f"{expected} finite strokes")
     return _opd(file, values).astype(np.float64)
+
+
+# --- where actuators are
+
+
+def rings(first_ring: int, last_ring: int, pitch_m: float) -> NDArray[np.float64]:
+    """Return actuators on concentric rings, ``(n_actuators, 2)``, x and y in metres.
+
+    Ring k has 6k + 3 actuators at radius (k - 1/2) pitch, the first of each on +x: the layout is
+    its own mirror image under y -> -y, so that the modes come out even or odd.
+    """
+    found = []
+    for ring in range(first_ring, last_ring + 1):
+        n_actuators = 6 * ring + 3
+        angle = 2.0 * np.pi * np.arange(n_actuators) / n_actuators
+        found.append((ring - 0.5) * pitch_m * np.column_stack([np.cos(angle), np.sin(angle)]))
+    return np.concatenate(found)
+
+
+def grid(n_across: int, pitch_m: float, diameter_m: float) -> NDArray[np.float64]:
+    """Return the points of a centred square grid inside a circle, ``(n_actuators, 2)``, metres.
+
+    Rows run along +x, from the lowest y up, as ``[y, x]`` arrays do.
+    """
+    line = (np.arange(n_across) - (n_across - 1) / 2) * pitch_m
+    y, x = np.meshgrid(line, line, indexing="ij")
+    points = np.column_stack([x.ravel(), y.ravel()])
+    rounding = 1.0 + 1e-9
+    inside = np.linalg.norm(points, axis=1) <= diameter_m / 2 * rounding
+    return np.asarray(points[inside])
+
+
+def typical_pitch(positions_m: NDArray[np.float64]) -> float:
+    """Return the median distance to the nearest neighbour, metres."""
+    return float(np.median(_nearest(positions_m)[0]))
+
+
+def coincident(positions_m: NDArray[np.float64]) -> tuple[int, int] | None:
+    """Return the indices of two actuators in the same place, or None."""
+    distances, neighbours = _nearest(positions_m)
+    same = np.flatnonzero(distances <= 1e-6 * np.ptp(positions_m))
+    if same.size == 0:
+        return None
+    first, second = sorted((int(same[0]), int(neighbours[same[0]])))
+    return first, second
+
+
+def _nearest(positions_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Return how far every point's nearest neighbour is, and which it is.
+
+    By brute force: a tree would take longer to import than this takes for a few thousand points.
+    """
+    n = len(positions_m)
+    distances, neighbours = np.full(n, np.inf), np.zeros(n, dtype=np.intp)
+    if n < 2:
+        return distances, neighbours
+    for start in range(0, n, _CHUNK):
+        rows = np.arange(start, min(start + _CHUNK, n))
+        apart = np.hypot(*(positions_m[rows, None] - positions_m).transpose(2, 0, 1))
+        apart[np.arange(len(rows)), rows] = np.inf
+        neighbours[rows] = apart.argmin(axis=1)
+        distances[rows] = apart.min(axis=1)
+    return distances, neighbours
 
 
 # --- measured

@@ -1,37 +1,53 @@
-"""The tracker's policy, from the user's settings."""
+"""The tracker's policy, and how far the model itself leads astray, from the user's settings."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from service.config.floor import floor_of
 from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE
 from service.reactions.policy import Policy
+
+FLAT = (0.004, 0.01, 0.001)
+"""Shift in subapertures, rotation in degrees, magnification: where telemetry of a working pyramid
+is compared with the response to a flat wavefront. What a window's misfit tells comes on top."""
+
+AT_WORK = (0.001, 0.005, 0.0005)
+"""The same where it is compared with the response at the working point."""
+
+
+def floor_of(settings: Settings) -> NDArray[np.float64]:
+    """Return the model-error floor ``(4,)`` in boundary units: subapertures, degrees, ratio.
+
+    What the settings leave open is what campaigns on the diffractive telescope found
+    (docs/results/night.md).
+    """
+    tracking = settings.tracking
+    flat = settings.compute.working_point_modes is None
+    shift, rotation, magnification = FLAT if flat else AT_WORK
+    given = (tracking.floor_shift_subap, tracking.floor_rotation_deg, tracking.floor_magnification)
+    shift, rotation, magnification = (
+        found if asked is None else asked
+        for found, asked in zip((shift, rotation, magnification), given, strict=True)
+    )
+    return np.array([shift, shift, rotation, magnification])
 
 
 def policy_of(settings: Settings) -> Policy:
     """Return the policy in numeric units: radians, rates per square root of a second."""
     dither, tracking, control = settings.dither, settings.tracking, settings.control
-    per_minute = np.array(
-        [
-            tracking.drift_subap_per_minute,
-            tracking.drift_subap_per_minute,
-            np.deg2rad(tracking.drift_deg_per_minute),
-            tracking.drift_magnification_per_minute,
-        ]
+    per_minute = _four(
+        tracking.drift_subap_per_minute,
+        tracking.drift_deg_per_minute,
+        tracking.drift_magnification_per_minute,
     )
     return Policy(
         dither_enabled=dither.enabled,
         dither_amplitude_m=dither.amplitude_m,
         dither_budget_m=dither.budget_m,
-        dither_sigma=np.array(
-            [
-                dither.sigma_shift_subap,
-                dither.sigma_shift_subap,
-                np.deg2rad(dither.sigma_rotation_deg),
-                dither.sigma_magnification,
-            ]
+        dither_sigma=_four(
+            dither.sigma_shift_subap, dither.sigma_rotation_deg, dither.sigma_magnification
         ),
         dither_avoid_hz=dither.avoid_hz,
         longest_pause_s=dither.longest_pause_s,
@@ -42,35 +58,27 @@ def policy_of(settings: Settings) -> Policy:
         drift_rate=per_minute / np.sqrt(60.0),
         floor=floor_of(settings) / BOUNDARY_SCALE,
         bias_memory_s=tracking.bias_memory_s,
-        flexure_per_degree=np.array(
-            [
-                tracking.flexure_subap_per_degree,
-                tracking.flexure_subap_per_degree,
-                np.deg2rad(tracking.flexure_deg_per_degree),
-                tracking.flexure_magnification_per_degree,
-            ]
+        flexure_per_degree=_four(
+            tracking.flexure_subap_per_degree,
+            tracking.flexure_deg_per_degree,
+            tracking.flexure_magnification_per_degree,
         ),
         slew_limit_deg=tracking.slew_limit_deg,
-        stale_sigma=np.array(
-            [
-                tracking.stale_shift_subap,
-                tracking.stale_shift_subap,
-                np.deg2rad(tracking.stale_rotation_deg),
-                tracking.stale_magnification,
-            ]
+        stale_sigma=_four(
+            tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification
         ),
         acquires=settings.acquisition.auto,
         acquisition_amplitude_m=settings.acquisition.amplitude_m,
         n_modes_target=control.n_modes_target,
-        update_threshold=np.array(
-            [
-                control.update_shift_subap,
-                control.update_shift_subap,
-                np.deg2rad(control.update_rotation_deg),
-                control.update_magnification,
-            ]
+        update_threshold=_four(
+            control.update_shift_subap, control.update_rotation_deg, control.update_magnification
         ),
         update_gain_m=control.update_gain_nm * 1e-9,
         update_margin=control.update_margin,
         minimum_interval_s=control.minimum_interval_s,
     )
+
+
+def _four(shift_subap: float, rotation_deg: float, magnification: float) -> NDArray[np.float64]:
+    """Return ``(4,)`` in numeric units: the same for both shifts."""
+    return np.array([shift_subap, shift_subap, np.deg2rad(rotation_deg), magnification])

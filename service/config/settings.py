@@ -10,7 +10,7 @@ from typing import Annotated, get_args, get_origin
 
 from pydantic import Field, model_validator
 
-from service.config.strict import Id, Table, Tuple, in_file, nearest, read_toml, validated
+from service.config.sources import Id, Table, Tuple, in_file, nearest, read_toml, validated
 from service.control.recipe import Method
 from service.control.reconstructor import MAX_CONDITION
 from service.errors import ConfigurationError
@@ -145,7 +145,7 @@ class TrackingTable(Table):
 
     floor_shift_subap: float | None = Field(default=None, ge=0.0)
     """1 σ model error of each shift, subapertures; no integration removes it. None: as measured for
-    the model in use, see ``service.config.floor``."""
+    the model in use, see ``service.config.policy``."""
 
     floor_rotation_deg: float | None = Field(default=None, ge=0.0)
     """Of the rotation, degrees."""

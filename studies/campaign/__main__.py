@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from service.config import load_settings
-from service.config.floor import floor_of
+from service.config.policy import floor_of
 from studies.campaign.night import play
 from studies.campaign.plan import Estimator, Night, without_dither
 from studies.campaign.plots import plot

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.config import Settings, load_instrument, load_settings
-from service.config.layouts import coincident, grid, rings, typical_pitch
+from service.config.mirrors import coincident, grid, rings, typical_pitch
 from service.errors import ConfigurationError
 from service.model.instrument import Influence, LoopFacts, Stop
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures

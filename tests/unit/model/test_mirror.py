@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.config.layouts import rings
+from service.config.mirrors import rings
 from service.model.instrument import Influence, Mirror
 from service.model.mirror import Gaussian, ThinPlate, mirror_surface
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.config.instrument import load_instrument
-from service.config.layouts import grid, rings
+from service.config.mirrors import grid, rings
 from service.errors import ModelError
 from service.model import modes
 from service.model.instrument import Influence

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from service.config.layouts import rings
+from service.config.mirrors import rings
 from service.model.instrument import KarhunenLoeve
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.telemetry.edge import (

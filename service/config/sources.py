@@ -1,19 +1,30 @@
-"""Read TOML against a pydantic schema and say in one line what is wrong with it."""
+"""What the user has written: TOML held against a pydantic schema, and the arrays it refers to.
+
+Whatever is wrong with either is one line that says where, what was found and what was expected.
+"""
 
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar, get_args
 
+from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, StringConstraints, ValidationError
 from pydantic_core import ErrorDetails
 
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, MatrixError
+
+if TYPE_CHECKING:
+    from service.files.container import Container, StoredArray
 
 _EXPECTED = "Input should be "
+
+_HDF5 = re.compile(r"(?P<path>.+):/(?P<name>.+)")
+_FITS = re.compile(r"(?P<path>.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::/?(?P<name>.+))?", re.IGNORECASE)
 
 
 class Table(BaseModel):
@@ -96,6 +107,48 @@ def nearest(word: str, known: Iterable[str]) -> str:
     known = sorted(known)
     close = difflib.get_close_matches(word, known, n=1)
     return f", did you mean {close[0]}?" if close else f"; known: {', '.join(known)}"
+
+
+def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
+    """Return the numeric array behind ``reference``, in this machine's byte order.
+
+    Parameters
+    ----------
+    reference
+        ``path:/dataset``, ``path.fits:EXTNAME``; a relative path starts at ``folder``.
+    folder
+        Where the instrument file lies.
+    where
+        The file and key that hold the reference, for the messages.
+
+    Raises
+    ------
+    ConfigurationError
+        If the reference has another form, or the file or dataset is missing, damaged or not
+        numeric.
+    """
+    from service.files.container import opened
+
+    parts = _FITS.fullmatch(reference) or _HDF5.fullmatch(reference)
+    if parts is None:
+        refuse(where, repr(reference), "path:/dataset of an HDF5 file, or path.fits:EXTNAME")
+    try:
+        with opened(folder / parts["path"]) as container:
+            stored = _named(container, parts["name"], where)
+            if stored.dtype.kind not in "biuf":
+                refuse(where, f"type {stored.dtype} in {stored.where}", "numbers")
+            values = stored.read()
+    except MatrixError as error:
+        raise ConfigurationError(f"{where}: {error}") from error
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+def _named(container: Container, name: str | None, where: str) -> StoredArray:
+    found = container.find(name) if name else next(iter(container.arrays.values()), None)
+    if found is None:
+        missing = f"no dataset /{name.strip('/')}" if name else "no image"
+        refuse(where, f"{missing} in {container.path}", f"one; it holds {container.listing()}")
+    return found
 
 
 def _line(schema: type[Table], problem: ErrorDetails, place: Place) -> str:

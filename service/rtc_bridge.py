@@ -18,14 +18,12 @@ import structlog
 from numpy.typing import NDArray
 
 from service.errors import LinkError, UnknownIdError, WireError
-from service.link import requests
 from service.link import session as link
 from service.link.endpoint import Endpoint
 from service.link.events import LinkEvent
 from service.link.intake import Intake
-from service.link.measured import MeasuredIntake
-from service.link.outbox import Offer, Outbox
-from service.link.standby import Standby
+from service.link.matrices import MeasuredIntake, Offer, Outbox
+from service.link.rivals import Standby
 from service.link.statistics import LinkStatistics
 from service.telemetry.frames import FrameBlock
 from service.wire import (
@@ -245,7 +243,7 @@ class Bridge:
         LinkError
             If the RTC does not answer or has none.
         """
-        return await asyncio.to_thread(requests.fetch_applied, self._opened(), self._keys)
+        return await asyncio.to_thread(link.fetch_applied, self._opened(), self._keys)
 
     def publish_state(self, message: StateMessage) -> None:
         """Tell whoever listens what the service knows; dropped while the network is slow."""
@@ -369,7 +367,7 @@ class Bridge:
         self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
 
     def _command(self, command: Command) -> Reply:
-        answer = requests.send_command(self._driven(), self._endpoint, command)
+        answer = link.send_command(self._driven(), self._endpoint, command)
         try:
             reply = decode_reply(answer)
         except WireError as error:

@@ -1,9 +1,10 @@
-"""What the link reports besides frames, and the bounded queue it waits in."""
+"""What the link reports besides frames, the bounded queue it waits in, and who is woken by it."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -167,3 +168,29 @@ class EventQueue:
             events = list(self._events)
             self._events.clear()
         return events
+
+
+class Wakeup:
+    """Rings at most once between two visits of the consumer, from whatever thread."""
+
+    __slots__ = ("_callback", "_rung")
+
+    def __init__(self) -> None:
+        self._callback: Callable[[], object] | None = None
+        self._rung = False
+
+    def connect(self, callback: Callable[[], object] | None) -> None:
+        """Call ``callback`` from now on; None: nothing."""
+        self._callback = callback
+        self._rung = False
+
+    def ring(self) -> None:
+        """Say that something new is there."""
+        callback = self._callback
+        if callback is not None and not self._rung:
+            self._rung = True
+            callback()
+
+    def answer(self) -> None:
+        """Say that the consumer is about to look: what comes from now on rings again."""
+        self._rung = False

@@ -25,11 +25,11 @@ from service.link.events import (
     SecondRtc,
     SessionChanged,
     StatusReceived,
+    Wakeup,
 )
 from service.link.ring import LEAP, FrameCounts, FrameRing
-from service.link.sessions import SessionWatch
+from service.link.rivals import SessionWatch
 from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
-from service.link.wakeup import Wakeup
 from service.telemetry.frames import FrameBlock
 from service.wire import (
     FRAMES_PER_BATCH,

@@ -22,6 +22,9 @@ LEAP: Final = "leap"
 LEAP_S: Final = 10.0
 """Of frames: a longer leap of the sequence is believed only when more batches confirm it."""
 
+ROOM: Final = 512
+"""Frames there is memory for at first: only a reader that falls behind needs more."""
+
 CONFIRMATIONS: Final = 2
 """Batches that must go on where a leap has led."""
 
@@ -53,7 +56,7 @@ class FrameRing:
 
     The reader's cursor and the head (one past the newest frame) bound what is undelivered.
     A place between them is held, missing (it may still come) or void (it came, with a number
-    that is not finite).
+    that is not finite). Numbers are kept modulo the room, which grows to the capacity.
     """
 
     def __init__(self, header: FrameHeader, capacity: int, counts: FrameCounts) -> None:
@@ -74,9 +77,10 @@ class FrameRing:
         self._counts = counts
         self._capacity = capacity
         self._cursor = self._head = header.seq0
-        self._slopes = np.empty((capacity, header.n_slopes), np.float32)
-        self._commands = np.empty((capacity, header.n_modes), np.float32)
-        self._dither = np.empty((capacity, header.n_modes), np.float32)
+        self._room = min(capacity, ROOM)
+        self._slopes = np.empty((self._room, header.n_slopes), np.float32)
+        self._commands = np.empty((self._room, header.n_modes), np.float32)
+        self._dither = np.empty((self._room, header.n_modes), np.float32)
         self._state = np.zeros(capacity, np.int8)
         self._seq = np.full(capacity, -1, np.int64)
         self._t_ns = np.zeros(capacity, np.int64)
@@ -188,6 +192,7 @@ class FrameRing:
         passed = np.arange(self._cursor, min(cursor, self._head)) % self._capacity
         self._counts.overwritten += int(np.count_nonzero(self._state[passed] == HELD))
         self._counts.lost += head - self._head
+        self._make_room(cursor, head)
         self._cursor = cursor
         seq = np.arange(max(self._head, head - self._capacity), head)
         slots = seq % self._capacity
@@ -196,6 +201,18 @@ class FrameRing:
         self._noticed_s[slots] = now_s
         self._head = head
 
+    def _make_room(self, cursor: int, head: int) -> None:
+        """Take memory for the numbers of all places from the cursor to the head."""
+        if head - cursor <= self._room:
+            return
+        kept = np.arange(cursor, self._head)
+        before, self._room = kept % self._room, min(self._capacity, 2 * (head - cursor))
+        for name in ("_slopes", "_commands", "_dither"):
+            old = getattr(self, name)
+            new = np.empty((self._room, old.shape[1]), np.float32)
+            new[kept % self._room] = old[before]
+            setattr(self, name, new)
+
     def _fill(self, batch: FrameBatch, rows: NDArray[np.intp], slots: NDArray[np.int64]) -> None:
         header = batch.header
         finite = np.isfinite(batch.rows[rows]).all(axis=1)
@@ -203,11 +220,12 @@ class FrameRing:
         self._counts.lost -= len(rows)
         self._counts.nonfinite += int(np.count_nonzero(~finite))
         self._counts.received += int(np.count_nonzero(finite))
-        self._slopes[slots] = batch.slopes[rows]
-        self._commands[slots] = batch.commands_m[rows]
+        places = (header.seq0 + rows) % self._room
+        self._slopes[places] = batch.slopes[rows]
+        self._commands[places] = batch.commands_m[rows]
         dither = batch.dither_m
         if dither is not None:
-            self._dither[slots] = dither[rows]
+            self._dither[places] = dither[rows]
         self._has_dither[slots] = header.dither
         self._t_ns[slots] = header.t0_ns + rows * header.dt_ns
         self._dt_ns[slots] = header.dt_ns
@@ -229,13 +247,14 @@ class FrameRing:
 
     def _block(self, slots: NDArray[np.int64]) -> FrameBlock:
         first = slots[0]
+        places = self._seq[slots] % self._room
         return FrameBlock(
             session=self.session,
             first_seq=int(self._seq[first]),
             t0_ns_utc=int(self._t_ns[first]),
             dt_ns=int(self._dt_ns[first]),
-            slopes=self._slopes[slots],
-            commands_m=self._commands[slots],
-            dither_m=self._dither[slots] if self._has_dither[first] else None,
+            slopes=self._slopes[places],
+            commands_m=self._commands[places],
+            dither_m=self._dither[places] if self._has_dither[first] else None,
             cm_id=self._cm_id[first],
         )

@@ -7,13 +7,30 @@ minor and their use is confined to this page.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
+from typing import Final
 
+import numpy as np
 import zenoh
 import zenoh.ext
+from numpy.typing import NDArray
 
 from service.errors import LinkError, WireError
 from service.link.endpoint import Endpoint
+from service.wire import (
+    ChunkAssembler,
+    Command,
+    CommandKind,
+    Encodings,
+    Keys,
+    Manifest,
+    Reply,
+    command_kind,
+    decode_manifest,
+    encode_command,
+    encode_reply,
+)
 
 HISTORY_S = 0.5
 """Telemetry asked for when the service comes late: asking for all of an RTC's cache stalled its
@@ -24,6 +41,16 @@ TOKENS_TIMEOUT_S = 1.0
 
 RETRY = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
 """Back-off of a client that lost its router; zenoh's own is 3 s at the first loss."""
+
+
+ABSENT_PAUSE_S: Final = 0.3
+"""Before a command is repeated: an RTC that is not there makes a query end at once."""
+
+OPTIONAL: Final = (CommandKind.RAMP,)
+"""Commands that an RTC need not know."""
+
+MATRIX_TIMEOUT_S: Final = 2.0
+"""For the RTC to answer with a manifest or a part of its matrix."""
 
 
 def open_session(endpoint: Endpoint) -> zenoh.Session:
@@ -213,3 +240,57 @@ def latency_s(session: zenoh.Session, sample: zenoh.Sample, now_ns: int) -> floa
     if stamp is None or str(stamp.get_id()) == str(session.zid()):
         return None
     return (now_ns - stamp.get_time_as_ntp64().as_nanos()) * 1e-9
+
+
+def send_command(session: zenoh.Session, endpoint: Endpoint, command: Command) -> bytes:
+    """Return the RTC's answer to a command, repeated with the same id until there is one.
+
+    Raises
+    ------
+    WireError
+        If the command breaks the contract.
+    LinkError
+        If there is none after all attempts.
+    """
+    payload, kind = encode_command(command), command_kind(command)
+    selector = Keys(endpoint.system).command(kind)
+    for attempt in range(endpoint.command_attempts):
+        if attempt:
+            time.sleep(ABSENT_PAUSE_S)
+        timeout_s, began_s = endpoint.command_timeout_s, time.monotonic()
+        answer = ask(session, selector, timeout_s, payload, Encodings.COMMAND)
+        if answer is not None:
+            return answer
+        # zenoh ends a query at once that nobody serves
+        if kind in OPTIONAL and time.monotonic() - began_s < timeout_s / 2:
+            reason = f"unsupported: the RTC offers no {kind}"
+            return encode_reply(Reply(id=command.id, accepted=False, reason=reason, start_seq=None))
+    raise LinkError(
+        f"no answer from the RTC to {kind} command {command.id} after "
+        f"{endpoint.command_attempts} attempts: whether it was carried out is unknown"
+    )
+
+
+def fetch_applied(session: zenoh.Session, keys: Keys) -> tuple[Manifest, NDArray[np.float32]]:
+    """Return the reconstructor the RTC uses, checked against its manifest.
+
+    Raises
+    ------
+    WireError
+        If what comes breaks the contract or the checksum differs.
+    LinkError
+        If the RTC does not answer or has none.
+    """
+    manifest = decode_manifest(_asked(session, keys.applied))
+    assembler = ChunkAssembler()
+    assembler.announce(manifest.layout)
+    for index in range(manifest.layout.n_chunks):
+        assembler.add(index, _asked(session, f"{keys.applied}?chunk={index}"))
+    return manifest, assembler.matrix()
+
+
+def _asked(session: zenoh.Session, selector: str) -> bytes:
+    answer = ask(session, selector, MATRIX_TIMEOUT_S)
+    if answer is None:
+        raise LinkError(f"no answer from the RTC on {selector} within {MATRIX_TIMEOUT_S} s")
+    return answer

@@ -15,10 +15,8 @@ from service.link.events import (
     StatusReceived,
 )
 from service.link.intake import Intake
-from service.link.measured import MeasuredIntake
-from service.link.outbox import OFFERS, Offer, Outbox
-from service.link.sessions import SessionWatch
-from service.link.standby import Order
+from service.link.matrices import OFFERS, MeasuredIntake, Offer, Outbox
+from service.link.rivals import Order, SessionWatch
 from service.wire import (
     Acknowledgement,
     AckState,

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from fastapi import FastAPI
 from fastapi.routing import APIRoute
+from typing_extensions import override
 
 from service import __version__
-from service.routes import (
-    acquisition,
-    estimators,
-    gains,
-    health,
-    loop,
-    measurements,
-    noisy,
-    operating,
-    pointing,
-    problems,
-    reading,
-)
-from service.routes import fits as fits_of_uploads
+from service.routes import commands, fits, health, matrices, problems, reading, views
 from service.routes.admission import Admission, Hosts
-from service.routes.fits import Fits
-from service.routes.service import Link, Service, Snapshot
+from service.routes.service import Fits, Service, Snapshot
 
-__all__ = ["Link", "Service", "Snapshot", "create_app"]
+__all__ = ["Fits", "Service", "Snapshot", "create_app"]
 
 _DESCRIPTION = """
 Calibration service of an adaptive telescope with a pyramid wavefront sensor.
@@ -36,7 +25,7 @@ finite is `null`. Errors are `application/problem+json` (RFC 9457).
 
 
 def create_app(
-    service: Service, fits: Fits | None = None, *, hosts: Hosts | None = None
+    service: Service, desk: Fits | None = None, *, hosts: Hosts | None = None
 ) -> FastAPI:
     """Return the REST application of a service, and of a desk for fits where there is one.
 
@@ -45,7 +34,7 @@ def create_app(
     Swagger and ReDoc pages are left out: they load their scripts from the internet, which an
     observatory's network need not reach. ``/openapi.json`` is there.
     """
-    app = FastAPI(
+    app = _Application(
         title="pyrcal",
         version=__version__,
         description=_DESCRIPTION,
@@ -57,23 +46,31 @@ def create_app(
     app.add_middleware(Admission, hosts=hosts or Hosts())
     app.state.service = service
     problems.install(app)
-    for routes in (
-        reading,
-        estimators,
-        gains,
-        operating,
-        acquisition,
-        pointing,
-        loop,
-        measurements,
-        noisy,
-        health,
-    ):
-        app.include_router(routes.router)
-    if fits is not None:
-        app.state.fits = fits
-        app.include_router(fits_of_uploads.router)
+    routers = [
+        reading.router,
+        commands.router,
+        commands.observatory,
+        matrices.router,
+        matrices.noisy,
+        health.router,
+    ]
+    if desk is not None:
+        app.state.fits = desk
+        routers.append(fits.router)
+    for router in routers:
+        app.include_router(router)
     return app
+
+
+class _Application(FastAPI):
+    """Describes what it answers when it is asked to, not when it is made."""
+
+    @override
+    def openapi(self) -> dict[str, Any]:
+        if self.openapi_schema is None:
+            document = super().openapi()
+            document["components"]["schemas"] |= views.schemas()
+        return super().openapi()
 
 
 def _operation_id(route: APIRoute) -> str:

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from http import HTTPStatus
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from starlette.requests import ClientDisconnect
 
 from service.errors import MatrixError
-from service.files.jobs import FitAsked, FitJob, FitState
+from service.files.jobs import FitAsked, FitState
 from service.files.request import parse_alpha, parse_modes
 from service.fit.options import FitOptions, Method
+from service.routes import pictures as shown
+from service.routes.pictures import FitJobs
 from service.routes.problems import INVALID, UNKNOWN, problem_response
-from service.routes.service import ServiceDep
-from service.routes.views import Number, View
+from service.routes.service import FitsDep, ServiceDep
+from service.routes.views import answer, picture, shows
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
 
@@ -26,47 +28,6 @@ FitId = Annotated[str, Path(alias="id", description="Id of a fit")]
 
 _TEXT = 200
 """Longest name of an array or a file."""
-
-
-class Fits(Protocol):
-    """The desk where fits are asked for, as REST sees it."""
-
-    async def take(
-        self, asked: FitAsked, body: AsyncIterator[bytes], n_bytes: int | None
-    ) -> FitJob:
-        """Keep an upload and put its fit in the queue.
-
-        Raises
-        ------
-        TooLargeError
-            If it is beyond the limit; before it is read where its length ``n_bytes`` is told.
-        TooSlowError
-            If it stands still, or trickles.
-        BusyError
-            If too many wait already.
-        MatrixError
-            If it stops half-way, or is no file a matrix could be in.
-        """
-
-    def jobs(self) -> Sequence[FitJob]:
-        """Return the fits that are remembered, oldest first."""
-
-    def job(self, fit_id: str) -> FitJob:
-        """Return one.
-
-        Raises
-        ------
-        UnknownIdError
-            If none has this id.
-        """
-
-
-def _fits_of(request: Request) -> Fits:
-    fits: Fits = request.app.state.fits
-    return fits
-
-
-FitsDep = Annotated[Fits, Depends(_fits_of)]
 
 
 class FitParameters(BaseModel):
@@ -140,41 +101,43 @@ class FitParameters(BaseModel):
         )
 
 
-class FitDocument(View):
+class FitDocument(BaseModel):
     """What a fit has found: the object that ``pyrcal fit --json`` prints."""
 
-    shift_x_subap: Number
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    shift_x_subap: float | None
     """Along sensor +x, subapertures."""
 
-    shift_y_subap: Number
+    shift_y_subap: float | None
     """Along sensor +y, subapertures."""
 
-    rotation_deg: Number
+    rotation_deg: float | None
     """From sensor +x towards +y, degrees."""
 
-    magnification: Number
+    magnification: float | None
     """Ratio; 1 is nominal."""
 
-    sigma: dict[str, Number]
+    sigma: dict[str, float | None]
     """1 σ of the four, by name; noise, disagreement of subsets and model error together."""
 
-    covariance: list[list[Number]]
+    covariance: list[list[float | None]]
     """4 x 4, in the units of the names."""
 
-    gains: list[Number]
+    gains: list[float | None]
     """Measured column over the model's, one for each mode used, passes divided out."""
 
-    residual_fraction: Number
+    residual_fraction: float | None
     """RMS of what is left over RMS of the measurement."""
 
-    condition_number: Number
+    condition_number: float | None
     """Of the synthetic matrix, modes used."""
 
     n_modes_used: int
     orientation: dict[str, Any]
     """Of the slopes, as the instrument file would say it."""
 
-    subset_scatter: dict[str, Number]
+    subset_scatter: dict[str, float | None]
     """1 σ scatter of disjoint sets of modes, by name."""
 
     converged: bool
@@ -184,36 +147,13 @@ class FitDocument(View):
     notes: list[str]
     """What was decided on the way, or overruled, and should be known."""
 
-    seconds: Number
+    seconds: float | None
 
 
-class FitJobView(View):
-    """A fit, and how far it is."""
-
-    id: str
-    state: FitState
-    """"receiving", "waiting", "running", "done" or "failed"."""
-
-    asked_ns_utc: int
-    n_bytes: int
-    """Of the upload."""
-
-    sha256: str
-    """Of the upload; empty until it is whole."""
-
-    reason: str
-    """Why it failed."""
-
-
-class FitJobsView(View):
-    """The fits the service remembers until it ends."""
-
-    fits: tuple[FitJobView, ...]
-    """Oldest first."""
-
-
-class FitAcceptedView(View):
+class FitAcceptedView(BaseModel):
     """A fit in the queue."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     id: str
     """Of the fit."""
@@ -264,16 +204,19 @@ async def fit(
     return FitAcceptedView(id=job.id, links={"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"})
 
 
-@router.get("/fits")
-async def fits_known(fits: FitsDep) -> FitJobsView:
+@router.get("/fits", responses={200: shows(shown.FIT_JOBS)})
+async def fits_known(fits: FitsDep) -> Response:
     """Return the fits the service remembers, oldest first."""
-    return FitJobsView.model_validate({"fits": tuple(fits.jobs())})
+    return answer(FitJobs(fits=tuple(fits.jobs())))
 
 
 @router.get(
     "/fits/{id}",
     response_model=FitDocument,
-    responses={202: {"model": FitJobView, "description": "Not finished yet"}, **UNKNOWN},
+    responses={
+        202: shows(shown.FIT_JOB) | {"description": "Not finished yet"},
+        **UNKNOWN,
+    },
 )
 async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
     """Return what a fit has found; 202 while it has not, 422 with the reason where it could not."""
@@ -282,8 +225,7 @@ async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
         return JSONResponse(dict(job.document))
     if job.state is FitState.FAILED:
         raise MatrixError(job.reason)
-    view = FitJobView.model_validate(job)
-    return JSONResponse(view.model_dump(mode="json"), status_code=HTTPStatus.ACCEPTED)
+    return JSONResponse(picture(job), status_code=HTTPStatus.ACCEPTED)
 
 
 async def _kept(content: bytes) -> AsyncIterator[bytes]:

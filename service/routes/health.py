@@ -7,17 +7,17 @@ from http import HTTPStatus
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
+from pydantic import BaseModel
 
 from service import __version__
 from service.routes.metrics import SnapshotCollector
 from service.routes.problems import problem, problem_response
 from service.routes.service import ServiceDep
-from service.routes.views import View
 
 router = APIRouter(tags=["how it is doing"])
 
 
-class HealthView(View):
+class HealthView(BaseModel):
     """The process runs and answers."""
 
     status: str
@@ -25,7 +25,7 @@ class HealthView(View):
     uptime_s: float
 
 
-class ReadyView(View):
+class ReadyView(BaseModel):
     """The service can do its work."""
 
     ready: bool
@@ -36,8 +36,7 @@ class ReadyView(View):
 async def healthz(service: ServiceDep) -> HealthView:
     """Answer as long as the process lives."""
     snapshot = service.snapshot()
-    uptime_s = (snapshot.now_ns - snapshot.started_ns) / 1e9
-    return HealthView(status="ok", version=__version__, uptime_s=uptime_s)
+    return HealthView(status="ok", version=__version__, uptime_s=snapshot.uptime_s)
 
 
 @router.get(

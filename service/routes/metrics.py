@@ -12,9 +12,9 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from service import __version__
+from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.routes.registration_views import age_s
-from service.routes.service import Link, Pace, Snapshot
+from service.routes.service import Pace, Snapshot
 from service.state import (
     DitherPhase,
     MatrixState,
@@ -59,8 +59,7 @@ class SnapshotCollector(Collector):
         snapshot = self._snapshot()
         yield _labelled_gauge("build_info", "Version", "version", {__version__: 1})
         yield _gauge("ready", "1 when the service can do its work", snapshot.ready)
-        uptime_s = (snapshot.now_ns - snapshot.started_ns) / 1e9
-        yield _gauge("uptime_seconds", "Since the service started", uptime_s)
+        yield _gauge("uptime_seconds", "Since the service started", snapshot.uptime_s)
         refused = "Attempts to write that the disk has refused"
         yield CounterMetricFamily(
             "pyrcal_archive_failures", refused, value=snapshot.archive_failures
@@ -94,7 +93,7 @@ def _of_pace(pace: Pace) -> Iterator[Metric]:
     yield _gauge("windows_late", late, pace.windows_late)
 
 
-def _of_link(link: Link) -> Iterator[Metric]:
+def _of_link(link: LinkStatistics) -> Iterator[Metric]:
     for name, text in _LINK_COUNTERS.items():
         yield CounterMetricFamily(f"pyrcal_{name}", text, value=getattr(link, name))
     yield _labelled_counter(
@@ -123,12 +122,13 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     yield _labelled_counter("windows", "Windows of telemetry, by verdict", "verdict", windows)
     explained = "Residual power over what noise explains, last of each kind: 1 is all explained"
     yield _labelled_gauge("misfit_ratio", explained, "source", _misfits(tracker))
-    registration = tracker.registration
-    if registration is None:
+    alpha = snapshot.alpha
+    if alpha is None:
         return
+    registration = alpha.known
     yield from _four("alpha", "Registration", registration.alpha.vector)
     yield from _four("alpha_sigma", "1 sigma, floor included", registration.sigma)
-    yield _gauge("alpha_age_seconds", "Age of the estimate", age_s(registration, snapshot))
+    yield _gauge("alpha_age_seconds", "Age of the estimate", alpha.age_s)
     valid = {str(kind): kind is registration.standing.validity for kind in Validity}
     yield _labelled_gauge("alpha_validity", "1 for what the estimate is worth", "validity", valid)
     due = tracker.dither_due_since_ns_utc is not None

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
+from dataclasses import replace
 from enum import StrEnum
 from http import HTTPStatus
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Path, Query, Request, Response
@@ -13,16 +15,15 @@ from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.errors import UnknownIdError
-from service.routes.problems import INVALID, UNKNOWN, problem, problem_response
-from service.routes.registration_views import AlphaView, HistoryView
-from service.routes.schemas import (
-    EventsView,
-    ReconstructorsView,
-    ReconstructorView,
-    StateView,
-)
+from service.errors import CommandError, UnknownIdError
+from service.reactions.gain_tables import table_of
+from service.routes import pictures as shown
+from service.routes.pictures import Estimator, Estimators, GainTableShown
+from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.routes.service import ServiceDep
+from service.routes.views import answer, shows
+from service.state import ModeGain, Source
+from service.telemetry.estimator import LOCK_IN, PASSIVE, RANDOM
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -59,74 +60,104 @@ class MatrixParameters(Parameters):
     """"npy" or "raw"."""
 
 
-@router.get("/state")
-async def state(service: ServiceDep) -> StateView:
+async def numbers_of(
+    matrix_of: Callable[[str], NDArray[np.float32]], matrix_id: str, *, raw: bool
+) -> Response:
+    """Return the numbers of a matrix: a NumPy file, or the bytes its SHA-256 is of."""
+    numbers = np.ascontiguousarray(await run_in_threadpool(matrix_of, matrix_id), "<f4")
+    buffer = io.BytesIO()
+    np.save(buffer, numbers, allow_pickle=False)
+    extension = "f4" if raw else "npy"
+    return Response(
+        numbers.tobytes() if raw else buffer.getvalue(),
+        media_type="application/octet-stream",
+        headers={
+            "X-Shape": ",".join(str(n) for n in numbers.shape),
+            "X-Dtype": "<f4",
+            "Content-Disposition": f'attachment; filename="{matrix_id}.{extension}"',
+        },
+    )
+
+
+def describes_numbers(description: str, rows_and_columns: str, example: str) -> dict[str, Any]:
+    """Return the OpenAPI description of such an answer."""
+    return {
+        "description": description,
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        "headers": {
+            "X-Shape": {
+                "description": rows_and_columns,
+                "schema": {"type": "string", "example": example},
+            },
+            "X-Dtype": {
+                "description": "C-ordered little-endian float32",
+                "schema": {"type": "string", "example": "<f4"},
+            },
+        },
+    }
+
+
+@router.get("/state", responses={200: shows(shown.STATE)})
+async def state(service: ServiceDep) -> Response:
     """Everything at one glance."""
-    return StateView.of(service.snapshot())
+    return answer(service.snapshot())
 
 
 @router.get(
     "/alpha",
-    response_model=AlphaView,
-    responses={404: problem_response("No window of telemetry has been accepted yet")},
+    responses={
+        200: shows(shown.ALPHA),
+        404: problem_response("No window of telemetry has been accepted yet"),
+    },
 )
-async def alpha(request: Request, service: ServiceDep) -> AlphaView | Response:
+async def alpha(request: Request, service: ServiceDep) -> Response:
     """Return the registration now: estimate, 1 σ, covariance and age."""
     snapshot = service.snapshot()
     tracker = snapshot.tracker
-    if tracker.registration is None:
+    known = snapshot.alpha
+    if known is None:
         detail = (
             f"no estimate yet: {tracker.windows_accepted} windows accepted, "
             f"{tracker.windows_refused} refused; {snapshot.ready_reason}"
         )
         return problem(request, HTTPStatus.NOT_FOUND, "no-estimate", detail)
-    return AlphaView.of(tracker.registration, snapshot)
+    return answer(known)
 
 
-@router.get("/alpha/history")
+@router.get("/alpha/history", responses={200: shows(shown.HISTORY)})
 async def alpha_history(
     service: ServiceDep, parameters: Annotated[LimitParameters, Query()]
-) -> HistoryView:
+) -> Response:
     """Return the estimates of the last windows, oldest first."""
-    history = service.snapshot().tracker.history
-    return HistoryView.model_validate({"entries": history[-parameters.limit :]})
+    tracker = service.snapshot().tracker
+    last = replace(tracker, history=tracker.history[-parameters.limit :])
+    return answer(last, shown.HISTORY)
 
 
-@router.get("/reconstructors")
-async def reconstructors(service: ServiceDep) -> ReconstructorsView:
+@router.get("/reconstructors", responses={200: shows(shown.RECONSTRUCTORS)})
+async def reconstructors(service: ServiceDep) -> Response:
     """Return the reconstructors the service remembers, oldest first."""
-    return ReconstructorsView.model_validate(service.snapshot().tracker)
+    return answer(service.snapshot().tracker, shown.RECONSTRUCTORS)
 
 
-@router.get("/reconstructors/{id}", responses={**UNKNOWN})
-async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> ReconstructorView:
+@router.get("/reconstructors/{id}", responses={200: shows(shown.RECONSTRUCTOR), **UNKNOWN})
+async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return what is known of one reconstructor."""
     record = service.snapshot().tracker.reconstructor(matrix_id)
     if record is None:
         raise UnknownIdError(f"reconstructor {matrix_id}: nobody has heard of it")
-    return ReconstructorView.model_validate(record)
+    return answer(record)
 
 
 @router.get(
     "/reconstructors/{id}/matrix",
     response_class=Response,
     responses={
-        200: {
-            "description": "The reconstructor, metres OPD per slope",
-            "content": {
-                "application/octet-stream": {"schema": {"type": "string", "format": "binary"}}
-            },
-            "headers": {
-                "X-Shape": {
-                    "description": "Rows (modes) and columns (slopes)",
-                    "schema": {"type": "string", "example": "400,1384"},
-                },
-                "X-Dtype": {
-                    "description": "C-ordered little-endian float32",
-                    "schema": {"type": "string", "example": "<f4"},
-                },
-            },
-        },
+        200: describes_numbers(
+            "The reconstructor, metres OPD per slope",
+            "Rows (modes) and columns (slopes)",
+            "400,1384",
+        ),
         **UNKNOWN,
     },
 )
@@ -138,33 +169,55 @@ async def reconstructor_matrix(
     ``?format=npy`` (the default) is a NumPy file, ``?format=raw`` the bytes as they travel to
     the RTC, whose SHA-256 is the reconstructor's ``sha256``.
     """
-    matrix = await run_in_threadpool(service.matrix, matrix_id)
-    numbers = np.ascontiguousarray(matrix, "<f4")
-    content = numbers.tobytes() if parameters.format is MatrixFormat.RAW else _npy(numbers)
-    extension = "npy" if parameters.format is MatrixFormat.NPY else "f4"
-    return Response(
-        content,
-        media_type="application/octet-stream",
-        headers={
-            "X-Shape": ",".join(str(n) for n in numbers.shape),
-            "X-Dtype": "<f4",
-            "Content-Disposition": f'attachment; filename="{matrix_id}.{extension}"',
-        },
-    )
+    raw = parameters.format is MatrixFormat.RAW
+    return await numbers_of(service.matrix, matrix_id, raw=raw)
 
 
-def _npy(numbers: NDArray[np.float32]) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, numbers, allow_pickle=False)
-    return buffer.getvalue()
-
-
-@router.get("/events")
-async def events(
-    service: ServiceDep, parameters: Annotated[LimitParameters, Query()]
-) -> EventsView:
+@router.get("/events", responses={200: shows(shown.EVENTS)})
+async def events(service: ServiceDep, parameters: Annotated[LimitParameters, Query()]) -> Response:
     """Return what happened, oldest first, and the alarms that last."""
     tracker = service.snapshot().tracker
-    return EventsView.model_validate(
-        {"alarms": tracker.alarms, "log": tracker.log[-parameters.limit :]}
+    return answer(replace(tracker, log=tracker.log[-parameters.limit :]), shown.EVENTS)
+
+
+@router.get("/gains", responses={200: shows(shown.GAINS), **COMMAND})
+async def gains(service: ServiceDep) -> Response:
+    """Return the table as it is now, for all modes of the basis.
+
+    ``POST /v1/loop`` with ``effective_gain`` sets the loop gains by it, if the gate agrees.
+    """
+    tracker = service.snapshot().tracker
+    if tracker.rtc is None:
+        raise CommandError("gains: no RTC is there: the number of modes is not known")
+    known = tracker.registration
+    return _gain_table(None, () if known is None else known.optical_gains, tracker.rtc.n_modes)
+
+
+@router.get("/reconstructors/{id}/gains", responses={200: shows(shown.GAINS), **UNKNOWN})
+async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Response:
+    """Return the table that was measured when this reconstructor was made, for its modes."""
+    record = service.snapshot().tracker.reconstructor(matrix_id)
+    if record is None:
+        raise UnknownIdError(f"reconstructor {matrix_id}: nobody has heard of it")
+    return _gain_table(record.id, record.optical_gains, record.n_modes)
+
+
+def _gain_table(matrix_id: str | None, measured: tuple[ModeGain, ...], n_modes: int) -> Response:
+    table = table_of(measured, n_modes)
+    return answer(
+        GainTableShown(
+            reconstructor=matrix_id,
+            measured=measured,
+            optical_gain=table.optical_gain.tolist(),
+            relative_sigma=table.relative_sigma.tolist(),
+            factor=table.factors.tolist(),
+        )
     )
+
+
+@router.get("/estimators", responses={200: shows(shown.ESTIMATORS)})
+async def estimators() -> Response:
+    """Return what the estimators can tell of the registration, and what they cannot."""
+    of = {Source.LOCK_IN: LOCK_IN, Source.RANDOM: RANDOM, Source.PASSIVE: PASSIVE}
+    found = (Estimator(source=source, determines=told) for source, told in of.items())
+    return answer(Estimators(estimators=tuple(found)))

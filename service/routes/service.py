@@ -2,96 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Annotated, Protocol
 
 import numpy as np
 from fastapi import Depends, Request
 from numpy.typing import NDArray
 
-from service.events import Command
-from service.state import TrackerState, Waiting
-
-
-class Link(Protocol):
-    """Counters of the link to the RTC, of all sessions together since the service started."""
-
-    @property
-    def rtc_alive(self) -> bool:
-        """Whether the RTC's liveliness token is there."""
-
-    @property
-    def session(self) -> str | None:
-        """The session that counts; None: none has been heard."""
-
-    @property
-    def frame_age_s(self) -> float | None:
-        """Seconds since the last frame arrived; None: none has."""
-
-    @property
-    def latency_p50_s(self) -> float | None:
-        """Median from put to callback, seconds; None: not known."""
-
-    @property
-    def batches_received(self) -> int:
-        """Well-formed batches of this session, basis and configuration."""
-
-    @property
-    def frames_received(self) -> int:
-        """Frames that could be used, recovered ones included."""
-
-    @property
-    def frames_lost(self) -> int:
-        """Frames missing in the sequence; falls again when they are recovered."""
-
-    @property
-    def frames_recovered(self) -> int:
-        """Frames that came after later ones and still found their place."""
-
-    @property
-    def frames_duplicate(self) -> int:
-        """Frames that came again."""
-
-    @property
-    def frames_late(self) -> int:
-        """Frames that came when their place had been passed."""
-
-    @property
-    def frames_nonfinite(self) -> int:
-        """Frames dropped because a number in them was not finite."""
-
-    @property
-    def frames_overwritten(self) -> int:
-        """Frames nobody drained in time, or that a new session made void."""
-
-    @property
-    def frames_refused(self) -> Mapping[str, int]:
-        """Frames of batches not used, by reason."""
-
-    @property
-    def messages_malformed(self) -> Mapping[str, int]:
-        """Messages that broke the contract, by kind."""
-
-    @property
-    def statuses_received(self) -> int:
-        """Status messages of the RTC."""
-
-    @property
-    def acknowledgements_received(self) -> int:
-        """Acknowledgements of reconstructors."""
-
-    @property
-    def acknowledgements_unknown(self) -> int:
-        """Acknowledgements for an id this process has never offered."""
-
-    @property
-    def events_dropped(self) -> int:
-        """Events of the link that gave way because nobody took them."""
-
-    @property
-    def callback_errors(self) -> int:
-        """Faults of the service itself while it took a message in."""
+from service.events import Command, GainGroup
+from service.files.jobs import FitAsked, FitJob
+from service.link.statistics import LinkStatistics
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.state import Registration, RtcView, TrackerState, Waiting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +48,7 @@ class Snapshot:
     tracker: TrackerState
     """What is known of registration and reconstructors."""
 
-    link: Link
+    link: LinkStatistics
     """What has passed on the link."""
 
     now_ns: int
@@ -157,6 +81,92 @@ class Snapshot:
 
     archive_waiting: int = 0
     """Lines of the audit trail that are not on the disk yet."""
+
+    @property
+    def uptime_s(self) -> float:
+        """Since the service started."""
+        return (self.now_ns - self.started_ns) / 1e9
+
+    @property
+    def alpha(self) -> Alpha | None:
+        """Null until the first accepted window."""
+        known = self.tracker.registration
+        return None if known is None else Alpha(known=known, snapshot=self)
+
+    @property
+    def rtc(self) -> Rtc | None:
+        """Null: no RTC has been heard, or it has vanished."""
+        known = self.tracker.rtc
+        return None if known is None else Rtc(known=known)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Alpha:
+    """The current estimate of the registration."""
+
+    known: Registration
+    snapshot: Snapshot
+
+    @property
+    def covariance(self) -> list[list[float]]:
+        """4 x 4, now, floor included, in the units of the names and the order of ``parameters``."""
+        scale = np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)
+        found: list[list[float]] = (self.known.total_covariance * scale).tolist()
+        return found
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Order of rows and columns of the covariance."""
+        return PARAMETERS
+
+    @property
+    def age_s(self) -> float:
+        """Since the last telemetry that entered it arrived, seconds."""
+        arrival_ns = self.snapshot.estimate_arrival_ns
+        then_ns = self.known.t_ns_utc if arrival_ns is None else arrival_ns
+        return (self.snapshot.now_ns - then_ns) / 1e9
+
+    @property
+    def window_age_s(self) -> float | None:
+        """Since the last dithered window arrived, seconds; null: not known."""
+        window_ns = self.known.window_ns_utc
+        return (self.snapshot.now_ns - window_ns) / 1e9 if window_ns else None
+
+    @property
+    def suspected(self) -> Misregistration | None:
+        """Where the last window saw it, too far away to be believed before another one has.
+
+        Null: no jump is suspected.
+        """
+        return None if self.known.candidate is None else self.known.candidate.alpha
+
+    @property
+    def passive_bias(self) -> NDArray[np.float64] | None:
+        """What the passive estimate reads more than α, as far as learnt; null: nothing is known."""
+        return None if self.known.bias is None else self.known.bias.offset
+
+    @property
+    def passive_bias_sigma(self) -> NDArray[np.float64] | None:
+        """1 σ of it."""
+        bias = self.known.bias
+        return None if bias is None else np.sqrt(np.diag(bias.covariance))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rtc:
+    """The RTC as its last status message shows it."""
+
+    known: RtcView
+
+    @property
+    def gains(self) -> tuple[GainGroup, ...]:
+        """Of all modes of the basis, 0 where uncontrolled: neighbours with the same gain."""
+        groups, first = [], 0
+        for gain, run in groupby(self.known.gains):
+            last = first + sum(1 for _ in run) - 1
+            groups.append(GainGroup(first=first, last=last, gain=gain))
+            first = last + 1
+        return tuple(groups)
 
 
 class Service(Protocol):
@@ -225,10 +235,51 @@ class Service(Protocol):
         """
 
 
+class Fits(Protocol):
+    """The desk where fits of uploaded matrices are asked for, as REST sees it."""
+
+    async def take(
+        self, asked: FitAsked, body: AsyncIterator[bytes], n_bytes: int | None
+    ) -> FitJob:
+        """Keep an upload and put its fit in the queue.
+
+        Raises
+        ------
+        TooLargeError
+            If it is beyond the limit; before it is read where its length ``n_bytes`` is told.
+        TooSlowError
+            If it stands still, or trickles.
+        BusyError
+            If too many wait already.
+        MatrixError
+            If it stops half-way, or is no file a matrix could be in.
+        """
+
+    def jobs(self) -> Sequence[FitJob]:
+        """Return the fits that are remembered, oldest first."""
+
+    def job(self, fit_id: str) -> FitJob:
+        """Return one.
+
+        Raises
+        ------
+        UnknownIdError
+            If none has this id.
+        """
+
+
 def _service_of(request: Request) -> Service:
     service: Service = request.app.state.service
     return service
 
 
+def _fits_of(request: Request) -> Fits:
+    fits: Fits = request.app.state.fits
+    return fits
+
+
 ServiceDep = Annotated[Service, Depends(_service_of)]
 """The service a route works for."""
+
+FitsDep = Annotated[Fits, Depends(_fits_of)]
+"""The desk a route works for."""

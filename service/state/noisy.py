@@ -82,6 +82,11 @@ class NoisyFinding:
     sha256: str
     """Of the matrix as C-ordered little-endian float32."""
 
+    @property
+    def sigma(self) -> NDArray[np.float64] | None:
+        """``(4,)`` 1 σ of the registration, numeric units, from the data alone; None as above."""
+        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoisyRecord:
@@ -117,6 +122,11 @@ class NoisyRecord:
 
     finding: NoisyFinding | None = None
     """None: not finished."""
+
+    @property
+    def n_modes(self) -> int:
+        """Columns."""
+        return len(self.modes)
 
     @property
     def amplitude_m(self) -> float:

@@ -8,7 +8,7 @@ import pytest
 from service.api import create_app
 from service.errors import CommandError
 from service.events import AbortAcquisition, Acquire
-from service.routes.acquisition_views import AcquisitionView
+from service.routes.views import picture
 from service.state import Acquisition, AcquisitionStage
 from tests.unit.reactions.situations import ALPHA
 
@@ -64,7 +64,7 @@ async def test_one_that_cannot_begin_says_why(client, service):
 
 def test_the_view_tells_stage_and_what_was_found_in_degrees():
     under_way = Acquisition(stage=AcquisitionStage.CONFIRMING, text="looking", attempt=1)
-    view = AcquisitionView.model_validate(replace(under_way, alpha=ALPHA))
-    assert (view.stage, view.under_way, view.n_attempts) == ("confirming", True, 1)
-    assert view.alpha.rotation_deg == pytest.approx(0.2)
-    assert AcquisitionView.model_validate(Acquisition()).alpha is None
+    shown = picture(replace(under_way, alpha=ALPHA))
+    assert (shown["stage"], shown["under_way"], shown["n_attempts"]) == ("confirming", True, 1)
+    assert shown["alpha"]["rotation_deg"] == pytest.approx(0.2)
+    assert picture(Acquisition())["alpha"] is None

@@ -10,7 +10,8 @@ from service.api import Snapshot, create_app
 from service.errors import CommandError, UnknownIdError
 from service.events import GiveUpNoisy, MeasureNoisy
 from service.model.misregistration import Misregistration
-from service.routes.rtc_views import GatheringView
+from service.routes.pictures import GATHERING
+from service.routes.views import picture
 from service.state import ModeSet, NoisyFinding, NoisyRecord, NoisyState, TrackerState
 
 FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"
@@ -190,8 +191,9 @@ async def test_no_route_publishes_one(client, service, action):
 async def test_the_state_shows_the_one_under_way(client):
     shown = (await client.get("/v1/noisy-matrix/noisy-2")).json()
     assert shown["state"] == "running"
-    view = GatheringView.model_validate(TrackerState(system="x", noisy=(RUNNING,)).gathering)
-    assert (view.id, view.state, view.duration_s) == ("noisy-2", NoisyState.RUNNING, 30.0)
+    state = picture(TrackerState(system="x", noisy=(RUNNING,)).gathering, GATHERING)
+    found = (state["id"], state["state"], state["duration_s"])
+    assert found == ("noisy-2", NoisyState.RUNNING, 30.0)
 
 
 async def test_every_estimator_says_what_it_cannot_tell(client):

@@ -11,8 +11,9 @@ import pytest
 
 from service.__main__ import main
 from service.commands.status import status_lines
-from service.routes.schemas import StateView
+from service.routes.pictures import STATE as STATE_VIEW
 from service.routes.service import Snapshot
+from service.routes.views import picture
 from service.state import TrackerState
 from tests.unit.test_api import LINK, SECOND, STATE
 
@@ -29,7 +30,7 @@ def told(tracker=STATE, *, ready=True, **changes):
         archive_failures=0,
         archive_waiting=0,
     )
-    return StateView.of(snapshot).model_dump(mode="json")
+    return picture(snapshot, STATE_VIEW)
 
 
 def test_the_first_line_says_whether_it_is_ready_and_the_next_what_is_wrong():

@@ -12,12 +12,11 @@ from service.archive.store import write_whole
 from service.commands.terminal import check_folder, say, show_progress
 from service.config import load_instrument
 from service.errors import ConfigurationError
-from service.files.figures.sheet import check_plots, write_sheet
+from service.files.figures import check_plots, write_sheet
 from service.files.light import Light, read_light
 from service.files.product import fill_fit
-from service.files.report import document
+from service.files.report import document, table
 from service.files.run import fit_file
-from service.files.table import table
 from service.fit.options import FitOptions, Method
 from service.fit.turned_light import Arms
 from service.model.instrument import Instrument

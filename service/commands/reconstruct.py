@@ -7,6 +7,7 @@ import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,13 @@ from service.control.modal_gains import CalibrationGains
 from service.control.recipe import Method, Provenance, Recipe, Source, reconstruct
 from service.control.regularised import Prior
 from service.errors import ConfigurationError, MatrixError
-from service.files.fingerprint import instrument_sha256
 from service.files.light import read_light
-from service.files.product import KnownFit, read_fit
-from service.files.reconstructor import Reconstructor, fill_reconstructor
+from service.files.product import (
+    KnownFit,
+    fill_reconstructor,
+    instrument_sha256,
+    read_fit,
+)
 from service.files.recorded import file_sha256
 from service.files.report import orientation_words
 from service.files.request import parse_alpha
@@ -55,7 +59,6 @@ def main(options: argparse.Namespace) -> int:
     found = instrument_sha256(described)
     if known.instrument_sha256 not in {None, found}:
         say(f"note: {options.instrument} has changed since {known.origin} was fitted with it")
-    known = replace(known, instrument_sha256=found)
     instrument = _oriented(described, known)
     light = None if options.flux_map is None else read_light(options.flux_map, instrument)
     with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
@@ -69,9 +72,23 @@ def main(options: argparse.Namespace) -> int:
         )
         show_progress(f"{model.n_slopes} slopes, {model.basis.n_modes} modes")
         matrix = model.interaction_matrix(known.alpha)
-    made = _made(options, known, instrument, model, matrix)
-    write_whole(options.output, lambda file: fill_reconstructor(file, made))
-    inversion = made.provenance.inversion
+    provenance, inverted = _inverted(options, known, model, matrix)
+    inversion, slopes = provenance.inversion, instrument.slopes
+    fill = partial(
+        fill_reconstructor,
+        reconstructor=inversion.matrix,
+        interaction_matrix=inverted[:, : options.modes],
+        provenance=provenance,
+        circumstances={
+            "instrument": instrument.name,
+            "instrument_sha256": found,
+            "alpha_from": known.origin,
+            "model_pupil_sampling": SAMPLING,
+            "model_detector_nodes": SAMPLING,
+            "slopes": json.dumps(orientation_words(slopes.assumed_orientation, slopes.order)),
+        },
+    )
+    write_whole(options.output, fill)
     print(
         f"{options.output}: {options.modes} modes, {model.n_slopes} slopes, {options.method}, "
         f"condition number {inversion.condition_number:.2f}, {inversion.n_truncated} singular "
@@ -127,13 +144,10 @@ def _oriented(instrument: Instrument, known: KnownFit) -> Instrument:
     return replace(instrument, slopes=recipe)
 
 
-def _made(
-    options: argparse.Namespace,
-    known: KnownFit,
-    instrument: Instrument,
-    model: RtcInteractionModel,
-    matrix: NDArray[Any],
-) -> Reconstructor:
+def _inverted(
+    options: argparse.Namespace, known: KnownFit, model: RtcInteractionModel, matrix: NDArray[Any]
+) -> tuple[Provenance, NDArray[Any]]:
+    """Return the reconstructor with how it was made, and the matrix that it inverts."""
     gains = None
     if known.gains is not None and known.modes is not None and not options.no_gains:
         gains = CalibrationGains.of_modes(
@@ -141,31 +155,18 @@ def _made(
         )
         matrix = gains.tuned(matrix)
     recipe = _recipe(options, model)
-    inversion = reconstruct(matrix, recipe)
-    slopes = instrument.slopes
-    return Reconstructor(
-        matrix=inversion.matrix,
-        interaction_matrix=matrix[:, : options.modes],
-        provenance=Provenance(
-            source=Source.SYNTHETIC,
-            recipe=recipe,
-            inversion=inversion,
-            alpha=known.alpha,
-            covariance=known.covariance,
-            gains=gains,
-            reference_sha256=known.reference_sha256,
-            measured_illumination=options.flux_map is not None,
-            reference_passes=None if known.double_pass is None else 1 + known.double_pass,
-        ),
-        circumstances={
-            "instrument": instrument.name,
-            "instrument_sha256": known.instrument_sha256 or instrument_sha256(instrument),
-            "alpha_from": known.origin,
-            "model_pupil_sampling": SAMPLING,
-            "model_detector_nodes": SAMPLING,
-            "slopes": json.dumps(orientation_words(slopes.assumed_orientation, slopes.order)),
-        },
+    provenance = Provenance(
+        source=Source.SYNTHETIC,
+        recipe=recipe,
+        inversion=reconstruct(matrix, recipe),
+        alpha=known.alpha,
+        covariance=known.covariance,
+        gains=gains,
+        reference_sha256=known.reference_sha256,
+        measured_illumination=options.flux_map is not None,
+        reference_passes=None if known.double_pass is None else 1 + known.double_pass,
     )
+    return provenance, matrix
 
 
 def _recipe(options: argparse.Namespace, model: RtcInteractionModel) -> Recipe:

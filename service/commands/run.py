@@ -27,7 +27,7 @@ from service.archive import Archive
 from service.config import Settings, load_instrument, load_settings, packaged_instrument
 from service.config.policy import policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
-from service.files.upload import UploadFitter
+from service.files.uploads import UploadFitter
 from service.model.instrument import Instrument
 from service.prepared import usual_folder
 from service.reactions.measurements import MEASUREMENTS_KEPT

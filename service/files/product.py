@@ -1,9 +1,11 @@
-"""A fit as an HDF5 file: all that was found, with what it was found from."""
+"""Fits and reconstructors as HDF5 files: all that was found, with what it was made of."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import __version__
+from service.control.recipe import Provenance
 from service.errors import MatrixError
 from service.files.report import FitReport, document
+from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.model.slopes import Orientation, SlopeOrder
 
@@ -44,19 +48,18 @@ def fill_fit(file: h5py.File, report: FitReport) -> None:
     arrays["subset_scatter"] = fit.subset_scatter * BOUNDARY_SCALE
     for name, values in arrays.items():
         if values is not None:
-            file[name] = values
-            file[name].attrs["description"] = _DESCRIPTIONS[name]
+            _put(file, name, values, _DESCRIPTIONS[name])
     file["covariance"].attrs["parameters"] = PARAMETERS
     for step, scan in enumerate(fit.paper_table or ()):
         group = file.create_group(f"paper_table/{step:02d}")
         group.attrs.update(parameter=scan.parameter, step=scan.step, minimum=scan.minimum)
         group["samples"], group["chi"] = scan.samples, scan.chi
     file.attrs.update(fit.alpha.to_boundary())
-    file.attrs.update(provenance(report))
+    file.attrs.update(_provenance(report))
     file.attrs["document"] = json.dumps(document(report), allow_nan=False)
 
 
-def provenance(report: FitReport) -> dict[str, Any]:
+def _provenance(report: FitReport) -> dict[str, Any]:
     """Return where a fit comes from, as HDF5 attributes."""
     return {
         "instrument": report.instrument,
@@ -68,8 +71,7 @@ def provenance(report: FitReport) -> dict[str, Any]:
         "verdict": report.fit.verdict,
         "accepted": report.fit.accepted,
         "notes": "\n".join(report.notes),
-        "software": f"pyrcal {__version__}",
-        "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        **_made_now(),
     }
 
 
@@ -162,3 +164,81 @@ def _of_product(file: h5py.File, path: Path) -> KnownFit:
         instrument_sha256=str(file.attrs["instrument_sha256"]),
         reference_sha256=str(file.attrs["reference_sha256"]),
     )
+
+
+def fill_reconstructor(
+    file: h5py.File,
+    reconstructor: NDArray[np.float32],
+    interaction_matrix: NDArray[np.float32],
+    provenance: Provenance,
+    circumstances: Mapping[str, str | int | float | bool],
+) -> None:
+    """Write a reconstructor, and what it is made of, into an open, empty HDF5 file.
+
+    Parameters
+    ----------
+    file
+        To be filled.
+    reconstructor
+        ``(n_modes, n_slopes)`` metres OPD per slope, slopes as the RTC lists them.
+    interaction_matrix
+        ``(n_slopes, n_modes)`` what it inverts, slopes as the RTC lists them.
+    provenance
+        How it was made.
+    circumstances
+        Instrument, model, orientation: further attributes.
+    """
+    described = "slopes as the RTC lists them, single pass"
+    for name, values, shape in (
+        ("reconstructor", reconstructor, "(n_modes, n_slopes), metres OPD per slope"),
+        ("interaction_matrix", interaction_matrix, "(n_slopes, n_modes), slope per metre OPD"),
+    ):
+        _put(file, name, np.ascontiguousarray(values, dtype="<f4"), f"{shape}, {described}")
+    if provenance.covariance is not None:
+        file["covariance"] = provenance.covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)
+        file["covariance"].attrs["parameters"] = PARAMETERS
+    if provenance.gains is not None:
+        n_modes = provenance.recipe.n_modes
+        file["calibration_gains"] = provenance.gains.values[:n_modes]
+        file["calibration_gains"].attrs["measured"] = provenance.gains.measured[:n_modes]
+    file.attrs.update({**circumstances, **provenance.attributes(), **_made_now()})
+
+
+def _put(file: h5py.File, name: str, values: NDArray[Any], description: str) -> None:
+    file[name] = values
+    file[name].attrs["description"] = description
+
+
+def _made_now() -> dict[str, str]:
+    return {
+        "software": f"pyrcal {__version__}",
+        "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def instrument_sha256(instrument: Instrument) -> str:
+    """Return the SHA-256 of every field of an instrument, arrays included, as hex.
+
+    Two files that describe the same instrument, one with the defaults spelt out, are the same.
+    """
+    digest = hashlib.sha256()
+    _add(digest, replace(instrument, remarks=()))
+    return digest.hexdigest()
+
+
+def _add(digest: hashlib._Hash, value: object) -> None:
+    if is_dataclass(value):
+        digest.update(f"{type(value).__name__}(".encode())
+        for part in fields(value):
+            digest.update(f"{part.name}=".encode())
+            _add(digest, getattr(value, part.name))
+        digest.update(b")")
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, tuple):
+        for item in value:
+            _add(digest, item)
+        digest.update(f"{len(value)};".encode())
+    else:
+        digest.update(f"{value!r};".encode())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.errors import MatrixError
-from service.files.fingerprint import instrument_sha256
+from service.files.product import instrument_sha256
 from service.files.recorded import FLUX_FRAME, Recorded, read_recorded
 from service.files.report import FitReport
 from service.fit.fit import fit_matrix

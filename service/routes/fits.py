@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from starlette.requests import ClientDisconnect
 
 from service.errors import MatrixError
-from service.files.jobs import FitAsked, FitState
 from service.files.request import parse_alpha, parse_modes
+from service.files.uploads import FitAsked, FitState
 from service.fit.options import FitOptions, Method
 from service.routes import pictures as shown
 from service.routes.pictures import FitJobs

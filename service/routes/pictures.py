@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
 from service.events import GainGroup
-from service.files.jobs import FitJob
+from service.files.uploads import FitJob
 from service.link.statistics import LinkStatistics
 from service.routes.service import Alpha, Pace, Rtc, Snapshot
 from service.routes.views import view

@@ -12,7 +12,7 @@ from fastapi import Depends, Request
 from numpy.typing import NDArray
 
 from service.events import Command, GainGroup
-from service.files.jobs import FitAsked, FitJob
+from service.files.uploads import FitAsked, FitJob
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.state import Registration, RtcView, TrackerState, Waiting

@@ -27,7 +27,7 @@ from service.errors import (
     TooSlowError,
     UnknownIdError,
 )
-from service.files.jobs import UNFINISHED, UPLOAD, FitAsked, FitJob, FitState
+from service.files.uploads import UNFINISHED, UPLOAD, FitAsked, FitJob, FitState
 from service.runtime.workers import run_in_process
 
 FITS_KEPT = 50

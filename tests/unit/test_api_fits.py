@@ -8,8 +8,8 @@ import pytest
 
 from service.api import create_app
 from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
-from service.files.jobs import FitJob, FitState
 from service.files.report import document
+from service.files.uploads import FitJob, FitState
 from service.fit.options import Method
 from tests.unit.files.made import a_report
 

@@ -11,8 +11,7 @@ from service.commands.reconstruct import SAMPLING, main
 from service.commands.terminal import with_negative_numbers
 from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError
-from service.files.fingerprint import instrument_sha256
-from service.files.product import fill_fit
+from service.files.product import fill_fit, instrument_sha256
 from service.files.report import document
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
-from service.files.figures import maps, panels, scans
-from service.files.figures.sheet import check_plots, write_sheet
+from service.files import figures
+from service.files.figures import check_plots, write_sheet
 from service.model.misregistration import Misregistration
 from tests.numerics import small_instrument
 from tests.unit.files.made import ALPHA, GAINS, SCAN, SYNTHETIC, VALID, a_fit, a_report
@@ -20,7 +20,7 @@ def axes():
 
 
 def test_singular_values_are_told_with_both_condition_numbers(axes):
-    panels.singular_values(axes, a_fit())
+    figures.singular_values(axes, a_fit())
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     condition = np.linalg.cond(SYNTHETIC * GAINS)
     assert labels == [
@@ -30,7 +30,7 @@ def test_singular_values_are_told_with_both_condition_numbers(axes):
 
 
 def test_gains_stand_at_their_modes(axes):
-    panels.gains(axes, a_fit())
+    figures.gains(axes, a_fit())
     points = axes.get_lines()[0]
     assert points.get_xdata().tolist() == [0, 1, 4]
     assert points.get_ydata().tolist() == GAINS.tolist()
@@ -40,14 +40,14 @@ def test_a_point_of_the_mirror_lands_turned_scaled_and_then_shifted():
     alpha = Misregistration(
         shift_x_subap=1.0, shift_y_subap=2.0, rotation_rad=np.pi / 2, magnification=2.0
     )
-    np.testing.assert_allclose(panels.landed(np.array([[3.0, 0.0]]), alpha), [[1.0, 8.0]])
+    np.testing.assert_allclose(figures.landed(np.array([[3.0, 0.0]]), alpha), [[1.0, 8.0]])
 
 
 def test_every_actuator_is_in_the_registration_picture(axes):
     instrument = small_instrument()
-    panels.registration(axes, a_fit(), instrument)
+    figures.registration(axes, a_fit(), instrument)
     drawn = axes.get_lines()[0].get_xydata()
-    expected = panels.landed(instrument.mirror.positions_m / instrument.subaperture_m, ALPHA)
+    expected = figures.landed(instrument.mirror.positions_m / instrument.subaperture_m, ALPHA)
     np.testing.assert_allclose(drawn, expected)
     low, high = axes.get_xlim()
     assert low < drawn.min()
@@ -55,7 +55,7 @@ def test_every_actuator_is_in_the_registration_picture(axes):
 
 
 def test_slopes_become_maps_side_by_side():
-    found = maps.as_maps(np.arange(10.0), VALID)
+    found = figures.as_maps(np.arange(10.0), VALID)
     assert found.shape == (3, 6)
     assert found[0].tolist()[1] == 0.0
     assert found[0].tolist()[4] == 5.0
@@ -64,13 +64,15 @@ def test_slopes_become_maps_side_by_side():
 
 def test_the_papers_modes_are_shown_where_they_were_used():
     fit = a_fit(modes=np.array([0, 3, 4]))
-    assert fit.modes[maps.shown_modes(fit)].tolist() == [0, 4], "1 and 5, as the paper counts"
-    assert maps.shown_modes(a_fit(modes=np.array([1, 2, 3]))).tolist() == [0, 1, 2]
+    assert fit.modes[figures.shown_modes(fit)].tolist() == [0, 4], "1 and 5, as the paper counts"
+    assert figures.shown_modes(a_fit(modes=np.array([1, 2, 3]))).tolist() == [0, 1, 2]
 
 
-def test_the_scans_take_as_many_rows_as_they_need():
-    assert scans.n_rows((SCAN,) * scans.ACROSS) == 1
-    assert scans.n_rows((SCAN,) * (scans.ACROSS + 1)) == 2
+@pytest.mark.parametrize(("n_scans", "n_places"), [(5, 5), (6, 10)])
+def test_the_scans_take_as_many_rows_of_five_as_they_need(n_scans, n_places):
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    figures.scans(figure.subfigures(), (SCAN,) * n_scans)
+    assert len(figure.subfigs[0].axes) == n_places
 
 
 @pytest.mark.parametrize("table", [None, (SCAN,) * 6])

@@ -15,7 +15,7 @@ from service.errors import (
     TooSlowError,
     UnknownIdError,
 )
-from service.files.jobs import FitAsked, FitState
+from service.files.uploads import FitAsked, FitState
 from service.fit.options import FitOptions
 from service.runtime import uploads
 from service.runtime.uploads import FitLimits, FitQueue

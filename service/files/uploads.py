@@ -1,4 +1,4 @@
-"""An upload of several files: the measured matrix, the instrument file, and what that refers to."""
+"""Fits of uploads: what may be asked, what came, and the fit in a process of its own."""
 
 from __future__ import annotations
 
@@ -6,12 +6,18 @@ import re
 import shutil
 import tomllib
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path, PurePosixPath
+from typing import Any
 
-from service.errors import ConfigurationError, MatrixError
+from service.errors import ConfigurationError, MatrixError, PyrcalError
 from service.files.container import check_sealed
+from service.files.report import document
+from service.files.run import fit_file
+from service.fit.options import FitOptions
+from service.model.instrument import Instrument
 
 MOST_FILES = 32
 
@@ -136,3 +142,120 @@ def _texts(value: object) -> Iterator[str]:
     elif isinstance(value, dict | list):
         for part in value.values() if isinstance(value, dict) else value:
             yield from _texts(part)
+
+
+UPLOAD = "upload"
+"""Name of what was uploaded, in the folder of its fit."""
+
+
+class FitState(StrEnum):
+    """How far a fit is."""
+
+    RECEIVING = "receiving"
+    """The upload is on its way."""
+
+    WAITING = "waiting"
+    """It stands in the queue."""
+
+    RUNNING = "running"
+    DONE = "done"
+    """There is a document; its verdict may be a refusal."""
+
+    FAILED = "failed"
+    """There is none; the reason says why."""
+
+
+UNFINISHED = frozenset({FitState.RECEIVING, FitState.WAITING, FitState.RUNNING})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FitAsked:
+    """What was asked for, besides the measured matrix itself."""
+
+    options: FitOptions
+    """As for any fit."""
+
+    dataset: str | None = None
+    """Name of the matrix in its file; None: the usual one."""
+
+    instrument: str | None = None
+    """A packaged instrument; None: the service's own, or the one that was uploaded."""
+
+    reference: str | None = None
+    """The measured file in an upload of several; None: the only one that can be it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FitJob:
+    """One fit the service was asked for."""
+
+    id: str
+    """Never reused while the service runs."""
+
+    state: FitState
+    """How far it is."""
+
+    asked_ns_utc: int
+    """When it was asked for, the service's clock."""
+
+    n_bytes: int = 0
+    """Of the upload so far."""
+
+    sha256: str = ""
+    """Of the upload; empty until it is whole."""
+
+    reason: str = ""
+    """Why it failed."""
+
+    document: Mapping[str, Any] | None = None
+    """What was found, as ``service.files.report.document`` says it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class UploadFitter:
+    """Fits what was uploaded into a folder; can be pickled."""
+
+    own: Instrument
+    """The service's own instrument."""
+
+    load_instrument: Callable[[Path], Instrument]
+    """Reads that of an upload."""
+
+    packaged_instrument: Callable[[str], Instrument]
+    """Reads a packaged one; a name is never a file of this machine."""
+
+    most_bytes: int
+    """Of the files of an archive together."""
+
+    threads: int
+    """That share the work."""
+
+    def __call__(self, folder: Path, asked: FitAsked) -> dict[str, Any]:
+        """Return the document of the fit.
+
+        Raises
+        ------
+        MatrixError
+            If something in the upload cannot be used, said without the service's own paths.
+        """
+        unpacked = folder / "unpacked"
+        unpacked.mkdir()
+        try:
+            parcel = opened_parcel(folder / UPLOAD, unpacked, asked.reference, self.most_bytes)
+            if asked.instrument is not None:
+                instrument = self.packaged_instrument(asked.instrument)
+            elif parcel.instrument is not None:
+                instrument = self.load_instrument(parcel.instrument)
+            else:
+                instrument = self.own
+            report = fit_file(
+                instrument,
+                parcel.reference,
+                asked.options,
+                dataset=asked.dataset,
+                threads=self.threads,
+            )
+        except PyrcalError as error:
+            said = str(error).replace(f"{unpacked}/", "").replace(f"{folder}/", "")
+            raise MatrixError(said) from error
+        return document(report)

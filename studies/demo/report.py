@@ -1,4 +1,4 @@
-"""What came of the demo: the estimate against the truth, and the loop before and after."""
+"""What came of the demo: the estimate against the truth, the loop before and after, as a table."""
 
 from __future__ import annotations
 
@@ -288,3 +288,61 @@ def _recovered(start: float | None, first: float | None) -> bool:
 
 def _less(value: float | None, limit: float | None) -> bool:
     return value is not None and limit is not None and math.isfinite(value) and value < limit
+
+
+def table(report: Report) -> str:
+    """Return the closing table."""
+    lines = ["", "registration       true        estimated    sigma       error      in sigma"]
+    lines += [f"  {name:15}" + _row(report, name) for name in PARAMETERS]
+    lines += ["", "loop                           modes   wavefront error   worst pole radius"]
+    for label, stage in (
+        ("at the start", report.start),
+        ("after the first update", report.first_update),
+        ("with more modes", report.target_modes),
+    ):
+        lines.append(_stage_row(label, stage))
+    seconds = report.seconds_to_first_applied
+    first = "never" if seconds is None else f"{seconds:.1f} s after it was ready"
+    ready = report.seconds_to_ready
+    lines += [
+        "",
+        "never ready" if ready is None else f"ready {ready:.1f} s after the start",
+        f"reconstructors: {report.reconstructors_published} published, "
+        f"{report.reconstructors_applied} applied, {report.reconstructors_refused_by_gate} refused "
+        f"by the gate, {report.reconstructors_rejected_by_rtc} rejected by the RTC; "
+        f"first applied {first}",
+        f"frames: {report.frames_received} received, {report.frames_lost} lost",
+    ]
+    lines += [
+        f"swap to {swap['cm_id']}: {swap['frames_skipped']} frames skipped, wavefront peak "
+        f"{swap['peak_before_nm']:.0f} nm before, {swap['peak_after_nm']:.0f} nm after"
+        for swap in report.swaps
+    ]
+    lines.append("")
+    lines += [f"FAILED: {text}" for text in report.failures] or ["GOOD: the main job was done"]
+    lines += [f"because: {text}" for text in report.reasons]
+    return "\n".join(lines)
+
+
+def _row(report: Report, name: str) -> str:
+    true = report.true_alpha
+    if true is None:
+        return "  not known"
+    if report.estimated_alpha is None or report.sigma is None or report.error is None:
+        return f"{true[name]:+11.5f}    no estimate"
+    in_sigma = (report.error_in_sigma or {})[name]
+    return (
+        f"{true[name]:+11.5f} {report.estimated_alpha[name]:+14.5f} {report.sigma[name]:9.5f} "
+        f"{report.error[name]:+11.5f} {in_sigma:+9.2f}"
+    )
+
+
+def _stage_row(label: str, stage: Stage) -> str:
+    if stage.id is None:
+        return f"  {label:28} never reached"
+    error, radius = stage.wavefront_error_nm, stage.worst_pole_radius
+    return (
+        f"  {label:28} {stage.n_modes:5d}   "
+        f"{'-' if error is None else f'{error:8.1f} nm':>15}   "
+        f"{'not judged' if radius is None else f'{radius:.3f}':>17}"
+    )

@@ -14,7 +14,7 @@ import httpx
 from service.errors import ConfigurationError, shown
 from studies.demo.arguments import FORWARDED, REPEATED
 from studies.demo.children import children, interrupted_by_any_end
-from studies.demo.screen import table
+from studies.demo.report import table
 from studies.demo.truth import TruthFile
 from studies.demo.watch import ANSWER_WITHIN_S, Promise, Watch
 

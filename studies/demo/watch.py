@@ -9,6 +9,7 @@ from typing import Any
 
 import httpx
 
+from service.model.misregistration import PARAMETERS
 from studies.demo.children import Child
 from studies.demo.report import (
     MODEL,
@@ -19,8 +20,7 @@ from studies.demo.report import (
     make_report,
     waits,
 )
-from studies.demo.screen import HEADING, awaited, live_line, slow_line
-from studies.demo.truth import TruthFile
+from studies.demo.truth import Line, TruthFile
 
 POLL_S = 0.5
 LINE_S = 2.0
@@ -268,3 +268,76 @@ class Watch:
         if line not in self._said:
             self._said.add(line)
             self._say(line)
+
+
+HEADING = (
+    "   time   frames  lost |  shift x        shift y        rotation         magnification    |"
+    "  age |   WFE  poles | matrix in use\n"
+    "      s                |  subap          subap          deg                               |"
+    "    s |    nm        |"
+)
+
+_FORMATS = {
+    "shift_x_subap": "{:+.4f}±{:.4f}",
+    "shift_y_subap": "{:+.4f}±{:.4f}",
+    "rotation_deg": "{:+.4f}±{:.4f}",
+    "magnification": "{:.5f}±{:.5f}",
+}
+
+
+def live_line(seconds: float, state: dict[str, Any] | None, truth: Line | None) -> str:
+    """Return one line of the running table."""
+    if state is None:
+        return f"{seconds:7.1f}  the service is starting"
+    link, known = state["link"], state["registration"]
+    registration = " not known yet".ljust(66)
+    age = "    -"
+    if known is not None:
+        cells = [
+            _FORMATS[name].format(known["alpha"][name], known["sigma"][name]) for name in PARAMETERS
+        ]
+        registration = " {:14} {:14} {:16} {:18}".format(*cells)
+        age = f"{known['age_s']:5.1f}"
+    error = "    -" if truth is None else f"{truth['wavefront_error_nm']:5.0f}"
+    margin = state["margin"]
+    poles = "    -" if margin is None else f"{margin['worst_pole_radius']:.3f}"
+    lost = link["frames_lost"]
+    return (
+        f"{seconds:7.1f} {link['frames_received']:8d} {lost:5d} |{registration}|{age} |"
+        f" {error}  {poles} | {_matrix(state)}"
+    )
+
+
+def awaited(state: dict[str, Any] | None) -> str:
+    """Return what keeps the clock from starting."""
+    if state is None:
+        return "the service is starting"
+    if MODEL in (waited_for := waits(state)):
+        return waited_for[MODEL]
+    return "the simulated telescope is being prepared"
+
+
+def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | None:
+    """Return what to say where it takes longer than asked for; None: it does not."""
+    if pace is not None and pace < REAL_TIME:
+        who = "this machine is slow: the simulator" if real_time else "the diffractive telescope"
+        return f"         {who} runs at {pace:.1f} of real time; this takes longer"
+    if behind:
+        return "         this machine is slow: the service's worker is behind; this takes longer"
+    return None
+
+
+def _matrix(state: dict[str, Any]) -> str:
+    alarms = " ".join([*(f"[{alarm['name']}]" for alarm in state["alarms"]), *_waits(state)])
+    if not state["ready"]:
+        return f"- {state['ready_reason']} {alarms}"
+    if state["rtc"] is None:
+        return f"- no RTC {alarms}"
+    return f"{state['in_use'] or '-'} ({state['rtc']['n_controlled']} modes) {alarms}"
+
+
+def _waits(state: dict[str, Any]) -> list[str]:
+    """Return what is waited for besides the end of alarms."""
+    known = {alarm["name"] for alarm in state["alarms"]}
+    names = [wait["name"] for wait in state.get("waiting_for", ()) if wait["name"] not in known]
+    return [f"waits for {', '.join(names)}"] if names else []

@@ -2,8 +2,7 @@ import json
 
 import pytest
 
-from studies.demo.report import Circumstances, make_report
-from studies.demo.screen import table
+from studies.demo.report import Circumstances, Report, Stage, make_report, table
 from studies.demo.truth import TruthFile
 
 TRUE = {"shift_x_subap": 0.1, "shift_y_subap": 0.0, "rotation_deg": 0.2, "magnification": 1.003}
@@ -256,3 +255,29 @@ def test_a_process_that_ended_is_named_with_its_last_words(truth):
 def test_an_old_answer_is_not_a_good_one(truth):
     report = make_report(service_state(), shelf(), truth, Circumstances(unanswered_s=7.2))
     assert report.failures == ["the service has not answered for 7 s"]
+
+
+def test_the_table_says_what_failed_or_that_all_is_good():
+    assert table(Report()).endswith("GOOD: the main job was done")
+    text = table(Report(failures=["no estimate of the registration"]))
+    assert "FAILED: no estimate of the registration" in text
+    assert "GOOD" not in text
+
+
+def test_the_table_shows_what_was_reached_and_what_was_not():
+    text = table(Report(start=Stage(id="a", n_modes=400, worst_pole_radius=0.93)))
+    assert "400" in text
+    assert "0.930" in text
+    assert text.count("never reached") == 2
+
+
+def test_the_table_names_the_reasons_behind_a_failure():
+    text = table(Report(failures=["no estimate"], reasons=["no frames"]))
+    assert text.endswith("FAILED: no estimate\nbecause: no frames")
+
+
+def test_the_table_tells_preparing_from_doing():
+    text = table(Report(seconds_to_ready=7.5, seconds_to_first_applied=9.2))
+    assert "ready 7.5 s after the start" in text
+    assert "first applied 9.2 s after it was ready" in text
+    assert "never ready" in table(Report())

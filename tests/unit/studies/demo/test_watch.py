@@ -1,4 +1,5 @@
 import json
+import re
 import time
 
 import httpx
@@ -6,7 +7,17 @@ import pytest
 
 from studies.demo.children import Child
 from studies.demo.truth import TruthFile
-from studies.demo.watch import HOLD_S, STRETCH, Promise, Stopwatch, Watch
+from studies.demo.watch import (
+    HEADING,
+    HOLD_S,
+    STRETCH,
+    Promise,
+    Stopwatch,
+    Watch,
+    awaited,
+    live_line,
+    slow_line,
+)
 from tests.unit.studies.demo.test_report import TRUE, service_state, shelf, waiting
 
 SECOND_NS = 1_000_000_000
@@ -206,3 +217,78 @@ def test_a_process_that_ends_ends_the_demo_with_its_last_words(scene, tmp_path):
     assert scene.now_s < 10.0
     ending = "the simulator ended with status 3: sim_rtc: no such telescope"
     assert ending in watch.closing_report().reasons
+
+
+SHOWN = {
+    "ready": True,
+    "ready_reason": "ready",
+    "rtc": {"n_controlled": 400},
+    "in_use": "cm-1",
+    "alarms": [],
+    "waiting_for": [],
+    "margin": {"worst_pole_radius": 0.712},
+    "link": {"frames_received": 12_345, "frames_lost": 2},
+    "registration": {
+        "alpha": {
+            "shift_x_subap": 0.12,
+            "shift_y_subap": -0.08,
+            "rotation_deg": 0.2,
+            "magnification": 1.003,
+        },
+        "sigma": {
+            "shift_x_subap": 0.003,
+            "shift_y_subap": 0.003,
+            "rotation_deg": 0.005,
+            "magnification": 0.0003,
+        },
+        "age_s": 1.25,
+    },
+}
+
+
+def test_a_line_shows_frames_registration_loop_and_matrix():
+    line = live_line(12.0, SHOWN, {"wavefront_error_nm": 117.6})
+    for part in ("12345", "+0.1200±0.0030", "+0.2000±0.0050", "1.00300", "118", "0.712", "cm-1"):
+        assert part in line
+    assert "(400 modes)" in line
+
+
+def test_the_columns_stand_below_their_headings():
+    line = live_line(12.0, SHOWN, {"wavefront_error_nm": 117.6})
+    heading = HEADING.splitlines()[0]
+    assert [m.start() for m in re.finditer(r"\|", line)] == [
+        m.start() for m in re.finditer(r"\|", heading)
+    ]
+
+
+def test_a_line_without_a_registration_is_as_wide():
+    full = live_line(12.0, SHOWN, None)
+    empty = live_line(12.0, SHOWN | {"registration": None}, None)
+    assert empty.index("cm-1") == full.index("cm-1")
+
+
+def test_alarms_and_what_is_waited_for_are_seen():
+    assert "[margin]" in live_line(1.0, SHOWN | {"alarms": [{"name": "margin"}]}, None)
+    assert "no RTC" in live_line(1.0, SHOWN | {"rtc": None}, None)
+    preparing = SHOWN | {"ready": False, "ready_reason": "the model is being prepared"}
+    assert "the model is being prepared" in live_line(1.0, preparing, None)
+    waits = [{"name": "margin"}, {"name": "status"}]
+    waiting = SHOWN | {"alarms": [{"name": "margin"}], "waiting_for": waits}
+    assert "[margin] waits for status" in live_line(1.0, waiting, None)
+    assert "the service is starting" in live_line(1.0, None, None)
+
+
+def test_a_slow_machine_is_said_to_be_slow_and_a_slow_telescope_is_not_its_fault():
+    assert slow_line(0.97, real_time=True, behind=False) is None
+    assert slow_line(None, real_time=True, behind=False) is None
+    slow = slow_line(0.61, real_time=True, behind=False)
+    assert "this machine is slow: the simulator runs at 0.6 of real time" in slow
+    assert "this machine" not in slow_line(0.2, real_time=False, behind=False)
+    assert "worker is behind" in slow_line(1.0, real_time=True, behind=True)
+
+
+def test_while_it_prepares_the_demo_says_what_it_waits_for():
+    assert awaited(None) == "the service is starting"
+    wait = {"name": "model", "party": "worker", "text": "it is being prepared", "hinders": True}
+    assert awaited({"waiting_for": [wait]}) == "for the worker: it is being prepared"
+    assert "telescope" in awaited({"waiting_for": []})

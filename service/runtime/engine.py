@@ -5,7 +5,7 @@ The running service and a simulated night drive the same engine; they differ in 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Protocol
 
@@ -39,6 +39,8 @@ from service.telemetry.randomdither import Correlated
 from service.tracker import step
 from service.worker import Description
 
+Step = Callable[[TrackerState, Event, Policy, int], tuple[TrackerState, tuple[Effect, ...]]]
+
 
 class Driver(Protocol):
     """What the engine leaves to whoever drives it, because it takes time."""
@@ -70,15 +72,20 @@ class Engine:
         The user's numbers; ``prepared`` adds the model's.
     driver
         Does what takes time.
+    step
+        The tracker; another one may write down what it is told.
     """
 
-    def __init__(self, state: TrackerState, policy: Policy, driver: Driver) -> None:
+    def __init__(
+        self, state: TrackerState, policy: Policy, driver: Driver, step: Step = step
+    ) -> None:
         self.state = state
         self.policy = policy
         self.streams: Streams | None = None
         """None until the optical model is prepared."""
 
         self._driver = driver
+        self._step = step
 
     def prepared(self, description: Description) -> None:
         """Take what the optical model expects of telemetry: estimators begin to listen."""
@@ -104,7 +111,7 @@ class Engine:
             If it names a reconstructor nobody has heard of.
         """
         before = self.state
-        self.state, effects = step(before, event, self.policy, self._driver.now_ns())
+        self.state, effects = self._step(before, event, self.policy, self._driver.now_ns())
         self._driver.stepped(before, event)
         self._follow()
         for effect in effects:

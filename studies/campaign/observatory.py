@@ -30,6 +30,7 @@ from service.runtime.supervisor import WATCH_INTERVAL_S
 from service.state import Mode, TrackerState
 from service.telemetry.lockin import Spectra
 from service.telemetry.randomdither import Correlated
+from service.tracker import step
 from service.wire import CHUNK_LIMIT, Manifest
 from service.worker import Workbench
 from studies.campaign.observatory_checks import Publication, Swap, published, true_radius
@@ -117,7 +118,8 @@ class Observatory:
         self.dome = dome or Dome(options)
         self.latencies = latencies or Latencies()
         system = self.dome.computer.identity.system
-        self._engine = Engine(TrackerState(system=system, mode=mode), policy, self)
+        state = TrackerState(system=system, mode=mode)
+        self._engine = Engine(state, policy, self, step=self.step)
         self._engine.prepared(workbench.describe())
         self.glances: list[Glance] = []
         self.swaps: list[Swap] = []
@@ -306,6 +308,12 @@ class Observatory:
     def now_ns(self) -> int:
         """Return the time, nanoseconds UTC."""
         return self.dome.now_ns
+
+    def step(
+        self, state: TrackerState, event: Event, policy: Policy, now_ns: int
+    ) -> tuple[TrackerState, tuple[Effect, ...]]:
+        """Let the tracker decide."""
+        return step(state, event, policy, now_ns)
 
     def stepped(self, before: TrackerState, event: Event) -> None:
         """Keep what the tracker heard."""

@@ -92,6 +92,9 @@ class OwnHands:
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
         """Processor time of the jobs, seconds, by name."""
 
+        self.broken = ""
+        """Why no job can be done; empty: all can."""
+
         self._workbench = workbench
 
     async def call(
@@ -99,6 +102,8 @@ class OwnHands:
     ) -> R:
         """Run a method of the workbench now; what goes wrong is said as the worker would."""
         before_s = time.process_time()
+        if self.broken:
+            raise WorkerError(self.broken)
         try:
             return job(self._workbench, *args, **kwargs)
         except PyrcalError:

@@ -1,0 +1,283 @@
+"""A short night of a small telescope, recorded where the tracker is told of events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+from typing_extensions import override
+
+from service import events as ev
+from service.config import load_settings
+from service.config.policy import policy_of
+from service.errors import LinkError, PyrcalError
+from service.events import Command, Effect, Event
+from service.link import events as heard
+from service.reactions.policy import Policy
+from service.state import (
+    MatrixState,
+    MeasureState,
+    Mode,
+    NoisyFinding,
+    NoisyRecord,
+    NoisyState,
+    TrackerState,
+)
+from service.wire import Command as Order
+from service.wire import DitherAction, DitherRequest, Reply
+from service.worker import Workbench
+from studies.campaign.golden import Entry, Teller
+from studies.campaign.golden_codec import encoded
+from studies.campaign.observatory import Latencies, Observatory
+from studies.campaign.observatory_link import OwnHands
+from studies.campaign.strange_rtc import Mischief, StrangeDome, StrangeLink
+
+TELESCOPE = "tests/system/small.toml"
+
+WORDS = (
+    f"--instrument={TELESCOPE}",
+    "--plant=linear",
+    "--imperfections=ideal",
+    "--optical-gain=0.7,0.9",
+    "--n-controlled=45",
+    "--mag=8",
+    "--seed=1",
+    "--alpha=0.05,-0.03,0.1,1.002",
+)
+"""The simulator's command line, where a night has no other."""
+
+SETTINGS: Mapping[str, object] = {
+    "dither.budget_m": 20e-9,
+    "dither.amplitude_m": 10e-9,
+    "dither.window_s": 1.0,
+    "dither.longest_window_s": 2.0,
+    "dither.longest_pause_s": 0.0,
+    "control.n_modes_target": 45,
+    "tracking.floor_rotation_deg": 0.04,
+    "tracking.floor_magnification": 0.0007,
+}
+"""Of the service, where a night has no others: few modes must tell as much as many."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """One night."""
+
+    name: str
+    seconds: float
+    words: tuple[str, ...] = ()
+    """Of the simulator's command line, besides ``WORDS``."""
+
+    settings: Mapping[str, object] = field(default_factory=dict)
+    """Of the service, besides ``SETTINGS``."""
+
+    mode: Mode = Mode.AUTO
+    slow: float = 1.0
+    """How much longer the worker takes than usual."""
+
+    deeds: tuple[tuple[float, Callable[[GoldenNight], None]], ...] = ()
+    """What happens and after how many seconds, in its order."""
+
+
+class GoldenDome(StrangeDome):
+    """A telescope whose RTC may refuse or ignore what it is asked, or not be reached."""
+
+    def __init__(self, words: Sequence[str]) -> None:
+        super().__init__(words)
+        self.refused: tuple[type[Order], ...] = ()
+        """Kinds of commands the RTC refuses."""
+
+        self.deaf = False
+        """It accepts dithers and plays none."""
+
+        self.unreachable = False
+        """No answer comes from it."""
+
+    @override
+    def order(self, command: Order) -> Reply:
+        """Tell the RTC something and return its answer."""
+        if isinstance(command, self.refused):
+            reason = "busy: it is told to refuse"
+            return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
+        starts = isinstance(command, DitherRequest) and command.action is DitherAction.START
+        if self.deaf and starts:
+            return Reply(id=command.id, accepted=True, reason="", start_seq=self.frame + 50)
+        return super().order(command)
+
+
+class GoldenLink(StrangeLink):
+    """The way to it, which may be cut."""
+
+    _strange: GoldenDome
+
+    @override
+    async def command(self, command: Order) -> Reply:
+        """Return the RTC's answer.
+
+        Raises
+        ------
+        LinkError
+            If none comes.
+        """
+        if self._strange.unreachable:
+            raise LinkError("the RTC did not answer within 2 s")
+        return await super().command(command)
+
+
+class GoldenNight(Observatory):
+    """A night that is recorded where the tracker is told of events."""
+
+    dome: GoldenDome
+
+    def __init__(self, plan: Plan, bench: Workbench) -> None:
+        self._teller: Teller | None = None
+        self._settings = {**SETTINGS, **plan.settings}
+        self._plan = plan
+        self.silent = False
+        """No status comes from the RTC."""
+
+        words = [*(w for w in WORDS if not _again(w, plan.words)), *plan.words]
+        slow = plan.slow
+        self._n_slopes = bench.describe().n_slopes
+        super().__init__(
+            words,
+            policy_of(load_settings(None, {}, self._settings)),
+            plan.mode,
+            bench,
+            latencies=Latencies(fit_s=0.5 * slow, make_s=2.0 * slow, judge_s=slow),
+            with_poles=False,
+            dome=GoldenDome(words),
+            link=GoldenLink,
+        )
+
+    @property
+    def recorded(self) -> list[Entry]:
+        """What was told so far, and how it began."""
+        begin = {
+            "night": self._plan.name,
+            "system": self.state.system,
+            "mode": self._plan.mode.value,
+            "settings": self._settings,
+        }
+        return [begin, *self._told.entries]
+
+    @property
+    def instrument(self) -> Entry:
+        """What the tracker knows of the telescope."""
+        return {
+            "mode_information": encoded(self._engine.policy.mode_information),
+            "start": encoded(self._engine.policy.start),
+        }
+
+    @property
+    def worker(self) -> OwnHands:
+        """What computes for the service."""
+        return self._workers
+
+    def play(self) -> None:
+        """Let the night pass and everything happen in it."""
+        for time_s, happen in self._plan.deeds:
+            self.advance(time_s - self.time_s)
+            happen(self)
+        self.advance(self._plan.seconds - self.time_s)
+
+    def ask(self, command: Command) -> None:
+        """Let an operator ask for something; a refusal is an answer, too."""
+        try:
+            self.command(command)
+        except PyrcalError:
+            return
+
+    def post(self, event: Event) -> None:
+        """Let the tracker hear of something."""
+        self._post(event)
+
+    def restart_service(self, mode: Mode) -> None:
+        """End the service and begin it anew; telescope and RTC go on."""
+        self._told.restart(mode, self.dome.now_ns)
+        self._agenda.clear()
+        self._link.sent.clear()
+        self._fitting, self._waiting, self._worker_free_ns = False, None, 0
+        self._engine.state = self._told.state
+        self._engine.begin_anew()
+        self._begin()
+
+    def measured(self) -> None:
+        """Let the RTC send the interaction matrix it measures."""
+        record = self.state.measuring
+        if record is not None:
+            session = self.dome.computer.snapshot().session
+            stored = replace(
+                record,
+                state=MeasureState.STORED,
+                created_ns_utc=self.dome.now_ns,
+                n_slopes=self._n_slopes,
+                double_pass=False,
+                session=session,
+                sha256="0" * 64,
+            )
+            self._post(ev.MatrixMeasured(record=stored))
+
+    def proposed(self) -> str:
+        """Return the id of the last proposal, or of nothing."""
+        records = self.state.reconstructors
+        return next((r.id for r in reversed(records) if r.state is MatrixState.PROPOSED), "none")
+
+    @override
+    def step(
+        self, state: TrackerState, event: Event, policy: Policy, now_ns: int
+    ) -> tuple[TrackerState, tuple[Effect, ...]]:
+        """Let the tracker decide, and write down what it is told."""
+        if self._teller is None:
+            self._teller = Teller(state, policy)
+        effects = self._teller.tell(event, now_ns)
+        return self._teller.state, effects
+
+    @property
+    def _told(self) -> Teller:
+        if self._teller is None:
+            raise ValueError("a night that has not begun")
+        return self._teller
+
+    @override
+    def _do(self, effect: Effect, state: TrackerState) -> None:
+        if isinstance(effect, ev.FinishNoisy) and not self.worker.broken:
+            event = ev.NoisyMade(record=self._finished(effect.record))
+            self._in(self.latencies.make_s, partial(self._post, event))
+            return
+        super()._do(effect, state)
+
+    @override
+    def _hear_status(self) -> None:
+        if not self.silent and Mischief.NO_STATUS not in self.dome.mischief:
+            super()._hear_status()
+
+    @override
+    def _hear(self, event: heard.LinkEvent) -> None:
+        told = isinstance(event, heard.AcknowledgementReceived)
+        if not (told and Mischief.NO_ACK in self.dome.mischief):
+            super()._hear(event)
+
+    def _finished(self, record: NoisyRecord) -> NoisyRecord:
+        """Return a noisy matrix as if it had been fitted: only that it was matters here."""
+        finding = NoisyFinding(
+            n_slopes=self._n_slopes,
+            n_frames=round(record.duration_s * self.dome.rate_hz),
+            n_missing=0,
+            snr=1.2,
+            alpha=None,
+            covariance=None,
+            optical_gain=None,
+            misfit=None,
+            cm_id=self.state.in_use,
+            session=self.dome.computer.snapshot().session,
+            created_ns_utc=self.dome.now_ns,
+            sha256="0" * 64,
+        )
+        return replace(record, state=NoisyState.STORED, finding=finding)
+
+
+def _again(word: str, words: Sequence[str]) -> bool:
+    """Return whether an option is given again."""
+    return any(other.split("=")[0] == word.split("=")[0] for other in words)

@@ -29,10 +29,10 @@ from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.prepared import usual_folder
-from service.reactions.update_choice import JUDGE_INTERVAL_S
-from service.state import Mode
 from service.telemetry.instrumental import Loop, fit_window
 from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan, Spectra
+from service.tracking.state import Mode
+from service.tracking.updates import JUDGE_INTERVAL_S
 from service.worker import Compute, Workbench
 from studies.campaign.observatory import Observatory
 

@@ -8,19 +8,25 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service import events as ev
-from service.events import Command, Event
-from service.reactions.acquisition import acquire, on_acquire
-from service.reactions.activity import refuse_if_occupied
-from service.reactions.decision import decide
-from service.reactions.dither import on_dither, on_silence, on_vibrations
-from service.reactions.dither_schedule import learnt
-from service.reactions.dither_unwanted import on_measured
-from service.reactions.evidence import over as ended
-from service.reactions.journal import logged, with_alarm
-from service.reactions.loop import close_again, on_loop
-from service.reactions.matrices import (
-    Step,
+from service.tracking import events as ev
+from service.tracking.acquisition import acquire, on_acquire
+from service.tracking.activity import refuse_if_occupied
+from service.tracking.alarms import logged, with_alarm
+from service.tracking.dither import on_dither, on_measured, on_silence, on_vibrations
+from service.tracking.dither_schedule import learnt
+from service.tracking.events import Command, Event, Step
+from service.tracking.loop_commands import close_again, on_loop
+from service.tracking.measuring import (
+    MEASURING,
+    awaits_its_dither,
+    gather,
+    meanwhile,
+    on_measurement,
+    on_noisy,
+)
+from service.tracking.operator import on_command
+from service.tracking.policy import Policy
+from service.tracking.reconstructors import (
     on_acknowledgement,
     on_fetched,
     on_margin,
@@ -28,12 +34,7 @@ from service.reactions.matrices import (
     on_proposal_judged,
     shelved,
 )
-from service.reactions.measurements import MEASURING, meanwhile, on_measurement
-from service.reactions.mode_ladder import declined
-from service.reactions.noisy import awaits_its_dither, gather, on_noisy
-from service.reactions.operator import on_command
-from service.reactions.policy import Policy
-from service.reactions.rtc import (
+from service.tracking.rtc import (
     on_failure,
     on_new_session,
     on_services,
@@ -41,10 +42,12 @@ from service.reactions.rtc import (
     on_tick,
     on_vanished,
 )
-from service.reactions.validity import aged
-from service.reactions.watchdog import on_watchdog
-from service.reactions.windows import on_window, refuse_window
-from service.state import TrackerState
+from service.tracking.state import TrackerState
+from service.tracking.updates import decide
+from service.tracking.validity import aged
+from service.tracking.validity import over as ended
+from service.tracking.windows import on_watchdog, on_window, refuse_window
+from service.tracking.worth import declined
 
 __all__ = ["Command", "Event", "Policy", "step"]
 

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from service.config.policy import policy_of
 from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.reactions.estimate import Measured
-from service.reactions.evidence import taken
-from service.reactions.policy import SECOND_NS, Policy
-from service.reactions.tracking import with_window
-from service.state import Source, TrackerState
+from service.tracking.estimate import Measured
+from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.registration import Source
+from service.tracking.state import TrackerState
+from service.tracking.validity import taken
+from service.tracking.windows import with_window
 
 WINDOW_S = 2.0
 FIT_S = 0.5

@@ -22,11 +22,11 @@ from service.archive.products import NoisyArchive
 from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.estimates import finished, work_out
-from service.state import NoisyRecord, NoisyState
 from service.telemetry import randomdither
 from service.telemetry.noisymatrix import RandomEstimate, noisy_matrix
 from service.telemetry.randomdither import Correlated, RandomDither, RandomPlan, joined
 from service.telemetry.span import WindowRefused
+from service.tracking.products import NoisyRecord, NoisyState
 from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, Workbench
 from sim_rtc.assembly import Telescope, build_telescope

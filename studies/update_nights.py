@@ -15,11 +15,11 @@ from collections import Counter
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from service import events as ev
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.control.edge import FORGIVING_LEAK
-from service.state import Mode
+from service.tracking import events as ev
+from service.tracking.state import Mode
 from service.worker import Compute, Workbench
 from studies.campaign.observatory import Observatory
 from studies.campaign.system_measures import wavefront_rms_nm

@@ -21,8 +21,8 @@ from service.archive.store import DAMAGE, Provenance, Store
 from service.archive.tracking import TrackingFile
 from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.reactions.gain_tables import table_of
-from service.state import MatrixState, ReconstructorRecord
+from service.tracking.loop_commands import table_of
+from service.tracking.products import MatrixState, ReconstructorRecord
 from service.wire import checked_id, checksum
 
 PROBE_BYTES = 1 << 20

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError
-from service.state import MeasurementRecord, ReconstructorRecord
+from service.tracking.products import MeasurementRecord, ReconstructorRecord
 
 Indexed = TypeVar("Indexed", ReconstructorRecord, MeasurementRecord)
 

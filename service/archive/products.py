@@ -14,7 +14,7 @@ from service.archive.records import COVARIANCE_SCALE
 from service.archive.store import Store
 from service.errors import ArchiveError, UnknownIdError
 from service.model.misregistration import PARAMETERS
-from service.state import MeasurementRecord, NoisyFinding, NoisyRecord, NoisyState
+from service.tracking.products import MeasurementRecord, NoisyFinding, NoisyRecord, NoisyState
 from service.wire import checked_id, checksum
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service import __version__
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError
-from service.state import MeasurementRecord, NoisyRecord, ReconstructorRecord
+from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import checksum
 
 Provenance = str | int | float | bool | NDArray[Any]

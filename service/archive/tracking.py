@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from service.archive.records import NOT_UNDERSTOOD, plain_numbers, refuse_unknown
 from service.errors import ArchiveError, StorageError
 from service.model.misregistration import Misregistration
-from service.state import Registration, Saved
+from service.tracking.registration import Registration
+from service.tracking.state import Saved
 
 VERSION = 1
 

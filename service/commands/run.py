@@ -30,9 +30,6 @@ from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.uploads import UploadFitter
 from service.model.instrument import Instrument
 from service.prepared import usual_folder
-from service.reactions.measurements import MEASUREMENTS_KEPT
-from service.reactions.noisy import NOISY_KEPT
-from service.reactions.shelf import restored
 from service.routes.admission import Hosts, server_config
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
@@ -40,7 +37,9 @@ from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
-from service.state import TrackerState
+from service.tracking.measuring import MEASUREMENTS_KEPT, NOISY_KEPT
+from service.tracking.reconstructors import restored
+from service.tracking.state import TrackerState
 from service.worker import Compute, start_worker
 
 _OPTIONS = {

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE
-from service.reactions.policy import Policy
+from service.tracking.policy import Policy
 
 FLAT = (0.004, 0.01, 0.001)
 """Shift in subapertures, rotation in degrees, magnification: where telemetry of a working pyramid

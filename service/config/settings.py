@@ -14,7 +14,7 @@ from service.config.sources import Id, Table, Tuple, in_file, nearest, read_toml
 from service.control.recipe import Method
 from service.control.reconstructor import MAX_CONDITION
 from service.errors import ConfigurationError
-from service.state import Mode
+from service.tracking.state import Mode
 from service.wire import CHUNK_LIMIT
 
 PREFIX = "PYRCAL_"

@@ -20,7 +20,10 @@ from pydantic import (
     model_validator,
 )
 
-from service.events import (
+from service.routes.problems import COMMAND, INVALID, UNKNOWN
+from service.routes.service import Service, ServiceDep
+from service.tracking.dither_plan import total_m
+from service.tracking.events import (
     AbortAcquisition,
     Acquire,
     Approve,
@@ -37,10 +40,9 @@ from service.events import (
     StartDither,
     StopDither,
 )
-from service.reactions.dither_choice import total_m
-from service.routes.problems import COMMAND, INVALID, UNKNOWN
-from service.routes.service import Service, ServiceDep
-from service.state import DitherKind, Mode, ModeSet, Pointing
+from service.tracking.loop import DitherKind, Pointing
+from service.tracking.products import ModeSet
+from service.tracking.state import Mode
 
 router = APIRouter(
     prefix="/v1",

@@ -16,8 +16,6 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from service.errors import UnknownIdError
-from service.events import GiveUp, GiveUpNoisy, Measure, MeasureNoisy
-from service.reactions.dither_choice import NOISY_DITHER
 from service.routes import pictures as shown
 from service.routes.commands import (
     MOST_MODES,
@@ -32,7 +30,9 @@ from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.reading import describes_numbers, numbers_of
 from service.routes.service import ServiceDep, Snapshot
 from service.routes.views import answer, shows
-from service.state import MeasurePattern, ModeSet
+from service.tracking.dither_plan import NOISY_DITHER
+from service.tracking.events import GiveUp, GiveUpNoisy, Measure, MeasureNoisy
+from service.tracking.products import MeasurePattern, ModeSet
 
 router = APIRouter(
     prefix="/v1", tags=["interaction matrices it has measured"], responses={**INVALID}

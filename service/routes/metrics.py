@@ -15,15 +15,10 @@ from service import __version__
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.routes.service import Pace, Snapshot
-from service.state import (
-    DitherPhase,
-    MatrixState,
-    MeasurePattern,
-    Mode,
-    Source,
-    TrackerState,
-    Validity,
-)
+from service.tracking.products import MatrixState, MeasurePattern
+from service.tracking.registration import Source, Validity
+from service.tracking.stages import DitherPhase
+from service.tracking.state import Mode, TrackerState
 
 _LINK_COUNTERS = {
     "batches_received": "Telemetry batches taken in",

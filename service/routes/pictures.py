@@ -6,34 +6,24 @@ from dataclasses import dataclass
 
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
-from service.events import GainGroup
 from service.files.uploads import FitJob
 from service.link.statistics import LinkStatistics
 from service.routes.service import Alpha, Pace, Rtc, Snapshot
 from service.routes.views import view
-from service.state import (
-    Acquisition,
-    Alarm,
+from service.telemetry.estimator import Determines
+from service.tracking.events import GainGroup
+from service.tracking.loop import DitherView, LoopCommand, Pointing
+from service.tracking.products import (
     Assessment,
-    Dithering,
-    DitherPlan,
-    DitherView,
-    HistoryEntry,
-    LogEntry,
-    LoopCommand,
     MeasurementRecord,
-    ModeGain,
     ModeLimit,
     NoisyFinding,
     NoisyRecord,
-    Pointing,
     ReconstructorRecord,
-    Source,
-    TrackerState,
-    Waiting,
-    Watchdog,
 )
-from service.telemetry.estimator import Determines
+from service.tracking.registration import HistoryEntry, ModeGain, Source, Watchdog
+from service.tracking.stages import Acquisition, Dithering, DitherPlan
+from service.tracking.state import Alarm, LogEntry, TrackerState, Waiting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

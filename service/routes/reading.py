@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.errors import CommandError, UnknownIdError
-from service.reactions.gain_tables import table_of
 from service.routes import pictures as shown
 from service.routes.pictures import Estimator, Estimators, GainTableShown
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.routes.service import ServiceDep
 from service.routes.views import answer, shows
-from service.state import ModeGain, Source
 from service.telemetry.estimator import LOCK_IN, PASSIVE, RANDOM
+from service.tracking.loop_commands import table_of
+from service.tracking.registration import ModeGain, Source
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 

@@ -11,11 +11,13 @@ import numpy as np
 from fastapi import Depends, Request
 from numpy.typing import NDArray
 
-from service.events import Command, GainGroup
 from service.files.uploads import FitAsked, FitJob
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
-from service.state import Registration, RtcView, TrackerState, Waiting
+from service.tracking.events import Command, GainGroup
+from service.tracking.loop import RtcView
+from service.tracking.registration import Registration
+from service.tracking.state import TrackerState, Waiting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

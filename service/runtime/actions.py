@@ -12,25 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import __version__
-from service import events as ev
 from service.control.gate import GateVerdict
 from service.errors import CommandError, LinkError, UnknownIdError
-from service.events import Effect, Event
 from service.link.events import MeasuredMatrix
 from service.model.instrument import Instrument
-from service.reactions.matrices import commanded_gains, extended_gains
 from service.runtime import translate
 from service.runtime.asking import Question, ask
 from service.runtime.estimates import NoisySums
 from service.runtime.loops import judged_now, loop_settings, modes_that_hold, timing
 from service.runtime.ports import RtcPort, StorePort, WorkerPort
-from service.state import (
-    MatrixState,
-    ReconstructorRecord,
-    Registration,
-    RtcView,
-    TrackerState,
-)
+from service.tracking import events as ev
+from service.tracking.events import Effect, Event
+from service.tracking.loop import RtcView
+from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.reconstructors import commanded_gains, extended_gains
+from service.tracking.registration import Registration
+from service.tracking.state import TrackerState
 from service.wire import LoopRequest, checksum, layout_of
 from service.worker import InUse, Workbench
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from service import events as ev
 from service.errors import CommandError, LinkError
-from service.events import Effect, Event
 from service.runtime import translate
 from service.runtime.ports import RtcPort
-from service.state import CommandState, MeasureState, TrackerState
+from service.tracking import events as ev
+from service.tracking.events import Effect, Event
+from service.tracking.loop import CommandState
+from service.tracking.products import MeasureState
+from service.tracking.state import TrackerState
 from service.wire import (
     DitherAction,
     DitherKind,

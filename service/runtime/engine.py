@@ -12,14 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from service import events as ev
 from service.errors import ModelError
-from service.events import Effect, Event
 from service.link.events import LinkEvent
-from service.reactions.alarms import OFF_LOOP, WRONG_LOOP, WRONG_UNIT, Act, forbidding
-from service.reactions.dither import SILENT_S
-from service.reactions.dither_unwanted import NOT_AS_ASKED, OVER_BUDGET
-from service.reactions.policy import Policy
 from service.runtime import translate
 from service.runtime.streams import (
     VERDICTS,
@@ -30,13 +24,19 @@ from service.runtime.streams import (
     with_matrix,
     with_rtc,
 )
-from service.state import Level, RtcView, TrackerState
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import Spectra, WindowRefused
 from service.telemetry.passive import Passive
 from service.telemetry.played import LOUDER, Finding
 from service.telemetry.randomdither import Correlated
 from service.tracker import step
+from service.tracking import events as ev
+from service.tracking.alarms import OFF_LOOP, WRONG_LOOP, WRONG_UNIT, Act, forbidding
+from service.tracking.dither import NOT_AS_ASKED, OVER_BUDGET, SILENT_S
+from service.tracking.events import Effect, Event
+from service.tracking.loop import RtcView
+from service.tracking.policy import Policy
+from service.tracking.state import Level, TrackerState
 from service.worker import Description
 
 Step = Callable[[TrackerState, Event, Policy, int], tuple[TrackerState, tuple[Effect, ...]]]

@@ -10,25 +10,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from service import events as ev
 from service.archive.products import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
-from service.events import Event
 from service.fit.dialect import setting_written
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
-from service.reactions.alarms import WRONG_MATRIX, Act, forbidding
-from service.reactions.watchdog import fit_begins_at
 from service.runtime.ports import StorePort, WorkerPort
-from service.state import (
-    Level,
-    NoisyFinding,
-    NoisyRecord,
-    NoisyState,
-    ReconstructorRecord,
-    RtcView,
-    TrackerState,
-)
 from service.telemetry import lockin, randomdither
 from service.telemetry.estimator import Window
 from service.telemetry.instrumental import Loop
@@ -36,6 +23,13 @@ from service.telemetry.lockin import Spectra, WindowRefused
 from service.telemetry.noisymatrix import RandomEstimate, noisy_matrix
 from service.telemetry.passive import Passive
 from service.telemetry.randomdither import Correlated
+from service.tracking import events as ev
+from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
+from service.tracking.events import Event
+from service.tracking.loop import RtcView
+from service.tracking.products import NoisyFinding, NoisyRecord, NoisyState, ReconstructorRecord
+from service.tracking.state import Level, TrackerState
+from service.tracking.windows import fit_begins_at
 from service.wire import checksum
 from service.worker import Workbench, run_job
 

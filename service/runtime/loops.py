@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
-from service.reactions.alarms import Act, forbidding
-from service.reactions.gain_tables import table_of
-from service.state import Judged, Registration, RtcView, TrackerState
-from service.state.rtc import same_gains
 from service.telemetry.loopcheck import LoopTerms
+from service.tracking.alarms import Act, forbidding
+from service.tracking.loop import RtcView, same_gains
+from service.tracking.loop_commands import table_of
+from service.tracking.products import Judged
+from service.tracking.registration import Registration
+from service.tracking.state import TrackerState
 
 GAIN_SAFETY = 1.1
 """Above a mean optical gain that nobody says which modes it is of."""

@@ -7,10 +7,10 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from service import events as ev
 from service.routes.service import Pace
 from service.runtime.workers import WorkerPool
-from service.state import TrackerState
+from service.tracking import events as ev
+from service.tracking.state import TrackerState
 
 WORKER_LOST = "worker-lost"
 """The alarm of a worker that died or hangs, until another has done a job."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
-from service.state import MeasurementRecord, NoisyRecord, ReconstructorRecord
+from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import Command, Manifest, Reply
 from service.worker import Done, Workbench
 

@@ -10,16 +10,15 @@ from functools import partial
 
 import structlog
 
-from service import events as ev
 from service.archive import Archive, AuditEntry
 from service.errors import ArchiveError, StorageError
-from service.events import Command, Effect
-from service.reactions.alarms import ARCHIVE_FAILED
-from service.reactions.journal import logged
-from service.reactions.orders import orders_of
-from service.reactions.policy import Policy
-from service.reactions.restoring import resumed, saved_of, with_orders
-from service.state import Level, LogEntry, ReconstructorRecord, TrackerState
+from service.tracking import events as ev
+from service.tracking.alarms import ARCHIVE_FAILED, logged
+from service.tracking.events import Command, Effect
+from service.tracking.policy import Policy
+from service.tracking.products import ReconstructorRecord
+from service.tracking.resume import orders_of, resumed, saved_of, with_orders
+from service.tracking.state import Level, LogEntry, TrackerState
 
 RETRY_S = 2.0
 """Between two attempts while the disk refuses."""

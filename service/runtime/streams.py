@@ -8,11 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.reactions.dither_choice import SETTLING_S, asked_of, lock_in_plan
-from service.reactions.random_dither import random_plan
 from service.runtime.loops import terms_of
-from service.state import DitherKind, DitherView, RtcView
-from service.state.rtc import same_rate
 from service.telemetry import lockin, loopcheck, looplaw, passive, randomdither
 from service.telemetry.edge import EdgeHealth, EdgeWatch, edge_watch, observe_edge
 from service.telemetry.frames import FrameBlock
@@ -24,6 +20,8 @@ from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, measured
 from service.telemetry.randomdither import Correlated, RandomDither
 from service.telemetry.vibration import Hearing, heard, hearing
+from service.tracking.dither_plan import SETTLING_S, asked_of, lock_in_plan, random_plan
+from service.tracking.loop import DitherKind, DitherView, RtcView, same_rate
 from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0

@@ -13,13 +13,9 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from service import events as ev
 from service.archive import Archive
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
-from service.events import Command, Effect, Event
 from service.link.events import MeasuredMatrix
-from service.reactions.journal import new_lines
-from service.reactions.policy import Policy
 from service.routes.service import Snapshot
 from service.rtc_bridge import Bridge
 from service.runtime import translate
@@ -31,9 +27,14 @@ from service.runtime.pace import PaceMeter
 from service.runtime.recording import Recorder
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, waiting_for
 from service.runtime.workers import WorkerPool
-from service.state import Level, MeasureState, TrackerState, Waiting
 from service.telemetry.lockin import Spectra
 from service.telemetry.randomdither import Correlated
+from service.tracking import events as ev
+from service.tracking.alarms import new_lines
+from service.tracking.events import Command, Effect, Event
+from service.tracking.policy import Policy
+from service.tracking.products import MeasureState
+from service.tracking.state import Level, TrackerState, Waiting
 from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, Workbench
 

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from service import events as ev
 from service.link import events as heard
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
-from service.state import (
-    DitherKind,
-    DitherView,
-    Level,
+from service.tracking import events as ev
+from service.tracking.loop import DitherKind, DitherView, Pointing, RtcView
+from service.tracking.products import (
     MatrixState,
     MeasurementRecord,
     MeasurePattern,
     MeasureState,
-    Pointing,
     ReconstructorRecord,
-    RtcView,
-    TrackerState,
-    Waiting,
 )
+from service.tracking.state import Level, TrackerState, Waiting
 from service.wire import (
     TEXT_LIMIT,
     Acknowledgement,

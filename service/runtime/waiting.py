@@ -7,20 +7,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from service import events as ev
 from service.link.intake import SPARED
 from service.link.statistics import MALFORMED, RECENT_S, USED, Fate, LinkStatistics
-from service.reactions.alarms import Act, forbids
-from service.reactions.policy import SECOND_NS
-from service.state import (
-    AcquisitionStage,
-    Alarm,
-    MatrixState,
-    Mode,
-    Party,
-    TrackerState,
-    Waiting,
-)
+from service.tracking import events as ev
+from service.tracking.alarms import Act, forbids
+from service.tracking.policy import SECOND_NS
+from service.tracking.products import MatrixState
+from service.tracking.stages import AcquisitionStage
+from service.tracking.state import Alarm, Mode, Party, TrackerState, Waiting
 
 SILENT_S: Final = 3.0
 """What has not come for so long is waited for."""

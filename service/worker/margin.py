@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service.control.expected_gain import ExpectedGain, Timing
 from service.control.gate import GateVerdict, LoopSettings
 from service.model.misregistration import Misregistration
-from service.state.rtc import SAME_GAIN
+from service.tracking.loop import SAME_GAIN
 
 Array = NDArray[np.float64]
 

@@ -24,10 +24,11 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.events import FarFitted
 from service.model.misregistration import BOUNDARY_SCALE
-from service.state import AcquisitionStage, Mode
 from service.telemetry.faraway import FarEstimate
+from service.tracking.events import FarFitted
+from service.tracking.stages import AcquisitionStage
+from service.tracking.state import Mode
 from service.worker import Compute, Workbench
 from studies.campaign.acquisition_table import table
 from studies.campaign.observatory import Observatory

@@ -21,15 +21,15 @@ import numpy as np
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import PyrcalError
-from service.events import Effect, Event
 from service.model.misregistration import Misregistration
-from service.reactions.activity import under_way
-from service.reactions.journal import new_lines
-from service.reactions.policy import Policy
-from service.reactions.restoring import resumed, saved_of
-from service.reactions.shelf import restored
-from service.state import Mode, TrackerState
 from service.tracker import step
+from service.tracking.activity import under_way
+from service.tracking.alarms import new_lines
+from service.tracking.events import Effect, Event
+from service.tracking.policy import Policy
+from service.tracking.reconstructors import restored
+from service.tracking.resume import resumed, saved_of
+from service.tracking.state import Mode, TrackerState
 from studies.campaign.golden_codec import Json, decoded, encoded, renewed
 
 FOLDER = Path("tests/data/golden")

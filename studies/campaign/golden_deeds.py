@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from service import events as ev
-from service.events import Command, Event
-from service.state import MatrixState, MeasurePattern, Mode, Pointing
+from service.tracking import events as ev
+from service.tracking.events import Command, Event
+from service.tracking.loop import Pointing
+from service.tracking.products import MatrixState, MeasurePattern
+from service.tracking.state import Mode
 from service.wire import Command as Order
 from service.wire import DitherAction, DitherKind, DitherRequest
 from studies.campaign.golden_night import GoldenNight

@@ -8,22 +8,21 @@ from functools import partial
 
 from typing_extensions import override
 
-from service import events as ev
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import LinkError, PyrcalError
-from service.events import Command, Effect, Event
 from service.link import events as heard
-from service.reactions.policy import Policy
-from service.state import (
+from service.tracking import events as ev
+from service.tracking.events import Command, Effect, Event
+from service.tracking.policy import Policy
+from service.tracking.products import (
     MatrixState,
     MeasureState,
-    Mode,
     NoisyFinding,
     NoisyRecord,
     NoisyState,
-    TrackerState,
 )
+from service.tracking.state import Mode, TrackerState
 from service.wire import Command as Order
 from service.wire import DitherAction, DitherRequest, Reply
 from service.worker import Workbench

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from service import events as ev
-from service.state import DitherKind, MeasurePattern, Mode, ModeSet
+from service.tracking import events as ev
+from service.tracking.loop import DitherKind
+from service.tracking.products import MeasurePattern, ModeSet
+from service.tracking.state import Mode
 from service.wire import DitherRequest, Loop, LoopRequest, MeasureRequest, RampRequest
 from studies.campaign.golden_deeds import (
     ACQUIRE,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from service import events as ev
-from service.state import Level, MatrixState, Mode
+from service.tracking import events as ev
+from service.tracking.products import MatrixState
+from service.tracking.state import Level, Mode
 from service.wire import DitherRequest, Loop, LoopRequest
 from studies.campaign.golden_deeds import (
     ABORT,

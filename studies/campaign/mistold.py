@@ -25,7 +25,7 @@ from service.config.policy import policy_of
 from service.fit.target import oriented
 from service.model.interaction import rtc_valid_subapertures
 from service.model.slopes import Orientation, SlopeOrder, to_rtc
-from service.state import Mode
+from service.tracking.state import Mode
 from service.wire import LoopRequest, Status
 from service.worker import Compute, Workbench
 from studies.campaign.observatory import Observatory

@@ -18,19 +18,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service import events as ev
 from service.errors import PyrcalError
-from service.events import Command, Effect, Event
 from service.link import events as heard
-from service.reactions.policy import SECOND_NS, Policy
 from service.runtime.actions import Actions, Publishing
 from service.runtime.engine import Engine
 from service.runtime.estimates import fitted, listened, lost, watched
 from service.runtime.supervisor import WATCH_INTERVAL_S
-from service.state import Mode, TrackerState
 from service.telemetry.lockin import Spectra
 from service.telemetry.randomdither import Correlated
 from service.tracker import step
+from service.tracking import events as ev
+from service.tracking.events import Command, Effect, Event
+from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.state import Mode, TrackerState
 from service.wire import CHUNK_LIMIT, Manifest
 from service.worker import Workbench
 from studies.campaign.observatory_checks import Publication, Swap, published, true_radius

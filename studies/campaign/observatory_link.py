@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.errors import PyrcalError, UnknownIdError, WorkerError
-from service.state import MeasurementRecord, NoisyRecord, ReconstructorRecord
+from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
 from service.worker import Done, Workbench
 from sim_rtc.reconstructors import Outcome, Staging, Verdict

@@ -24,9 +24,9 @@ from typing_extensions import override
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.events import Event
-from service.reactions.journal import new_lines
-from service.state import Mode, TrackerState
+from service.tracking.alarms import new_lines
+from service.tracking.events import Event
+from service.tracking.state import Mode, TrackerState
 from service.worker import Compute, Workbench
 from studies.campaign.observatory import Latencies, Observatory
 

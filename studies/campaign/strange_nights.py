@@ -23,12 +23,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
-from service import events as ev
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.errors import PyrcalError
 from service.link import events as heard
-from service.state import MatrixState, MeasurePattern, Mode
+from service.tracking import events as ev
+from service.tracking.products import MatrixState, MeasurePattern
+from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest
 from service.worker import Compute, Workbench
 from studies.campaign.observatory import Latencies, Observatory

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE
-from service.state import MatrixState
+from service.tracking.products import MatrixState
 from studies.campaign.observatory import Observatory
 from studies.campaign.observatory_checks import Outcome, Publication
 from studies.campaign.observatory_dome import START_NS, Moment

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.state import Mode
+from service.tracking.state import Mode
 from service.wire import DitherRequest
 from service.worker import Compute, Workbench
 from studies.campaign.observatory import Observatory

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from service.archive.records import from_json, to_json
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
-from service.state import MatrixState, ReconstructorRecord
+from service.tracking.products import MatrixState, ReconstructorRecord
 
 numbers = st.floats(-10, 10)
 radii = st.floats(0, allow_nan=False)

@@ -5,13 +5,13 @@ from dataclasses import replace
 import hypothesis.strategies as st
 from hypothesis import given
 
-from service import events as ev
 from service.control.expected_gain import ExpectedGain
-from service.reactions.matrices import commanded_gains
-from service.reactions.verdicts import why_stale
-from service.state import MatrixState, Mode
+from service.tracking import events as ev
+from service.tracking.products import MatrixState
+from service.tracking.reconstructors import commanded_gains, why_stale
+from service.tracking.state import Mode
 from tests.properties.test_tracker_laws import LAWS, Night, commands, heard, ids
-from tests.unit.reactions.situations import ALPHA, moved, record, rtc, verdict
+from tests.unit.tracking.situations import ALPHA, moved, record, rtc, verdict
 
 MADE = [f"made-{k}" for k in range(1, 6)]
 any_id = st.one_of(ids, st.sampled_from(MADE))

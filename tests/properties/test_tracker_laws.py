@@ -6,24 +6,18 @@ import hypothesis.strategies as st
 import numpy as np
 from hypothesis import HealthCheck, given, settings
 
-from service import events as ev
 from service.errors import CommandError
-from service.reactions.dither_choice import total_m
-from service.reactions.estimate import HISTORY_LENGTH
-from service.reactions.journal import LOG_LENGTH
-from service.reactions.measurements import MEASUREMENTS_KEPT
-from service.reactions.shelf import RECONSTRUCTORS_KEPT
-from service.state import (
-    MatrixState,
-    MeasurementRecord,
-    MeasurePattern,
-    MeasureState,
-    Mode,
-    TrackerState,
-)
 from service.telemetry.lockin import WindowRefused
 from service.tracker import step
-from tests.unit.reactions.situations import (
+from service.tracking import events as ev
+from service.tracking.alarms import LOG_LENGTH
+from service.tracking.dither_plan import total_m
+from service.tracking.estimate import HISTORY_LENGTH
+from service.tracking.measuring import MEASUREMENTS_KEPT
+from service.tracking.products import MatrixState, MeasurementRecord, MeasurePattern, MeasureState
+from service.tracking.reconstructors import RECONSTRUCTORS_KEPT
+from service.tracking.state import Mode, TrackerState
+from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
     START_NS,

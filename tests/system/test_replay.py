@@ -6,17 +6,17 @@ import sys
 import numpy as np
 import pytest
 
-from service import events as ev
 from service.config import load_instrument
 from service.link.endpoint import Endpoint
 from service.link.intake import Intake
 from service.model.misregistration import PARAMETERS, Misregistration
-from service.reactions.policy import Policy
 from service.runtime import translate
 from service.runtime.engine import Engine
-from service.state import Mode, TrackerState
 from service.telemetry.instrumental import Loop as FitLoop
 from service.telemetry.instrumental import WindowEstimate
+from service.tracking import events as ev
+from service.tracking.policy import Policy
+from service.tracking.state import Mode, TrackerState
 from service.wire import decode_manifest
 from service.worker import Compute, Workbench
 from sim_rtc.record import Kind, Recording

@@ -25,7 +25,9 @@ from service.errors import (
     StorageError,
     UnknownIdError,
 )
-from service.events import (
+from service.link.statistics import LinkStatistics
+from service.model.misregistration import PARAMETERS, Misregistration
+from service.tracking.events import (
     Approve,
     Publish,
     Refit,
@@ -36,37 +38,27 @@ from service.events import (
     StartDither,
     StopDither,
 )
-from service.link.statistics import LinkStatistics
-from service.model.misregistration import PARAMETERS, Misregistration
-from service.state import (
-    Alarm,
-    Candidate,
-    CommandState,
-    Dithering,
-    DitherPhase,
-    DitherPlan,
-    DitherView,
-    HistoryEntry,
-    Level,
-    LogEntry,
-    LoopCommand,
+from service.tracking.loop import CommandState, DitherView, LoopCommand, Pointing, RtcView
+from service.tracking.products import (
     MatrixState,
     MeasurementRecord,
     MeasurePattern,
     MeasureState,
-    Mode,
+    ReconstructorRecord,
+)
+from service.tracking.registration import (
+    Candidate,
+    HistoryEntry,
     ModeGain,
     PassiveBias,
-    Pointing,
-    ReconstructorRecord,
     Registration,
-    RtcView,
     Source,
     Standing,
-    TrackerState,
     Validity,
     Watchdog,
 )
+from service.tracking.stages import Dithering, DitherPhase, DitherPlan
+from service.tracking.state import Alarm, Level, LogEntry, Mode, TrackerState
 
 SECOND = 1_000_000_000
 ALPHA = Misregistration(

@@ -7,10 +7,10 @@ import pytest
 
 from service.api import create_app
 from service.errors import CommandError
-from service.events import AbortAcquisition, Acquire
 from service.routes.views import picture
-from service.state import Acquisition, AcquisitionStage
-from tests.unit.reactions.situations import ALPHA
+from service.tracking.events import AbortAcquisition, Acquire
+from service.tracking.stages import Acquisition, AcquisitionStage
+from tests.unit.tracking.situations import ALPHA
 
 
 class FakeService:

@@ -7,10 +7,11 @@ import httpx
 import pytest
 
 from service.api import create_app
-from service.events import SetLoop
-from service.state import ModeGain, TrackerState
-from tests.unit.reactions.situations import START_NS, record, rtc
+from service.tracking.events import SetLoop
+from service.tracking.registration import ModeGain
+from service.tracking.state import TrackerState
 from tests.unit.runtime.test_actions import REGISTRATION
+from tests.unit.tracking.situations import START_NS, record, rtc
 
 MEASURED = (
     ModeGain(mode=20, gain=0.5, sigma=0.01, scatter=0.02, t_ns_utc=START_NS),

@@ -5,7 +5,7 @@ import pytest
 
 from service.api import create_app
 from service.errors import CommandError, LinkError
-from service.events import GainGroup, Ramp, SetLoop
+from service.tracking.events import GainGroup, Ramp, SetLoop
 
 
 class FakeService:

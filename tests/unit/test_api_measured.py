@@ -10,8 +10,9 @@ import pytest
 
 from service.api import Snapshot, create_app
 from service.errors import CommandError, LinkError, UnknownIdError
-from service.events import GiveUp, Measure
-from service.state import MeasurementRecord, MeasurePattern, MeasureState, TrackerState
+from service.tracking.events import GiveUp, Measure
+from service.tracking.products import MeasurementRecord, MeasurePattern, MeasureState
+from service.tracking.state import TrackerState
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3)
 FILE = b"\x89HDF the product"

@@ -8,11 +8,12 @@ import pytest
 
 from service.api import Snapshot, create_app
 from service.errors import CommandError, UnknownIdError
-from service.events import GiveUpNoisy, MeasureNoisy
 from service.model.misregistration import Misregistration
 from service.routes.pictures import GATHERING
 from service.routes.views import picture
-from service.state import ModeSet, NoisyFinding, NoisyRecord, NoisyState, TrackerState
+from service.tracking.events import GiveUpNoisy, MeasureNoisy
+from service.tracking.products import ModeSet, NoisyFinding, NoisyRecord, NoisyState
+from service.tracking.state import TrackerState
 
 FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"
 STORED = NoisyRecord(

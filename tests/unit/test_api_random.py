@@ -4,8 +4,10 @@ import httpx
 import pytest
 
 from service.api import Snapshot, create_app
-from service.events import StartDither
-from service.state import DitherKind, ModeSet, TrackerState
+from service.tracking.events import StartDither
+from service.tracking.loop import DitherKind
+from service.tracking.products import ModeSet
+from service.tracking.state import TrackerState
 
 
 class FakeService:

@@ -18,7 +18,7 @@ from service.archive import Archive, AuditEntry
 from service.control.gate import GateVerdict
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.model.misregistration import Misregistration
-from service.state import Judged, MatrixState, ReconstructorRecord
+from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.wire import checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4)
@@ -445,7 +445,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from service.archive import Archive
-from service.state import Judged, MatrixState, ReconstructorRecord
+from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 
 archive = Archive(Path(sys.argv[1]))
 archive.open()

@@ -9,8 +9,8 @@ import pytest
 
 from service.archive import Archive
 from service.errors import ArchiveError, UnknownIdError, WireError
-from service.state import MatrixState, MeasurementRecord, MeasurePattern, MeasureState
-from service.state import ReconstructorRecord as Reconstructor
+from service.tracking.products import MatrixState, MeasurementRecord, MeasurePattern, MeasureState
+from service.tracking.products import ReconstructorRecord as Reconstructor
 from service.wire import checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3) * 1e6

@@ -12,7 +12,7 @@ from service.archive.records import from_json, to_json
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.files.recorded import read_recorded
 from service.model.misregistration import Misregistration
-from service.state import NoisyFinding, NoisyRecord, NoisyState
+from service.tracking.products import NoisyFinding, NoisyRecord, NoisyState
 from service.wire import checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3) * 1e6

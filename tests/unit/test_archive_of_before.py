@@ -8,16 +8,10 @@ import pytest
 
 from service.archive import Archive, AuditEntry
 from service.archive.tracking import TrackingFile
-from service.state import (
-    AcquisitionStage,
-    MatrixState,
-    MeasurePattern,
-    MeasureState,
-    Mode,
-    ModeGain,
-    NoisyState,
-    Orders,
-)
+from service.tracking.products import MatrixState, MeasurePattern, MeasureState, NoisyState
+from service.tracking.registration import ModeGain
+from service.tracking.stages import AcquisitionStage
+from service.tracking.state import Mode, Orders
 
 WRITTEN = Path(__file__).parents[1] / "data" / "archive"
 

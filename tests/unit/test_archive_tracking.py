@@ -6,15 +6,17 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from service import events as ev
 from service.archive import Archive
 from service.archive.tracking import TrackingFile
 from service.errors import ArchiveError
-from service.reactions.restoring import saved_of
-from service.state import Mode, Orders, Pointing, Registration
-from tests.unit.reactions.situations import START_NS, Story, moved, rtc
-from tests.unit.reactions.test_acquisition import Acquiring
-from tests.unit.reactions.test_watchdog import learnt, watch
+from service.tracking import events as ev
+from service.tracking.loop import Pointing
+from service.tracking.registration import Registration
+from service.tracking.resume import saved_of
+from service.tracking.state import Mode, Orders
+from tests.unit.tracking.situations import START_NS, Story, moved, rtc
+from tests.unit.tracking.test_acquisition import Acquiring
+from tests.unit.tracking.test_watchdog import learnt, watch
 
 
 @pytest.fixture(scope="module")

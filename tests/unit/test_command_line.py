@@ -13,7 +13,7 @@ from service.control.recipe import Method as MakeMethod
 from service.control.recipe import Recipe
 from service.fit.options import FitOptions
 from service.fit.options import Method as FitMethod
-from service.state import Mode
+from service.tracking.state import Mode
 
 ROOT = Path(__file__).parents[2]
 

@@ -15,7 +15,7 @@ from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Normalisation, Orientation, SlopeOrder
-from service.state import Mode
+from service.tracking.state import Mode
 
 ABOUT = '[instrument]\nname = "bench"\ndiameter_m = 8.0\nstop = "telescope"\n'
 WFS = (

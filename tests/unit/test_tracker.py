@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from service import events as ev
 from service.errors import CommandError
-from service.state import MatrixState, Mode, TrackerState
 from service.tracker import step
-from tests.unit.reactions.situations import (
+from service.tracking import events as ev
+from service.tracking.products import MatrixState
+from service.tracking.state import Mode, TrackerState
+from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
     START_NS,

@@ -7,7 +7,7 @@ import pytest
 from service.archive import Archive
 from service.errors import MatrixError
 from service.files.recorded import read_recorded
-from service.state import MeasurementRecord, MeasurePattern, MeasureState
+from service.tracking.products import MeasurementRecord, MeasurePattern, MeasureState
 from service.wire import checksum
 
 MATRIX = np.random.default_rng(1).normal(size=(8, 3))

@@ -5,18 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service import events as ev
 from service.archive import Archive
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.runtime.actions import Actions, Publishing
 from service.runtime.translate import manifest_of
 from service.runtime.workers import WorkerPool
-from service.state import DitherView, MatrixState, Registration, TrackerState
+from service.tracking import events as ev
+from service.tracking.loop import DitherView
+from service.tracking.products import MatrixState
+from service.tracking.registration import Registration
+from service.tracking.state import TrackerState
 from service.wire import DitherAction, Loop, LoopRequest, RampRequest, Reply, checksum, layout_of
 from service.worker import start_worker
-from tests.unit.reactions.situations import START_NS, foreign, record, rtc
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
+from tests.unit.tracking.situations import START_NS, foreign, record, rtc
 
 pytestmark = pytest.mark.timeout(60)
 

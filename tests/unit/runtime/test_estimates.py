@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service import events as ev
 from service.runtime.estimates import Backlog, watched
-from service.state import Mode
 from service.telemetry import passive
+from service.tracking import events as ev
+from service.tracking.state import Mode
 from service.worker import Workbench
 from tests.numerics import block_of
-from tests.unit.reactions.situations import ALPHA, Story
-from tests.unit.reactions.test_watchdog import watched as look
 from tests.unit.telemetry.test_lockin import run, telemetry
+from tests.unit.tracking.situations import ALPHA, Story
+from tests.unit.tracking.test_watchdog import watched as look
 
 
 class Worker:

@@ -6,19 +6,20 @@ import h5py
 import numpy as np
 import pytest
 
-from service import events as ev
 from service.archive import Archive
 from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
-from service.reactions.journal import with_alarm
 from service.runtime.actions import Actions, Publishing
 from service.runtime.estimates import NoisySums
-from service.state import NoisyRecord, NoisyState, TrackerState
 from service.telemetry.frames import FrameBlock
 from service.telemetry.randomdither import RandomDither, RandomPlan, accumulate
+from service.tracking import events as ev
+from service.tracking.alarms import with_alarm
+from service.tracking.products import NoisyRecord, NoisyState
+from service.tracking.state import TrackerState
 from service.worker import Workbench
-from tests.unit.reactions.situations import rtc
 from tests.unit.runtime.small import COMPUTE, small_instrument
+from tests.unit.tracking.situations import rtc
 
 ALPHA = Misregistration(
     shift_x_subap=0.12, shift_y_subap=-0.08, rotation_rad=0.004, magnification=1.003

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from service import events as ev
 from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
@@ -13,12 +12,14 @@ from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.supervisor import Supervisor
 from service.runtime.workers import WorkerPool
-from service.state import AcquisitionStage, Mode, TrackerState
+from service.tracking import events as ev
+from service.tracking.stages import AcquisitionStage
+from service.tracking.state import Mode, TrackerState
 from service.worker import Workbench, start_worker
 from studies.campaign.observatory import Observatory
-from tests.unit.reactions.situations import POLICY, estimate, rtc
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 from tests.unit.runtime.test_supervisor import running
+from tests.unit.tracking.situations import POLICY, estimate, rtc
 
 NOMINAL_DEG = 65.08
 """As at the LBT."""

@@ -4,7 +4,7 @@ import pytest
 
 from service.runtime import pace as pace_module
 from service.runtime.pace import PaceMeter
-from service.state import Alarm, TrackerState
+from service.tracking.state import Alarm, TrackerState
 
 QUIET = TrackerState(system="small")
 

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from service import events as ev
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.runtime.engine import shape_mismatch
 from service.runtime.streams import Streams, fed, taken, with_rtc
-from service.state import Mode, Source
 from service.telemetry.edge import LOW_MODES
+from service.tracking import events as ev
+from service.tracking.registration import Source
+from service.tracking.state import Mode
 from service.worker import Workbench
 from studies.campaign.observatory import Observatory
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument

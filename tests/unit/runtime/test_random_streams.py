@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError, ModelError
-from service.reactions.random_dither import Asked, plan_random
 from service.runtime.streams import Streams, fed, with_dither, with_rtc
-from service.state import DitherKind, DitherView, ModeSet
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import WindowRefused
 from service.telemetry.randomdither import Correlated
+from service.tracking.dither_plan import RandomChoice, plan_random
+from service.tracking.loop import DitherKind, DitherView
+from service.tracking.products import ModeSet
 from service.worker import Description
-from tests.unit.reactions.situations import POLICY, rtc
+from tests.unit.tracking.situations import POLICY, rtc
 
 N_SLOPES, N_MODES = 6, 8
 DESCRIPTION = Description(
@@ -104,7 +105,10 @@ def test_a_new_reconstructor_inside_a_window_cuts_it_short(streams):
 def test_all_modes_of_a_basis_may_share_a_few_nanometres():
     """5 nm on 594 modes: 0.205 nm each; windows of 594 modes at 1 kHz last 4.75 s at least."""
     dither = plan_random(
-        Asked(id="noisy-1", modes=ModeSet.ALL, total_m=5e-9, duration_s=30.0), rtc(), POLICY, 77
+        RandomChoice(id="noisy-1", modes=ModeSet.ALL, total_m=5e-9, duration_s=30.0),
+        rtc(),
+        POLICY,
+        77,
     )
     assert dither.modes == tuple(range(594))
     assert np.sqrt(np.sum(np.square(dither.amplitude_m))) == pytest.approx(5e-9)
@@ -114,7 +118,7 @@ def test_all_modes_of_a_basis_may_share_a_few_nanometres():
 
 
 def test_the_controlled_modes_are_those_in_the_loop():
-    asked = Asked(id="n", modes=ModeSet.CONTROLLED, total_m=5e-9, duration_s=30.0)
+    asked = RandomChoice(id="n", modes=ModeSet.CONTROLLED, total_m=5e-9, duration_s=30.0)
     assert plan_random(asked, rtc(), POLICY, 0).modes == tuple(range(400))
 
 
@@ -129,10 +133,10 @@ def test_the_controlled_modes_are_those_in_the_loop():
 def test_a_dither_that_cannot_be_played_is_refused_before_it_is_asked_for(changes, words):
     values = {"id": "n", "modes": ModeSet.CONTROLLED, "total_m": 5e-9, "duration_s": 30.0}
     with pytest.raises(CommandError, match=words):
-        plan_random(Asked(**(values | changes)), rtc(), POLICY, 0)
+        plan_random(RandomChoice(**(values | changes)), rtc(), POLICY, 0)
 
 
 def test_more_modes_than_the_rtc_dithers_are_refused():
-    asked = Asked(id="n", modes=ModeSet.ALL, total_m=5e-9, duration_s=30.0)
+    asked = RandomChoice(id="n", modes=ModeSet.ALL, total_m=5e-9, duration_s=30.0)
     with pytest.raises(CommandError, match="found 594 modes; the RTC dithers at most 64"):
         plan_random(asked, rtc(max_dither_modes=64), POLICY, 0)

@@ -6,19 +6,20 @@ from pathlib import Path
 import pytest
 from threadpoolctl import threadpool_limits
 
-from service import events as ev
 from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.reactions.shelf import restored
 from service.runtime.engine import Engine
 from service.runtime.recording import has_news, is_urgent, leave, taken_up
-from service.state import AcquisitionStage, Mode, TrackerState
+from service.tracking import events as ev
+from service.tracking.reconstructors import restored
+from service.tracking.stages import AcquisitionStage
+from service.tracking.state import Mode, TrackerState
 from service.worker import Compute, Workbench
 from studies.campaign.acquisition import Start
 from studies.campaign.observatory import Observatory
-from tests.unit.reactions.situations import START_NS
-from tests.unit.reactions.test_acquisition import Acquiring
+from tests.unit.tracking.situations import START_NS
+from tests.unit.tracking.test_acquisition import Acquiring
 
 SMALL = Path(__file__).parents[2] / "system" / "small.toml"
 START = Start(instrument=str(SMALL), n_controlled=60, seed=0)

@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service import events as ev
 from service.errors import ModelError
 from service.runtime.engine import news, shape_mismatch, troubles
 from service.runtime.streams import (
@@ -14,13 +13,15 @@ from service.runtime.streams import (
     with_matrix,
     with_rtc,
 )
-from service.state import DitherView, TrackerState
 from service.telemetry.edge import LOW_MODES, Actuators
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import Spectra, WindowRefused
+from service.tracking import events as ev
+from service.tracking.loop import DitherView
+from service.tracking.state import TrackerState
 from service.worker import Description
-from tests.unit.reactions.situations import rtc
 from tests.unit.telemetry import test_loopcheck as loops
+from tests.unit.tracking.situations import rtc
 
 N_SLOPES, N_MODES = 6, 8
 DESCRIPTION = Description(

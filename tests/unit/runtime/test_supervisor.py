@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service import events as ev
 from service.archive import Archive
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
@@ -19,12 +18,13 @@ from service.runtime.actions import Actions, Publishing
 from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
 from service.runtime.workers import WorkerPool
-from service.state import Level, LogEntry, Mode, TrackerState
+from service.tracking import events as ev
+from service.tracking.state import Level, LogEntry, Mode, TrackerState
 from service.worker import start_worker
 from tests.system.fake_rtc import client_session
-from tests.unit.reactions.situations import POLICY, Story, record
-from tests.unit.reactions.test_acquisition import Acquiring
 from tests.unit.runtime.small import COMPUTE, small_instrument
+from tests.unit.tracking.situations import POLICY, Story, record
+from tests.unit.tracking.test_acquisition import Acquiring
 
 pytestmark = pytest.mark.timeout(60)
 

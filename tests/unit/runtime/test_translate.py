@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 
-from service import events as ev
 from service.link import events as heard
 from service.runtime import translate
-from service.state import DitherView, Level, MatrixState, Mode, Pointing
+from service.tracking import events as ev
+from service.tracking.loop import DitherView, Pointing
+from service.tracking.products import MatrixState
+from service.tracking.state import Level, Mode
 from service.wire import (
     Acknowledgement,
     AckState,
@@ -17,7 +19,7 @@ from service.wire import (
     Status,
     layout_of,
 )
-from tests.unit.reactions.situations import ALPHA, Story, foreign, record, rtc
+from tests.unit.tracking.situations import ALPHA, Story, foreign, record, rtc
 
 
 def status(**changes):

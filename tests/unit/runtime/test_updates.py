@@ -7,21 +7,23 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from service import events as ev
 from service.archive import Archive
 from service.control.edge import HELD_LIMIT_M, LIMIT_M
 from service.control.gate import LoopSettings
 from service.errors import CommandError
 from service.model.misregistration import Misregistration
-from service.reactions.mode_ladder import fewer_than
 from service.runtime.actions import Actions, Publishing
 from service.runtime.loops import GAIN_SAFETY, loop_settings, modes_that_hold, timing
 from service.runtime.workers import WorkerPool
-from service.state import Alarm, MatrixState, ModeGain
+from service.tracking import events as ev
+from service.tracking.products import MatrixState
+from service.tracking.registration import ModeGain
+from service.tracking.state import Alarm
+from service.tracking.worth import fewer_than
 from service.worker import Workbench, start_worker
-from tests.unit.reactions.situations import START_NS, rtc
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
 from tests.unit.runtime.test_actions import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
+from tests.unit.tracking.situations import START_NS, rtc
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -14,15 +14,9 @@ from service.runtime.waiting import (
     news_of_link,
     waiting_for,
 )
-from service.state import (
-    Alarm,
-    MatrixState,
-    Mode,
-    Party,
-    TrackerState,
-    Waiting,
-)
-from tests.unit.reactions.situations import START_NS, record, rtc
+from service.tracking.products import MatrixState
+from service.tracking.state import Alarm, Mode, Party, TrackerState, Waiting
+from tests.unit.tracking.situations import START_NS, record, rtc
 
 SECOND = 1_000_000_000
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from service import events as ev
-from service.state import Mode, TrackerState
 from service.telemetry.noisymatrix import RandomEstimate
+from service.tracking import events as ev
+from service.tracking.state import Mode, TrackerState
 from studies.campaign.golden import INSTRUMENT, Teller, first_difference, nights_in, read, written
 from studies.campaign.golden_codec import decoded, encoded, renewed
-from tests.unit.reactions.situations import (
+from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
     START_NS,

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from service import events as ev
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import CommandError
-from service.state import MatrixState, Mode
+from service.tracking import events as ev
+from service.tracking.products import MatrixState
+from service.tracking.state import Mode
 from service.wire import DitherRequest
 from service.worker import Workbench
 from studies.campaign.observatory import Latencies, Observatory

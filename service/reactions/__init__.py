@@ -1,1 +1,0 @@
-"""What each kind of event does to the state; ``service.tracker`` hands them out."""

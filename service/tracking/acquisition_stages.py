@@ -1,0 +1,424 @@
+"""What an acquisition asks for, how it goes from stage to stage, and its stages in an open loop."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from service.control.continuation import (
+    FEWEST_LINES,
+    FINER,
+    SMOOTH,
+    Reach,
+    first_closed,
+    lines_of,
+    modes_of,
+)
+from service.model.misregistration import Misregistration
+from service.tracking import events as ev
+from service.tracking.alarms import Act, forbidding, forbids, logged, with_alarm
+from service.tracking.dither_plan import ACQUIRING_DITHER
+from service.tracking.events import Step
+from service.tracking.loop import DitherView, RtcView
+from service.tracking.loop_commands import on_loop
+from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.registration import Registration
+from service.tracking.stages import Acquisition, AcquisitionStage, LoopFound
+from service.tracking.state import Level, Mode, TrackerState
+from service.tracking.validity import taken, voided, why_void
+from service.tracking.worth import half_of, limited
+
+WINDOW_S = 2.0
+"""Of telemetry in one far estimate."""
+
+DITHER_S = 6.0
+"""Two windows and the time until they are fitted: a dead service leaves no dither behind."""
+
+CLOSING_GAIN = 0.3
+"""Of every mode of a loop that was found open: its status does not tell the gains."""
+
+OUT_OF_HAND_S = 2.0
+"""For so long before the loop is opened by the service itself."""
+
+MISSES_BEFORE = 3
+"""Windows in a row that found no registration, before the service acquires by itself."""
+
+MISSES_DESPITE = 10
+"""The same while α is known: what comes may only be bad telemetry, which opens no loop."""
+
+NOT_CAPTURED = ("the fit did not settle", "outside the capture range")
+"""How the reasons of such windows begin."""
+
+
+def reach_of(stage: AcquisitionStage) -> Reach:
+    """Return the band of modes that is dithered in a stage with the loop open."""
+    return SMOOTH if stage is AcquisitionStage.COARSE else FINER
+
+
+def far_dither(
+    stage: AcquisitionStage, rtc: RtcView, policy: Policy, now_ns: int
+) -> DitherView | str:
+    """Return the dither of a stage with the loop open, or why there is none.
+
+    It is strong: an open loop leaves the pyramid little response, and nothing is observed
+    meanwhile that could be spoilt.
+    """
+    lines = lines_of(rtc.frame_rate_hz, WINDOW_S, rtc.max_dither_modes)
+    modes = modes_of(reach_of(stage), rtc.n_modes, len(lines)) if lines else ()
+    if len(modes) < FEWEST_LINES:
+        return (
+            f"found room for {len(modes)} dithered modes; expected at least {FEWEST_LINES}: the "
+            f"RTC plays {rtc.max_dither_modes} at once, at {rtc.frame_rate_hz:g} Hz, and its basis "
+            f"has {rtc.n_modes}"
+        )
+    return DitherView(
+        id=f"{ACQUIRING_DITHER}{now_ns}",
+        modes=modes,
+        amplitude_m=(min(policy.acquisition_amplitude_m, rtc.max_dither_m),) * len(modes),
+        frequency_hz=lines[: len(modes)],
+        duration_s=DITHER_S,
+        start_seq=None,
+        asked_ns_utc=now_ns,
+        window_s=WINDOW_S,
+    )
+
+
+def loop_found(state: TrackerState, rtc: RtcView, policy: Policy) -> LoopFound:
+    """Return the loop as it is, and as it shall be closed again."""
+    closed = rtc.loop != "open"
+    out_of_hand = forbidding(state, Act.HOLD) is not None
+    goal = rtc.n_controlled or min(policy.n_modes_target, rtc.n_modes)
+    gains = rtc.gains if closed else (CLOSING_GAIN,) * goal
+    return LoopFound(
+        closed=closed,
+        gains=gains,
+        n_controlled=goal,
+        leak=rtc.leak,
+        held=closed and not out_of_hand,
+    )
+
+
+def left_open(state: TrackerState, rtc: RtcView) -> Acquisition | None:
+    """Return the acquisition that was cut off, if the loop is as it left it.
+
+    Opening a loop begins a session: the same one means that nobody has closed it in between.
+    """
+    left = state.acquisition.interruption
+    if left is None or left.session != rtc.session or rtc.loop != "open":
+        return None
+    return state.acquisition
+
+
+def gains_for(found: LoopFound, n_modes: int, of_basis: int) -> tuple[float, ...]:
+    """Return the gains ``(of_basis,)`` with which so many modes are closed."""
+    return (*found.gains[:n_modes], *(0.0,) * (of_basis - n_modes))
+
+
+def begun(
+    state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int, *, why: str, commanded: bool
+) -> TrackerState:
+    """Return the state in which an acquisition begins: nothing is known of α any more."""
+    left = left_open(state, rtc)
+    found = left.found if left is not None else None
+    found = found or loop_found(state, rtc, policy)
+    acquisition = Acquisition(
+        stage=AcquisitionStage.OPENING,
+        text=f"opening the loop: {why}",
+        started_ns_utc=now_ns,
+        since_ns_utc=now_ns,
+        commanded=commanded,
+        attempt=1,
+        found=found,
+        n_modes=first_closed(found.n_controlled),
+        sent=left is not None and left.sent,
+    )
+    state = voided(state, "the acquisition had not begun")
+    return replace(state, acquisition=acquisition, registration=None, margin=None)
+
+
+def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
+    """Return why the service should acquire by itself, or None."""
+    rtc, acquisition = state.rtc, state.acquisition
+    if not policy.acquires or state.mode is not Mode.AUTO or rtc is None or rtc.loop == "open":
+        return None
+    if not policy.dither_enabled or state.dither_stopped or state.measuring is not None:
+        return None
+    failed = acquisition.stage is AcquisitionStage.FAILED
+    if failed or acquisition.held_off or forbidding(state, Act.SEND_NEW) is not None:
+        return None
+    for alarm in state.alarms:
+        lasted_ns = now_ns - alarm.since_ns_utc
+        if forbids(alarm, Act.HOLD) and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
+            return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
+    known = state.registration is not None and state.registration.usable
+    if acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE):
+        return f"{acquisition.misses} windows in a row found no registration"
+    return None
+
+
+def missed(state: TrackerState, reason: str) -> TrackerState:
+    """Return the state that has counted a refused window, if α was out of its reach."""
+    acquisition = state.acquisition
+    if acquisition.under_way or not reason.startswith(NOT_CAPTURED):
+        return state
+    return replace(state, acquisition=replace(acquisition, misses=acquisition.misses + 1))
+
+
+def why_not_now(state: TrackerState, policy: Policy) -> str | None:
+    """Return why an operator cannot have an acquisition now, or None."""
+    if state.rtc is None:
+        return "no RTC is there"
+    if not policy.dither_enabled:
+        return "the settings forbid any dither"
+    alarm = forbidding(state, Act.SEND_NEW)
+    if alarm is not None:
+        return f"{alarm.name}: {alarm.text}"
+    dither = far_dither(AcquisitionStage.COARSE, state.rtc, policy, 0)
+    return dither if isinstance(dither, str) else None
+
+
+def sigma_of(acquisition: Acquisition) -> str:
+    """Return 1 σ of the α found, for a person."""
+    if acquisition.covariance is None:
+        return "not known"
+    x, y, rotation, magnification = np.sqrt(np.diag(acquisition.covariance))
+    return f"{x:.3f}, {y:.3f} subap, {np.rad2deg(rotation):.2f} deg, {magnification:.3f} (1 sigma)"
+
+
+MOST_ATTEMPTS = 3
+"""Times the loop is opened for one acquisition."""
+
+HELD_OFF = (
+    "; none begins by itself until windows agree in a closed loop, the mode is set anew, or one is "
+    "asked for"
+)
+"""After an operator ended one, in the text of it."""
+
+_BELIEVED = (
+    AcquisitionStage.PARTIAL,
+    AcquisitionStage.WIDENING,
+    AcquisitionStage.INTERRUPTED,
+)
+"""Stages in which α, where there is one, has been found by this acquisition."""
+
+
+def entered(state: TrackerState, stage: AcquisitionStage, text: str, now_ns: int) -> TrackerState:
+    """Return the state at the beginning of a stage."""
+    acquisition = replace(
+        state.acquisition, stage=stage, text=text, since_ns_utc=now_ns, misses=0, command=None
+    )
+    level = Level.WARNING if stage is AcquisitionStage.FAILED else Level.INFO
+    state = replace(state, acquisition=acquisition)
+    return logged(state, f"acquisition.{stage}", text, now_ns, level)
+
+
+def told(state: TrackerState, command: ev.SetLoop, now_ns: int) -> Step:
+    """Tell the RTC to change its loop, and remember that it was told."""
+    state, effects = on_loop(state, command, now_ns)
+    asked = state.loop_command
+    acquisition = replace(state.acquisition, command=None if asked is None else asked.id)
+    return replace(state, acquisition=acquisition), effects
+
+
+def without_dither(state: TrackerState) -> Step:
+    """Stop the dither that runs, if one does; nobody takes it for a dither to be adopted."""
+    running = state.dither.id if state.dither is not None else None
+    if running is None and state.rtc is not None:
+        running = state.rtc.dither_id
+    if running is None:
+        return state, ()
+    dithering = replace(state.dithering, stopped_id=running)
+    return replace(state, dither=None, dithering=dithering), (ev.AskNoDither(),)
+
+
+def again(state: TrackerState, reason: str, now_ns: int, *, slipped: bool = False) -> Step:
+    """Begin anew with the loop opened again, at once, a few times; then give up.
+
+    A loop that has slipped is closed on half as many modes next time.
+    """
+    acquisition = state.acquisition
+    if acquisition.attempt >= MOST_ATTEMPTS:
+        return fail(state, f"{reason}, after {acquisition.attempt} attempts", now_ns)
+    most = acquisition.most_modes
+    if slipped:
+        most = half_of(acquisition.n_modes)
+        state = limited(state, most, reason, now_ns)
+    goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
+    state, effects = without_dither(voided(state, "the acquisition had not begun anew"))
+    state = replace(
+        state,
+        registration=None,
+        acquisition=replace(
+            acquisition,
+            attempt=acquisition.attempt + 1,
+            alpha=None,
+            covariance=None,
+            matrix=None,
+            most_modes=most,
+            n_modes=min(acquisition.n_modes, most or goal),
+        ),
+    )
+    state = entered(state, AcquisitionStage.OPENING, f"opening the loop again: {reason}", now_ns)
+    if state.rtc is None or state.rtc.loop == "open":
+        return state, effects
+    state, more = told(state, ev.SetLoop(closed=False), now_ns)
+    return state, (*effects, *more)
+
+
+def fail(state: TrackerState, reason: str, now_ns: int) -> Step:
+    """Give up: the loop stays as it is, but one that is out of hand is opened."""
+    closed = state.rtc is not None and state.rtc.loop != "open"
+    out_of_hand = forbidding(state, Act.HOLD) is not None
+    state, effects = without_dither(state)
+    over = replace(state.acquisition, windows=state.windows_accepted)
+    state = replace(state, registration=None, acquisition=over)
+    if closed and out_of_hand:
+        state, more = told(state, ev.SetLoop(closed=False), now_ns)
+        effects = (*effects, *more)
+    text = (
+        f"no registration was acquired: {reason}; see the log, then acquire again, or close the "
+        "loop on a matrix of your own"
+    )
+    state = entered(state, AcquisitionStage.FAILED, text, now_ns)
+    return with_alarm(state, "acquisition", text, now_ns), effects
+
+
+def abort(state: TrackerState, why: str, now_ns: int, *, held_off: bool = False) -> Step:
+    """End it at once: the loop as it was found, if it held then and nothing was sent; else as is.
+
+    As is means open, or closed on a reconstructor that has passed the gate. ``held_off``: none
+    begins by itself for now, though what made this one begin may last.
+    """
+    acquisition = state.acquisition
+    state, effects = without_dither(state)
+    if acquisition.stage not in _BELIEVED:
+        state = replace(state, registration=None)
+    left, found = "left as it is", _to_give_back(state)
+    if found is not None:
+        left = "closed as it was found"
+        state, more = told(state, ev.SetLoop(closed=True, leak=found.leak), now_ns)
+        effects = (*effects, *more)
+    text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
+    over = replace(state.acquisition, held_off=held_off, windows=state.windows_accepted)
+    state = replace(state, acquisition=over)
+    return entered(state, AcquisitionStage.ABORTED, text, now_ns), effects
+
+
+def _to_give_back(state: TrackerState) -> LoopFound | None:
+    """Return the loop as it was found, if it held then and its matrix is still in the RTC."""
+    acquisition, rtc = state.acquisition, state.rtc
+    found = acquisition.found
+    if rtc is None or found is None or acquisition.sent or not (found.closed and found.held):
+        return None
+    if acquisition.interruption is not None and left_open(state, rtc) is None:
+        return None
+    return found
+
+
+AGREE = 23.5
+"""χ² of the difference of two estimates (4 degrees of freedom) that one in 10^4 exceeds."""
+
+MOST_MISSES = 4
+"""Windows of a stage that lead nowhere before the loop is opened anew."""
+
+STOPS_WITHIN_S = 2.0
+"""A dither that was told to stop, by the status."""
+
+
+def far_stage(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+    """Open the loop, then keep the dither of the stage running."""
+    acquisition = state.acquisition
+    if acquisition.stage is AcquisitionStage.OPENING:
+        if rtc.loop != "open":
+            if acquisition.command is not None:
+                return state, ()
+            return told(state, ev.SetLoop(closed=False), now_ns)
+        text = "looking for the registration with the loop open, on smooth modes"
+        state = entered(state, AcquisitionStage.COARSE, text, now_ns)
+    elif rtc.loop != "open":
+        return again(state, "somebody closed the loop", now_ns)
+    return _dithered(state, rtc, policy, now_ns)
+
+
+def on_far(state: TrackerState, event: ev.FarFitted, policy: Policy, now_ns: int) -> Step:
+    """Take over where a window puts the mirror, or hold it against where another one did."""
+    rtc, acquisition, estimate = state.rtc, state.acquisition, event.found.estimate
+    if why_void(state, taken(event.began_ns_utc, estimate.t_ns_utc)) is not None:
+        return state, ()
+    if acquisition.stage not in {AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING}:
+        return state, ()
+    if (
+        rtc is None
+        or estimate.session != rtc.session
+        or not _of_stage(state, rtc, policy, estimate.modes)
+    ):
+        return state, ()
+    covariance = estimate.covariance + np.diag(reach_of(acquisition.stage).floor ** 2)
+    before = acquisition
+    acquisition = replace(acquisition, alpha=estimate.alpha, covariance=covariance)
+    if before.stage is AcquisitionStage.COARSE or before.alpha is None or before.covariance is None:
+        state, effects = without_dither(replace(state, acquisition=acquisition))
+        text = f"{_said(estimate.alpha)} +- {sigma_of(acquisition)}: other modes must confirm it"
+        return entered(state, AcquisitionStage.CONFIRMING, text, now_ns), effects
+    difference = estimate.alpha.vector - before.alpha.vector
+    chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
+    if chi2 > AGREE:
+        reason = (
+            f"two sets of modes disagree: {_said(before.alpha)} and {_said(estimate.alpha)}, "
+            f"chi2 {chi2:.0f}, expected at most {AGREE}"
+        )
+        return again(state, reason, now_ns)
+    registration = Registration(
+        alpha=estimate.alpha,
+        covariance=covariance,
+        floor=policy.floor,
+        t_ns_utc=estimate.t_ns_utc,
+        arrived_ns_utc=now_ns,
+        n_windows=1,
+        basis_id=state.basis_id,
+        config_id=state.config_id,
+    )
+    state = replace(state, acquisition=acquisition, registration=registration)
+    state, effects = without_dither(state)
+    text = f"{_said(estimate.alpha)} +- {sigma_of(acquisition)}: closing the loop"
+    return entered(state, AcquisitionStage.PARTIAL, text, now_ns), effects
+
+
+def on_missed(state: TrackerState, reason: str, now_ns: int) -> Step:
+    """Count a window that led nowhere; after a few begin anew."""
+    misses = state.acquisition.misses + 1
+    if misses >= MOST_MISSES:
+        return again(state, reason, now_ns)
+    return replace(state, acquisition=replace(state.acquisition, misses=misses)), ()
+
+
+def _dithered(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+    """Ask for the dither of the stage once no other one runs."""
+    if state.dither is not None:
+        return state, ()
+    if rtc.dither_id is not None:
+        stopping = rtc.dither_id == state.dithering.stopped_id
+        since_s = (now_ns - state.acquisition.since_ns_utc) / SECOND_NS
+        if now_ns < state.retries.dither_ns_utc or (stopping and since_s < STOPS_WITHIN_S):
+            return state, ()
+        retry_ns = now_ns + round(STOPS_WITHIN_S * SECOND_NS)
+        retries = state.retries.later(dither_ns_utc=retry_ns)
+        return replace(state, retries=retries), (ev.AskNoDither(),)
+    if now_ns < state.retries.dither_ns_utc:
+        return state, ()
+    dither = far_dither(state.acquisition.stage, rtc, policy, now_ns)
+    if isinstance(dither, str):
+        return fail(state, dither, now_ns)
+    return replace(state, dither=dither), (ev.AskDither(dither=dither),)
+
+
+def _of_stage(state: TrackerState, rtc: RtcView, policy: Policy, modes: tuple[int, ...]) -> bool:
+    """Return whether these are the modes of the present stage."""
+    dither = far_dither(state.acquisition.stage, rtc, policy, 0)
+    return not isinstance(dither, str) and dither.modes == modes
+
+
+def _said(alpha: Misregistration) -> str:
+    x, y, rotation, magnification = alpha.to_boundary().values()
+    return f"({x:+.2f}, {y:+.2f} subap, {rotation:+.2f} deg, {magnification:.4f})"

@@ -1,0 +1,173 @@
+"""What occupies the mirror or the loop now, and which of an operator's commands that allows.
+
+The one table of refusals for what runs; what a command needs besides is checked where it is
+carried out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import get_args
+
+from service.errors import CommandError
+from service.tracking import events as ev
+from service.tracking.alarms import STANDING_BY
+from service.tracking.dither_plan import OUR_DITHERS, OWN_DITHER
+from service.tracking.events import Command, Event
+from service.tracking.loop import CommandState, LoopCommand
+from service.tracking.policy import SECOND_NS
+from service.tracking.products import MatrixState
+from service.tracking.state import TrackerState
+
+GONE_WITHIN_S = 3.0
+"""For a stop to be answered, and for the next status to show it."""
+
+ANSWERED_WITHIN_S = 30.0
+"""A gain ramp that the RTC has neither accepted nor refused for so long is none."""
+
+
+class Activity(StrEnum):
+    """What may run."""
+
+    MEASURING = "an interaction matrix is being measured"
+    GATHERING = "a noisy interaction matrix is being measured"
+    RAMPING = "a gain ramp is under way"
+    ACQUIRING = "an acquisition is under way"
+    OWN_DITHER = "a dither of the service's own choice plays"
+    OTHER_DITHER = "a dither of an operator's, or of somebody else, plays"
+    STANDING_BY = "another service drives the RTC"
+    MAKING = "a reconstructor is being computed"
+    SENDING = "a reconstructor is on its way to the RTC"
+
+
+_ALL = frozenset[type](get_args(Command))
+
+_ALWAYS = frozenset[type](
+    {
+        ev.AbortAcquisition,
+        ev.GiveUp,
+        ev.GiveUpNoisy,
+        ev.Reject,
+        ev.SetMode,
+        ev.SetPointing,
+        ev.StopDither,
+    }
+)
+"""What ends something, and what disturbs nothing."""
+
+ALLOWS: dict[Activity, frozenset[type]] = {
+    Activity.MEASURING: _ALWAYS,
+    # a swap costs it a window, and must not wait for minutes
+    Activity.GATHERING: _ALWAYS | {ev.Refit, ev.Approve, ev.Publish, ev.Rollback},
+    Activity.RAMPING: _ALWAYS,
+    Activity.ACQUIRING: _ALWAYS,
+    # it makes way for what needs the loop, and an RTC measures under no dither
+    Activity.OWN_DITHER: _ALL - {ev.Measure, ev.StartDither},
+    Activity.OTHER_DITHER: _ALL - {ev.Measure, ev.StartDither, ev.MeasureNoisy},
+    Activity.STANDING_BY: frozenset[type]({ev.Reject, ev.SetMode, ev.SetPointing}),
+    Activity.MAKING: _ALL - {ev.Measure, ev.Refit, ev.Publish, ev.Rollback},
+    Activity.SENDING: _ALL - {ev.Measure},
+}
+"""Commands that are carried out while it runs; a gain ramp also lets the loop be opened."""
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """Something that runs, in words."""
+
+    activity: Activity
+    text: str
+    """What runs, and what ends it."""
+
+
+def refuse_if_occupied(state: TrackerState, event: Event, now_ns: int) -> None:
+    """Refuse a command that would strand what runs, or be stranded by it.
+
+    Raises
+    ------
+    CommandError
+        If that is what an operator asks for: what runs, and how to end it.
+    """
+    if not isinstance(event, Command):
+        return
+    for running in under_way(state, now_ns):
+        opens = running.activity is Activity.RAMPING and _opens(event)
+        if type(event) not in ALLOWS[running.activity] and not opens:
+            raise CommandError(f"{type(event).__name__}: {running.text}")
+
+
+def under_way(state: TrackerState, now_ns: int) -> tuple[Running, ...]:
+    """Return all that runs now, what is exclusive first."""
+    found = (*_exclusive(state, now_ns), _dither(state, now_ns), *_of_matrices(state))
+    return tuple(running for running in found if running is not None)
+
+
+def ramping(state: TrackerState, now_ns: int) -> LoopCommand | None:
+    """Return the gain ramp that the RTC is busy with, or None: opening the loop ends one."""
+    asked, rtc = state.loop_command, state.rtc
+    if asked is None or not asked.lasts_s or rtc is None or rtc.loop == "open":
+        return None
+    if asked.state is CommandState.ASKED:
+        waits = now_ns - asked.asked_ns_utc < ANSWERED_WITHIN_S * SECOND_NS
+        return asked if waits else None
+    accepted = asked.state is CommandState.ACCEPTED
+    return asked if accepted and now_ns < asked.until_ns_utc else None
+
+
+def _exclusive(state: TrackerState, now_ns: int) -> tuple[Running, ...]:
+    found = [
+        Running(Activity.STANDING_BY, alarm.text)
+        for alarm in state.alarms
+        if alarm.name == STANDING_BY
+    ]
+    if state.measuring is not None:
+        text = (
+            f"interaction matrix {state.measuring.id} is being measured; wait for it, or give it up"
+        )
+        found.append(Running(Activity.MEASURING, text))
+    if state.gathering is not None:
+        text = f"noisy matrix {state.gathering.id} is under way; wait for it, or give it up"
+        found.append(Running(Activity.GATHERING, text))
+    ramp = ramping(state, now_ns)
+    if ramp is not None:
+        left_s = max((ramp.until_ns_utc - now_ns) / SECOND_NS, 0.0) or ramp.lasts_s
+        text = (
+            f"gain ramp {ramp.id} is under way; wait for it, {left_s:.0f} s, or open the loop "
+            "to end it"
+        )
+        found.append(Running(Activity.RAMPING, text))
+    if state.acquisition.under_way:
+        text = f"an acquisition is under way ({state.acquisition.text}); wait for it, or abort it"
+        found.append(Running(Activity.ACQUIRING, text))
+    return tuple(found)
+
+
+def _dither(state: TrackerState, now_ns: int) -> Running | None:
+    """Return the dither that plays, followed or not; one that was told to stop does no more."""
+    known = None if state.dither is None else state.dither.id
+    told = now_ns - state.dithering.told_ns_utc < GONE_WITHIN_S * SECOND_NS
+    seen = None if state.rtc is None or told else state.rtc.dither_id
+    playing = known or (None if seen is None or seen.startswith(OUR_DITHERS) else seen)
+    if playing is None:
+        return None
+    own = playing.startswith(OWN_DITHER)
+    activity = Activity.OWN_DITHER if own else Activity.OTHER_DITHER
+    return Running(activity, f"{playing} is running; stop it first")
+
+
+def _of_matrices(state: TrackerState) -> tuple[Running, ...]:
+    found = []
+    if state.making_since_ns_utc is not None:
+        text = "a reconstructor is being computed; wait for it"
+        found.append(Running(Activity.MAKING, text))
+    sent = (MatrixState.PUBLISHED, MatrixState.STAGED)
+    for record in state.reconstructors:
+        if record.state in sent:
+            text = f"reconstructor {record.id} is on its way to the RTC; wait for it"
+            found.append(Running(Activity.SENDING, text))
+    return tuple(found)
+
+
+def _opens(command: Command) -> bool:
+    return isinstance(command, ev.SetLoop) and command.closed is False

@@ -1,0 +1,304 @@
+"""One measurement folded into the registration by the joint filter of α and of passive bias."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.misregistration import Misregistration
+from service.telemetry.wind import Drift, Joint, begin_joint, predicted
+from service.tracking.alarms import without_alarm
+from service.tracking.jumps import last_of
+from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.registration import (
+    Earlier,
+    HistoryEntry,
+    ModeGain,
+    PassiveBias,
+    Registration,
+    Seen,
+    Source,
+)
+from service.tracking.state import TrackerState
+from service.tracking.validity import (
+    CLOCK_SET_BACK_S,
+    Taken,
+    aged,
+    flexure,
+    pointing_at,
+    precedes,
+    slewed_deg,
+    without_dither_due,
+)
+
+MODES_KEPT = 64
+"""More than any dither plays at once: of those measured longest ago the rest is forgotten."""
+
+GAIN_RATE = 0.05 / np.sqrt(60.0)
+"""Random walk of a gain, relative, 1 σ after one second: seeing changes it by 5 % in a minute."""
+
+FIRST_SCATTER = 0.1
+"""Relative 1 σ of one window before any two were compared."""
+
+LEARNING = 0.1
+"""Weight of the newest window in the scatter: ten windows are remembered."""
+
+_FARTHEST = 3.0
+"""A window further out than this many σ counts as one at this distance."""
+
+Array = NDArray[np.float64]
+
+
+def followed_gains(
+    known: tuple[ModeGain, ...],
+    modes: tuple[int, ...],
+    gains: Array,
+    sigma: Array | None,
+    t_ns: int,
+) -> tuple[ModeGain, ...]:
+    """Return the gains after a window that held these modes, in the order of the modes.
+
+    ``gains`` and ``sigma`` ``(n_lines,)`` are modulus and 1 σ from the window's own data; None:
+    nothing but the scatter from window to window tells how precise they are.
+    """
+    table = {gain.mode: gain for gain in known}
+    own = np.zeros(len(gains)) if sigma is None else sigma
+    for mode, gain, noise in zip(modes, gains, own, strict=True):
+        table[mode] = _followed(table.get(mode), mode, float(gain), float(noise), t_ns)
+    newest = sorted(table.values(), key=lambda gain: gain.t_ns_utc)[-MODES_KEPT:]
+    return tuple(sorted(newest, key=lambda gain: gain.mode))
+
+
+def _followed(
+    known: ModeGain | None, mode: int, measured: float, noise: float, t_ns: int
+) -> ModeGain:
+    """Return one gain as a scalar random walk; its windows' scatter is learnt as it goes.
+
+    A window's own σ knows the noise beside the lines, not that the gain itself swings.
+    """
+    if known is None:
+        scatter = max(noise, FIRST_SCATTER * measured)
+        return ModeGain(mode=mode, gain=measured, sigma=scatter, scatter=scatter, t_ns_utc=t_ns)
+    elapsed_s = max((t_ns - known.t_ns_utc) / SECOND_NS, 0.0)
+    prior = known.sigma**2 + (GAIN_RATE * known.gain) ** 2 * elapsed_s
+    farthest = _FARTHEST * float(np.sqrt(prior + known.scatter**2))
+    innovation = float(np.clip(measured - known.gain, -farthest, farthest))
+    learnt = max(innovation**2 - prior, noise**2)
+    scatter = float(np.sqrt((1 - LEARNING) * known.scatter**2 + LEARNING * learnt))
+    weight = prior / (prior + scatter**2)
+    return ModeGain(
+        mode=mode,
+        gain=known.gain + weight * innovation,
+        sigma=float(np.sqrt((1 - weight) * prior)),
+        scatter=scatter,
+        t_ns_utc=t_ns,
+    )
+
+
+HISTORY_LENGTH = 5000
+
+SUSPECTED = "jump-suspected"
+"""Alarm while a window far out waits for the one that decides about it."""
+
+DISAGREES = "watchdog"
+"""Alarm while ordinary telemetry contradicts α."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measured:
+    """What one dithered window says of α."""
+
+    alpha: Misregistration
+    covariance: Array
+    """``(4, 4)`` numeric units, from its own data."""
+
+    when: Taken
+    source: Source
+    optical_gain: float
+    """Mean modulus of the gains of the dithered modes."""
+
+    optical_gains: tuple[ModeGain, ...]
+    """Those of every mode known, this window's included."""
+
+    floor: Array
+    """``(4,)`` 1 σ of the model error, numeric units: it does not average down."""
+
+    misfit: float
+    """Residual power over what noise explains; 1: the model explains the window."""
+
+    @property
+    def t_ns_utc(self) -> int:
+        """End of the window, the RTC's clock."""
+        return self.when.ended_ns_utc
+
+    @property
+    def seen(self) -> Seen:
+        """Return what was measured, whatever the filter makes of it."""
+        return Seen(alpha=self.alpha, covariance=self.covariance, t_ns_utc=self.t_ns_utc)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Folded:
+    """What the filter makes of a window."""
+
+    joint: Joint
+    n_windows: int
+    """Windows that agree with it, it included."""
+
+    innovation: float
+    """Normalised innovation squared (4 degrees of freedom)."""
+
+    jumped: bool = False
+    """Whether it is of a new place, to which what was known before says nothing."""
+
+
+def brought_forward(
+    state: TrackerState, known: Registration, t_ns_utc: int, policy: Policy, now_ns: int
+) -> Joint:
+    """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
+    elapsed_ns = t_ns_utc - known.t_ns_utc
+    if elapsed_ns < -CLOCK_SET_BACK_S * SECOND_NS:
+        # a clock that was set back, or another night played again: the service's own must do
+        elapsed_ns = now_ns - known.arrived_ns_utc
+    drift = Drift(alpha_rate=policy.drift_rate, bias_memory_s=policy.bias_memory_s)
+    bent = flexure(known.pointing, state.pointing, policy)
+    return predicted(joint_of(known), drift, elapsed_ns / SECOND_NS, bent)
+
+
+def joint_of(known: Registration) -> Joint:
+    """Return the filter's state that a registration holds."""
+    fresh = begin_joint(known.alpha.vector, known.covariance)
+    bias = known.bias
+    if bias is None:
+        return fresh
+    covariance = fresh.covariance.copy()
+    covariance[4:, 4:] = bias.covariance
+    covariance[4:, :4], covariance[:4, 4:] = bias.shared, bias.shared.T
+    mean = np.concatenate([known.alpha.vector, bias.offset])
+    return Joint(mean=mean, covariance=covariance, excess=bias.excess)
+
+
+def bias_of(
+    joint: Joint,
+    looked_ns_utc: int,
+    loop: tuple[float, ...],
+    earlier: Earlier | None = None,
+) -> PassiveBias:
+    """Return what the filter knows of the passive estimate's bias, in the loop of its last look."""
+    return PassiveBias(
+        loop=loop,
+        earlier=earlier,
+        offset=joint.bias,
+        covariance=joint.covariance[4:, 4:],
+        shared=joint.covariance[4:, :4],
+        looked_ns_utc=looked_ns_utc,
+        excess=joint.excess,
+    )
+
+
+def remembered(state: TrackerState, entry: HistoryEntry) -> TrackerState:
+    """Return the state with one more line in its history."""
+    return replace(state, history=(*state.history, entry)[-HISTORY_LENGTH:])
+
+
+def counted(state: TrackerState, known: Registration, prior: Joint, policy: Policy) -> int:
+    """Return how many windows agree after this one: it stands alone where α had gone stale."""
+    sigma = np.sqrt(np.diag(prior.alpha_covariance) + known.floor**2)
+    alone = slewed_deg(state, known) > policy.slew_limit_deg or np.any(sigma > policy.stale_sigma)
+    return 1 if alone else known.n_windows + 1
+
+
+def accepted(
+    state: TrackerState, folded: Folded, measured: Measured, policy: Policy, now_ns: int
+) -> TrackerState:
+    """Return the state whose registration is what the filter says after a window."""
+    joint, when = folded.joint, measured.when
+    known = state.registration
+    bias = None if known is None else known.bias
+    doubted = _still_doubted(state, folded, when)
+    anew = folded.jumped or (known is not None and known.candidate is not None)
+    registration = Registration(
+        alpha=Misregistration.from_vector(joint.alpha),
+        covariance=joint.alpha_covariance,
+        floor=measured.floor,
+        t_ns_utc=when.ended_ns_utc,
+        arrived_ns_utc=now_ns,
+        n_windows=folded.n_windows,
+        window_ns_utc=now_ns,
+        window_began_ns_utc=when.began_ns_utc,
+        optical_gain=measured.optical_gain,
+        optical_gains=measured.optical_gains,
+        bias=bias_of(
+            joint,
+            0 if bias is None else bias.looked_ns_utc,
+            () if bias is None else bias.loop,
+            None if bias is None or anew else bias.earlier,
+        ),
+        passive_after_ns_utc=known.passive_after_ns_utc if known is not None else 0,
+        earlier=None if anew else _earlier(known, folded, measured),
+        jumped_ns_utc=_jumped_ns_utc(known, folded, now_ns),
+        doubt=known.doubt if known is not None and doubted else "",
+        doubted_ns_utc=known.doubted_ns_utc if known is not None and doubted else 0,
+        pointing=pointing_at(state, when.ended_ns_utc),
+        window_pointing=pointing_at(state, when.began_ns_utc),
+        restored_ns_utc=known.restored_ns_utc if known is not None else None,
+        basis_id=state.basis_id,
+        config_id=state.config_id,
+    )
+    state = replace(state, registration=registration, windows_accepted=state.windows_accepted + 1)
+    if not doubted:
+        state = without_alarm(without_dither_due(state), SUSPECTED, now_ns)
+        state = without_alarm(state, DISAGREES, now_ns)
+    state = remembered(state, entry_of(measured, registration, folded.innovation))
+    return aged(state, policy, now_ns)
+
+
+def _still_doubted(state: TrackerState, folded: Folded, when: Taken) -> bool:
+    """Return whether α stays in doubt: the window is of before.
+
+    One that confirms where the mirror has jumped to need not have begun since, for it tells no
+    other place than the window before it.
+    """
+    known = state.registration
+    if known is None or not known.doubt:
+        return False
+    if folded.jumped:
+        when = replace(when, began_ns_utc=when.ended_ns_utc)
+    return precedes(state, when, known.doubted_ns_utc)
+
+
+def _jumped_ns_utc(known: Registration | None, folded: Folded, now_ns: int) -> int | None:
+    if folded.jumped:
+        return now_ns
+    return None if known is None else known.jumped_ns_utc
+
+
+def _earlier(known: Registration | None, folded: Folded, measured: Measured) -> Earlier | None:
+    """Return what was known before a window, and before the one that came before it."""
+    if known is None or folded.n_windows == 1:
+        return None
+    before = known.earlier
+    return replace(
+        last_of(known),
+        then=measured.seen,
+        earlier=None if before is None else replace(before, then=None, earlier=None),
+    )
+
+
+def entry_of(
+    measured: Measured, registration: Registration, innovation: float, *, entered: bool = True
+) -> HistoryEntry:
+    """Return the line of the history that a window leaves."""
+    return HistoryEntry(
+        t_ns_utc=measured.t_ns_utc,
+        measured=measured.alpha,
+        measured_sigma=np.sqrt(np.diag(measured.covariance)),
+        filtered=registration.alpha,
+        filtered_sigma=registration.sigma,
+        innovation=innovation,
+        misfit=measured.misfit,
+        source=measured.source,
+        entered=entered,
+    )

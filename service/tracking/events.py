@@ -1,0 +1,643 @@
+"""What can happen to the service, what operators can ask, and what is to be done about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.control.expected_gain import ExpectedGain
+from service.control.gate import GateVerdict
+from service.model.misregistration import Misregistration
+from service.telemetry.faraway import FarEstimate
+from service.telemetry.instrumental import WindowEstimate
+from service.telemetry.lockin import WindowRefused
+from service.telemetry.noisymatrix import RandomEstimate
+from service.telemetry.passive import PassiveEstimate
+from service.tracking.loop import DitherKind, DitherView, Pointing, RtcView
+from service.tracking.products import (
+    Judged,
+    MatrixState,
+    MeasurementRecord,
+    MeasurePattern,
+    ModeSet,
+    NoisyRecord,
+    ReconstructorRecord,
+)
+from service.tracking.state import Level, Mode, TrackerState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetMode:
+    """An operator chooses how much the service may do by itself."""
+
+    mode: Mode
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refit:
+    """Compute a reconstructor for the current α now; it still passes the gate and the mode."""
+
+    n_modes: int | None = None
+    """Modes to control; None: as many as now."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartDither:
+    """Start a dither; None: the service's own choice."""
+
+    kind: DitherKind = DitherKind.SINE
+    modes: tuple[int, ...] | ModeSet | None = None
+    """0-based basis indices, or which they are: as many as that only with random signs."""
+
+    amplitude_m: float | None = None
+    """RMS of each mode of a sine, metres OPD."""
+
+    total_m: float | None = None
+    """RMS of all modes of random signs together, metres OPD."""
+
+    frequency_hz: tuple[float, ...] | None = None
+    """One for each mode."""
+
+    duration_s: float | None = None
+    over_budget: bool = False
+    """More than the budget of the settings is meant."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopDither:
+    """Stop the dither and do not start another until told to."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Approve:
+    """Publish a proposed reconstructor."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reject:
+    """Discard a proposed reconstructor."""
+
+    id: str
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Publish:
+    """Send a known reconstructor again, under a new id, unless the gate refuses it now."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rollback:
+    """Go back to the reconstructor that was in use before the present one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measure:
+    """Have the RTC measure an interaction matrix; None: the service's own choice."""
+
+    id: str
+    """Of the matrix to come; never used before."""
+
+    pattern: MeasurePattern
+    modes: tuple[int, ...] | None = None
+    """0-based basis indices."""
+
+    amplitude_m: float | None = None
+    """RMS of each mode's stroke, metres OPD."""
+
+    n_average: int | None = None
+    """Repetitions; None for a sine."""
+
+    frequency_hz: tuple[float, ...] | None = None
+    """One for each mode of a sine."""
+
+    duration_s: float | None = None
+    """Of a sine."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GiveUp:
+    """Wait no longer for an interaction matrix; the wire has no way to stop the RTC's work."""
+
+    id: str
+    """Of the measurement."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetPointing:
+    """The observatory says where the telescope looks."""
+
+    pointing: Pointing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasureNoisy:
+    """Measure a noisy interaction matrix, loop closed; None: the service's own choice."""
+
+    id: str
+    """Of the matrix to come, and of its dither; never used before."""
+
+    modes: tuple[int, ...] | ModeSet = ModeSet.CONTROLLED
+    """0-based basis indices, or which they are."""
+
+    total_m: float | None = None
+    """RMS of all modes together, metres OPD."""
+
+    duration_s: float | None = None
+    """Of telemetry."""
+
+    over_budget: bool = False
+    """Whether it may be more than the budget of the dither."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GiveUpNoisy:
+    """End a noisy interaction matrix under way, and its dither; nothing of it is kept."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GainGroup:
+    """One gain for a range of modes."""
+
+    first: int
+    last: int
+    """0-based basis indices, both included."""
+
+    gain: float
+    """Loop gain; 0 leaves these modes alone."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetLoop:
+    """Change the loop; what is None stays as it is."""
+
+    closed: bool | None = None
+    """False: open it."""
+
+    gains: tuple[GainGroup, ...] | None = None
+    """Modes in no group keep their gain."""
+
+    leak: float | None = None
+    """Per frame; 1 forgets nothing."""
+
+    n_controlled: int | None = None
+    """Takes effect with the next reconstructor of that many modes."""
+
+    effective_gain: float | None = None
+    """Gains that act as this on every mode, by the table of optical gains, if the gate agrees."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ramp:
+    """Have the RTC try gains on groups of modes; None: the service's own choice."""
+
+    groups: tuple[tuple[int, int], ...] | None = None
+    """First and last mode of each, both included."""
+
+    gains: tuple[float, ...] | None = None
+    """Tried in this order."""
+
+    step_s: float | None = None
+    """How long each is tried, settling included."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acquire:
+    """Find the registration from nothing: open the loop, look, and close it step by step.
+
+    Its reconstructors need no further approval, in any mode.
+    """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AbortAcquisition:
+    """End an acquisition under way; the loop is left safe."""
+
+
+Command = (
+    Acquire
+    | AbortAcquisition
+    | SetMode
+    | Refit
+    | StartDither
+    | StopDither
+    | Approve
+    | Reject
+    | Publish
+    | Rollback
+    | Measure
+    | GiveUp
+    | MeasureNoisy
+    | GiveUpNoisy
+    | SetLoop
+    | SetPointing
+    | Ramp
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MakeMatrix:
+    """Compute a reconstructor for the current α and judge it."""
+
+    n_modes: int
+    why: str
+    gains: tuple[float, ...] | None = None
+    """``(n_modes of the basis,)`` gains it is to run with; None: those in force."""
+
+    fewer: tuple[int, ...] = ()
+    """Tried instead, largest first, where the gate refuses ``n_modes``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CopyMatrix:
+    """Judge an earlier reconstructor at the current α and offer it under a new id."""
+
+    source: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgeMatrix:
+    """Judge the matrix in use at the current α."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgeProposal:
+    """Judge a reconstructor that is to be sent, at the current α and with these gains."""
+
+    id: str
+    gains: tuple[float, ...]
+    """Of the modes it commands."""
+
+    wanted: bool = True
+    """Somebody asked for it to be sent; False: the service would by itself."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SendMatrix:
+    """Publish a reconstructor; first tell the RTC how many modes it commands."""
+
+    id: str
+    n_modes: int
+    gains: tuple[float, ...] | None
+    """``(n_modes of the basis,)`` gains to go with it; None: those in force."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FetchMatrix:
+    """Ask the RTC for the matrix it uses."""
+
+    id: str | None
+    """By its status; None: its status does not say."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskDither:
+    """Ask the RTC for a dither."""
+
+    dither: DitherView
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskNoDither:
+    """Ask the RTC to stop its dither."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskMeasurement:
+    """Ask the RTC to measure an interaction matrix."""
+
+    record: MeasurementRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskLoop:
+    """Ask the RTC to change its loop; None leaves a value as it is."""
+
+    id: str
+    closed: bool | None = None
+    gains: tuple[float, ...] | None = None
+    """One for each mode of the basis."""
+
+    leak: float | None = None
+    n_controlled: int | None = None
+    judged: bool = False
+    """Only if the gate lets the matrix in use run with these gains."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AskRamp:
+    """Ask the RTC to try gains on groups of modes."""
+
+    id: str
+    groups: tuple[tuple[int, int], ...]
+    """First and last mode of each, both included."""
+
+    gains: tuple[float, ...]
+    frames_per_gain: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FinishNoisy:
+    """Fit and archive what has been summed of a noisy interaction matrix."""
+
+    record: NoisyRecord
+
+
+Effect = (
+    MakeMatrix
+    | CopyMatrix
+    | JudgeMatrix
+    | JudgeProposal
+    | SendMatrix
+    | FetchMatrix
+    | AskDither
+    | AskNoDither
+    | AskMeasurement
+    | AskLoop
+    | AskRamp
+    | FinishNoisy
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tick:
+    """Time has passed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusSeen:
+    """The RTC said how it is."""
+
+    rtc: RtcView
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionStarted:
+    """The RTC started anew: its windows, commands and staged matrices are void."""
+
+    session: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RtcVanished:
+    """The RTC's liveliness token went away."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServicesMet:
+    """Other services of this system came or went."""
+
+    drives: bool
+    """Whether this service drives the RTC; otherwise it stands by."""
+
+    others: tuple[str, ...]
+    """In words, the first one first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trouble:
+    """A condition that must be seen while it lasts."""
+
+    name: str
+    text: str
+    over: bool = False
+    """The condition has ended."""
+
+    t_ns_utc: int = 0
+    """End of the telemetry that told, the RTC's clock; 0: it was not telemetry."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noted:
+    """Something happened that changes nothing but should be on record."""
+
+    name: str
+    text: str
+    level: Level = Level.INFO
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WindowFitted:
+    """The worker estimated α from one window."""
+
+    estimate: WindowEstimate | RandomEstimate
+    began_ns_utc: int = 0
+    """Begin of the window, the RTC's clock; 0: not told."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FarFitted:
+    """The worker found α from afar, in a window with the loop open."""
+
+    found: FarEstimate
+    began_ns_utc: int = 0
+    """Begin of the window, the RTC's clock; 0: not told."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowLost:
+    """A window gave no estimate."""
+
+    refused: WindowRefused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Watched:
+    """The watchdog estimated α from ordinary telemetry."""
+
+    estimate: PassiveEstimate
+    t_ns_utc: int
+    """End of the telemetry it is of."""
+
+    began_ns_utc: int = 0
+    """Begin of it, the RTC's clock; 0: not told."""
+
+    loop: tuple[float, ...] = ()
+    """``RtcView.loop_numbers`` of the loop it is of; empty: not known."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unwatched:
+    """The watchdog cannot estimate α from ordinary telemetry as it is."""
+
+    text: str
+    """Why, and what it would need."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatrixMade:
+    """A reconstructor has been computed, or copied, and judged."""
+
+    record: ReconstructorRecord
+    wanted: bool
+    """An operator asked for this very matrix: no further approval is needed."""
+
+    asked_modes: int | None = None
+    """Modes it should have had; None: nobody asked for a number."""
+
+    why_fewer: str = ""
+    """Why it has fewer than were asked for: the gate's words."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatrixFetched:
+    """The matrix the RTC uses, which the service did not make, is known now."""
+
+    record: ReconstructorRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarginJudged:
+    """The gate's verdict on the matrix in use, at the current α."""
+
+    id: str
+    verdict: GateVerdict
+    alpha: Misregistration | None = None
+    """The registration it was judged at; None: not told."""
+
+    expected: ExpectedGain | None = None
+    """What a new one would win; None: not computed."""
+
+    judged: Judged | None = None
+    """What the verdict is of; None: not told."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ProposalJudged:
+    """The gate's verdict on a reconstructor that is to be sent."""
+
+    id: str
+    verdict: GateVerdict
+    judged: Judged
+    wanted: bool = True
+    """As it was in what asked for the verdict."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acknowledged:
+    """The RTC answered to a reconstructor."""
+
+    id: str | None
+    """None: it could not read which one it rejects."""
+
+    sha256: str | None = None
+    """Of the matrix it means; None: not told."""
+
+    session: str | None = None
+    """Of the RTC that answers; None: not known."""
+
+    state: MatrixState
+    reason: str
+    frame_seq: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DitherAnswered:
+    """The RTC accepted or refused a dither."""
+
+    id: str
+    accepted: bool
+    reason: str
+    start_seq: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DitherSilent:
+    """A dither should be on the mirror, and the frames hold none of it."""
+
+    id: str
+    silent_s: float
+    """By the frames' own time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DitherMeasured:
+    """What the frames hold of a dither is otherwise than it was asked for, or is so no more."""
+
+    id: str
+    found_m: float
+    """RMS of all modes together, metres OPD."""
+
+    asked_m: float
+    text: str
+    """What is otherwise; empty: nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vibrations:
+    """The vibration lines in the slopes are others than before."""
+
+    lines_hz: tuple[float, ...]
+    """Lowest first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopAnswered:
+    """The RTC accepted or refused a change of its loop, or a gain ramp."""
+
+    id: str
+    accepted: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatrixMeasured:
+    """A measured interaction matrix is one step further: begun, refused, failed or stored."""
+
+    record: MeasurementRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NoisyMade:
+    """A noisy interaction matrix has been archived."""
+
+    record: NoisyRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobFailed:
+    """Something that was to be done could not be."""
+
+    effect: Effect
+    text: str
+
+
+Event = (
+    Command
+    | Tick
+    | StatusSeen
+    | SessionStarted
+    | RtcVanished
+    | ServicesMet
+    | Trouble
+    | Noted
+    | WindowFitted
+    | FarFitted
+    | WindowLost
+    | Watched
+    | Unwatched
+    | MatrixMade
+    | MatrixFetched
+    | MarginJudged
+    | ProposalJudged
+    | Acknowledged
+    | DitherAnswered
+    | DitherSilent
+    | DitherMeasured
+    | Vibrations
+    | LoopAnswered
+    | MatrixMeasured
+    | NoisyMade
+    | JobFailed
+)
+
+Step = tuple[TrackerState, tuple[Effect, ...]]
+"""The next state, and what is to be done."""

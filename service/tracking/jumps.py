@@ -1,0 +1,217 @@
+"""How far a measurement lies from what was known: whether the mirror has jumped.
+
+The filter allows for a random walk, which can go far in a few seconds. Flexure is smooth: over less
+than a minute it goes as time itself and not as its root, and what goes faster should be seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.misregistration import Misregistration
+from service.telemetry.passive import BIAS_FLOOR
+from service.telemetry.wind import JUMP_THRESHOLD, Joint
+from service.tracking.loop import Pointing
+from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.registration import Earlier, Registration, Seen
+from service.tracking.validity import CLOCK_SET_BACK_S, flexure
+
+STEADY_S = 60.0
+"""The drift of a minute is what the settings tell: over less it is that share of it."""
+
+VARYING = 0.3
+"""Share of the model error that differs from window to window: bright stars scatter by 0.1 % of a
+subaperture and 6 mdeg, twice what their own data say (docs/results/night.md)."""
+
+ROTATION_LIMIT = 15.1
+"""What the normalised square of one parameter exceeds once in 10 000, ``JUMP_THRESHOLD`` that of
+four. 0.1 deg are 4 to 6 σ of a window at magnitude 10 and do not stand out among four parameters; a
+tenth of a subaperture is 20 σ and needs no such help."""
+
+ROTATION_LIMIT_OF_TWO = 12.2
+"""The same for two windows together, once in 2000: they must also agree."""
+
+LITTLE = 0.3
+"""Share of a jump by which a window may fall short of it and still be of the new place."""
+
+_ROTATION = 2
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reading:
+    """What was measured, when, and where the telescope looked."""
+
+    value: Array
+    """``(4,)`` numeric units."""
+
+    noise: Array
+    """``(4, 4)`` its covariance."""
+
+    t_ns_utc: int
+    pointing: Pointing | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Distance:
+    """How far a reading lies from what was known."""
+
+    innovation: float
+    """Squared, normalised, of all four parameters: 4 is expected."""
+
+    rotation: float
+    """The same of the likelihood ratio of a mirror that has turned against none: 1 is expected."""
+
+    rotation_limit: float = ROTATION_LIMIT
+
+    @property
+    def excess(self) -> float:
+        """What is least likely of it, over what chance hardly ever exceeds."""
+        return max(self.innovation / JUMP_THRESHOLD, self.rotation / self.rotation_limit)
+
+    @property
+    def far(self) -> bool:
+        """Whether it is no chance."""
+        return self.excess > 1.0
+
+
+NEAR = Distance(innovation=0.0, rotation=0.0)
+"""Where nothing can be told."""
+
+
+def distance(difference: Array, covariance: Array) -> Distance:
+    """Return how far ``(4,)`` lies from zero by its covariance ``(4, 4)``."""
+    weight = np.linalg.inv(covariance)
+    score = weight @ difference
+    return Distance(
+        innovation=float(score @ difference),
+        rotation=float(score[_ROTATION] ** 2 / weight[_ROTATION, _ROTATION]),
+    )
+
+
+def window_surprise(known: Registration, reading: Reading, policy: Policy) -> Distance:
+    """Return how far a window lies from α.
+
+    It is seen from after the last window and from before it: a jump in the middle of a window
+    moves that one by half of it and the next by the other half, and neither half need be far out.
+    """
+    return _farthest((last_of(known), known.earlier), reading, policy)
+
+
+def pair_surprise(known: Registration, reading: Reading, policy: Policy) -> Distance:
+    """Return how far a window and the one before it lie from what was known, both together.
+
+    Half the noise of one: a jump that no window alone can tell. The one before was held, or has
+    entered. They are seen from before both and from before the window before, in whose middle the
+    jump may have been; and they are no jump unless each lies nearer to the other than to α.
+    """
+    first, before = window_before(known), known.earlier
+    if first is None:
+        return NEAR
+    seen_from = (last_of(known), before)
+    if known.candidate is None and before is not None:
+        seen_from = (before, before.earlier)
+    alone = replace(
+        reading, value=first.alpha.vector, noise=first.covariance, t_ns_utc=first.t_ns_utc
+    )
+    nearest = min(_farthest(seen_from, one, policy).innovation for one in (alone, reading))
+    if distance_apart(first, reading, policy) >= min(nearest, JUMP_THRESHOLD):
+        return NEAR
+    found = _farthest(seen_from, _together(first, reading), policy)
+    return replace(found, rotation_limit=ROTATION_LIMIT_OF_TWO)
+
+
+def window_before(known: Registration) -> Seen | None:
+    """Return the window before the present one: held, or the last that entered."""
+    if known.candidate is not None:
+        return known.candidate.seen
+    return None if known.earlier is None else known.earlier.then
+
+
+def distance_apart(first: Seen, reading: Reading, policy: Policy) -> float:
+    """Return how far two windows lie apart: squared, normalised, expected 4."""
+    return _apart(reading.value - first.alpha.vector, first, reading, policy)
+
+
+def wholly_after(first: Seen, reading: Reading, old: Array, policy: Policy) -> bool:
+    """Return whether a window is of the new place ``reading`` tells, and not partly of the ``old``.
+
+    The first window after a jump began before it. What it may lack of the way (2 σ of the
+    difference allowed for) must be little.
+    """
+    lacks = np.sqrt(_apart(reading.value - first.alpha.vector, first, reading, policy)) + 2.0
+    return bool(lacks <= LITTLE * np.sqrt(_apart(reading.value - old, first, reading, policy)))
+
+
+def look_surprise(known: Registration, joint: Joint, reading: Reading, policy: Policy) -> float:
+    """Return the same of a passive look, its bias allowed for; ``joint`` is at ``known``'s time."""
+    before = known.bias.earlier if known.bias is not None else None
+    found = []
+    for earlier in (sum_of(known, joint), before):
+        if earlier is not None:
+            elapsed_s = max(reading.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
+            fading = -np.expm1(-2.0 * elapsed_s / policy.bias_memory_s)
+            found.append(_surprise(earlier, reading, policy, BIAS_FLOOR**2 * fading).innovation)
+    return max(found)
+
+
+def last_of(known: Registration) -> Earlier:
+    """Return what is known, for when it will have been before."""
+    return Earlier(
+        alpha=known.alpha,
+        covariance=known.covariance,
+        t_ns_utc=known.t_ns_utc,
+        pointing=known.pointing,
+    )
+
+
+def sum_of(known: Registration, joint: Joint) -> Earlier:
+    """Return what a passive look should read: α and its bias together, the filter as it stands."""
+    covariance = joint.covariance
+    shared = covariance[4:, :4]
+    return Earlier(
+        alpha=Misregistration.from_vector(joint.alpha + joint.bias),
+        covariance=covariance[:4, :4] + covariance[4:, 4:] + shared + shared.T,
+        t_ns_utc=known.t_ns_utc,
+        pointing=known.pointing,
+    )
+
+
+def _together(first: Seen, reading: Reading) -> Reading:
+    """Return the mean of two windows, each by its precision, at the time of the second."""
+    weights = [np.linalg.inv(noise) for noise in (first.covariance, reading.noise)]
+    noise = np.linalg.inv(weights[0] + weights[1])
+    value = noise @ (weights[0] @ first.alpha.vector + weights[1] @ reading.value)
+    return replace(reading, value=value, noise=noise)
+
+
+def _apart(difference: Array, first: Seen, reading: Reading, policy: Policy) -> float:
+    elapsed_s = max(reading.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
+    added = _drifted(elapsed_s, policy) + 2.0 * (VARYING * policy.floor) ** 2
+    total = first.covariance + reading.noise + np.diag(added)
+    return float(difference @ np.linalg.solve(total, difference))
+
+
+def _drifted(elapsed_s: float, policy: Policy) -> Array:
+    """Return ``(4,)`` variance that a smooth flexure has added."""
+    return np.asarray(policy.drift_rate**2 * elapsed_s * min(elapsed_s / STEADY_S, 1.0))
+
+
+def _farthest(seen_from: tuple[Earlier | None, ...], reading: Reading, policy: Policy) -> Distance:
+    found = [_surprise(earlier, reading, policy, np.zeros(4)) for earlier in seen_from if earlier]
+    return max(found, key=lambda one: one.excess)
+
+
+def _surprise(earlier: Earlier, reading: Reading, policy: Policy, forgot: Array) -> Distance:
+    elapsed_s = (reading.t_ns_utc - earlier.t_ns_utc) / SECOND_NS
+    if elapsed_s < -CLOCK_SET_BACK_S:
+        return NEAR
+    elapsed_s = max(elapsed_s, 0.0)
+    bent = flexure(earlier.pointing, reading.pointing, policy)
+    added = _drifted(elapsed_s, policy) + bent**2 + (VARYING * policy.floor) ** 2 + forgot
+    total = earlier.covariance + reading.noise + np.diag(added)
+    return distance(reading.value - earlier.alpha.vector, total)

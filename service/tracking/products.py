@@ -1,0 +1,384 @@
+"""What is made and measured: reconstructors, interaction matrices, and where each of them is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.expected_gain import ExpectedGain
+from service.control.gate import GateVerdict
+from service.model.misregistration import Misregistration
+from service.tracking.registration import ModeGain
+
+
+class MatrixState(StrEnum):
+    """Where a reconstructor is on its way to the RTC."""
+
+    REFUSED = "refused"
+    """The stability gate refused it: it is never offered."""
+
+    PROPOSED = "proposed"
+    """It passed the gate and waits for an operator."""
+
+    DISCARDED = "discarded"
+    """An operator rejected it."""
+
+    PUBLISHED = "published"
+    """Sent; the RTC has not answered yet."""
+
+    STAGED = "staged"
+    """The RTC holds it, checked, ready to swap."""
+
+    APPLIED = "applied"
+    """It multiplies the slopes now."""
+
+    SUPERSEDED = "superseded"
+    """It was applied, and another one has been since."""
+
+    REJECTED = "rejected"
+    """The RTC refused it; the reason is the RTC's."""
+
+    FAILED = "failed"
+    """No acknowledgement came in time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Judged:
+    """What a verdict of the gate is of: of another loop, or of another α, it says nothing."""
+
+    session: str
+    """Of the RTC."""
+
+    gains: tuple[float, ...]
+    """Of the modes that the reconstructor commands."""
+
+    leak: float
+    delay_frames: float
+    alpha: Misregistration
+    sigma: NDArray[np.float64]
+    """``(4,)`` 1 σ, floor included, numeric units."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReconstructorRecord:
+    """All that is known of one reconstructor but its numbers."""
+
+    id: str
+    """Never reused."""
+
+    state: MatrixState
+    """Where it is on its way."""
+
+    n_modes: int
+    """Modes it commands: the first ones of the basis."""
+
+    created_ns_utc: int
+    """When it was computed."""
+
+    alpha: Misregistration | None = None
+    """The registration it was computed for; None when the service did not make it."""
+
+    sigma: NDArray[np.float64] | None = None
+    """``(4,)`` 1 σ of that registration, floor included, numeric units."""
+
+    parent: str | None = None
+    """The reconstructor in use when it was computed, or the one a rollback copies."""
+
+    sha256: str = ""
+    """Of the matrix as it travels, 64 lower-case hex digits."""
+
+    condition_number: float | None = None
+    """Of the interaction matrix it inverts."""
+
+    gate: GateVerdict | None = None
+    """The stability gate's latest verdict; None: not judged yet."""
+
+    judged: Judged | None = None
+    """What that verdict is of, in this run of the service; None: nobody knows any more."""
+
+    optical_gains: tuple[ModeGain, ...] = ()
+    """Measured when it was made, for the table of loop gains beside it; never folded in."""
+
+    reason: str = ""
+    """Why it is in this state: the RTC's or the operator's words."""
+
+    published_ns_utc: int | None = None
+    """When it was sent; None: never."""
+
+    applied_frame_seq: int | None = None
+    """First frame whose slopes it multiplied; None: not applied, or before this service came."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Assessment:
+    """What the reconstructor in use loses against a new one, at one registration."""
+
+    id: str
+    """Of the reconstructor in use then."""
+
+    alpha: Misregistration
+    """The registration it was computed for."""
+
+    expected: ExpectedGain
+    t_ns_utc: int
+    """When it came, by the service's clock."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModeLimit:
+    """More modes than these gate, RTC or operator would not have; they are tried again later."""
+
+    n_modes: int
+    """As many as may be controlled for now."""
+
+    since_ns_utc: int
+    until_ns_utc: int
+    """More are not tried before."""
+
+    wait_s: float
+    """From one to the other; doubled each time the limit is found again."""
+
+    reason: str
+    """What was said of more: the words of the gate, the RTC or the operator."""
+
+
+class MeasurePattern(StrEnum):
+    """How the RTC measures an interaction matrix."""
+
+    PUSH_PULL_MODAL = "push-pull-modal"
+    """One mode after the other, loop open."""
+
+    PUSH_PULL_ZONAL = "push-pull-zonal"
+    """One actuator after the other, loop open."""
+
+    HADAMARD = "hadamard"
+    """All modes at once with the signs of a Hadamard matrix, loop open."""
+
+    SYSTEM_MODES = "system-modes"
+    """One eigenmode of the reconstructor in use after the other, loop open."""
+
+    SINE = "sine"
+    """All modes at once, each at its own frequency, loop closed."""
+
+
+class MeasureState(StrEnum):
+    """Where a measurement of an interaction matrix is."""
+
+    ASKED = "asked"
+    """The RTC has not answered yet."""
+
+    RUNNING = "running"
+    """The RTC measures."""
+
+    REFUSED = "refused"
+    """The RTC would not; the reason is the RTC's."""
+
+    FAILED = "failed"
+    """There is no matrix; the reason says why."""
+
+    STORED = "stored"
+    """The matrix is in the archive."""
+
+    GIVEN_UP = "given-up"
+    """An operator waits for it no longer; the RTC may go on, what it sends is ignored."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasurementRecord:
+    """All that is known of one measured interaction matrix but its numbers."""
+
+    id: str
+    """Never reused."""
+
+    state: MeasureState
+    pattern: MeasurePattern
+    modes: tuple[int, ...]
+    """0-based basis indices, one for each column."""
+
+    amplitude_m: tuple[float, ...]
+    """RMS of each mode's stroke, metres OPD."""
+
+    n_average: int | None
+    """Repetitions averaged; None: the pattern has none."""
+
+    frequency_hz: tuple[float, ...] | None = None
+    """Of each mode; None: not a sine, or asked for by somebody else."""
+
+    duration_s: float | None = None
+    """Of a sine; None as above."""
+
+    asked_ns_utc: int | None = None
+    """When the service asked for it; None: it did not."""
+
+    start_seq: int | None = None
+    """First frame that contained a stroke; None: not known."""
+
+    closed_before: bool = False
+    """Whether the loop was closed when it was asked for."""
+
+    overdue_since_ns_utc: int | None = None
+    """Since when everything looks as if it were over, but no matrix has come."""
+
+    reason: str = ""
+    """Why there is no matrix."""
+
+    created_ns_utc: int | None = None
+    """When it was measured, by the RTC's clock; None: it was not, or not yet."""
+
+    n_slopes: int | None = None
+    double_pass: bool | None = None
+    """Whether the light saw the mirror twice: the matrix is then twice as large."""
+
+    session: str | None = None
+    """The RTC's session."""
+
+    basis_id: str | None = None
+    config_id: str | None = None
+    sha256: str = ""
+    """Of the matrix as it travels, 64 lower-case hex digits."""
+
+    @property
+    def opens_loop(self) -> bool:
+        """Whether the loop is open while it is measured."""
+        return self.pattern is not MeasurePattern.SINE
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the service waits for the matrix."""
+        return self.state in {MeasureState.ASKED, MeasureState.RUNNING}
+
+
+class ModeSet(StrEnum):
+    """Modes by what they are, instead of by index."""
+
+    CONTROLLED = "controlled"
+    """Those in the loop."""
+
+    ALL = "all"
+    """Those of the basis."""
+
+
+class NoisyState(StrEnum):
+    """Where a noisy interaction matrix is."""
+
+    WAITING = "waiting"
+    """The service's own dither has to end first."""
+
+    ASKED = "asked"
+    """The RTC has not answered yet."""
+
+    RUNNING = "running"
+    """The dither plays, its windows are being summed."""
+
+    FINISHING = "finishing"
+    """The dither is over; the matrix is being fitted and archived."""
+
+    STORED = "stored"
+    """It is in the archive."""
+
+    FAILED = "failed"
+    """There is none; the reason says why."""
+
+    GIVEN_UP = "given-up"
+    """An operator did not want it any more."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NoisyFinding:
+    """What came of one."""
+
+    n_slopes: int
+    n_frames: int
+    """Frames that entered it."""
+
+    n_missing: int
+    """Frames of its windows that never came."""
+
+    snr: float
+    """RMS signal of an element over its noise: about 1 on a bright star, less on a faint one."""
+
+    alpha: Misregistration | None
+    """The registration fitted to it; None: none could be."""
+
+    covariance: NDArray[np.float64] | None
+    """``(4, 4)`` of that, numeric units, from the data alone; None as above."""
+
+    optical_gain: float | None
+    """Mean gain of the modes against the model; None as above."""
+
+    misfit: float | None
+    """Residual power over what noise explains; None as above."""
+
+    cm_id: str | None
+    """The reconstructor in use at its end."""
+
+    session: str
+    created_ns_utc: int
+    """End of its last frame, the RTC's clock."""
+
+    sha256: str
+    """Of the matrix as C-ordered little-endian float32."""
+
+    @property
+    def sigma(self) -> NDArray[np.float64] | None:
+        """``(4,)`` 1 σ of the registration, numeric units, from the data alone; None as above."""
+        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NoisyRecord:
+    """All that is known of one noisy interaction matrix but its numbers.
+
+    Nothing of it can become a reconstructor: it is a measurement to fit a model to.
+    """
+
+    id: str
+    """Never reused; also that of its dither."""
+
+    state: NoisyState
+    modes: tuple[int, ...]
+    """0-based basis indices, one for each column."""
+
+    total_m: float
+    """RMS of all modes together, metres OPD."""
+
+    duration_s: float
+    """Of telemetry asked for."""
+
+    window_s: float
+    """Of the windows it is summed from."""
+
+    seed: int
+    """Of the dither's signs."""
+
+    asked_ns_utc: int
+    basis_id: str
+    config_id: str
+    reason: str = ""
+    """Why there is none, or what is missing."""
+
+    finding: NoisyFinding | None = None
+    """None: not finished."""
+
+    @property
+    def n_modes(self) -> int:
+        """Columns."""
+        return len(self.modes)
+
+    @property
+    def amplitude_m(self) -> float:
+        """RMS of each mode, metres OPD."""
+        return float(self.total_m / np.sqrt(len(self.modes)))
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the service still works on it."""
+        return self.state in {
+            NoisyState.WAITING,
+            NoisyState.ASKED,
+            NoisyState.RUNNING,
+            NoisyState.FINISHING,
+        }

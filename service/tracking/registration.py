@@ -1,0 +1,312 @@
+"""The registration: now, window by window, and as ordinary telemetry sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.misregistration import Misregistration
+from service.tracking.loop import Pointing
+
+Array = NDArray[np.float64]
+
+
+class Source(StrEnum):
+    """What a measurement of α was made from."""
+
+    LOCK_IN = "lock-in"
+    """A window of sinusoidal dither."""
+
+    RANDOM = "random"
+    """A window of random dither."""
+
+    PASSIVE = "passive"
+    """Ordinary telemetry: biased by the wind."""
+
+
+class Validity(StrEnum):
+    """Whether α may be relied on."""
+
+    FRESH = "fresh"
+    """σ is less than half of what makes it stale."""
+
+    AGEING = "ageing"
+    """σ grows towards the limit."""
+
+    STALE = "stale"
+    """σ has passed the limit, or nothing has confirmed α since a restart."""
+
+    INVALID = "invalid"
+    """α may be somewhere else: nothing is made or published from it by itself."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Standing:
+    """Whether α may be relied on, why, and until when."""
+
+    validity: Validity = Validity.FRESH
+    reason: str = ""
+    """Why it is not fresh."""
+
+    until_ns_utc: int | None = None
+    """When it goes stale if nothing else is measured, by the service's clock; None: it is not
+    valid, or never will go stale."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModeGain:
+    """The optical gain of one mode, followed over the windows that dithered it."""
+
+    mode: int
+    """0-based basis index."""
+
+    gain: float
+    """Modulus of the sensor's response over the model's."""
+
+    sigma: float
+    """1 σ of it at ``t_ns_utc``."""
+
+    scatter: float
+    """1 σ of a single window, as the windows themselves scattered."""
+
+    t_ns_utc: int
+    """End of the last window that held this mode."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Seen:
+    """A dithered window as it was measured, whatever the filter made of it."""
+
+    alpha: Misregistration
+    covariance: Array
+    """``(4, 4)`` from its own data, numeric units."""
+
+    t_ns_utc: int
+    """End of the window."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Earlier:
+    """What was known before the last measurement: a jump inside that one is seen from here."""
+
+    alpha: Misregistration
+    covariance: Array
+    """``(4, 4)`` at ``t_ns_utc``, numeric units."""
+
+    t_ns_utc: int
+    """End of the telemetry that had entered, the RTC's clock."""
+
+    pointing: Pointing | None
+    """Of the telescope then; None: not known."""
+
+    then: Seen | None = None
+    """The window that entered next; None: it is not kept."""
+
+    earlier: Earlier | None = None
+    """Before the window before that; None: that was the first, or it is not kept."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PassiveBias:
+    """What has been learnt of how far the passive estimate is off, and how sure that is."""
+
+    offset: Array
+    """``(4,)`` what a passive estimate reads more than α, numeric units."""
+
+    covariance: Array
+    """``(4, 4)`` of it."""
+
+    shared: Array
+    """``(4, 4)`` covariance of it (rows) with α (columns)."""
+
+    looked_ns_utc: int
+    """End of the telemetry of the last passive estimate, the RTC's clock; 0: there was none."""
+
+    excess: Array = field(default_factory=lambda: np.zeros(4))
+    """``(4,)`` variance beyond the least that the scatter of passive estimates has told of."""
+
+    loop: tuple[float, ...] = ()
+    """``RtcView.loop_numbers`` of the loop it is the bias of; empty: not known."""
+
+    earlier: Earlier | None = None
+    """α and bias together before that one; None: it was the first, or has been doubted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Candidate:
+    """A window far from all before, held until the next one says which of them was right."""
+
+    alpha: Misregistration
+    covariance: Array
+    """``(4, 4)`` from its own data, numeric units."""
+
+    t_ns_utc: int
+    """End of the window."""
+
+    held_ns_utc: int
+    """When it was put aside, by the service's clock."""
+
+    innovation: float
+    """Normalised innovation squared (4 degrees of freedom)."""
+
+    @property
+    def seen(self) -> Seen:
+        """What was measured."""
+        return Seen(alpha=self.alpha, covariance=self.covariance, t_ns_utc=self.t_ns_utc)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Registration:
+    """The current estimate of α and how sure the service is of it."""
+
+    alpha: Misregistration
+    """The estimate."""
+
+    covariance: Array
+    """``(4, 4)`` at ``t_ns_utc``, numeric units (subapertures, radians, ratio), model-error floor
+    not included."""
+
+    floor: Array
+    """``(4,)`` 1 σ of the model error that no integration removes, numeric units."""
+
+    t_ns_utc: int
+    """End of the last telemetry that entered the estimate, the RTC's clock."""
+
+    arrived_ns_utc: int
+    """When that arrived, by the service's clock: age is judged by arrival, never by comparing
+    clocks."""
+
+    n_windows: int
+    """Windows that entered the estimate since it began, jumped, went stale or was restored."""
+
+    window_ns_utc: int = 0
+    """When the last dithered window arrived, by the service's clock; 0: not known."""
+
+    window_began_ns_utc: int = 0
+    """When that window began, by the RTC's clock; 0: not known."""
+
+    grown: Array = field(default_factory=lambda: np.zeros(4))
+    """``(4,)`` variance that drift and flexure have added since ``t_ns_utc``, numeric units."""
+
+    optical_gain: float | None = None
+    """Mean modulus of the measured complex gain of the dithered modes; None: not measured."""
+
+    optical_gains: tuple[ModeGain, ...] = ()
+    """Of every mode that was dithered, in the order of the modes, bounded."""
+
+    bias: PassiveBias | None = None
+    """Of the passive estimate; None: nothing is known of it."""
+
+    passive_after_ns_utc: int = 0
+    """End of the window in which α jumped, the RTC's clock: only a passive estimate that began
+    after it is of the new place."""
+
+    pointing: Pointing | None = None
+    """Of the telescope at ``t_ns_utc``; None: not known."""
+
+    window_pointing: Pointing | None = None
+    """Of the telescope at the last dithered window; None: not known."""
+
+    earlier: Earlier | None = None
+    """Before the last window; None: that was the first, or it was the first after a jump."""
+
+    jumped_ns_utc: int | None = None
+    """When it was last found to have jumped, by the service's clock; None: it has not."""
+
+    candidate: Candidate | None = None
+    """A jump that the next window confirms or denies; None: there is none."""
+
+    doubt: str = ""
+    """Why α may be somewhere else, until a dithered window decides; empty: no doubt."""
+
+    doubted_ns_utc: int = 0
+    """End of the telemetry that cast the doubt, the RTC's clock: a window that began before it
+    cannot end it."""
+
+    standing: Standing = Standing()
+    """How much it is worth now."""
+
+    restored_ns_utc: int | None = None
+    """When it was taken over from before a restart of the service; None: it is of this run."""
+
+    basis_id: str | None = None
+    """Of the modes it was measured with; None: not known."""
+
+    config_id: str | None = None
+    """Of the RTC's configuration; None: not known."""
+
+    @property
+    def total_covariance(self) -> Array:
+        """``(4, 4)`` covariance as it is now: growth and model-error floor added."""
+        return self.covariance + np.diag(self.grown + self.floor**2)
+
+    @property
+    def sigma(self) -> Array:
+        """``(4,)`` 1 σ now, floor included, numeric units (rotation in radians)."""
+        return np.sqrt(np.diag(self.total_covariance))
+
+    @property
+    def usable(self) -> bool:
+        """Whether anything may be made or published from it without being asked for."""
+        return self.standing.validity is not Validity.INVALID
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class HistoryEntry:
+    """One measurement's own estimate and the filtered one after it."""
+
+    t_ns_utc: int
+    """End of the telemetry."""
+
+    measured: Misregistration
+    """What this measurement alone says; a passive one without the bias learnt."""
+
+    measured_sigma: Array
+    """``(4,)`` its 1 σ from the data, numeric units."""
+
+    filtered: Misregistration
+    """The Kalman estimate after it."""
+
+    filtered_sigma: Array
+    """``(4,)`` 1 σ of the filtered estimate, floor included, numeric units."""
+
+    innovation: float
+    """Normalised innovation squared (4 degrees of freedom); 0 for the first window."""
+
+    misfit: float
+    """Residual power over what noise explains; 1: the model explains the data. NaN: not known."""
+
+    source: Source = Source.LOCK_IN
+    """What it was made from."""
+
+    entered: bool = True
+    """False: it was too far out to be believed, and did not enter the estimate."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Watchdog:
+    """The passive estimate, from ordinary telemetry, beside the dithered one."""
+
+    alpha: Misregistration
+    """As read: the bias is in it."""
+
+    sigma: Array
+    """``(4,)`` 1 σ of it as a reading of α, once the bias known is taken off; numeric units.
+    Infinite where it cannot tell."""
+
+    misfit: float
+    """Residual power over what noise explains; 1: the model explains the telemetry. NaN: too young
+    to tell."""
+
+    t_ns_utc: int
+    consistent: bool
+    """False when it disagrees with the current α by more than its own uncertainty allows."""
+
+    text: str
+    """What the operator should know."""
+
+    bias: Array = field(default_factory=lambda: np.zeros(4))
+    """``(4,)`` what is known of its bias, numeric units; 0: nothing."""

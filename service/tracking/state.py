@@ -1,0 +1,318 @@
+"""Everything the service knows: one frozen record, replaced as a whole, read by REST, metrics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from service.control.gate import GateVerdict
+from service.tracking.loop import DitherView, LoopCommand, Pointing, RtcView
+from service.tracking.products import (
+    Assessment,
+    MeasurementRecord,
+    ModeLimit,
+    NoisyRecord,
+    ReconstructorRecord,
+)
+from service.tracking.registration import HistoryEntry, Registration, Watchdog
+from service.tracking.stages import Acquisition, Dithering
+
+
+class Level(StrEnum):
+    """How loudly an event speaks."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ALARM = "alarm"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alarm:
+    """Something that must be seen, for as long as it lasts."""
+
+    name: str
+    since_ns_utc: int
+    text: str
+    """What was found, and what to do."""
+
+    seen_ns_utc: int = 0
+    """When it was last found to be so."""
+
+    t_ns_utc: int = 0
+    """When it was raised, by the RTC's clock: telemetry from before does not tell that it is over.
+    0: not known."""
+
+
+class Party(StrEnum):
+    """Whom the service waits for."""
+
+    RTC = "rtc"
+    OPERATOR = "operator"
+    WORKER = "worker"
+    """The service's own, which computes."""
+
+    SERVICE = "service"
+    """Another one, of the same system."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Waiting:
+    """Something the service waits for."""
+
+    name: str
+    """Machine-readable."""
+
+    party: Party
+    """Who can end it."""
+
+    text: str
+    """What is missing, and what to do."""
+
+    hinders: bool = False
+    """Whether the service can do nothing of its work meanwhile."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogEntry:
+    """One thing that happened."""
+
+    t_ns_utc: int
+    level: Level
+    name: str
+    """Machine-readable, like ``reconstructor.applied``."""
+
+    text: str
+
+    times: int = 1
+    """How often: a line that repeats within a minute is told once, and again with this count."""
+
+    last_ns_utc: int = 0
+    """The last time, where it was more than once."""
+
+    @property
+    def line(self) -> tuple[int, str, str]:
+        """What makes it this line and no other, however often it has happened."""
+        return self.t_ns_utc, self.name, self.text
+
+
+class Mode(StrEnum):
+    """How much the service may do by itself."""
+
+    AUTO = "auto"
+    """Estimate, compute and publish whatever passes the gate."""
+
+    PROPOSE = "propose"
+    """Estimate and compute; an operator approves each publication."""
+
+    HOLD = "hold"
+    """Estimate only: nothing is computed or published unless asked for."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Retries:
+    """Before when nothing of a kind is tried again: what cannot be had holds up nothing else."""
+
+    dither_ns_utc: int = 0
+    make_ns_utc: int = 0
+    """A reconstructor."""
+
+    def later(self, *, dither_ns_utc: int = 0, make_ns_utc: int = 0) -> Retries:
+        """Return them with what is named put off until then at least."""
+        return Retries(
+            dither_ns_utc=max(self.dither_ns_utc, dither_ns_utc),
+            make_ns_utc=max(self.make_ns_utc, make_ns_utc),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackerState:
+    """Everything the service knows; ``service.tracker.step`` makes the next one."""
+
+    system: str
+    """The ``{system}`` of the wire."""
+
+    mode: Mode = Mode.PROPOSE
+    settings_mode: Mode | None = None
+    """What the settings say while an operator has ordered another; None: ``mode`` is theirs."""
+
+    registration: Registration | None = None
+    """None until the first accepted window."""
+
+    history: tuple[HistoryEntry, ...] = ()
+    """Oldest first, bounded."""
+
+    reconstructors: tuple[ReconstructorRecord, ...] = ()
+    """Oldest first, bounded; the one in use is always among them once known."""
+
+    measurements: tuple[MeasurementRecord, ...] = ()
+    """Of interaction matrices, oldest first, bounded."""
+
+    noisy: tuple[NoisyRecord, ...] = ()
+    """Noisy interaction matrices, oldest first, bounded."""
+
+    in_use: str | None = None
+    """Id of the matrix the RTC multiplies with; None: unknown."""
+
+    wrong_matrix: str | None = None
+    """Id under which the RTC holds other numbers than were sent; None: it holds what it should."""
+
+    applied_asked_ns_utc: int = 0
+    """When the RTC was last asked for the matrix it uses."""
+
+    unfetched: str = ""
+    """Why it could not be had; empty: it could, or was not asked for."""
+
+    margin: GateVerdict | None = None
+    """The gate's verdict on the matrix in use at the current α ± 3σ; None: not known yet."""
+
+    assessment: Assessment | None = None
+    """What the matrix in use loses against a new one; None: not known yet."""
+
+    mode_limit: ModeLimit | None = None
+    """How many modes the gate lets be controlled; None: as many as are wanted."""
+
+    rtc: RtcView | None = None
+    """None until the first status, and again when the RTC has vanished."""
+
+    basis_id: str | None = None
+    """Pinned or adopted; frames of another basis are refused."""
+
+    config_id: str | None = None
+    """Pinned or adopted; frames of another configuration are refused."""
+
+    dither: DitherView | None = None
+    """Requested or running; None: none, and a new one may be asked for."""
+
+    dither_stopped: bool = False
+    """An operator stopped it: the service does not start another by itself."""
+
+    dither_lost: str | None = None
+    """The last dither that did not reach the mirror: not adopted though a status shows it."""
+
+    dither_losses: int = 0
+    """Dithers lost since the last window was accepted."""
+
+    dithering: Dithering = field(default_factory=Dithering)
+    """What the dither policy has learnt, and its account of why it dithers or does not."""
+
+    vibrations_hz: tuple[float, ...] = ()
+    """Vibration lines in the slopes, lowest first."""
+
+    acquisition: Acquisition = field(default_factory=Acquisition)
+    """Finding α from nothing: under way, or how the last one ended."""
+
+    loop_command: LoopCommand | None = None
+    """The last change of the loop that was asked of the RTC; None: none was."""
+
+    close_since_ns_utc: int | None = None
+    """Since when the loop should close again after a measurement that was given up; None: no."""
+
+    making_since_ns_utc: int | None = None
+    """When the reconstructor now being computed was asked for; None: none is."""
+
+    judged_ns_utc: int | None = None
+    """When ``margin`` was last asked for."""
+
+    retries: Retries = Retries()
+    """Before when what could not be had is not tried again by itself."""
+
+    dither_due_since_ns_utc: int | None = None
+    """Since when a dithered window is wanted before anything else is believed; None: it is not."""
+
+    dither_due_reason: str = ""
+    """Why: what makes α doubtful."""
+
+    pointing: Pointing | None = None
+    """Of the telescope, from the RTC's status or the observatory; None: nobody has told."""
+
+    pointings: tuple[tuple[int, Pointing], ...] = ()
+    """Where it looked, and from when on by the RTC's clock: oldest first, bounded."""
+
+    void_before_ns_utc: int = 0
+    """Telemetry that began before this time of the RTC's clock measures nothing."""
+
+    void_because: str = ""
+    """What was the matter with it."""
+
+    watchdog: Watchdog | None = None
+    unwatched: str = ""
+    """Why ordinary telemetry says nothing of α now; empty: it does, or was not looked at yet."""
+
+    alarms: tuple[Alarm, ...] = ()
+    log: tuple[LogEntry, ...] = ()
+    """Oldest first, bounded."""
+
+    windows_accepted: int = 0
+    windows_refused: int = 0
+    windows_outlying: int = 0
+    """Believable in themselves, but so far from all others that they were not believed."""
+
+    def reconstructor(self, matrix_id: str) -> ReconstructorRecord | None:
+        """Return the record of this id, or None."""
+        return next((r for r in reversed(self.reconstructors) if r.id == matrix_id), None)
+
+    def measurement(self, measurement_id: str) -> MeasurementRecord | None:
+        """Return the record of this measured matrix, or None."""
+        return next((r for r in reversed(self.measurements) if r.id == measurement_id), None)
+
+    def noisy_matrix(self, noisy_id: str) -> NoisyRecord | None:
+        """Return the record of this noisy interaction matrix, or None."""
+        return next((r for r in reversed(self.noisy) if r.id == noisy_id), None)
+
+    @property
+    def gathering(self) -> NoisyRecord | None:
+        """The noisy interaction matrix under way, or None."""
+        return next((r for r in reversed(self.noisy) if r.under_way), None)
+
+    @property
+    def measuring(self) -> MeasurementRecord | None:
+        """The measurement under way, or None."""
+        return next((r for r in reversed(self.measurements) if r.under_way), None)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Orders:
+    """What an operator has ordered that a restart of the service does not undo."""
+
+    mode: Mode | None = None
+    """None: that of the settings holds."""
+
+    settings_mode: Mode | None = None
+    """What the settings said then; where they say something else now, they have the last word."""
+
+    dither_stopped: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Saved:
+    """What a service leaves to the one after it, besides its products."""
+
+    system: str
+    """The ``{system}`` of the wire."""
+
+    saved_ns_utc: int
+    """When, by the service's clock."""
+
+    session: str | None
+    """The RTC's; None: none was there."""
+
+    in_use: str | None
+    """Id of the matrix the RTC multiplied with; None: unknown."""
+
+    pointing: Pointing | None
+    """Of the telescope; None: nobody had told."""
+
+    registration: Registration | None
+    """Without the window that may be waiting for another: that one will not come. None: an
+    acquisition has forgotten it, and found no other yet."""
+
+    acquisition: Acquisition | None = None
+    """One under way, or over without an α; None: neither."""
+
+    orders: Orders | None = None
+    """None: nothing was ordered that the settings do not say."""
+
+    @property
+    def tells_of_alpha(self) -> bool:
+        """Whether it says what α was, or why it is not known."""
+        return self.registration is not None or self.acquisition is not None

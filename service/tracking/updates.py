@@ -1,0 +1,150 @@
+"""What the service wants by itself: the matrix in use, a verdict on it, a new one, a dither."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from service.tracking.activity import ramping
+from service.tracking.alarms import Act, forbidding
+from service.tracking.dither import without_unwanted
+from service.tracking.dither_schedule import choose_dither
+from service.tracking.events import Effect, FetchMatrix, JudgeMatrix, MakeMatrix, Step
+from service.tracking.loop import RtcView
+from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.reconstructors import settled
+from service.tracking.registration import Registration
+from service.tracking.state import Mode, TrackerState
+from service.tracking.worth import fewer_than, more_to_try, outdated, why_worthwhile
+
+JUDGE_INTERVAL_S = 15.0
+"""Least time between two looks at the margin of the matrix in use, while α stays: with 594 modes
+it takes 2.4 s of a core."""
+
+JUDGE_AGAIN_S = 2.0
+"""The same when α has moved."""
+
+NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
+"""A move of α that calls for a look at once (numeric units), if it is more than 1 σ."""
+
+_SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
+
+
+def judge_in_use(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+    """Look at the margin of the matrix in use once α is known, when it moves, and now and then."""
+    known = state.registration
+    if known is None or state.in_use is None or not settled(known):
+        return state, ()
+    if state.making_since_ns_utc is not None or not _judgement_due(state, known, now_ns):
+        return state, ()
+    return replace(state, judged_ns_utc=now_ns), (JudgeMatrix(id=state.in_use),)
+
+
+def _judgement_due(state: TrackerState, known: Registration, now_ns: int) -> bool:
+    if state.judged_ns_utc is None:
+        return True
+    waited_s = (now_ns - state.judged_ns_utc) / SECOND_NS
+    last = state.assessment
+    if waited_s > JUDGE_INTERVAL_S or last is None:
+        return waited_s > JUDGE_INTERVAL_S
+    moved = np.abs(known.alpha.vector - last.alpha.vector)
+    noise = np.sqrt(np.diag(known.covariance))
+    return waited_s > JUDGE_AGAIN_S and bool(np.any(moved > np.maximum(NOTICED, noise)))
+
+
+def choose_update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+    """Compute a reconstructor when it is worthwhile, or could command more modes."""
+    known = state.registration
+    if state.mode is Mode.HOLD or known is None or not settled(known):
+        return state, ()
+    if not rtc.in_loop or state.making_since_ns_utc is not None:
+        return state, ()
+    if forbidding(state, Act.SEND_NEW) is not None:
+        return state, ()
+    first_ns = max(_next_attempt_ns(state, rtc, policy), state.retries.make_ns_utc)
+    if _busy(state) or now_ns < first_ns:
+        return state, ()
+    in_use = state.reconstructor(state.in_use) if state.in_use else None
+    if in_use is None:
+        return state, ()
+    why, n_now = why_worthwhile(state, in_use, policy, now_ns), rtc.n_controlled
+    more = () if why is not None else more_to_try(state, rtc, policy, now_ns)
+    if why is not None:
+        effect = MakeMatrix(n_modes=n_now, why=why, fewer=fewer_than(n_now))
+    elif more:
+        why = f"{n_now} of {more[0]} modes controlled"
+        effect = MakeMatrix(n_modes=more[0], why=why, fewer=more[1:])
+    else:
+        return state, ()
+    return replace(state, making_since_ns_utc=now_ns), (effect,)
+
+
+def _busy(state: TrackerState) -> bool:
+    """Return whether a reconstructor is on its way, or one that fits α awaits an operator.
+
+    In auto nobody is going to decide on a proposal left from another mode or an absent RTC.
+    """
+    return any(
+        r.state in _SENT
+        or (
+            r.state is MatrixState.PROPOSED
+            and state.mode is not Mode.AUTO
+            and not outdated(state, r)
+        )
+        for r in state.reconstructors
+    )
+
+
+def _next_attempt_ns(state: TrackerState, rtc: RtcView, policy: Policy) -> int:
+    """Return before when no reconstructor is computed by itself.
+
+    One refused for another α, or for more modes than are controlled, holds back no other.
+    """
+    own = [r for r in state.reconstructors if r.parent is not None and not _overtaken(state, r)]
+    if not own:
+        return 0
+    last = own[-1]
+    failed = (MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED, MatrixState.DISCARDED)
+    again = last.state in failed and not outdated(state, last) and last.n_modes <= rtc.n_controlled
+    wait_s = policy.refused_interval_s if again else policy.minimum_interval_s
+    return last.created_ns_utc + int(wait_s * SECOND_NS)
+
+
+def _overtaken(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether a reconstructor was never sent, and α is elsewhere by now."""
+    return record.state is MatrixState.DISCARDED and outdated(state, record)
+
+
+ASK_FIRST_S = 3.0
+"""For the RTC's matrix to come before it is asked for again."""
+
+ASK_AGAIN_S = 10.0
+"""Between two questions for a matrix that was not to be had, or has no name."""
+
+
+def decide(state: TrackerState, policy: Policy, now_ns: int) -> Step:
+    """Return what is to be done now, and the state that remembers having asked for it."""
+    if state.rtc is None or forbidding(state, Act.ASK) is not None:
+        return state, ()
+    chosen = [_fetch, choose_dither, judge_in_use, choose_update]
+    if forbidding(state, Act.DECIDE) is not None or ramping(state, now_ns) is not None:
+        chosen = [without_unwanted] if state.wrong_matrix is None else [_fetch, without_unwanted]
+    effects: list[Effect] = []
+    for choose in chosen:
+        state, wanted = choose(state, state.rtc, policy, now_ns)
+        effects += wanted
+    return state, tuple(effects)
+
+
+def _fetch(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+    """Ask for the matrix in use when nobody here has it, its name, or a reason to trust it."""
+    known = rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None
+    if known and state.wrong_matrix is None:
+        return state, ()
+    anew = rtc.cm_id is not None and not state.unfetched and state.wrong_matrix is None
+    every_s = ASK_FIRST_S if anew else ASK_AGAIN_S
+    if now_ns - state.applied_asked_ns_utc < every_s * SECOND_NS:
+        return state, ()
+    return replace(state, applied_asked_ns_utc=now_ns), (FetchMatrix(id=rtc.cm_id),)

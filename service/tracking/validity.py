@@ -1,0 +1,250 @@
+"""When telemetry was taken, what it can therefore tell of, and how long α may be relied on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.tracking.alarms import RULES, Act, forbids, logged, with_alarm, without_alarm
+from service.tracking.loop import Pointing
+from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.registration import Registration, Standing, Validity
+from service.tracking.state import TrackerState
+
+CLOCK_SET_BACK_S = 60.0
+"""Telemetry is never so much older than what is known: the RTC's clock has gone back."""
+
+_ROUNDING_NS = 1_000_000
+"""A window that follows another begins where that one ends, but for the rounding of a frame."""
+
+_POINTINGS_KEPT = 120
+_TURNED_DEG = 0.05
+"""By how much the telescope turns before another line of its way is kept."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Taken:
+    """A stretch of telemetry, by the RTC's clock."""
+
+    began_ns_utc: int
+    ended_ns_utc: int
+
+
+def taken(began_ns_utc: int, ended_ns_utc: int) -> Taken:
+    """Return the stretch that ended then; 0: nobody says when it began, it is taken for short."""
+    return Taken(began_ns_utc=began_ns_utc or ended_ns_utc, ended_ns_utc=ended_ns_utc)
+
+
+def precedes(state: TrackerState, when: Taken, since_ns_utc: int) -> bool:
+    """Return whether telemetry began before a time, and so cannot tell of what is since then."""
+    if state.rtc is not None and since_ns_utc - state.rtc.t_ns_utc > CLOCK_SET_BACK_S * SECOND_NS:
+        return False
+    return when.began_ns_utc < since_ns_utc - _ROUNDING_NS
+
+
+def why_void(state: TrackerState, when: Taken) -> str | None:
+    """Return why telemetry taken then measures nothing, whatever is the matter now; None: it may.
+
+    What is the matter now is asked of the alarms.
+    """
+    if not precedes(state, when, state.void_before_ns_utc):
+        return None
+    return f"{state.void_because} when it was taken: its telemetry is no measurement"
+
+
+def voided(state: TrackerState, because: str, t_ns_utc: int = 0) -> TrackerState:
+    """Return the state in which nothing taken until now is a measurement any more.
+
+    ``t_ns_utc`` is the RTC's clock now, where it is known better than by its status.
+    """
+    before_ns = max(t_ns_utc, 0 if state.rtc is None else state.rtc.t_ns_utc)
+    return replace(state, void_before_ns_utc=before_ns, void_because=because)
+
+
+def over(state: TrackerState, name: str, now_ns: int, t_ns_utc: int = 0) -> TrackerState:
+    """Return the state without an alarm; telemetry that it was of stays what it was."""
+    alarm = next((alarm for alarm in state.alarms if alarm.name == name), None)
+    state = without_alarm(state, name, now_ns)
+    if alarm is None or not forbids(alarm, Act.MEASURE):
+        return state
+    return voided(state, RULES[name].because, t_ns_utc)
+
+
+def tells_of(state: TrackerState, name: str, when: Taken) -> bool:
+    """Return whether telemetry was taken since this alarm was raised, or there is no such alarm."""
+    alarm = next((alarm for alarm in state.alarms if alarm.name == name), None)
+    return alarm is None or not precedes(state, when, alarm.t_ns_utc)
+
+
+def pointed(state: TrackerState, pointing: Pointing | None) -> TrackerState:
+    """Return the state of a telescope that looks there, and remembers its way."""
+    if pointing is None:
+        return state
+    way, t_ns = state.pointings, 0 if state.rtc is None else state.rtc.t_ns_utc
+    if not way or way[-1][1].separation_deg(pointing) >= _TURNED_DEG:
+        way = (*way, (t_ns, pointing))[-_POINTINGS_KEPT:]
+    return replace(state, pointing=pointing, pointings=way)
+
+
+def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
+    """Return where the telescope looked at a time of the RTC's clock, as far as it is known."""
+    later = [place for place in state.pointings if place[0] > t_ns_utc]
+    if not later:
+        return state.pointing
+    earlier = state.pointings[: len(state.pointings) - len(later)]
+    return earlier[-1][1] if earlier else later[0][1]
+
+
+USELESS_SIGMA = np.array([0.1, 0.1, np.deg2rad(0.3), 0.01])
+"""1 σ that says nothing worth keeping, of a window or of α (numeric units)."""
+
+AGEING_SHARE = 0.5
+"""Share of the stale limit from which on α is ageing."""
+
+STALE_AFTER_S = 60.0
+"""Of a running dither without an accepted window. A simulated RTC may be ten times slower than its
+timestamps: a window then takes 20 s."""
+
+CANDIDATE_FOR_S = 60.0
+"""A jump that nothing has confirmed or denied for so long is no longer waited for."""
+
+_ALARM = "estimate-stale"
+
+_WORTHLESS = (Validity.STALE, Validity.INVALID)
+
+Array = NDArray[np.float64]
+
+
+def aged(state: TrackerState, policy: Policy, now_ns: int) -> TrackerState:
+    """Return the state with σ grown to the present, and what α is then worth."""
+    known = state.registration
+    if known is not None:
+        known = _without_old_candidate(known, now_ns)
+        known = replace(known, grown=_growth(state, known, policy, now_ns))
+        standing = _standing(state, known, policy, now_ns)
+        if standing.validity in _WORTHLESS:
+            state = with_dither_due(state, standing.reason, now_ns)
+        state = replace(state, registration=replace(known, standing=standing))
+    return _alarmed(state, now_ns)
+
+
+def with_dither_due(state: TrackerState, reason: str, now_ns: int) -> TrackerState:
+    """Return the state that wants a dithered window; a wish that stands keeps its beginning."""
+    if state.dither_due_since_ns_utc is not None:
+        return state
+    state = replace(state, dither_due_since_ns_utc=now_ns, dither_due_reason=reason)
+    return logged(state, "dither.due", reason, now_ns)
+
+
+def without_dither_due(state: TrackerState) -> TrackerState:
+    """Return the state whose wish has been fulfilled."""
+    return replace(state, dither_due_since_ns_utc=None, dither_due_reason="")
+
+
+def flexure(known: Pointing | None, now: Pointing | None, policy: Policy) -> Array:
+    """Return ``(4,)`` 1 σ of what a change of elevation has done to α; 0 where nobody tells it."""
+    if known is None or now is None:
+        return np.zeros(4)
+    return policy.flexure_per_degree * abs(now.elevation_deg - known.elevation_deg)
+
+
+def slewed_deg(state: TrackerState, known: Registration) -> float:
+    """Return how far the telescope has moved since the last dithered window, degrees."""
+    if state.pointing is None or known.window_pointing is None:
+        return 0.0
+    return state.pointing.separation_deg(known.window_pointing)
+
+
+def elapsed_s(state: TrackerState, known: Registration, now_ns: int) -> float:
+    """Return how old the estimate is: by the RTC's clock while it tells the time, else by arrival.
+
+    A simulated RTC may be slower than its timestamps, and the mirror drifts by its time.
+    """
+    if state.rtc is not None and state.rtc.t_ns_utc >= known.t_ns_utc:
+        return (state.rtc.t_ns_utc - known.t_ns_utc) / SECOND_NS
+    return max(now_ns - known.arrived_ns_utc, 0) / SECOND_NS
+
+
+def _growth(state: TrackerState, known: Registration, policy: Policy, now_ns: int) -> Array:
+    """Return ``(4,)`` variance that drift and flexure have added since the last measurement."""
+    walked = policy.drift_rate**2 * elapsed_s(state, known, now_ns)
+    return np.asarray(walked + flexure(known.pointing, state.pointing, policy) ** 2)
+
+
+def _standing(state: TrackerState, known: Registration, policy: Policy, now_ns: int) -> Standing:
+    reason = _why_invalid(state, known, policy)
+    if reason is not None:
+        return Standing(validity=Validity.INVALID, reason=reason)
+    sigma, limit = known.sigma, policy.stale_sigma
+    if known.n_windows == 0:
+        return Standing(validity=Validity.STALE, reason="no window has confirmed it yet")
+    if np.any(sigma > limit):
+        return Standing(validity=Validity.STALE, reason=_worst(sigma, limit))
+    rate = np.maximum(policy.drift_rate**2, np.finfo(float).tiny)
+    left_s = float(np.min((limit**2 - sigma**2) / rate))
+    # a rate of zero never ends it; a century is beyond any night
+    until_ns = now_ns + round(left_s * SECOND_NS) if left_s < 3e9 else None
+    if np.any(sigma > AGEING_SHARE * limit):
+        reason = _worst(sigma, AGEING_SHARE * limit)
+        return Standing(validity=Validity.AGEING, reason=reason, until_ns_utc=until_ns)
+    return Standing(until_ns_utc=until_ns)
+
+
+def _why_invalid(state: TrackerState, known: Registration, policy: Policy) -> str | None:
+    """Return why α may be somewhere else altogether, or None."""
+    if known.doubt:
+        return known.doubt
+    moved_deg = slewed_deg(state, known)
+    if moved_deg > policy.slew_limit_deg:
+        return f"the telescope has moved by {moved_deg:.0f} deg since the last dithered window"
+    if np.any(known.sigma > USELESS_SIGMA):
+        return _worst(known.sigma, USELESS_SIGMA)
+    return None
+
+
+def _worst(sigma: Array, limit: Array) -> str:
+    worst = int(np.argmax(sigma / limit))
+    most = limit[worst] * BOUNDARY_SCALE[worst]
+    # the present value would make another alarm of it every second
+    return f"1 sigma of {PARAMETERS[worst]} has grown beyond {most:.4g}"
+
+
+def _without_old_candidate(known: Registration, now_ns: int) -> Registration:
+    candidate = known.candidate
+    if candidate is None or now_ns - candidate.held_ns_utc < CANDIDATE_FOR_S * SECOND_NS:
+        return known
+    return replace(known, candidate=None, doubt="a window was far out, and none has come since")
+
+
+def _alarmed(state: TrackerState, now_ns: int) -> TrackerState:
+    """Raise the alarm while a closed loop runs on an α that is not worth much, or none at all."""
+    text = _why_stale(state, now_ns)
+    if text is None:
+        return without_alarm(state, _ALARM, now_ns)
+    return with_alarm(state, _ALARM, text, now_ns)
+
+
+def _why_stale(state: TrackerState, now_ns: int) -> str | None:
+    known, dither = state.registration, state.dither
+    if dither is not None:
+        since_ns = max(known.window_ns_utc if known else 0, dither.asked_ns_utc)
+        patience_s = max(STALE_AFTER_S, 3.0 * (dither.window_s or 0.0))
+        if now_ns - since_ns >= patience_s * SECOND_NS:
+            return (
+                f"no window was accepted for {patience_s:.0f} s although a dither runs: α may "
+                "have moved; see the log for the reasons"
+            )
+    if known is None or state.rtc is None or not state.rtc.in_loop or known.n_windows == 0:
+        return None
+    if known.standing.validity in _WORTHLESS and not known.doubt:
+        return f"{known.standing.reason}: have it dithered"
+    margin = state.margin
+    # an edge that would slip is refused whatever σ is
+    if margin is not None and margin.worst_pole_radius > margin.bound:
+        own = np.sqrt(np.diag(known.covariance) + known.floor**2)
+        if np.any(known.sigma > 2.0 * own):
+            return "σ has grown beyond what the stability gate accepts: have it dithered"
+    return None

@@ -1,0 +1,275 @@
+"""Whether another reconstructor is worth a swap, and for how many modes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.expected_gain import explained_by_noise
+from service.model.misregistration import BOUNDARY_SCALE
+from service.tracking.alarms import logged
+from service.tracking.events import Event, Reject
+from service.tracking.loop import RtcView
+from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.products import Assessment, MatrixState, ModeLimit, ReconstructorRecord
+from service.tracking.registration import Registration
+from service.tracking.state import Level, TrackerState
+
+CALMING_S = 60.0
+"""After an update the thresholds are doubled, and come down to their own over this time."""
+
+SIGNIFICANT = 18.5
+"""Squared distance, in σ, of a step of four parameters that noise makes once in a thousand."""
+
+VERDICT_REACH = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
+"""A verdict of the gate is not for a registration further away than this (numeric units)."""
+
+
+def why_worthwhile(
+    state: TrackerState, in_use: ReconstructorRecord, policy: Policy, now_ns: int
+) -> str | None:
+    """Return why the reconstructor in use should be replaced now, or None."""
+    known = state.registration
+    if known is None:
+        return None
+    if in_use.alpha is None:
+        return f"{in_use.id} was not made for a known registration"
+    if state.margin is not None and not state.margin.accepted:
+        return f"{in_use.id}: {state.margin.reason}"
+    if moved(state, in_use, policy):
+        step = (known.alpha.vector - in_use.alpha.vector) * BOUNDARY_SCALE
+        return (
+            f"moved by {step[0]:+.3f}, {step[1]:+.3f} subap, {step[2]:+.3f} deg, {step[3]:+.4f} "
+            f"since {in_use.id}"
+        )
+    if _jumped(state, in_use, known):
+        return f"{in_use.id} was made before the mirror jumped"
+    last = state.assessment
+    if last is None or last.id != in_use.id:
+        return None
+    return _why_gaining(last, in_use, known, policy, now_ns)
+
+
+def _why_gaining(
+    last: Assessment,
+    in_use: ReconstructorRecord,
+    known: Registration,
+    policy: Policy,
+    now_ns: int,
+) -> str | None:
+    """Return what a new one would win, where that is more than the threshold of now."""
+    covariance = _of_step(in_use, known)
+    if covariance is None or in_use.alpha is None:
+        return None
+    step = last.alpha.vector - in_use.alpha.vector
+    if step @ np.linalg.solve(covariance, step) < SIGNIFICANT:
+        return None
+    found, raised = last.expected, _raised(in_use, now_ns)
+    win_m = found.loss_m - explained_by_noise(found.loss_m, step, covariance)
+    if win_m > policy.update_gain_m * raised:
+        return f"a new one is expected to win {win_m * 1e9:.2f} nm over {in_use.id}"
+    share = _margin_lost(last)
+    if share > policy.update_margin * raised:
+        return (
+            f"{in_use.id} has lost {share:.0%} of its stability margin: pole radius "
+            f"{found.pole_radius:.3f}, a new one's {found.fresh_pole_radius:.3f}"
+        )
+    return None
+
+
+def _margin_lost(last: Assessment) -> float:
+    """Return how much of the margin of a new reconstructor the one in use no longer has."""
+    whole = 1.0 - last.expected.fresh_pole_radius
+    return (1.0 - (1.0 - last.expected.pole_radius) / whole) if whole > 0.0 else 0.0
+
+
+def _raised(in_use: ReconstructorRecord, now_ns: int) -> float:
+    """Return by how much the thresholds are raised so soon after an update."""
+    since_s = (now_ns - in_use.created_ns_utc) / SECOND_NS
+    return 1.0 + max(0.0, 1.0 - since_s / CALMING_S)
+
+
+def _of_step(in_use: ReconstructorRecord, known: Registration) -> NDArray[np.float64] | None:
+    """Return the covariance of what separates two registrations, as both were measured.
+
+    They share the model error; what drift may have added since is no error of either.
+    """
+    if in_use.sigma is None:
+        return None
+    then = np.maximum(in_use.sigma**2 - known.floor**2, 0.0)
+    return np.asarray(known.covariance + np.diag(then))
+
+
+def moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
+    """Return whether α is so far from what this reconstructor was made for that it must go.
+
+    Whatever is expected of it: the linear model knows nothing of how a pyramid's gains change.
+    """
+    return _apart(state, record, policy.update_threshold)
+
+
+def _jumped(state: TrackerState, in_use: ReconstructorRecord, known: Registration) -> bool:
+    """Return whether the mirror has jumped since, further than the gate's verdict reaches.
+
+    What a new one wins does not matter: what has jumped once may jump again.
+    """
+    since = known.jumped_ns_utc is not None and known.jumped_ns_utc > in_use.created_ns_utc
+    return since and outdated(state, in_use)
+
+
+def outdated(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether this reconstructor's verdict is of another registration than the present."""
+    return _apart(state, record, VERDICT_REACH)
+
+
+def _apart(
+    state: TrackerState, record: ReconstructorRecord, threshold: NDArray[np.float64]
+) -> bool:
+    known = state.registration
+    if known is None:
+        return False
+    if record.alpha is None or record.sigma is None:
+        return True
+    distance = np.abs(known.alpha.vector - record.alpha.vector)
+    noise = np.sqrt(np.diag(known.covariance))
+    return bool(np.any(distance > np.maximum(threshold, 3.0 * noise)))
+
+
+LADDER = (
+    *(594, 550, 500, 450, 400, 350, 300, 260, 230, 200, 175, 150),
+    *(130, 115, 100, 90, 80, 70, 60, 52, 45, 40, 35, 30),
+)
+"""Numbers of modes that are tried. A step costs 2 nm of wavefront at 594 modes, 6 at 400, 11 at 100
+(FLAO, 1", where 400 leave 117); halves are tried, so that a finer list costs a trial at most."""
+
+FIRST_WAIT_S = 60.0
+"""After modes were lowered, before more are tried."""
+
+LONGEST_WAIT_S = 1800.0
+
+OPERATORS_WAIT_S = 3600.0
+"""After an operator declined more modes: who has said no is not asked again in the same hour."""
+
+FORGIVEN_AFTER_S = 3600.0
+"""A limit found again later than this has nothing to do with the last one."""
+
+COMFORT = 1.5
+"""More modes are tried only while there is this times the margin that the gate asks for."""
+
+_DECLINED = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED})
+"""By the gate when it judged it again, or by the RTC."""
+
+
+def half_of(n_modes: int) -> int:
+    """Return the largest rung that is at most half of ``n_modes``, or these where there is none."""
+    return max((rung for rung in LADDER if 2 * rung <= n_modes), default=n_modes)
+
+
+def fewer_than(n_modes: int) -> tuple[int, ...]:
+    """Return the rungs below ``n_modes``, largest first."""
+    return tuple(rung for rung in LADDER if rung < n_modes)
+
+
+def more_to_try(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> tuple[int, ...]:
+    """Return the numbers of modes above the present one that may be tried now, largest first.
+
+    New modes get the gain of the last: where that is 0 they would not be in the loop.
+    """
+    if not rtc.gains[rtc.n_controlled - 1]:
+        return ()
+    target = min(policy.n_modes_target, rtc.n_modes)
+    limit = state.mode_limit
+    if limit is not None and (now_ns < limit.until_ns_utc or not _comfortable(state)):
+        target = min(target, limit.n_modes)
+    rungs = {target, *fewer_than(target)}
+    return tuple(sorted((rung for rung in rungs if rung > rtc.n_controlled), reverse=True))
+
+
+def _comfortable(state: TrackerState) -> bool:
+    margin = state.margin
+    if margin is None or not margin.accepted:
+        return False
+    return 1.0 - margin.worst_pole_radius >= COMFORT * (1.0 - margin.bound)
+
+
+def with_limit(
+    state: TrackerState, record: ReconstructorRecord, asked: int, why_fewer: str, now_ns: int
+) -> TrackerState:
+    """Note what a reconstructor asked to have ``asked`` modes says of how many are possible."""
+    n_now = state.rtc.n_controlled if state.rtc is not None else record.n_modes
+    if record.state is MatrixState.REFUSED:
+        if asked <= n_now:
+            return state
+        reason = record.gate.reason if record.gate is not None else record.reason
+        return limited(state, n_now, reason, now_ns)
+    if record.n_modes < asked:
+        state = limited(state, record.n_modes, why_fewer, now_ns)
+    if record.n_modes < n_now:
+        text = f"{record.id} has {record.n_modes} modes, {n_now} are controlled: {why_fewer}"
+        return logged(state, "modes.lowered", text, now_ns, Level.WARNING)
+    if record.n_modes > n_now:
+        text = f"{record.id} has {record.n_modes} modes, {n_now} are controlled"
+        state = logged(state, "modes.raised", text, now_ns)
+    limit = state.mode_limit
+    if limit is not None and record.n_modes > limit.n_modes:
+        # kept: a limit found again soon must be waited out longer
+        state = replace(state, mode_limit=replace(limit, n_modes=record.n_modes))
+    return state
+
+
+def declined(before: TrackerState, state: TrackerState, event: Event, now_ns: int) -> TrackerState:
+    """Note that a reconstructor which had passed the gate was declined before it came into use.
+
+    If it has more modes than are controlled, that is what it was made for: no more are tried for a
+    while, longer each time. An acquisition counts its own failures.
+    """
+    if state.reconstructors is before.reconstructors or state.acquisition.under_way:
+        return state
+    rtc = state.rtc or before.rtc
+    if rtc is None or rtc.n_controlled == 0:
+        return state
+    earlier = {record.id: record.state for record in before.reconstructors}
+    for record in state.reconstructors:
+        wait_s = _wait_after(record, earlier.get(record.id), event)
+        if wait_s is not None and record.n_modes > rtc.n_controlled:
+            reason = f"{record.id} was {record.state}: {record.reason}"
+            state = limited(state, rtc.n_controlled, reason, now_ns, wait_s)
+    return state
+
+
+def _wait_after(
+    record: ReconstructorRecord, earlier: MatrixState | None, event: Event
+) -> float | None:
+    """Return for how long more modes are not tried after what became of one; None: no matter."""
+    if earlier is None or earlier is record.state:
+        return None
+    if record.state in _DECLINED:
+        return FIRST_WAIT_S
+    if record.state is MatrixState.DISCARDED and isinstance(event, Reject):
+        return OPERATORS_WAIT_S
+    return None
+
+
+def limited(
+    state: TrackerState,
+    n_modes: int,
+    reason: str,
+    now_ns: int,
+    first_wait_s: float = FIRST_WAIT_S,
+) -> TrackerState:
+    """Try no more than these for a while, longer each time that it is found again."""
+    before, wait_s = state.mode_limit, first_wait_s
+    if before is not None and now_ns - before.since_ns_utc < FORGIVEN_AFTER_S * SECOND_NS:
+        left_s = (before.until_ns_utc - now_ns) / SECOND_NS
+        wait_s = max(first_wait_s, min(2.0 * before.wait_s, LONGEST_WAIT_S), left_s)
+    limit = ModeLimit(
+        n_modes=n_modes,
+        since_ns_utc=now_ns,
+        until_ns_utc=now_ns + round(wait_s * SECOND_NS),
+        wait_s=wait_s,
+        reason=reason,
+    )
+    text = f"no more than {n_modes} modes for {wait_s:.0f} s: {reason}"
+    return logged(replace(state, mode_limit=limit), "modes.limited", text, now_ns)

@@ -1,0 +1,202 @@
+"""Situations as values: an RTC, windows, reconstructors, and a story to tell them in."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from service.control.gate import GateVerdict
+from service.model.misregistration import Misregistration
+from service.telemetry.instrumental import WindowEstimate
+from service.tracker import step
+from service.tracking import events as ev
+from service.tracking.loop import RtcView
+from service.tracking.policy import Policy
+from service.tracking.products import Judged, MatrixState, ReconstructorRecord
+from service.tracking.reconstructors import commanded_gains
+from service.tracking.state import Mode, TrackerState
+
+SECOND = 1_000_000_000
+START_NS = 1_800_000_000 * SECOND
+N_MODES = 594
+PRECISE = np.diag([0.002, 0.002, 5e-5, 2e-4]) ** 2
+POLICY = Policy(
+    drift_rate=np.array([0.006, 0.006, 1e-4, 6e-5]),
+    floor=np.array([0.003, 0.003, 9e-5, 3e-4]),
+    update_threshold=np.array([0.01, 0.01, np.deg2rad(0.02), 0.001]),
+)
+ALPHA = Misregistration(
+    shift_x_subap=0.12, shift_y_subap=-0.08, rotation_rad=np.deg2rad(0.2), magnification=1.003
+)
+
+
+def rtc(n_controlled=400, **changes):
+    values = {
+        "session": "s1",
+        "loop": "closed",
+        "frame_rate_hz": 1000.0,
+        "delay_frames": 2.0,
+        "leak": 0.999,
+        "gains": (0.4,) * n_controlled + (0.0,) * (N_MODES - n_controlled),
+        "n_controlled": n_controlled,
+        "n_modes": N_MODES,
+        "n_slopes": 1384,
+        "cm_id": "initial",
+        "basis_id": "kl-594",
+        "config_id": "pyramid-30",
+        "magnitude": 8.0,
+        "max_dither_m": 5e-8,
+        "max_dither_modes": 594,
+        "dither_id": None,
+        "t_ns_utc": START_NS,
+    }
+    return RtcView(**(values | changes))
+
+
+def verdict(*, accepted=True, radius=0.7):
+    return GateVerdict(
+        accepted=accepted,
+        worst_pole_radius=radius,
+        aligned_pole_radius=0.65,
+        bound=0.95,
+        n_points=9,
+        reason="stable" if accepted else "too little margin",
+    )
+
+
+def judged(known, view, n_modes=400, **changes):
+    """What a verdict given now is of."""
+    values = {
+        "session": view.session,
+        "gains": commanded_gains(view, n_modes),
+        "leak": view.leak,
+        "delay_frames": view.delay_frames,
+        "alpha": known.alpha,
+        "sigma": known.sigma,
+    }
+    return Judged(**(values | changes))
+
+
+def record(matrix_id, state=MatrixState.PROPOSED, **changes):
+    """A reconstructor the service made for ``ALPHA``."""
+    values = {
+        "id": matrix_id,
+        "state": state,
+        "n_modes": 400,
+        "created_ns_utc": START_NS,
+        "alpha": ALPHA,
+        "sigma": np.array([0.003, 0.003, 9e-5, 3e-4]),
+        "parent": "initial",
+        "gate": verdict(accepted=state is not MatrixState.REFUSED),
+    }
+    return ReconstructorRecord(**(values | changes))
+
+
+def foreign(matrix_id="initial", n_modes=400):
+    """What the RTC brought: nobody can say for which registration."""
+    return ReconstructorRecord(
+        id=matrix_id, state=MatrixState.APPLIED, n_modes=n_modes, created_ns_utc=START_NS
+    )
+
+
+def estimate(alpha=ALPHA, *, t_ns=START_NS, session="s1", **changes):
+    values = {
+        "alpha": alpha,
+        "covariance": PRECISE,
+        "optical_gain": np.full(4, 0.6 + 0.0j),
+        "lag_frames": np.zeros(4),
+        "misfit": 1.0,
+        "step": np.zeros(4),
+        "t_ns_utc": t_ns,
+        "cm_id": "initial",
+        "session": session,
+    }
+    return WindowEstimate(**(values | changes))
+
+
+def moved(alpha=ALPHA, **by):
+    """A registration some way from another, in the numeric units of its fields."""
+    return replace(alpha, **{name: getattr(alpha, name) + step for name, step in by.items()})
+
+
+class Story:
+    """Tells events to the tracker one after another and keeps everything it wanted done."""
+
+    def __init__(self, mode=Mode.AUTO, policy=POLICY, state=None):
+        self.state = state or TrackerState(system="flao", mode=mode)
+        self.policy = policy
+        self.now_ns = START_NS
+        self.effects = []
+
+    def tell(self, event, after_s=0.0):
+        """Let time pass, then something happen; return what is to be done about it."""
+        self.now_ns += round(after_s * SECOND)
+        self.state, effects = step(self.state, event, self.policy, self.now_ns)
+        self.effects += effects
+        return effects
+
+    def wait(self, seconds, every_s=1.0):
+        """Let time pass with nothing but the clock ticking; return what it made the service do."""
+        effects = ()
+        for _ in range(round(seconds / every_s)):
+            effects += self.tell(ev.Tick(), every_s)
+        return effects
+
+    def meet(self, **changes):
+        """Meet an RTC whose matrix is then known."""
+        self.tell(ev.SessionStarted(session=changes.get("session", "s1")))
+        self.tell(ev.StatusSeen(rtc=rtc(**changes)))
+        view = self.state.rtc
+        if view.cm_id is not None and self.state.reconstructor(view.cm_id) is None:
+            self.tell(ev.MatrixFetched(record=foreign(view.cm_id, view.n_controlled)))
+        self.tell(ev.Tick(), after_s=3)  # a fetch keeps other questions back for so long
+        return self
+
+    def see(self, alpha=ALPHA, n_windows=1, every_s=2.0, **changes):
+        """Take in windows that measure this registration; return what they made it do."""
+        effects = ()
+        for _ in range(n_windows):
+            self.now_ns += round(every_s * SECOND)
+            fitted = estimate(alpha, t_ns=self.now_ns, session=self.state.rtc.session, **changes)
+            effects += self.tell(ev.WindowFitted(estimate=fitted))
+        return effects
+
+    def make(self, matrix_id, state=MatrixState.PROPOSED, *, wanted=False, **changes):
+        """Hand in a reconstructor, made for the current registration."""
+        known, view = self.state.registration, self.state.rtc
+        changes = {"created_ns_utc": self.now_ns, "alpha": known and known.alpha} | changes
+        if view is not None and known is not None:
+            n_modes = changes.get("n_modes", 400)
+            changes = {"judged": judged(known, view, n_modes)} | changes
+        made = record(matrix_id, state, **changes)
+        return self.tell(ev.MatrixMade(record=made, wanted=wanted))
+
+    def acknowledge(self, matrix_id, state=MatrixState.APPLIED, reason="", frame_seq=1000):
+        return self.tell(
+            ev.Acknowledged(id=matrix_id, state=state, reason=reason, frame_seq=frame_seq)
+        )
+
+    def use(self, matrix_id, n_modes=400):
+        """Make, send and apply a reconstructor; the RTC's status follows."""
+        self.make(matrix_id, wanted=True, n_modes=n_modes)
+        self.acknowledge(matrix_id)
+        self.tell(ev.StatusSeen(rtc=replace(rtc(n_modes), cm_id=matrix_id)))
+        return self
+
+    def asked(self, kind):
+        """Return all effects of one kind so far."""
+        return [effect for effect in self.effects if isinstance(effect, kind)]
+
+    def matrix_state(self, matrix_id):
+        return self.state.reconstructor(matrix_id).state
+
+    @property
+    def alarms(self):
+        return {alarm.name for alarm in self.state.alarms}
+
+    @property
+    def logged(self):
+        return [entry.name for entry in self.state.log]
+
+
+def of_kind(effects, kind):
+    return [effect for effect in effects if isinstance(effect, kind)]

@@ -1,0 +1,599 @@
+"""From nothing known to tracking, as a story told to the tracker."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.errors import CommandError
+from service.model.misregistration import Misregistration
+from service.telemetry.faraway import FarEstimate
+from service.telemetry.lockin import WindowRefused
+from service.tracking import events as ev
+from service.tracking.acquisition import PATIENCE_S
+from service.tracking.acquisition_stages import (
+    MISSES_BEFORE,
+    MISSES_DESPITE,
+    MOST_ATTEMPTS,
+    MOST_MISSES,
+    OUT_OF_HAND_S,
+    far_dither,
+)
+from service.tracking.dither_plan import lock_in_plan
+from service.tracking.products import MatrixState
+from service.tracking.stages import AcquisitionStage
+from service.tracking.state import Mode
+from service.tracking.worth import fewer_than
+from tests.unit.tracking.situations import POLICY, Story, estimate, moved, rtc, verdict
+
+ACQUIRES = replace(POLICY, acquires=True)
+FAR = Misregistration(
+    shift_x_subap=1.2, shift_y_subap=-0.9, rotation_rad=np.deg2rad(4.0), magnification=0.97
+)
+DIVERGING = ev.Trouble(name="loop-diverging", text="found")
+CALM = ev.Trouble(name="loop-diverging", text="gone", over=True)
+
+
+class Acquiring(Story):
+    """A story with an RTC that does what it is told."""
+
+    def __init__(self, mode=Mode.AUTO, policy=ACQUIRES):
+        super().__init__(mode, policy)
+        self.session = 1
+        self.meet()
+
+    @property
+    def stage(self):
+        return self.state.acquisition.stage
+
+    @property
+    def text(self):
+        return self.state.acquisition.text
+
+    @property
+    def far_dithers(self):
+        asked = [effect.dither for effect in self.asked(ev.AskDither)]
+        return [dither for dither in asked if dither.id.startswith("acquire-")]
+
+    def status(self, after_s=0.2, **changes):
+        seen = {"session": f"s{self.session}", "cm_id": self.state.in_use} | changes
+        return self.tell(ev.StatusSeen(rtc=rtc(**seen)), after_s)
+
+    def open(self):
+        """The RTC opens the loop, which begins a new session."""
+        command = self.asked(ev.AskLoop)[-1]
+        assert command.closed is False
+        self.tell(ev.LoopAnswered(id=command.id, accepted=True, reason=""), 0.1)
+        self.session += 1
+        self.tell(ev.SessionStarted(session=f"s{self.session}"))
+        self.tell(CALM)
+        return self.still_open()
+
+    def still_open(self, **changes):
+        gains = (0.0,) * 594
+        return self.status(loop="open", gains=gains, **{"cm_id": "initial"} | changes)
+
+    def see_afar(self, alpha=FAR, sigma=0.01):
+        """A window with the dither of this stage puts the mirror there."""
+        dither = self.state.dither
+        self.tell(ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=5000), 0.1)
+        fitted = estimate(
+            alpha,
+            t_ns=self.now_ns,
+            session=f"s{self.session}",
+            modes=dither.modes,
+            covariance=np.diag([sigma, sigma, sigma / 30, sigma / 10]) ** 2,
+        )
+        found = FarEstimate(estimate=fitted, unexplained=0.05, n_starts=1)
+        effects = self.tell(ev.FarFitted(found=found), 3.0)
+        self.still_open(dither_id=dither.id)
+        self.still_open()
+        return effects
+
+    def miss_afar(self, reason="registration not found: nothing fits"):
+        lost = WindowRefused(reason=reason, t_ns_utc=self.now_ns)
+        return self.tell(ev.WindowLost(refused=lost), 2.0)
+
+    def close(self, n_modes):
+        """The reconstructor asked for is made, applied, and the loop closes on it."""
+        name = f"cm-{len(self.asked(ev.SendMatrix))}-{n_modes}"
+        self.make(name, n_modes=n_modes)
+        self.acknowledge(name)
+        self.still_open(cm_id=name)
+        command = self.asked(ev.AskLoop)[-1]
+        assert command.closed is True
+        self.tell(ev.LoopAnswered(id=command.id, accepted=True, reason=""), 0.1)
+        return self.closed(n_modes)
+
+    def closed(self, n_modes):
+        return self.status(n_controlled=n_modes)
+
+    def widen(self, n_modes):
+        """One more reconstructor is made and swapped in."""
+        name = f"cm-{len(self.asked(ev.SendMatrix))}-{n_modes}"
+        self.make(name, n_modes=n_modes)
+        self.acknowledge(name)
+        return self.closed(n_modes)
+
+    def to_partial(self):
+        self.tell(ev.Acquire())
+        self.open()
+        self.see_afar()
+        self.see_afar(moved(FAR, shift_x_subap=0.02))
+        return self
+
+    def to_widening(self):
+        self.to_partial()
+        self.close(150)
+        return self
+
+
+def test_an_operator_is_led_from_nothing_to_tracking():
+    story = Acquiring(Mode.PROPOSE)
+    story.tell(ev.Acquire())
+    assert story.stage is AcquisitionStage.OPENING
+    story.open()
+    assert story.stage is AcquisitionStage.COARSE
+    story.see_afar()
+    assert story.stage is AcquisitionStage.CONFIRMING
+    story.see_afar()
+    assert story.stage is AcquisitionStage.PARTIAL
+    story.close(150)
+    assert story.stage is AcquisitionStage.WIDENING
+    story.see(FAR)
+    story.widen(400)
+    story.see(FAR, n_windows=2)
+    story.closed(400)
+    assert story.stage is AcquisitionStage.TRACKING
+    assert "400 modes" in story.text
+    assert [made.n_modes for made in story.asked(ev.MakeMatrix)] == [150, 400]
+    assert [sent.n_modes for sent in story.asked(ev.SendMatrix)] == [150, 400]
+
+
+def test_the_two_dithers_have_no_mode_in_common_and_are_stopped_in_between():
+    story = Acquiring().to_partial()
+    far = story.far_dithers
+    assert len(far) == 2
+    assert not set(far[0].modes) & set(far[1].modes)
+    assert len(story.asked(ev.AskNoDither)) >= 2
+
+
+def test_reconstructors_are_judged_and_sent_with_the_gains_the_loop_was_found_with():
+    story = Acquiring().to_partial()
+    (made,) = story.asked(ev.MakeMatrix)
+    assert made.gains == (0.4,) * 150 + (0.0,) * 444
+    story.close(150)
+    (sent,) = story.asked(ev.SendMatrix)
+    assert sent.gains == made.gains
+
+
+def test_a_loop_found_open_is_closed_with_a_low_gain_and_not_opened_first():
+    story = Acquiring()
+    story.status(loop="open", gains=(0.0,) * 594)
+    story.tell(ev.Acquire())
+    assert story.stage is AcquisitionStage.COARSE
+    assert not story.asked(ev.AskLoop)
+    story.see_afar()
+    story.see_afar()
+    (made,) = story.asked(ev.MakeMatrix)
+    assert set(made.gains[:150]) == {0.3}
+
+
+class TestByItself:
+    def test_it_begins_when_the_loop_goes_on_diverging(self):
+        story = Acquiring()
+        story.tell(DIVERGING)
+        assert not story.wait(OUT_OF_HAND_S - 1)
+        story.wait(2)
+        assert story.stage is AcquisitionStage.OPENING
+        assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
+
+    @pytest.mark.parametrize("mode", [Mode.PROPOSE, Mode.HOLD])
+    def test_only_in_auto(self, mode):
+        story = Acquiring(mode)
+        story.tell(DIVERGING)
+        story.wait(60)
+        assert not story.asked(ev.AskLoop)
+
+    def test_not_where_the_settings_forbid_it(self):
+        story = Acquiring(policy=POLICY)
+        story.tell(DIVERGING)
+        story.wait(60)
+        assert not story.asked(ev.AskLoop)
+
+    def test_not_when_an_operator_stopped_the_dither(self):
+        story = Acquiring()
+        story.tell(ev.StopDither())
+        story.tell(DIVERGING)
+        story.wait(60)
+        assert not story.asked(ev.AskLoop)
+
+    def test_it_begins_when_windows_find_no_registration(self):
+        story = Acquiring()
+        for _ in range(MISSES_BEFORE - 1):
+            story.miss_afar("the fit did not settle: it is far away")
+        assert story.stage is AcquisitionStage.IDLE
+        story.miss_afar("the fit did not settle: it is far away")
+        assert story.stage is AcquisitionStage.OPENING
+
+    def test_with_alpha_known_bad_windows_must_go_on_for_longer(self):
+        story = Acquiring()
+        story.see(n_windows=3)
+        for _ in range(MISSES_DESPITE - 1):
+            story.miss_afar("the fit did not settle: it is far away")
+        assert story.stage is AcquisitionStage.IDLE
+        story.miss_afar("the fit did not settle: it is far away")
+        assert story.stage is AcquisitionStage.OPENING
+
+    def test_a_window_that_is_accepted_ends_the_counting(self):
+        story = Acquiring()
+        for _ in range(3):
+            story.miss_afar("the fit did not settle: it is far away")
+            story.see()
+        assert story.stage is AcquisitionStage.IDLE
+
+    def test_windows_refused_for_another_reason_do_not_count(self):
+        story = Acquiring()
+        for _ in range(2 * MISSES_BEFORE):
+            story.miss_afar("520 of 2000 frames missing")
+        assert story.stage is AcquisitionStage.IDLE
+
+    def test_it_does_not_begin_again_after_it_has_failed(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        command = story.asked(ev.AskLoop)[-1]
+        story.tell(ev.LoopAnswered(id=command.id, accepted=False, reason="busy"))
+        story.tell(DIVERGING)
+        n_before = len(story.asked(ev.AskLoop))
+        story.wait(60)
+        assert len(story.asked(ev.AskLoop)) == n_before
+        assert "acquisition" in story.alarms
+
+    def test_it_begins_again_when_an_rtc_that_vanished_is_back_and_diverges(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.tell(ev.RtcVanished())
+        story.meet(session="s9")
+        assert story.stage is AcquisitionStage.ABORTED
+        story.tell(DIVERGING)
+        story.wait(4)
+        assert story.stage is AcquisitionStage.OPENING
+
+
+class TestNothingWrong:
+    def test_two_estimates_that_disagree_are_not_believed(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        story.see_afar()
+        story.see_afar(moved(FAR, rotation_rad=np.deg2rad(3.0)))
+        assert story.stage in {AcquisitionStage.OPENING, AcquisitionStage.COARSE}
+        assert story.state.registration is None
+        assert not story.asked(ev.MakeMatrix)
+
+    def test_a_window_of_another_session_is_not_used(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        late = estimate(FAR, session="s1", modes=story.state.dither.modes)
+        story.tell(ev.FarFitted(found=FarEstimate(estimate=late, unexplained=0.0, n_starts=1)))
+        assert story.stage is AcquisitionStage.COARSE
+
+    def test_a_window_of_other_modes_is_not_used(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        other = estimate(FAR, session="s2", modes=(1, 2, 3))
+        story.tell(ev.FarFitted(found=FarEstimate(estimate=other, unexplained=0.0, n_starts=1)))
+        assert story.stage is AcquisitionStage.COARSE
+
+    def test_nothing_known_before_is_relied_on(self):
+        story = Acquiring()
+        story.see(n_windows=3)
+        story.tell(ev.Acquire())
+        assert story.state.registration is None
+
+    def test_fewer_modes_are_made_where_the_gate_refuses_many(self):
+        story = Acquiring().to_partial()
+        (made,) = story.asked(ev.MakeMatrix)
+        assert (made.n_modes, made.fewer) == (150, fewer_than(150))
+        story.close(60)
+        (sent,) = story.asked(ev.SendMatrix)
+        assert sent.gains == (0.4,) * 60 + (0.0,) * 534
+
+    def test_when_no_number_of_modes_passes_the_gate_it_ends_with_the_loop_open(self):
+        story = Acquiring().to_partial()
+        story.make("cm-150", MatrixState.REFUSED, n_modes=150)
+        assert story.stage is AcquisitionStage.FAILED
+        assert not story.asked(ev.SendMatrix)
+        assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
+        assert story.state.registration is None
+
+    def test_where_the_edge_would_slip_with_any_modes_a_leak_is_asked_for_first(self):
+        story = Acquiring().to_partial()
+        slips = replace(verdict(accepted=False), edge_motion_m=5e-7)
+        story.make("cm-150", MatrixState.REFUSED, n_modes=150, gate=slips)
+        asked = story.asked(ev.AskLoop)[-1]
+        assert (asked.closed, asked.leak) == (None, 0.99)
+        story.tell(ev.LoopAnswered(id=asked.id, accepted=True, reason=""))
+        story.still_open()
+        assert len(story.asked(ev.MakeMatrix)) == 1
+        story.still_open(leak=0.99)
+        assert len(story.asked(ev.MakeMatrix)) == 2
+        story.close(150)
+        assert story.stage is AcquisitionStage.WIDENING
+
+    def test_a_leak_that_does_not_help_ends_it(self):
+        story = Acquiring().to_partial()
+        slips = replace(verdict(accepted=False), edge_motion_m=5e-7)
+        story.make("cm-150", MatrixState.REFUSED, n_modes=150, gate=slips)
+        story.still_open(leak=0.99)
+        story.make("cm-151", MatrixState.REFUSED, n_modes=150, gate=slips)
+        assert story.stage is AcquisitionStage.FAILED
+
+    def test_a_matrix_asked_for_before_it_began_is_not_sent(self):
+        story = Acquiring()
+        story.see(n_windows=3)
+        assert story.asked(ev.MakeMatrix)
+        story.tell(ev.Acquire())
+        story.make("cm-late")
+        assert not story.asked(ev.SendMatrix)
+
+    def test_more_modes_that_the_gate_refuses_are_done_without(self):
+        story = Acquiring().to_widening()
+        story.see(FAR)
+        asked = story.asked(ev.MakeMatrix)[-1]
+        assert (asked.n_modes, asked.fewer) == (400, (350, 300, 260, 230, 200, 175))
+        story.make("cm-400", MatrixState.REFUSED, n_modes=400)
+        story.see(FAR)
+        story.widen(150)
+        story.see(FAR, n_windows=2)
+        story.closed(150)
+        assert story.stage is AcquisitionStage.TRACKING
+        assert "150 of 400" in story.text
+
+
+class TestTrouble:
+    def test_a_loop_that_slips_is_opened_again_and_closed_on_fewer_modes(self):
+        story = Acquiring().to_widening()
+        story.tell(ev.Trouble(name="edge-slip", text="found"))
+        assert story.stage is AcquisitionStage.OPENING
+        assert story.asked(ev.AskLoop)[-1].closed is False
+        story.tell(ev.Trouble(name="edge-slip", text="gone", over=True))
+        story.open()
+        story.see_afar()
+        story.see_afar()
+        assert story.asked(ev.MakeMatrix)[-1].n_modes == 70
+        assert story.state.mode_limit.n_modes == 70
+
+    def test_one_that_slips_once_it_tracks_is_acquired_anew_on_half_as_many_modes(self):
+        """More are tried after a while, and after a longer one when it slips again."""
+        story = Acquiring(Mode.AUTO).to_widening()
+        story.see(FAR)
+        story.widen(400)
+        story.see(FAR, n_windows=3)
+        assert story.stage is AcquisitionStage.TRACKING
+        story.tell(ev.Trouble(name="edge-slip", text="found"))
+        story.wait(3)
+        assert story.stage is AcquisitionStage.OPENING
+        assert story.state.acquisition.most_modes == 200
+        limit = story.state.mode_limit
+        assert (limit.n_modes, limit.reason) == (200, "edge-slip with 400 modes")
+
+    def test_that_a_loop_slips_on_the_rtcs_own_matrix_says_nothing_of_the_modes(self):
+        story = Acquiring(Mode.AUTO)
+        story.tell(ev.Trouble(name="edge-slip", text="found"))
+        story.wait(3)
+        assert story.stage is AcquisitionStage.OPENING
+        assert story.state.acquisition.most_modes is None
+        assert story.state.mode_limit is None
+
+    def test_windows_that_lead_nowhere_begin_it_anew_and_end_it_after_a_few_attempts(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        for _ in range(MOST_ATTEMPTS * MOST_MISSES):
+            assert story.state.acquisition.under_way
+            story.miss_afar()
+            story.still_open()
+        assert story.stage is AcquisitionStage.FAILED
+        assert "nothing fits" in story.text
+        assert "acquisition" in story.alarms
+
+    def test_windows_that_were_never_looked_at_do_not_count(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        for _ in range(2 * MOST_MISSES):
+            story.miss_afar("the worker is too slow for the telemetry: a window was given up")
+        assert story.state.acquisition.attempt == 1
+
+    def test_a_stage_that_takes_too_long_begins_it_anew(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        story.wait(PATIENCE_S + 2)
+        assert story.state.acquisition.attempt == 2
+
+    def test_an_rtc_that_will_not_open_its_loop_ends_it(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        command = story.asked(ev.AskLoop)[-1]
+        story.tell(ev.LoopAnswered(id=command.id, accepted=False, reason="busy"))
+        assert story.stage is AcquisitionStage.FAILED
+        assert "busy" in story.text
+
+    def test_an_rtc_that_begins_anew_is_looked_at_anew(self):
+        story = Acquiring().to_widening()
+        story.session += 1
+        story.tell(ev.SessionStarted(session=f"s{story.session}"))
+        assert story.stage is AcquisitionStage.OPENING
+        assert story.state.acquisition.attempt == 2
+
+    def test_a_refused_dither_is_asked_for_again(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        dither = story.state.dither
+        refused = ev.DitherAnswered(id=dither.id, accepted=False, reason="busy", start_seq=None)
+        story.tell(refused)
+        for _ in range(12):
+            story.still_open()
+            story.wait(1)
+        assert len(story.far_dithers) == 2
+
+    def test_a_reconstructor_the_rtc_rejects_begins_it_anew(self):
+        story = Acquiring().to_partial()
+        story.make("cm-150", n_modes=150)
+        story.acknowledge("cm-150", MatrixState.REJECTED, reason="wrong basis")
+        story.still_open()
+        assert story.state.acquisition.attempt == 2
+        assert "wrong basis" in story.text or "looking" in story.text
+
+    def test_a_loop_somebody_closes_meanwhile_is_opened_again(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        story.closed(400)
+        assert story.stage is AcquisitionStage.OPENING
+        assert len(story.asked(ev.AskLoop)) == 2
+
+    def test_too_few_modes_to_dither_are_named_at_once(self):
+        story = Acquiring()
+        story.status(max_dither_modes=2)
+        with pytest.raises(CommandError, match="at least 3"):
+            story.tell(ev.Acquire())
+
+
+class TestOperator:
+    @pytest.mark.parametrize(
+        "command",
+        [ev.Refit(), ev.SetLoop(closed=True), ev.StartDither(), ev.MeasureNoisy(id="noisy-1")],
+    )
+    def test_cannot_disturb_it(self, command):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        with pytest.raises(CommandError, match="acquisition"):
+            story.tell(command)
+
+    def test_can_have_only_one(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        with pytest.raises(CommandError, match="under way"):
+            story.tell(ev.Acquire())
+
+    def test_cannot_abort_what_is_not_there(self):
+        with pytest.raises(CommandError, match="none is under way"):
+            Acquiring().tell(ev.AbortAcquisition())
+
+    def test_who_aborts_gets_a_healthy_loop_back_as_it_was(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        story.tell(ev.AbortAcquisition())
+        assert story.stage is AcquisitionStage.ABORTED
+        last = story.asked(ev.AskLoop)[-1]
+        assert (last.closed, last.gains, last.leak) == (True, None, 0.999)
+        assert story.asked(ev.AskNoDither)
+
+    def test_who_aborts_gets_a_diverging_loop_open(self):
+        story = Acquiring()
+        story.tell(DIVERGING)
+        story.tell(ev.Acquire())
+        story.open()
+        story.tell(ev.AbortAcquisition())
+        assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
+
+    def test_who_aborts_late_keeps_the_loop_on_its_judged_matrix(self):
+        story = Acquiring().to_widening()
+        n_asked = len(story.asked(ev.AskLoop))
+        story.tell(ev.AbortAcquisition())
+        assert len(story.asked(ev.AskLoop)) == n_asked
+        assert story.state.registration is not None
+
+    def test_stopping_the_dither_aborts_it(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.open()
+        story.tell(ev.StopDither())
+        assert story.stage is AcquisitionStage.ABORTED
+
+    def test_hold_aborts_what_began_by_itself(self):
+        story = Acquiring()
+        story.tell(DIVERGING)
+        story.wait(4)
+        story.tell(ev.SetMode(mode=Mode.HOLD))
+        assert story.stage is AcquisitionStage.ABORTED
+
+    def test_hold_leaves_alone_what_was_asked_for(self):
+        story = Acquiring()
+        story.tell(ev.Acquire())
+        story.tell(ev.SetMode(mode=Mode.HOLD))
+        assert story.state.acquisition.under_way
+
+    def test_cannot_have_it_without_an_rtc(self):
+        story = Acquiring()
+        story.tell(ev.RtcVanished())
+        with pytest.raises(CommandError, match="no RTC"):
+            story.tell(ev.Acquire())
+
+    def test_cannot_have_it_where_the_settings_forbid_a_dither(self):
+        story = Acquiring(policy=replace(ACQUIRES, dither_enabled=False))
+        with pytest.raises(CommandError, match="forbid"):
+            story.tell(ev.Acquire())
+
+
+def test_the_loop_open_alarm_is_kept_quiet_meanwhile():
+    story = Acquiring()
+    story.tell(ev.Acquire())
+    story.open()
+    assert "loop-open" not in story.alarms
+
+
+def test_the_far_dither_is_as_strong_as_settings_and_rtc_allow():
+    dither = far_dither(AcquisitionStage.COARSE, rtc(max_dither_m=2e-8), ACQUIRES, 0)
+    assert set(dither.amplitude_m) == {2e-8}
+    dither = far_dither(AcquisitionStage.COARSE, rtc(), ACQUIRES, 0)
+    assert set(dither.amplitude_m) == {5e-8}
+
+
+@pytest.mark.parametrize("rate_hz", [300.0, 300.00003, 499.99, 999.9993, 1000.0, 2000.017])
+@pytest.mark.parametrize("stage", [AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING])
+def test_its_dithers_can_be_read_at_any_frame_rate(rate_hz, stage):
+    view = rtc(frame_rate_hz=rate_hz)
+    dither = far_dither(stage, view, POLICY, 0)
+    assert lock_in_plan(dither, view, 2.0).n_frames == round(2.0 * rate_hz)
+
+
+def test_a_status_whose_rate_differs_by_parts_per_million_reads_the_dither_all_the_same():
+    dither = far_dither(AcquisitionStage.COARSE, rtc(frame_rate_hz=300.0), POLICY, 0)
+    assert lock_in_plan(dither, rtc(frame_rate_hz=300.0007), 2.0)
+
+
+def test_one_whose_dither_cannot_be_read_ends_and_says_why():
+    story = Acquiring()
+    story.tell(ev.Acquire())
+    story.open()
+    story.tell(ev.Noted(name="dither.unusable", text="600 frames cut a period"))
+    assert story.stage is AcquisitionStage.FAILED
+    assert "600 frames cut a period" in story.text
+
+
+def test_one_in_whose_dithers_no_window_ever_ends_comes_to_an_end():
+    story = Acquiring()
+    story.tell(ev.Acquire())
+    story.open()
+    for _ in range(1200):
+        dither = story.state.dither
+        if story.stage is AcquisitionStage.FAILED:
+            break
+        if story.stage is AcquisitionStage.OPENING:
+            story.still_open()
+        if dither is not None and dither.start_seq is None:
+            story.tell(
+                ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=story.now_ns)
+            )
+        story.still_open()
+        story.tell(ev.Tick(), 1.0)
+    assert story.stage is AcquisitionStage.FAILED
+    assert len(story.far_dithers) < 60

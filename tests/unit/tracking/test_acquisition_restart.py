@@ -1,0 +1,354 @@
+"""A service that ends in the middle of an acquisition, and the one after it."""
+
+from dataclasses import replace
+
+import pytest
+
+from service.tracking import events as ev
+from service.tracking.acquisition_stages import MOST_ATTEMPTS
+from service.tracking.products import MatrixState
+from service.tracking.resume import resumed, saved_of
+from service.tracking.stages import AcquisitionStage
+from service.tracking.state import Mode, TrackerState
+from tests.unit.tracking.situations import POLICY, SECOND
+from tests.unit.tracking.test_acquisition import ACQUIRES, DIVERGING, FAR, Acquiring
+
+N_MODES = 594
+OPEN = {"loop": "open", "gains": (0.0,) * N_MODES, "cm_id": "initial"}
+
+
+class Again(Acquiring):
+    """What the service does that has only what the one of ``before`` has saved."""
+
+    def __init__(self, before, mode=Mode.AUTO, policy=ACQUIRES, away_s=20.0):
+        super().__init__(mode, policy)
+        self.effects, self.session = [], before.session
+        self.now_ns = before.now_ns + round(away_s * SECOND)
+        fresh = TrackerState(system="flao", mode=mode)
+        saved = saved_of(before.state, before.now_ns)
+        self.state = fresh if saved is None else resumed(fresh, saved, policy, self.now_ns)
+
+    def find(self, **changes):
+        """The RTC is there, and like this."""
+        seen = OPEN | {"session": f"s{self.session}"} | changes
+        self.tell(ev.SessionStarted(session=seen["session"]), 0.1)
+        self.status(**seen)
+        return self
+
+    @property
+    def loop_orders(self):
+        return [asked.closed for asked in self.asked(ev.AskLoop)]
+
+
+@pytest.fixture
+def opened():
+    """A healthy loop was opened because an operator asked; the mirror is looked for."""
+    story = Acquiring()
+    story.see(n_windows=3)
+    story.tell(ev.Acquire())
+    story.open()
+    assert story.stage is AcquisitionStage.COARSE
+    return story
+
+
+def test_in_auto_it_begins_anew_with_the_loop_the_one_before_had_opened(opened):
+    again = Again(opened)
+    assert again.stage is AcquisitionStage.INTERRUPTED
+    assert "acquisition" in again.alarms
+    again.find()
+    assert "acquisition" not in again.alarms
+    again.still_open()
+    assert again.stage is AcquisitionStage.COARSE
+    assert again.loop_orders == []
+    again.see_afar()
+    again.see_afar()
+    (made,) = again.asked(ev.MakeMatrix)
+    assert made.gains == (0.4,) * 150 + (0.0,) * 444
+    again.close(150)
+    assert again.stage is AcquisitionStage.WIDENING
+    again.see(FAR)
+    assert again.asked(ev.MakeMatrix)[-1].n_modes == 400
+
+
+def test_the_alpha_it_had_forgotten_is_not_believed_again(opened):
+    assert opened.state.registration is None
+    assert Again(opened).state.registration is None
+
+
+@pytest.mark.parametrize("mode", [Mode.PROPOSE, Mode.HOLD])
+def test_in_other_modes_it_waits_and_says_what_to_do(opened, mode):
+    again = Again(opened, mode).find()
+    again.wait(60)
+    assert again.stage is AcquisitionStage.INTERRUPTED
+    assert not again.asked(ev.AskLoop)
+    assert not again.asked(ev.AskDither)
+    (alarm,) = [alarm for alarm in again.state.alarms if alarm.name == "acquisition"]
+    assert "looking for the registration" in alarm.text
+    assert f"the mode is {mode}" in alarm.text
+    assert "acquire again" in alarm.text
+    assert again.text == alarm.text
+    assert "loop-open" not in again.alarms
+    assert again.logged.count("acquisition.interrupted") == 2  # before the RTC was there, and since
+
+
+def test_it_begins_when_the_operator_says_auto(opened):
+    again = Again(opened, Mode.PROPOSE).find()
+    again.tell(ev.SetMode(mode=Mode.AUTO))
+    again.still_open()
+    assert again.stage is AcquisitionStage.COARSE
+    assert "acquisition" not in again.alarms
+
+
+def test_it_begins_when_the_operator_asks_and_comes_back_to_the_loop_as_it_was(opened):
+    again = Again(opened, Mode.PROPOSE).find()
+    again.tell(ev.Acquire())
+    assert again.stage is AcquisitionStage.COARSE
+    found = again.state.acquisition.found
+    assert (found.closed, found.n_controlled, set(found.gains[:400])) == (True, 400, {0.4})
+
+
+@pytest.mark.parametrize(
+    "policy", [POLICY, replace(ACQUIRES, dither_enabled=False)], ids=["no auto", "no dither"]
+)
+def test_not_where_the_settings_forbid_it(opened, policy):
+    again = Again(opened, policy=policy).find()
+    again.wait(10)
+    assert again.stage is AcquisitionStage.INTERRUPTED
+    assert "settings forbid" in again.text
+
+
+def test_a_loop_that_is_open_in_another_session_is_not_touched(opened):
+    """Somebody closed it and opened it again, or the RTC restarted: it may be open on purpose."""
+    again = Again(opened).find(session="s9")
+    again.wait(60)
+    assert again.stage is AcquisitionStage.INTERRUPTED
+    assert not again.asked(ev.AskLoop)
+    assert not again.asked(ev.AskDither)
+    assert "another session" in again.text
+    again.tell(ev.Acquire())
+    assert again.state.acquisition.found.closed is False
+
+
+def test_who_aborts_gets_a_healthy_loop_back_as_it_was(opened):
+    again = Again(opened, Mode.PROPOSE).find()
+    again.tell(ev.AbortAcquisition())
+    assert again.stage is AcquisitionStage.ABORTED
+    (asked,) = again.asked(ev.AskLoop)
+    assert (asked.closed, asked.leak) == (True, 0.999)
+    assert "acquisition" not in again.alarms
+
+
+def test_who_aborts_in_another_session_closes_nothing(opened):
+    again = Again(opened, Mode.PROPOSE).find(session="s9")
+    again.tell(ev.AbortAcquisition())
+    assert not again.asked(ev.AskLoop)
+    assert "left as it is" in again.text
+
+
+def test_who_aborts_after_a_matrix_was_sent_closes_nothing():
+    """The RTC no longer has the matrix with which the loop held."""
+    story = Acquiring().to_partial()
+    story.make("cm-150", n_modes=150)
+    again = Again(story, Mode.PROPOSE).find(cm_id="cm-150")
+    again.tell(ev.Acquire())
+    again.tell(ev.AbortAcquisition())
+    assert not again.asked(ev.AskLoop)
+
+
+def test_a_loop_that_diverged_is_not_given_back():
+    story = Acquiring()
+    story.tell(DIVERGING)
+    story.wait(4)
+    story.open()
+    again = Again(story, Mode.PROPOSE).find()
+    again.tell(ev.AbortAcquisition())
+    assert not again.asked(ev.AskLoop)
+
+
+def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there():
+    story = Acquiring().to_widening()
+    matrix = story.state.in_use
+    again = Again(story)
+    assert again.state.registration is not None
+    again.find(loop="closed", gains=(0.4,) * 150 + (0.0,) * 444, n_controlled=150, cm_id=matrix)
+    assert again.stage is AcquisitionStage.ABORTED
+    assert f"closed on {matrix}, which had passed the gate" in again.text
+    assert "acquisition" not in again.alarms
+    assert not again.asked(ev.AskLoop)
+
+
+def test_a_loop_the_operator_closes_meanwhile_is_the_operators(opened):
+    again = Again(opened, Mode.PROPOSE).find()
+    again.tell(ev.SetLoop(closed=True))
+    again.status()
+    assert again.stage is AcquisitionStage.ABORTED
+    assert "not judged" in again.text
+    assert "acquisition" not in again.alarms
+
+
+def test_a_loop_that_had_not_been_opened_yet_is_left_closed():
+    story = Acquiring()
+    story.tell(ev.Acquire())
+    assert story.stage is AcquisitionStage.OPENING
+    again = Again(story)
+    again.find(loop="closed", gains=(0.4,) * 400 + (0.0,) * 194)
+    assert again.stage is AcquisitionStage.ABORTED
+    assert not again.asked(ev.AskLoop)
+
+
+def test_it_is_not_begun_anew_for_ever(opened):
+    for _ in range(MOST_ATTEMPTS - 1):
+        opened = Again(opened).find()
+        opened.still_open()
+        assert opened.stage is AcquisitionStage.COARSE
+    last = Again(opened).find()
+    assert last.stage is AcquisitionStage.FAILED
+    assert "acquisition" in last.alarms
+    assert not last.asked(ev.AskDither)
+
+
+def test_a_service_that_only_waited_leaves_it_to_the_next(opened):
+    waiting = Again(opened, Mode.PROPOSE)
+    for away_s in (20.0, 30.0):
+        waiting = Again(waiting, Mode.PROPOSE, away_s=away_s)
+        assert "acquisition" in waiting.alarms
+    again = Again(waiting).find()
+    again.still_open()
+    assert again.stage is AcquisitionStage.COARSE
+
+
+def test_the_dither_left_behind_is_stopped_before_another_is_asked_for(opened):
+    again = Again(opened, away_s=1.0).find(dither_id="acquire-1")
+    assert again.asked(ev.AskNoDither)
+    assert not again.asked(ev.AskDither)
+    again.still_open()
+    assert again.asked(ev.AskDither)
+
+
+def test_one_that_had_failed_has_still_failed():
+    story = Acquiring().to_partial()
+    story.make("cm-150", MatrixState.REFUSED, n_modes=150)
+    assert story.stage is AcquisitionStage.FAILED
+    again = Again(story)
+    assert again.stage is AcquisitionStage.FAILED
+    assert "acquisition" in again.alarms
+    again.find()
+    again.tell(DIVERGING)
+    again.wait(60)
+    assert not again.asked(ev.AskLoop)
+
+
+def test_one_that_was_aborted_leaves_no_alpha_behind(opened):
+    opened.tell(ev.AbortAcquisition())
+    again = Again(opened)
+    assert again.stage is AcquisitionStage.ABORTED
+    assert again.state.registration is None
+    assert "acquisition" not in again.alarms
+
+
+def test_one_that_ended_tracking_is_not_spoken_of():
+    story = Acquiring().to_widening()
+    story.see(FAR)
+    story.widen(400)
+    story.see(FAR, n_windows=2)
+    story.closed(400)
+    assert story.stage is AcquisitionStage.TRACKING
+    again = Again(story)
+    assert again.stage is AcquisitionStage.IDLE
+    assert again.state.registration is not None
+
+
+class TestGap:
+    """The RTC's token goes away for some seconds, and the same session comes back."""
+
+    def test_in_auto_it_begins_anew_in_the_same_session(self, opened):
+        opened.tell(ev.RtcVanished())
+        assert opened.stage is AcquisitionStage.INTERRUPTED
+        assert {"acquisition", "rtc-vanished"} <= opened.alarms
+        assert "the RTC vanished during an acquisition (coarse" in opened.text
+        assert "no RTC is there" in opened.text
+        assert "not begin anew by itself" not in opened.text
+        opened.still_open()
+        opened.still_open()
+        assert opened.stage is AcquisitionStage.COARSE
+        assert opened.state.acquisition.attempt == 2
+        assert not {"acquisition", "rtc-vanished", "loop-open"} & opened.alarms
+        opened.see_afar()
+        opened.see_afar()
+        opened.close(150)
+        assert opened.stage is AcquisitionStage.WIDENING
+
+    def test_it_ends_in_the_same_state_as_after_a_restart_of_the_service(self, opened):
+        again = Again(opened).find()
+        opened.tell(ev.RtcVanished())
+        opened.still_open()
+        one, other = again.state.acquisition, opened.state.acquisition
+        assert (one.stage, one.attempt, one.found) == (other.stage, other.attempt, other.found)
+
+    def test_what_the_gap_left_playing_is_stopped_before_another_dither_is_asked_for(self, opened):
+        left, n_before = opened.state.dither.id, len(opened.asked(ev.AskDither))
+        opened.tell(ev.RtcVanished())
+        opened.still_open(dither_id=left)
+        assert opened.asked(ev.AskNoDither)
+        assert len(opened.asked(ev.AskDither)) == n_before
+        opened.still_open()
+        assert len(opened.asked(ev.AskDither)) == n_before + 1
+
+    def test_in_another_mode_it_waits_and_says_what_to_do(self):
+        story = Acquiring(Mode.PROPOSE)
+        story.tell(ev.Acquire())
+        story.open()
+        story.tell(ev.RtcVanished())
+        story.still_open()
+        story.wait(60)
+        assert story.stage is AcquisitionStage.INTERRUPTED
+        assert "acquire again" in story.text
+        assert "acquisition" in story.alarms
+
+    def test_in_another_session_nobody_touches_the_loop(self, opened):
+        n_asked = len(opened.asked(ev.AskLoop)), len(opened.asked(ev.AskDither))
+        opened.tell(ev.RtcVanished())
+        opened.tell(ev.SessionStarted(session="s9"))
+        opened.status(session="s9", **OPEN)
+        opened.wait(60)
+        assert opened.stage is AcquisitionStage.INTERRUPTED
+        assert "another session" in opened.text
+        assert (len(opened.asked(ev.AskLoop)), len(opened.asked(ev.AskDither))) == n_asked
+
+    def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there(self):
+        story = Acquiring().to_widening()
+        matrix, n_asked = story.state.in_use, len(story.asked(ev.AskLoop))
+        story.tell(ev.RtcVanished())
+        story.status(gains=(0.4,) * 150 + (0.0,) * 444, n_controlled=150, cm_id=matrix)
+        assert story.stage is AcquisitionStage.ABORTED
+        assert f"closed on {matrix}, which had passed the gate" in story.text
+        assert "acquisition" not in story.alarms
+        assert story.state.registration is not None
+        assert len(story.asked(ev.AskLoop)) == n_asked
+
+    def test_a_link_that_fails_again_and_again_ends_it(self, opened):
+        for _ in range(MOST_ATTEMPTS):
+            assert opened.stage is AcquisitionStage.COARSE
+            opened.tell(ev.RtcVanished())
+            opened.still_open()
+            opened.still_open()
+        assert opened.stage is AcquisitionStage.FAILED
+        assert "the RTC vanished, after 3 attempts" in opened.text
+
+    def test_a_service_that_ends_in_the_gap_leaves_it_to_the_next(self, opened):
+        opened.tell(ev.RtcVanished())
+        again = Again(opened)
+        assert "the RTC vanished during an acquisition" in again.text
+        again.find()
+        again.still_open()
+        assert again.stage is AcquisitionStage.COARSE
+
+    def test_who_aborts_after_it_gets_a_healthy_loop_back_as_it_was(self):
+        story = Acquiring(Mode.PROPOSE)
+        story.tell(ev.Acquire())
+        story.open()
+        story.tell(ev.RtcVanished())
+        story.still_open()
+        story.tell(ev.AbortAcquisition())
+        last = story.asked(ev.AskLoop)[-1]
+        assert (last.closed, last.leak) == (True, 0.999)

@@ -1,0 +1,335 @@
+"""Every command in every activity: all comes to an end, or the command is refused in one line."""
+
+from copy import copy
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from service.errors import CommandError, UnknownIdError
+from service.tracking import events as ev
+from service.tracking.activity import under_way
+from service.tracking.loop import DitherView, Pointing
+from service.tracking.products import MatrixState, MeasurePattern, MeasureState, ModeSet, NoisyState
+from service.tracking.stages import AcquisitionStage
+from service.tracking.state import Mode
+from tests.unit.tracking.situations import POLICY, Story
+from tests.unit.tracking.world import World
+
+LONGEST_S = 400
+"""For everything to be over: an acquisition with all its patience takes less."""
+
+
+def idle():
+    return copy(quiet())
+
+
+@cache
+def quiet():
+    """A night on which α is known, no dither plays, and two matrices have been in use."""
+    world = World(Mode.HOLD)
+    world.pass_(10.0)
+    assert world.state.registration is not None
+    world.tell(ev.Refit())
+    world.pass_(2.0)
+    world.tell(ev.Approve(id="cm-1"))
+    world.pass_(2.0)
+    world.tell(ev.StopDither())
+    world.tell(ev.SetMode(mode=Mode.PROPOSE))
+    world.pass_(3.0)
+    assert world.state.in_use == "cm-1"
+    assert not under_way(world.state, world.now_ns)
+    return world
+
+
+def measuring():
+    world = idle()
+    world.tell(ev.Measure(id="im-1", pattern=MeasurePattern.PUSH_PULL_MODAL))
+    return world.pass_(1.0)
+
+
+def measuring_sines():
+    world = idle()
+    world.tell(ev.Measure(id="im-1", pattern=MeasurePattern.SINE))
+    return world.pass_(1.0)
+
+
+def waiting_for_a_noisy_one():
+    world = own_dither()
+    world.tell(ev.MeasureNoisy(id="noisy-1", duration_s=30.0))
+    assert world.state.gathering.state is NoisyState.WAITING
+    return world
+
+
+def gathering():
+    world = idle()
+    world.tell(ev.MeasureNoisy(id="noisy-1", modes=ModeSet.CONTROLLED, duration_s=30.0))
+    world.pass_(3.0)
+    assert world.state.gathering.state is NoisyState.RUNNING
+    return world
+
+
+def ramping():
+    world = idle()
+    world.tell(ev.Ramp())
+    return world.pass_(1.0)
+
+
+def acquiring():
+    world = idle()
+    world.tell(ev.Acquire())
+    return world.pass_(2.0)
+
+
+def own_dither():
+    world = idle()
+    world.tell(ev.StartDither())
+    return world.pass_(2.0)
+
+
+def operators_dither():
+    world = idle()
+    world.tell(ev.StartDither(modes=(501,), amplitude_m=2e-9, frequency_hz=(250.0,)))
+    return world.pass_(2.0)
+
+
+def others_dither():
+    world = idle()
+    world.playing = DitherView(
+        id="of-another-program",
+        modes=(501,),
+        amplitude_m=(2e-9,),
+        frequency_hz=(250.1234,),
+        duration_s=60.0,
+        start_seq=world.seq,
+        asked_ns_utc=0,
+    )
+    return world.pass_(2.0)
+
+
+def making():
+    world = idle()
+    world.tell(ev.Refit())
+    return world
+
+
+def sending():
+    world = idle()
+    world.tell(ev.Refit())
+    world.pass_(0.5)
+    proposed = [r.id for r in world.state.reconstructors if r.state is MatrixState.PROPOSED]
+    world.tell(ev.Approve(id=proposed[-1]))
+    return world
+
+
+ACTIVITIES = [
+    idle,
+    measuring,
+    measuring_sines,
+    waiting_for_a_noisy_one,
+    gathering,
+    ramping,
+    acquiring,
+    own_dither,
+    operators_dither,
+    others_dither,
+    making,
+    sending,
+]
+COMMANDS = [
+    ev.Acquire(),
+    ev.AbortAcquisition(),
+    ev.SetMode(mode=Mode.AUTO),
+    ev.SetMode(mode=Mode.HOLD),
+    ev.Refit(),
+    ev.StartDither(),
+    ev.StartDither(modes=(502,), amplitude_m=2e-9, frequency_hz=(260.0,)),
+    ev.StopDither(),
+    ev.Approve(id="cm-1"),
+    ev.Reject(id="cm-1"),
+    ev.Publish(id="initial"),
+    ev.Rollback(),
+    ev.Measure(id="im-9", pattern=MeasurePattern.PUSH_PULL_MODAL),
+    ev.Measure(id="im-9", pattern=MeasurePattern.SINE),
+    ev.GiveUp(id="im-1"),
+    ev.MeasureNoisy(id="noisy-9", duration_s=30.0),
+    ev.GiveUpNoisy(id="noisy-1"),
+    ev.SetLoop(closed=False),
+    ev.SetLoop(gains=(ev.GainGroup(first=0, last=399, gain=0.3),)),
+    ev.SetPointing(pointing=Pointing(elevation_deg=60.0, azimuth_deg=0.0)),
+    ev.Ramp(),
+]
+
+
+def named(command):
+    return "-".join(str(word) for word in (type(command).__name__, *command_words(command)))
+
+
+def command_words(command):
+    return [
+        getattr(command, name)
+        for name in ("id", "pattern", "mode", "closed")
+        if getattr(command, name, None) is not None
+    ]
+
+
+def strands(world):
+    """What has neither ended nor goes on."""
+    state = world.state
+    left = [f"{r.id} {r.state}" for r in state.measurements if r.under_way]
+    left += [f"{r.id} {r.state}" for r in state.noisy if r.under_way]
+    left += [f"{r.id} {r.state}" for r in state.reconstructors if r.state in SENT]
+    if state.acquisition.under_way:
+        left.append(state.acquisition.text)
+    if state.making_since_ns_utc is not None:
+        left.append("a matrix that is made")
+    left += [a.text for a in state.alarms if a.name == "dither-not-stopped"]
+    return left
+
+
+SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
+
+
+@pytest.mark.parametrize("activity", ACTIVITIES, ids=lambda activity: activity.__name__)
+@pytest.mark.parametrize("command", COMMANDS, ids=named)
+def test_it_is_carried_out_and_all_ends_or_it_is_refused_in_one_line(activity, command):
+    world = activity()
+    running = under_way(world.state, world.now_ns)
+    refusal = refused(world, command)
+    assert "\n" not in refusal
+    if refusal.startswith(f"{type(command).__name__}: "):
+        assert any(one.text in refusal for one in running)
+    passed_s = 0
+    while strands(world) and passed_s < LONGEST_S:
+        world.pass_(5.0)
+        passed_s += 5
+    assert not strands(world)
+    assert not [entry.text for entry in world.state.log if "busy: " in entry.text]
+
+
+def refused(world, command):
+    """Why the tracker does not carry out a command, and stands as it was; empty: it does."""
+    before = world.state
+    try:
+        world.tell(command)
+    except (CommandError, UnknownIdError) as refusal:
+        text = str(refusal)
+    else:
+        return ""
+    assert world.state is before
+    assert text
+    return text
+
+
+@pytest.mark.parametrize("activity", ACTIVITIES[1:], ids=lambda activity: activity.__name__)
+def test_what_runs_is_named_with_what_ends_it(activity):
+    world = activity()
+    running = under_way(world.state, world.now_ns)
+    assert running
+    assert all("; " in one.text for one in running)
+    assert all("\n" not in one.text for one in running)
+
+
+REFUSED = [
+    (measuring, "im-1", [ev.Acquire(), ev.SetLoop(closed=False), ev.Ramp(), ev.Refit()]),
+    (
+        gathering,
+        "noisy-1",
+        [
+            ev.Acquire(),
+            ev.SetLoop(closed=False),
+            ev.Ramp(),
+            ev.StartDither(),
+            ev.Measure(id="im-9", pattern=MeasurePattern.PUSH_PULL_MODAL),
+            ev.MeasureNoisy(id="noisy-9"),
+        ],
+    ),
+    (
+        ramping,
+        "open the loop to end it",
+        [
+            ev.Acquire(),
+            ev.SetLoop(gains=(ev.GainGroup(first=0, last=399, gain=0.3),)),
+            ev.Ramp(),
+            ev.StartDither(),
+            ev.Measure(id="im-9", pattern=MeasurePattern.PUSH_PULL_MODAL),
+            ev.MeasureNoisy(id="noisy-9"),
+        ],
+    ),
+    (
+        others_dither,
+        "of-another-program is running; stop it first",
+        [ev.MeasureNoisy(id="noisy-9"), ev.StartDither()],
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("activity", "what", "command"),
+    [(activity, what, command) for activity, what, commands in REFUSED for command in commands],
+    ids=lambda value: getattr(value, "__name__", type(value).__name__),
+)
+def test_what_would_strand_it_is_refused_by_its_name(activity, what, command):
+    world = activity()
+    with pytest.raises(CommandError, match=what):
+        world.tell(command)
+
+
+def test_a_gain_ramp_ends_when_the_loop_is_opened():
+    world = ramping()
+    world.tell(ev.SetLoop(closed=False))
+    world.pass_(2.0)
+    assert world.state.rtc.loop == "open"
+    assert not under_way(world.state, world.now_ns)
+
+
+def test_while_gains_are_tried_nothing_is_made_sent_or_dithered():
+    world = ramping()
+    world.tell(ev.SetMode(mode=Mode.AUTO))
+    world.effects.clear()
+    world.pass_(15.0)
+    assert not world.effects
+    world.pass_(10.0)
+    assert not under_way(world.state, world.now_ns)
+
+
+def test_a_loop_that_goes_out_of_hand_while_signs_are_gathered_takes_the_dither_with_it():
+    world = World(Mode.AUTO, replace(POLICY, acquires=True))
+    world.pass_(20.0)
+    world.tell(ev.MeasureNoisy(id="noisy-1", duration_s=60.0))
+    world.pass_(5.0)
+    world.tell(ev.Trouble(name="loop-diverging", text="found"))
+    world.pass_(4.0)
+    assert world.state.acquisition.under_way
+    (noisy,) = world.state.noisy
+    assert noisy.state is NoisyState.FAILED
+    assert "acquisition" in noisy.reason
+
+
+def test_a_stopped_dither_ends_the_wait_for_one_that_measures():
+    world = waiting_for_a_noisy_one()
+    world.tell(ev.StopDither())
+    (noisy,) = world.state.noisy
+    assert noisy.state is NoisyState.FAILED
+    assert "stopped" in noisy.reason
+    assert not world.pass_(20.0).playing
+
+
+def test_a_ramp_nobody_answers_for_keeps_nothing_back_for_ever():
+    story = Story().meet()
+    story.tell(ev.Ramp())
+    assert under_way(story.state, story.now_ns)
+    story.wait(60.0)
+    assert not [one for one in under_way(story.state, story.now_ns) if "ramp" in one.text]
+
+
+def test_an_acquisition_after_all_this_leads_to_tracking():
+    world = acquiring()
+    world.pass_(120.0)
+    assert world.state.acquisition.stage is AcquisitionStage.TRACKING
+    assert not strands(world)
+
+
+def test_a_measurement_ends_stored():
+    world = measuring().pass_(10.0)
+    assert [r.state for r in world.state.measurements] == [MeasureState.STORED]

@@ -1,0 +1,147 @@
+"""A dither that does not reach the mirror, or not as it was asked for."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from service.tracking import events as ev
+from service.tracking.dither import LONGEST_PATIENCE_S, PATIENCE_S
+from service.tracking.state import Mode
+from tests.unit.tracking.situations import Story, of_kind, rtc
+
+START = 1000
+
+
+@pytest.fixture
+def story():
+    """A dither accepted, to begin at frame 1000."""
+    story = Story(Mode.HOLD).meet(seq=900)
+    accept(story)
+    return story
+
+
+def accept(story, start_seq=START):
+    dither = story.state.dither
+    story.tell(ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=start_seq))
+
+
+def status(story, seq, *, dither=None, after_s=0.5, **changes):
+    shown = {"dither_id": dither and dither.id, "dither": dither}
+    return story.tell(ev.StatusSeen(rtc=rtc(seq=seq, **shown, **changes)), after_s=after_s)
+
+
+def silence(story, silent_s):
+    return story.tell(ev.DitherSilent(id=story.state.dither.id, silent_s=silent_s), after_s=0.5)
+
+
+class TestTheStatusShowsNone:
+    def test_it_is_missed_by_the_first_status_that_should_show_it_and_asked_for_again(self, story):
+        first = story.state.dither.id
+        (asked,) = of_kind(status(story, START + 500), ev.AskDither)
+        assert asked.dither.id != first
+        assert "dither-lost" in story.alarms
+        assert "dither.lost" in story.logged
+
+    def test_a_status_made_before_it_began_says_nothing(self, story):
+        status(story, START - 1)
+        assert story.state.dither is not None
+        assert not story.alarms
+
+    def test_one_that_has_run_its_time_has_ended(self, story):
+        stop_seq = START + round(story.state.dither.duration_s * 1000)
+        status(story, stop_seq - 1500)
+        assert "dither-lost" in story.alarms
+        story = Story(Mode.HOLD).meet(seq=900)
+        accept(story)
+        status(story, stop_seq)
+        assert not story.alarms
+        assert "dither.ended" in story.logged
+
+    def test_one_lost_again_and_again_is_asked_for_less_and_less_often(self, story):
+        asked, seq = [], START
+        for _ in range(40):
+            seq += 1000
+            if of_kind(status(story, seq, after_s=1.0), ev.AskDither):
+                asked.append(seq)
+                accept(story, start_seq=seq)
+        waits = [after - before for before, after in pairwise(asked)]
+        assert len(asked) <= 6
+        assert waits == sorted(waits)
+
+    def test_a_window_that_holds_it_ends_the_alarm(self, story):
+        status(story, START + 500)
+        story.see()
+        assert "dither-lost" not in story.alarms
+        assert story.state.dither_losses == 0
+
+    def test_an_operator_who_wants_none_ends_the_alarm(self, story):
+        status(story, START + 500)
+        story.tell(ev.StopDither())
+        assert "dither-lost" not in story.alarms
+
+
+class TestTheFramesHoldNone:
+    @pytest.fixture
+    def shown(self, story):
+        """The status shows it all the same."""
+        shown = replace(story.state.dither, asked_ns_utc=0)
+        status(story, START + 100, dither=shown)
+        return shown
+
+    def test_it_is_named_after_a_second_and_another_is_asked_for_soon(self, story, shown):
+        silence(story, 1.0)
+        assert "dither-lost" in story.alarms
+        assert story.state.dither is not None
+        effects = silence(story, PATIENCE_S)
+        assert of_kind(effects, ev.AskNoDither), "the RTC plays no second one beside it"
+        assert story.state.dither is None
+        status(story, START + 2000)
+        assert of_kind(story.wait(2), ev.AskDither)
+
+    def test_what_a_status_shows_and_the_frames_do_not_is_not_adopted(self, story, shown):
+        silence(story, 2 * PATIENCE_S)
+        for second in range(5):
+            status(story, START + 3000 + 1000 * second, dither=shown, after_s=1)
+            assert story.state.dither is None
+
+    def test_the_next_is_given_more_time(self, story, shown):
+        silence(story, PATIENCE_S)
+        status(story, START + 3000, after_s=5)
+        accept(story, START + 3100)
+        status(story, START + 3200, dither=replace(story.state.dither, asked_ns_utc=0))
+        silence(story, 1.5 * PATIENCE_S)
+        assert story.state.dither is not None
+        silence(story, 2 * PATIENCE_S)
+        assert story.state.dither is None
+
+    def test_patience_has_an_end(self, story, shown):
+        story.state = replace(story.state, dither_losses=50)
+        silence(story, LONGEST_PATIENCE_S - 1)
+        assert story.state.dither is not None
+        silence(story, LONGEST_PATIENCE_S)
+        assert story.state.dither is None
+
+    def test_silence_of_another_dither_means_nothing(self, story):
+        story.tell(ev.DitherSilent(id="dither-0", silent_s=100.0))
+        assert story.state.dither is not None
+        assert not story.alarms
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"start_seq": START + 700},
+        {"amplitude_m": (3e-9,) * 4},
+        {"frequency_hz": (212.0, 240.0, 284.0, 332.0)},
+    ],
+)
+def test_the_rtcs_word_counts_where_it_plays_something_else(story, changes):
+    playing = replace(story.state.dither, asked_ns_utc=0, **changes)
+    status(story, START + 100, dither=playing)
+    assert replace(story.state.dither, asked_ns_utc=0) == playing
+    assert story.logged[-1] == "dither.other"
+    before = story.state
+    status(story, START + 200, dither=playing)
+    assert story.state.dither == before.dither
+    assert story.logged.count("dither.other") == 1

@@ -1,0 +1,314 @@
+"""A dither the RTC plays although nobody wants one, or stronger than it may."""
+
+from dataclasses import replace
+
+import pytest
+
+from service.tracking import events as ev
+from service.tracking.activity import GONE_WITHIN_S
+from service.tracking.dither import CALM_S, NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET, TELL_EVERY_S
+from service.tracking.dither_plan import total_m
+from service.tracking.products import NoisyState
+from service.tracking.stages import AcquisitionStage, DitherPhase
+from tests.unit.tracking.situations import POLICY, Story, of_kind, rtc
+
+START = 1000
+
+
+def playing(story, dither, seconds=1, **changes):
+    """Let the RTC's status show a dither once a second; return what is done about it."""
+    effects = ()
+    for _ in range(seconds):
+        shown = replace(dither, start_seq=START, asked_ns_utc=0, window_s=None)
+        seq = START + round((story.now_ns - dither.asked_ns_utc) * 1e-6)
+        status = rtc(dither_id=dither.id, dither=shown, seq=seq, **changes)
+        effects += story.tell(ev.StatusSeen(rtc=status), after_s=1.0)
+        effects += story.tell(ev.Tick())
+    return effects
+
+
+def silent(story, seconds=1):
+    effects = ()
+    for _ in range(seconds):
+        effects += story.tell(ev.StatusSeen(rtc=rtc()), after_s=1.0)
+    return effects
+
+
+def accept(story, dither):
+    return story.tell(
+        ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=START), after_s=0.3
+    )
+
+
+@pytest.fixture
+def story():
+    """The first window is in, and the RTC has been asked for a dither."""
+    story = Story().meet()
+    story.see()
+    return story
+
+
+class TestOffByTheOperator:
+    def test_a_stop_that_fails_is_repeated_until_the_status_shows_none(self, story):
+        dither = story.state.dither
+        accept(story, dither)
+        assert of_kind(story.tell(ev.StopDither()), ev.AskNoDither) == [ev.AskNoDither()]
+        story.tell(ev.JobFailed(effect=ev.AskNoDither(), text="no answer"))
+        asked = of_kind(playing(story, dither, 20), ev.AskNoDither)
+        assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+        assert NOT_STOPPED in story.alarms
+        assert story.state.dithering.phase is DitherPhase.OFF
+        assert dither.id in story.state.dithering.reason
+        assert not silent(story, 60)
+        assert NOT_STOPPED not in story.alarms
+        assert story.state.dithering.reason == "stopped by the operator"
+
+    def test_a_start_that_overtakes_the_stop_is_stopped_too(self, story):
+        dither = story.state.dither
+        story.tell(ev.StopDither())
+        accept(story, dither)
+        assert of_kind(playing(story, dither, 4), ev.AskNoDither)
+        silent(story)
+        assert not story.alarms
+
+    def test_a_status_from_before_the_stop_is_no_alarm_and_nothing_is_asked_twice(self, story):
+        dither = story.state.dither
+        accept(story, dither)
+        story.tell(ev.StopDither())
+        assert not playing(story, dither)
+        silent(story)
+        assert not story.alarms
+
+    @pytest.mark.parametrize("name", ["operator-1", "noisy-1", "acquire-1"])
+    def test_whatever_of_the_services_it_is(self, story, name):
+        dither = replace(story.state.dither, id=name)
+        story.tell(ev.StopDither())
+        assert of_kind(playing(story, dither, 4), ev.AskNoDither)
+
+    def test_somebody_elses_is_left_alone_and_told_as_it_is(self, story):
+        dither = replace(story.state.dither, id="engineer-1")
+        story.tell(ev.StopDither())
+        assert not playing(story, dither, 10)
+        assert not story.alarms
+
+    def test_what_it_costs_is_what_the_rtc_plays(self, story):
+        dither = story.state.dither
+        accept(story, dither)
+        story.tell(ev.StopDither())
+        playing(story, dither, 3600)
+        expected = pytest.approx(total_m(dither), rel=0.01)
+        assert story.state.dithering.mean_cost_m == expected
+
+    @pytest.mark.parametrize("alarm", ["loop-diverging", "edge-slip"])
+    def test_a_loop_out_of_hand_keeps_none_on_the_mirror(self, story, alarm):
+        dither = story.state.dither
+        accept(story, dither)
+        story.tell(ev.StopDither())
+        story.tell(ev.Trouble(name=alarm, text="x"))
+        assert of_kind(playing(story, dither, 4), ev.AskNoDither)
+
+    def test_nobody_knows_whose_it_is_while_two_rtcs_send(self, story):
+        dither = story.state.dither
+        story.tell(ev.StopDither())
+        story.tell(ev.Trouble(name="second-rtc", text="x"))
+        assert not playing(story, dither, 4)
+
+    def test_the_alarm_ends_with_the_rtc(self, story):
+        dither = story.state.dither
+        story.tell(ev.StopDither())
+        playing(story, dither, 10)
+        assert NOT_STOPPED in story.alarms
+        story.tell(ev.RtcVanished())
+        assert NOT_STOPPED not in story.alarms
+
+    def test_an_rtc_that_does_not_answer_keeps_no_matrix_waiting(self, story):
+        before = story.state.retries
+        story.tell(ev.JobFailed(effect=ev.AskNoDither(), text="no answer"))
+        assert story.state.retries == before
+
+    def test_the_operator_may_have_it_again(self, story):
+        dither = story.state.dither
+        accept(story, dither)
+        story.tell(ev.StopDither())
+        playing(story, dither, round(GONE_WITHIN_S) + 2)
+        story.tell(ev.StartDither())
+        assert not of_kind(playing(story, dither, 10), ev.AskNoDither)
+        assert NOT_STOPPED not in story.alarms
+
+
+def louder(dither, by=10.0):
+    return replace(dither, amplitude_m=tuple(by * a for a in dither.amplitude_m))
+
+
+class TestTooStrong:
+    @pytest.fixture
+    def loud(self, story):
+        """80 nm where 8 nm were asked for."""
+        dither = story.state.dither
+        accept(story, dither)
+        return louder(dither)
+
+    def test_it_is_stopped_at_once_with_an_alarm_that_tells_how_strong_it_was(self, story, loud):
+        assert playing(story, loud) == (ev.AskNoDither(),)
+        assert story.state.dither is None
+        text = next(a.text for a in story.state.alarms if a.name == OVER_BUDGET)
+        assert "a dither of 80 nm RMS in all, more than the budget of 8 nm" in text
+        assert "dither.other" in story.logged
+
+    def test_another_is_tried_after_a_minute_and_ends_the_alarm_if_it_is_as_it_may_be(
+        self, story, loud
+    ):
+        playing(story, loud)
+        assert not of_kind(silent(story, round(CALM_S) - 2), ev.AskDither)
+        assert OVER_BUDGET in story.alarms
+        assert "too strong" in story.state.dithering.reason
+        (asked,) = of_kind(silent(story, 4), ev.AskDither)
+        accept(story, asked.dither)
+        assert OVER_BUDGET in story.alarms
+        playing(story, asked.dither)
+        assert OVER_BUDGET not in story.alarms
+
+    def test_an_rtc_that_does_so_always_does_it_for_a_second_a_minute(self, story, loud):
+        on, n_tried, lived_s = loud, 0, 0
+        for _ in range(600):
+            lived_s += on is not None
+            for effect in playing(story, on) if on is not None else silent(story):
+                match effect:
+                    case ev.AskDither(dither=dither):
+                        accept(story, dither)
+                        on, n_tried = louder(dither), n_tried + 1
+                    case ev.AskNoDither():
+                        on = None
+        assert n_tried == pytest.approx(600 / CALM_S, abs=1)
+        assert lived_s <= n_tried + 1
+        assert OVER_BUDGET in story.alarms
+
+    def test_one_that_does_not_stop_is_asked_again_and_again_and_read_all_the_same(
+        self, story, loud
+    ):
+        asked = of_kind(playing(story, loud, 20), ev.AskNoDither)
+        assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+        assert {OVER_BUDGET, NOT_STOPPED} <= story.alarms
+        assert story.state.dither.id == loud.id
+        silent(story)
+        assert NOT_STOPPED not in story.alarms
+        assert "dither-lost" not in story.alarms
+
+    def test_rounding_is_no_excess(self, story, loud):
+        assert not playing(story, louder(loud, 0.1 * 1.0005), 3)
+        assert not story.alarms
+        assert story.state.dither is not None
+
+    def test_within_the_budget_the_rtcs_word_counts(self, story):
+        story.see(n_windows=12)
+        weak = louder(story.state.dither, 0.5)
+        accept(story, weak)
+        assert not playing(story, weak, 3)
+        assert not story.alarms
+
+    @pytest.mark.parametrize(("by", "stopped"), [(1.0, False), (1.0005, False), (4.0, True)])
+    def test_an_operators_may_exceed_the_budget_but_not_what_was_asked_for(
+        self, story, by, stopped
+    ):
+        story.tell(ev.StopDither())
+        story.tell(ev.StartDither(amplitude_m=10e-9, over_budget=True))
+        dither = story.state.dither
+        accept(story, dither)
+        effects = playing(story, louder(dither, by), 3)
+        assert bool(of_kind(effects, ev.AskNoDither)) is stopped
+        assert (OVER_BUDGET in story.alarms) is stopped
+
+    def test_an_operator_who_wants_none_has_no_alarm(self, story, loud):
+        playing(story, loud)
+        story.tell(ev.StopDither())
+        silent(story, 2)
+        assert not story.alarms
+
+
+def test_settings_that_forbid_it_do_not_tolerate_what_an_earlier_service_has_left():
+    dither = Story().meet().state.dither
+    story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
+    asked = of_kind(playing(story, dither, 20), ev.AskNoDither)
+    assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+    assert "the settings forbid" in next(a.text for a in story.state.alarms)
+
+
+class TestByTheFrames:
+    """The status says what was asked for; the frames hold something else."""
+
+    @pytest.fixture
+    def on(self, story):
+        accept(story, story.state.dither)
+        playing(story, story.state.dither)
+        return story.state.dither
+
+    def measured(self, story, dither, by, text="the frames hold much"):
+        asked = total_m(dither)
+        return story.tell(
+            ev.DitherMeasured(id=dither.id, found_m=by * asked, asked_m=asked, text=text)
+        )
+
+    def test_too_strong_it_is_stopped_at_once_and_named(self, story, on):
+        assert of_kind(self.measured(story, on, 20.0), ev.AskNoDither)
+        assert story.state.dither is None
+        (alarm,) = [a for a in story.state.alarms if a.name == OVER_BUDGET]
+        assert "the frames hold much; the budget is 8 nm" in alarm.text
+
+    def test_a_status_that_goes_on_saying_all_is_well_ends_no_alarm(self, story, on):
+        self.measured(story, on, 20.0)
+        (asked,) = of_kind(silent(story, round(CALM_S) + 3), ev.AskDither)
+        accept(story, asked.dither)
+        playing(story, asked.dither, 2)
+        assert OVER_BUDGET in story.alarms
+        self.measured(story, asked.dither, 1.0, text="")
+        assert OVER_BUDGET not in story.alarms
+
+    def test_one_that_is_not_stopped_is_told_again_and_again(self, story, on):
+        self.measured(story, on, 20.0)
+        asked = of_kind(playing(story, on, 20), ev.AskNoDither)
+        assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
+        assert {OVER_BUDGET, NOT_STOPPED} <= story.alarms
+
+    def test_otherwise_than_asked_but_within_the_budget_it_is_named_and_goes_on(self, story, on):
+        assert not self.measured(story, on, 0.1)
+        assert story.state.dither is not None
+        assert NOT_AS_ASKED in story.alarms
+        self.measured(story, on, 1.0, text="")
+        assert NOT_AS_ASKED not in story.alarms
+
+    def test_what_an_operator_asked_for_may_cost_more_than_the_budget(self, story):
+        story.tell(ev.StopDither())
+        story.tell(ev.StatusSeen(rtc=rtc()), after_s=1.0)
+        meant = ev.StartDither(
+            modes=(501,), frequency_hz=(250.0,), amplitude_m=15e-9, over_budget=True
+        )
+        story.tell(meant)
+        dither = story.state.dither
+        accept(story, dither)
+        playing(story, dither)
+        assert not self.measured(story, dither, 1.05)
+        assert of_kind(self.measured(story, dither, 2.0), ev.AskNoDither)
+
+    def test_an_acquisition_ends_and_says_why(self):
+        story = Story(policy=replace(POLICY, acquires=True)).meet()
+        story.tell(ev.Acquire())
+        story.tell(ev.SessionStarted(session="s2"))
+        view = rtc(session="s2", loop="open", gains=(0.0,) * 594)
+        story.tell(ev.StatusSeen(rtc=view))
+        dither = story.state.dither
+        accept(story, dither)
+        self.measured(story, dither, 5.0)
+        assert story.state.acquisition.stage is AcquisitionStage.FAILED
+        assert "the frames hold much" in story.state.acquisition.text
+
+    def test_a_noisy_matrix_ends_and_says_why(self, story):
+        story.tell(ev.StopDither())
+        story.tell(ev.StatusSeen(rtc=rtc()), after_s=1.0)
+        story.tell(ev.MeasureNoisy(id="noisy-1"))
+        dither = story.state.dither
+        accept(story, dither)
+        playing(story, dither)
+        self.measured(story, dither, 5.0)
+        (noisy,) = story.state.noisy
+        assert noisy.state is NoisyState.FAILED
+        assert "too strong" in noisy.reason

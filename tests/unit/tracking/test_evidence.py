@@ -1,0 +1,302 @@
+"""Evidence counts by when it was taken, not by when a busy worker was done with it."""
+
+from dataclasses import replace
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from service.errors import CommandError
+from service.telemetry.faraway import FarEstimate
+from service.tracking import events as ev
+from service.tracking.loop import Pointing
+from service.tracking.products import MatrixState
+from service.tracking.registration import Validity
+from service.tracking.state import Mode
+from tests.unit.tracking.situations import (
+    ALPHA,
+    SECOND,
+    Story,
+    estimate,
+    judged,
+    moved,
+    of_kind,
+    record,
+    rtc,
+    verdict,
+)
+from tests.unit.tracking.test_watchdog import SCATTER, watched
+
+THERE = moved(shift_x_subap=0.15)
+ELSEWHERE = moved(shift_x_subap=0.5, shift_y_subap=0.5)
+
+
+class Late(Story):
+    """A night in ``auto`` on which telemetry has times of its own, in seconds since its begin."""
+
+    def __init__(self, mode=Mode.AUTO):
+        super().__init__(mode)
+        self.meet()
+        self.zero_ns = self.now_ns
+        for end_s in (2, 4, 6):
+            self.window(end_s)
+        self.effects.clear()
+
+    @property
+    def doubted(self):
+        return self.state.registration.standing.validity is Validity.INVALID
+
+    def at(self, s):
+        """The service's and the RTC's clock are there."""
+        self.now_ns = max(self.now_ns, self.zero_ns + round(s * SECOND))
+        return self.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=self.now_ns)))
+
+    def window(self, end_s, alpha=ALPHA, *, fitted_s=None, **began):
+        """A window that ended then, fitted at once or later."""
+        self.at(end_s if fitted_s is None else fitted_s)
+        found = estimate(alpha, t_ns=self.zero_ns + round(end_s * SECOND))
+        return self.tell(ev.WindowFitted(estimate=found, **began))
+
+    def look(self, end_s, alpha, *, done_s=None):
+        self.at(end_s if done_s is None else done_s)
+        end_ns = self.zero_ns + round(end_s * SECOND)
+        return self.tell(ev.Watched(estimate=watched(alpha, SCATTER), t_ns_utc=end_ns))
+
+
+@pytest.fixture
+def night():
+    return Late()
+
+
+class TestLookThatBarks:
+    def test_a_window_from_before_it_ends_no_doubt_and_nothing_is_sent_for_the_old_place(
+        self, night
+    ):
+        night.look(10, ELSEWHERE)
+        assert night.doubted
+        night.window(8, fitted_s=12)
+        assert night.doubted
+        assert "watchdog" in night.alarms
+        night.tell(ev.MatrixMade(record=made(night), wanted=False))
+        assert not of_kind(night.wait(10), ev.MakeMatrix | ev.SendMatrix)
+        assert not night.asked(ev.SendMatrix)
+
+    def test_one_that_began_before_it_and_ended_after_ends_none_either(self, night):
+        night.look(10, ELSEWHERE)
+        night.window(11, began_ns_utc=night.zero_ns + 9 * SECOND)
+        assert night.doubted
+
+    def test_one_taken_since_does(self, night):
+        night.look(10, ELSEWHERE)
+        night.window(12, began_ns_utc=night.zero_ns + 10 * SECOND)
+        assert not night.doubted
+        assert "watchdog" not in night.alarms
+
+    def test_two_from_before_that_agree_on_another_place_do_not_say_where_it_is_now(self, night):
+        night.look(20, ELSEWHERE)
+        night.window(10, THERE, fitted_s=21)
+        night.window(12, THERE, fitted_s=23)
+        assert night.doubted
+        night.window(25, THERE)
+        assert not night.doubted
+
+    def test_a_look_from_before_a_window_that_agreed_says_nothing_new(self, night):
+        night.window(14)
+        night.look(9, ELSEWHERE, done_s=15)
+        assert not night.doubted
+        assert "dithered window" in night.state.unwatched
+
+    def test_a_clock_that_was_set_back_keeps_no_doubt_for_an_hour(self, night):
+        night.look(3600, ELSEWHERE)
+        assert night.doubted
+        night.now_ns = night.zero_ns + 100 * SECOND
+        night.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=night.now_ns)))
+        for end_s in (102, 104, 106):
+            night.window(end_s)
+        assert not night.doubted
+
+    def test_a_worker_that_was_stopped_for_minutes_is_no_clock_that_was_set_back(self, night):
+        night.look(300, ELSEWHERE)
+        night.window(8, fitted_s=301)
+        assert night.doubted
+
+
+class TestWindowFarOut:
+    def test_it_is_not_denied_by_one_from_before_it(self, night):
+        night.window(10, THERE)
+        assert night.doubted
+        night.window(9, fitted_s=11)
+        assert night.doubted
+        assert night.state.windows_outlying == 0
+        night.window(12)
+        assert not night.doubted
+        assert night.state.windows_outlying == 1
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    st.lists(
+        st.tuples(st.integers(7, 40), st.integers(0, 12), st.sampled_from(["window", "look"])),
+        min_size=1,
+        max_size=12,
+    )
+)
+def test_in_whatever_order_it_comes_nothing_taken_before_a_doubt_ends_it(evidence):
+    night = Late()
+    night.look(20, ELSEWHERE)
+    assert night.doubted
+    told = False
+    for end_s, late_s, kind in sorted(evidence, key=lambda one: max(one[0], 20) + one[1]):
+        done_s = max(end_s, 20) + late_s
+        if kind == "look":
+            night.look(end_s, ALPHA, done_s=done_s)
+        else:
+            night.window(end_s, fitted_s=done_s)
+            told = told or end_s >= 20
+        assert told or night.doubted
+
+
+class TestLoopOutOfHand:
+    def test_a_window_of_it_counts_for_nothing_once_it_is_over_either(self, night):
+        before = night.state.windows_accepted
+        night.at(10)
+        night.tell(ev.Trouble(name="loop-diverging", text="found"))
+        night.at(14)
+        night.tell(ev.Trouble(name="loop-diverging", text="calm", over=True))
+        night.window(13, fitted_s=15)
+        assert night.state.windows_accepted == before
+        assert "diverging" in night.state.log[-1].text
+        night.window(17)
+        assert night.state.windows_accepted == before + 1
+
+    def test_the_frames_say_until_when(self, night):
+        before = night.state.windows_accepted
+        night.at(10)
+        night.tell(ev.Trouble(name="edge-slip", text="found"))
+        over_ns = night.zero_ns + round(14.8 * SECOND)
+        night.at(14)
+        night.tell(ev.Trouble(name="edge-slip", text="back", over=True, t_ns_utc=over_ns))
+        night.window(16, began_ns_utc=night.zero_ns + round(14.2 * SECOND))
+        assert night.state.windows_accepted == before
+
+    def test_a_look_at_it_counts_for_nothing_either(self, night):
+        night.at(10)
+        night.tell(ev.Trouble(name="loop-diverging", text="found"))
+        night.at(14)
+        night.tell(ev.Trouble(name="loop-diverging", text="calm", over=True))
+        night.look(13, ELSEWHERE, done_s=15)
+        assert not night.doubted
+        assert "not used" in night.state.unwatched
+
+
+def test_a_look_at_a_session_that_is_over_counts_for_nothing(night):
+    night.at(10)
+    night.tell(ev.SessionStarted(session="s2"))
+    night.tell(ev.StatusSeen(rtc=rtc(session="s2", t_ns_utc=night.now_ns)))
+    end_ns = night.zero_ns + 9 * SECOND
+    night.tell(ev.Watched(estimate=watched(ELSEWHERE), t_ns_utc=end_ns), 1.0)
+    assert not night.state.registration.doubt
+
+
+class TestSlew:
+    FROM, TO = (
+        Pointing(elevation_deg=70.0, azimuth_deg=0.0),
+        Pointing(elevation_deg=40.0, azimuth_deg=0.0),
+    )
+
+    def point(self, night, s, where):
+        night.at(s)
+        night.tell(ev.SetPointing(pointing=where))
+
+    def test_a_window_from_before_it_says_nothing_of_where_the_telescope_is_now(self, night):
+        self.point(night, 8, self.FROM)
+        night.window(10)
+        self.point(night, 14, self.TO)
+        night.at(15)
+        night.tell(ev.Tick())
+        assert night.doubted
+        night.window(12, fitted_s=16)
+        assert night.doubted
+        night.window(18, began_ns_utc=night.zero_ns + 16 * SECOND)
+        assert not night.doubted
+
+
+def made(story, matrix_id="cm-1", **changes):
+    known, view = story.state.registration, story.state.rtc
+    return record(
+        matrix_id,
+        **({"judged": judged(known, view), "alpha": known.alpha} | changes),
+    )
+
+
+class TestVerdicts:
+    def test_one_given_while_alpha_came_into_doubt_sends_nothing(self):
+        night = Late(Mode.PROPOSE)
+        proposal = made(night)
+        of_old = replace(proposal.judged, leak=0.9)
+        night.tell(ev.MatrixMade(record=replace(proposal, judged=of_old), wanted=False))
+        assert of_kind(night.tell(ev.Approve(id="cm-1")), ev.JudgeProposal)
+        night.look(10, ELSEWHERE)
+        passed = ev.ProposalJudged(id="cm-1", verdict=verdict(), judged=proposal.judged)
+        assert not of_kind(night.tell(passed), ev.SendMatrix)
+        assert night.matrix_state("cm-1") is MatrixState.PROPOSED
+        with pytest.raises(CommandError, match="invalid"):
+            night.tell(ev.Approve(id="cm-1"))
+
+    def test_a_margin_of_the_place_before_a_jump_calms_nobody(self, night):
+        then = judged(night.state.registration, night.state.rtc)
+        for end_s in (10, 12, 14):
+            night.window(end_s, THERE)
+        now = judged(night.state.registration, night.state.rtc)
+        short = verdict(accepted=False)
+        night.tell(ev.MarginJudged(id="initial", verdict=short, judged=now))
+        assert "margin" in night.alarms
+        night.tell(ev.MarginJudged(id="initial", verdict=verdict(), judged=then))
+        assert "margin" in night.alarms
+        assert not night.state.margin.accepted
+
+    def test_a_margin_worked_out_while_alpha_came_into_doubt_is_none(self, night):
+        then = judged(night.state.registration, night.state.rtc)
+        night.look(10, ELSEWHERE)
+        night.tell(ev.MarginJudged(id="initial", verdict=verdict(), judged=then))
+        assert night.state.margin is None
+
+    def test_what_is_applied_after_a_jump_is_not_as_good_as_it_was_judged_before(self):
+        night = Late(Mode.PROPOSE)
+        night.tell(ev.MatrixMade(record=made(night), wanted=False))
+        night.tell(ev.Approve(id="cm-1"))
+        for end_s in (10, 12, 14):
+            night.window(end_s, THERE)
+        effects = night.acknowledge("cm-1")
+        assert night.state.in_use == "cm-1"
+        assert night.state.margin is None
+        assert of_kind(effects, ev.JudgeMatrix)
+
+
+def test_a_window_from_before_a_dither_was_lost_has_not_found_it_again(night):
+    night.at(10)
+    asked = night.state.dither
+    night.tell(ev.DitherAnswered(id=asked.id, accepted=True, reason="", start_seq=10))
+    night.tell(ev.DitherSilent(id=asked.id, silent_s=1.0))
+    assert "dither-lost" in night.alarms
+    night.window(9, fitted_s=11)
+    assert "dither-lost" in night.alarms
+    night.window(13)
+    assert "dither-lost" not in night.alarms
+
+
+def test_what_was_seen_from_afar_before_an_acquisition_began_anew_counts_for_nothing(night):
+    open_loop = {"loop": "open", "gains": (0.0,) * 594}
+    night.at(10)
+    night.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=night.now_ns, **open_loop)))
+    night.tell(ev.Acquire())
+    dither = night.state.dither
+    found = estimate(ALPHA, t_ns=night.zero_ns + 9 * SECOND, modes=dither.modes)
+    found = replace(found, covariance=np.diag([0.01, 0.01, 3e-4, 1e-3]) ** 2)
+    far = FarEstimate(estimate=found, unexplained=0.05, n_starts=1)
+    night.tell(ev.FarFitted(found=far))
+    assert night.state.acquisition.alpha is None
+    later = replace(found, t_ns_utc=night.zero_ns + 14 * SECOND)
+    night.tell(ev.FarFitted(found=replace(far, estimate=later)), 5.0)
+    assert night.state.acquisition.alpha is not None

@@ -1,0 +1,76 @@
+from service.tracking.alarms import LOG_LENGTH, counted, logged, with_alarm, without_alarm
+from service.tracking.state import Level, TrackerState
+
+STATE = TrackerState(system="flao")
+
+
+SECOND_NS = 10**9
+
+
+def test_a_repeated_line_is_counted():
+    state = logged(logged(STATE, "x", "same", 1), "x", "same", 9)
+    (entry,) = state.log
+    assert (entry.t_ns_utc, entry.last_ns_utc, entry.text, entry.times) == (1, 9, "same", 2)
+
+
+def test_a_burst_of_refused_windows_is_one_line_and_then_one_with_a_count():
+    """Eleven windows a second were refused; their texts differ in their numbers."""
+    state = STATE
+    for k in range(600):
+        text = f"mode 3 carries {0.1 * k:.2f} nm of dither"
+        state = logged(state, "window.refused", text, k * SECOND_NS // 11)
+        state = logged(state, "other", str(k), k * SECOND_NS // 11) if k % 50 == 0 else state
+        state = counted(state, k * SECOND_NS // 11)
+    lines = [entry for entry in state.log if entry.name == "window.refused"]
+    assert [entry.times for entry in lines] == [600]
+    state = counted(state, 61 * SECOND_NS)
+    lines = [entry for entry in state.log if entry.name == "window.refused"]
+    assert lines[-1].text == "mode 3 carries 0.00 nm of dither (600 times in 54 s)"
+    assert [entry.times for entry in lines] == [1, 1]
+    assert counted(state, 200 * SECOND_NS) is state
+
+
+def test_after_a_minute_a_repeated_line_is_told_again():
+    state = logged(STATE, "window.refused", "a", 1)
+    state = logged(state, "window.refused", "a", 61 * SECOND_NS)
+    assert [entry.times for entry in state.log] == [1, 1]
+
+
+def test_another_reason_is_another_line():
+    state = logged(logged(STATE, "window.refused", "a", 1), "window.refused", "b", 2)
+    assert [entry.text for entry in state.log] == ["a", "b"]
+
+
+def test_deeds_that_name_what_they_are_of_are_never_counted_together():
+    state = logged(STATE, "reconstructor.published", "cm-1", 1)
+    state = logged(state, "reconstructor.published", "cm-2", 2)
+    assert [entry.text for entry in state.log] == ["cm-1", "cm-2"]
+
+
+def test_the_same_text_after_another_line_is_a_new_line():
+    state = STATE
+    for text in ("one", "two", "one"):
+        state = logged(state, "x", text, 1)
+    assert [entry.text for entry in state.log] == ["one", "two", "one"]
+
+
+def test_the_log_forgets_its_oldest_lines():
+    state = STATE
+    for number in range(LOG_LENGTH + 3):
+        state = logged(state, "x", str(number), number)
+    assert len(state.log) == LOG_LENGTH
+    assert state.log[0].text == "3"
+
+
+def test_an_alarm_raised_again_keeps_its_beginning_and_is_logged_once():
+    state = with_alarm(with_alarm(STATE, "margin", "short", 5), "margin", "shorter", 8)
+    (alarm,) = state.alarms
+    assert (alarm.since_ns_utc, alarm.seen_ns_utc, alarm.text) == (5, 8, "shorter")
+    assert [(entry.level, entry.text) for entry in state.log] == [(Level.ALARM, "short")]
+
+
+def test_an_alarm_that_ends_says_so_once():
+    state = without_alarm(with_alarm(STATE, "margin", "short", 5), "margin", 9)
+    assert not state.alarms
+    assert state.log[-1].text == "margin: over"
+    assert without_alarm(state, "margin", 10) is state

@@ -1,0 +1,204 @@
+from dataclasses import replace
+
+import pytest
+
+from service.tracker import step
+from service.tracking import events as ev
+from service.tracking.products import MatrixState
+from service.tracking.reconstructors import extended_gains
+from service.tracking.state import Level, Mode, TrackerState
+from tests.unit.tracking.situations import (
+    POLICY,
+    START_NS,
+    Story,
+    foreign,
+    of_kind,
+    record,
+    rtc,
+    verdict,
+)
+
+
+@pytest.fixture
+def story():
+    story = Story(Mode.HOLD).meet()
+    story.see(n_windows=2)
+    return story
+
+
+def test_more_modes_get_the_gain_of_the_last_controlled_one():
+    view = rtc(gains=(0.4,) * 399 + (0.3,) + (0.0,) * 194)
+    gains = extended_gains(view, 500)
+    assert gains == (0.4,) * 399 + (0.3,) * 101 + (0.0,) * 94
+
+
+def test_fewer_modes_keep_their_gains_and_release_the_rest():
+    gains = extended_gains(rtc(), 100)
+    assert gains == (0.4,) * 100 + (0.0,) * 494
+
+
+def test_in_auto_a_matrix_that_passed_is_sent_at_once():
+    story = Story(Mode.AUTO).meet()
+    story.see(n_windows=2)
+    assert of_kind(story.make("cm-1"), ev.SendMatrix)
+    assert story.matrix_state("cm-1") is MatrixState.PUBLISHED
+    assert story.state.reconstructor("cm-1").published_ns_utc == story.now_ns
+
+
+@pytest.mark.parametrize("mode", [Mode.PROPOSE, Mode.HOLD])
+def test_otherwise_it_waits_for_an_operator(mode):
+    story = Story(mode).meet()
+    assert not of_kind(story.make("cm-1"), ev.SendMatrix)
+    assert story.matrix_state("cm-1") is MatrixState.PROPOSED
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+@pytest.mark.parametrize("wanted", [True, False])
+def test_a_refused_matrix_is_never_sent(mode, wanted):
+    story = Story(mode).meet()
+    assert not of_kind(story.make("cm-1", MatrixState.REFUSED, wanted=wanted), ev.SendMatrix)
+    entry = story.state.log[-1]
+    assert (entry.name, entry.level) == ("reconstructor.refused", Level.WARNING)
+    assert "too little margin" in entry.text
+
+
+def test_a_newer_proposal_replaces_one_nobody_has_decided_on(story):
+    story.make("cm-1")
+    story.make("cm-2")
+    assert story.matrix_state("cm-1") is MatrixState.DISCARDED
+    assert story.state.reconstructor("cm-1").reason == "cm-2 replaces it"
+    assert story.matrix_state("cm-2") is MatrixState.PROPOSED
+
+
+def test_the_number_of_modes_is_commanded_only_when_it_changes(story):
+    (same,) = story.make("cm-1", wanted=True, n_modes=400)
+    (more,) = story.make("cm-2", wanted=True, n_modes=500)
+    assert (same.n_modes, same.gains) == (400, None)
+    assert more.n_modes == 500
+    assert more.gains == (0.4,) * 500 + (0.0,) * 94
+
+
+@pytest.mark.parametrize("name", ["second-rtc", "basis-mismatch", "instrument-mismatch"])
+def test_nothing_is_published_to_an_rtc_that_may_be_the_wrong_one(name):
+    story = Story(Mode.AUTO).meet()
+    story.tell(ev.Trouble(name=name, text="found"))
+    assert not of_kind(story.make("cm-1"), ev.SendMatrix)
+    assert story.matrix_state("cm-1") is MatrixState.PROPOSED
+
+
+def test_an_applied_matrix_is_in_use_from_the_frame_the_rtc_names(story):
+    story.make("cm-1", wanted=True)
+    story.acknowledge("cm-1", MatrixState.STAGED)
+    assert story.matrix_state("cm-1") is MatrixState.STAGED
+    assert story.state.in_use == "initial"
+    story.acknowledge("cm-1", frame_seq=4242)
+    assert story.state.in_use == "cm-1"
+    assert story.state.reconstructor("cm-1").applied_frame_seq == 4242
+    assert story.matrix_state("initial") is MatrixState.SUPERSEDED
+    assert story.state.margin == story.state.reconstructor("cm-1").gate
+
+
+def test_a_late_acknowledgement_is_accepted_and_ends_the_alarm(story):
+    story.make("cm-1", wanted=True)
+    story.wait(10)
+    assert "no-acknowledgement" in story.alarms
+    story.acknowledge("cm-1")
+    assert story.state.in_use == "cm-1"
+    assert "no-acknowledgement" not in story.alarms
+
+
+def test_staged_after_applied_does_not_take_it_back(story):
+    story.use("cm-1")
+    story.acknowledge("cm-1", MatrixState.STAGED)
+    assert story.matrix_state("cm-1") is MatrixState.APPLIED
+
+
+def test_an_acknowledgement_repeated_for_an_earlier_matrix_does_not_bring_it_back(story):
+    story.use("cm-1")
+    story.use("cm-2")
+    story.acknowledge("cm-1")
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-2")))
+    assert story.state.in_use == "cm-2"
+    assert story.matrix_state("cm-1") is MatrixState.SUPERSEDED
+
+
+def test_the_rtcs_reason_for_a_rejection_is_kept(story):
+    story.make("cm-1", wanted=True)
+    story.acknowledge("cm-1", MatrixState.REJECTED, "range: 399 modes, expected 400")
+    assert story.matrix_state("cm-1") is MatrixState.REJECTED
+    assert story.state.reconstructor("cm-1").reason == "range: 399 modes, expected 400"
+    assert story.state.in_use == "initial"
+    assert story.state.log[-1].level is Level.WARNING
+
+
+def test_an_acknowledgement_for_an_unknown_id_is_logged_and_changes_nothing(story):
+    before = story.state.reconstructors
+    story.acknowledge("cm-unknown")
+    assert story.state.reconstructors == before
+    assert story.state.in_use == "initial"
+    assert story.state.log[-1].name == "acknowledgement.unknown"
+    assert "cm-unknown" in story.state.log[-1].text
+
+
+def test_the_margin_of_the_matrix_in_use_is_kept_and_short_is_an_alarm(story):
+    story.tell(ev.MarginJudged(id="initial", verdict=verdict(accepted=False, radius=1.1)))
+    assert story.state.margin.worst_pole_radius == 1.1
+    assert story.state.reconstructor("initial").gate.worst_pole_radius == 1.1
+    assert "margin" in story.alarms
+    story.tell(ev.MarginJudged(id="initial", verdict=verdict()))
+    assert "margin" not in story.alarms
+
+
+def test_a_verdict_that_comes_too_late_belongs_to_its_own_matrix(story):
+    story.use("cm-1")
+    margin = story.state.margin
+    story.tell(ev.MarginJudged(id="initial", verdict=verdict(accepted=False, radius=1.1)))
+    assert story.state.margin is margin
+    assert not story.alarms
+    assert story.state.reconstructor("initial").gate.worst_pole_radius == 1.1
+
+
+def test_the_alarm_of_a_short_margin_ends_with_the_matrix_it_was_about(story):
+    story.tell(ev.MarginJudged(id="initial", verdict=verdict(accepted=False, radius=1.1)))
+    story.use("cm-1")
+    assert "margin" not in story.alarms
+
+
+def test_a_fetched_matrix_is_the_one_in_use(story):
+    story.tell(ev.MatrixFetched(record=foreign("other", 300)))
+    assert story.state.in_use == "other"
+    assert story.matrix_state("initial") is MatrixState.SUPERSEDED
+
+
+def test_a_matrix_made_while_the_rtc_was_away_is_not_sent_to_nobody():
+    story = Story(Mode.AUTO).meet()
+    story.state = replace(story.state, rtc=None)
+    assert not of_kind(story.make("cm-1"), ev.SendMatrix)
+
+
+class TestOldAcknowledgements:
+    def test_one_of_another_session_changes_nothing(self):
+        state = TrackerState(
+            system="flao", rtc=rtc(), reconstructors=(record("cm-1", MatrixState.PUBLISHED),)
+        )
+        told = ev.Acknowledged(
+            id="cm-1", session="s0", state=MatrixState.APPLIED, reason="", frame_seq=5
+        )
+        after, _ = step(state, told, POLICY, START_NS)
+        assert after.reconstructor("cm-1").state is MatrixState.PUBLISHED
+
+    def test_one_repeated_for_a_matrix_since_replaced_does_not_bring_it_back(self):
+        state = TrackerState(
+            system="flao",
+            rtc=rtc(cm_id="cm-2"),
+            in_use="cm-2",
+            reconstructors=(
+                record("cm-1", MatrixState.SUPERSEDED, applied_frame_seq=5),
+                record("cm-2", MatrixState.APPLIED, applied_frame_seq=9),
+            ),
+        )
+        told = ev.Acknowledged(
+            id="cm-1", session="s1", state=MatrixState.APPLIED, reason="", frame_seq=5
+        )
+        after, _ = step(state, told, POLICY, START_NS)
+        assert after.in_use == "cm-2"

@@ -1,0 +1,79 @@
+"""The optical gain of every dithered mode."""
+
+import numpy as np
+import pytest
+
+from service.tracking import events as ev
+from service.tracking.estimate import FIRST_SCATTER, GAIN_RATE, MODES_KEPT, followed_gains
+from service.tracking.state import Mode
+from tests.unit.tracking.situations import SECOND, START_NS, Story, estimate
+
+
+def windows(gains, mode=501, every_s=2.0, sigma=0.001):
+    table = ()
+    for k, gain in enumerate(gains):
+        t_ns = START_NS + round(k * every_s * SECOND)
+        table = followed_gains(table, (mode,), np.array([gain]), np.array([sigma]), t_ns)
+    return table[0]
+
+
+def test_a_first_window_is_worth_a_tenth_whatever_its_own_sigma_says():
+    found = windows([0.6])
+    assert (found.mode, found.gain, found.sigma) == (501, 0.6, FIRST_SCATTER * 0.6)
+
+
+def test_windows_that_scatter_tell_how_precise_one_is_and_their_mean_is_better():
+    rng = np.random.default_rng(4)
+    found = [windows(0.6 + 0.02 * rng.normal(size=100)) for _ in range(20)]
+    assert np.mean([gain.scatter for gain in found]) == pytest.approx(0.02, rel=0.15)
+    errors = np.array([gain.gain - 0.6 for gain in found])
+    sigma = np.mean([gain.sigma for gain in found])
+    assert sigma < 0.02
+    assert np.sqrt(np.mean(errors**2)) < 1.3 * sigma
+
+
+def test_a_gain_that_changes_is_followed():
+    """From 0.6 to 0.5 within five minutes, to two of its own σ."""
+    found = windows([0.6 - 0.1 * k / 150 for k in range(150)])
+    assert abs(found.gain - 0.5) < 2.0 * found.sigma
+    assert found.sigma < 0.02
+
+
+def test_one_mad_window_does_not_move_it_far():
+    found = windows([*[0.6] * 50, 3.0, *[0.6] * 5])
+    assert found.gain == pytest.approx(0.6, abs=0.2)
+
+
+def test_after_a_pause_the_next_window_counts_more():
+    steady = followed_gains((), (7,), np.array([0.6]), None, START_NS)
+    for k in range(1, 30):
+        t_ns = START_NS + k * 2 * SECOND
+        steady = followed_gains(steady, (7,), np.array([0.6]), np.array([0.02]), t_ns)
+    (known,) = steady
+    later = known.t_ns_utc + 600 * SECOND
+    (found,) = followed_gains(steady, (7,), np.array([0.5]), np.array([0.02]), later)
+    walked = (GAIN_RATE * 0.6) ** 2 * 600.0
+    assert walked > 10 * known.scatter**2
+    assert found.gain == pytest.approx(0.5, abs=0.01)
+
+
+def test_modes_that_are_dithered_no_more_are_kept_and_the_oldest_forgotten():
+    table = ()
+    for mode in range(MODES_KEPT + 10):
+        table = followed_gains(table, (mode,), np.array([0.5]), None, START_NS + mode)
+    assert [gain.mode for gain in table] == list(range(10, MODES_KEPT + 10))
+
+
+def test_every_window_brings_those_of_its_lines():
+    story = Story(Mode.HOLD).meet()
+    modes, gains = (501, 519, 537, 555), np.array([0.5, 0.55, 0.6, 0.65]) * np.exp(0.01j)
+    story.see(modes=modes, optical_gain=gains, gain_sigma=np.full(4, 0.01))
+    found = story.state.registration.optical_gains
+    assert [gain.mode for gain in found] == list(modes)
+    np.testing.assert_allclose([gain.gain for gain in found], np.abs(gains))
+
+
+def test_a_window_that_does_not_know_its_modes_brings_none():
+    story = Story(Mode.HOLD).meet()
+    story.tell(ev.WindowFitted(estimate=estimate()))
+    assert story.state.registration.optical_gains == ()

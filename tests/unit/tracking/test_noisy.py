@@ -1,0 +1,236 @@
+"""Noisy interaction matrices: asked for, waited for, given up, stored; never published."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.errors import CommandError, UnknownIdError
+from service.tracking import events as ev
+from service.tracking.loop import DitherKind
+from service.tracking.measuring import FREE_WITHIN_S
+from service.tracking.products import ModeSet, NoisyFinding, NoisyState
+from tests.unit.tracking.situations import ALPHA, POLICY, PRECISE, START_NS, Story, of_kind, rtc
+
+ASK = ev.MeasureNoisy(id="noisy-1", modes=ModeSet.CONTROLLED, total_m=5e-9, duration_s=30.0)
+STILL = replace(POLICY, dither_enabled=False)
+FINDING = NoisyFinding(
+    n_slopes=1384,
+    n_frames=29_994,
+    n_missing=0,
+    snr=1.4,
+    alpha=ALPHA,
+    covariance=PRECISE,
+    optical_gain=0.6,
+    misfit=1.0,
+    cm_id="initial",
+    session="s1",
+    created_ns_utc=START_NS,
+    sha256="0" * 64,
+)
+
+
+@pytest.fixture
+def story():
+    """A loop in which the service does not dither by itself."""
+    return Story(policy=STILL).meet()
+
+
+@pytest.fixture
+def dithering():
+    """A loop in which the service's own dither runs."""
+    story = Story().meet()
+    own = story.state.dither
+    answer = ev.DitherAnswered(id=own.id, accepted=True, reason="", start_seq=500)
+    story.tell(answer)
+    status(story, dither_id=own.id)
+    return story
+
+
+def status(story, **changes):
+    return story.tell(ev.StatusSeen(rtc=rtc(**changes)))
+
+
+def state_of(story, noisy_id="noisy-1"):
+    return story.state.noisy_matrix(noisy_id).state
+
+
+def begun(story):
+    story.tell(ASK)
+    story.tell(ev.DitherAnswered(id="noisy-1", accepted=True, reason="", start_seq=1000))
+    status(story, dither_id="noisy-1", seq=1100)
+    return story
+
+
+def test_random_signs_on_all_controlled_modes_are_asked_for(story):
+    (asked,) = of_kind(story.tell(ASK), ev.AskDither)
+    dither = asked.dither
+    assert (dither.id, dither.kind, dither.modes) == (
+        "noisy-1",
+        DitherKind.BINARY,
+        tuple(range(400)),
+    )
+    assert np.sqrt(np.sum(np.square(dither.amplitude_m))) == pytest.approx(5e-9)
+    assert state_of(story) is NoisyState.ASKED
+    assert story.state.gathering.seed == dither.seed
+
+
+def test_the_services_own_dither_makes_way_and_none_of_its_own_follows(dithering):
+    effects = dithering.tell(ASK)
+    assert of_kind(effects, ev.AskNoDither)
+    assert not of_kind(effects, ev.AskDither)
+    assert state_of(dithering) is NoisyState.WAITING
+    assert not dithering.wait(2.0)
+    (asked,) = of_kind(status(dithering, dither_id=None), ev.AskDither)
+    assert asked.dither.id == "noisy-1"
+
+
+def test_a_dither_that_does_not_make_way_ends_the_wait(dithering):
+    own = dithering.state.dither.id
+    dithering.tell(ASK)
+    status(dithering, dither_id=own)
+    dithering.wait(FREE_WITHIN_S + 2.0)
+    assert state_of(dithering) is NoisyState.FAILED
+    assert "did not end within" in dithering.state.noisy_matrix("noisy-1").reason
+
+
+def test_it_runs_from_when_the_rtc_has_accepted(story):
+    begun(story)
+    assert state_of(story) is NoisyState.RUNNING
+    assert story.state.dither.id == "noisy-1"
+
+
+def test_the_end_of_the_dither_is_the_beginning_of_the_fit(story):
+    begun(story)
+    effects = status(story, dither_id=None, seq=1100 + 31_000)
+    (finish,) = of_kind(effects, ev.FinishNoisy)
+    assert finish.record.id == "noisy-1"
+    assert state_of(story) is NoisyState.FINISHING
+    assert not of_kind(story.wait(3.0), ev.FinishNoisy)
+
+
+def finished(story):
+    begun(story)
+    status(story, dither_id=None, seq=1100 + 31_000)
+    record = replace(story.state.gathering, state=NoisyState.STORED, finding=FINDING)
+    story.tell(ev.NoisyMade(record=record))
+    return story
+
+
+def test_what_is_archived_is_stored_and_the_service_dithers_on(story):
+    finished(story)
+    assert state_of(story) is NoisyState.STORED
+    assert story.state.gathering is None
+    assert "signal / noise of an element 1.40" in story.state.log[-1].text
+
+
+def test_a_session_that_ends_in_the_middle_is_finished_with_what_there_is(story):
+    begun(story)
+    effects = story.tell(ev.SessionStarted(session="s2"))
+    assert of_kind(effects, ev.FinishNoisy)
+
+
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        (
+            ev.DitherAnswered(id="noisy-1", accepted=False, reason="busy: ramp", start_seq=None),
+            "the RTC refused the dither: busy: ramp",
+        ),
+        ("silence", "no answer from the RTC"),
+    ],
+)
+def test_a_dither_that_never_begins_is_a_failure_with_its_reason(story, event, words):
+    (asked,) = of_kind(story.tell(ASK), ev.AskDither)
+    if event == "silence":
+        event = ev.JobFailed(effect=asked, text=words)
+    story.tell(event)
+    assert state_of(story) is NoisyState.FAILED
+    assert story.state.noisy_matrix("noisy-1").reason == words
+
+
+def test_a_fit_that_fails_is_a_failure_with_its_reason(story):
+    begun(story)
+    (finish,) = of_kind(status(story, dither_id=None, seq=1100 + 31_000), ev.FinishNoisy)
+    story.tell(ev.JobFailed(effect=finish, text="no window of its dither was whole"))
+    assert state_of(story) is NoisyState.FAILED
+
+
+def test_one_given_up_ends_its_dither_and_stays_given_up(story):
+    begun(story)
+    effects = story.tell(ev.GiveUpNoisy(id="noisy-1"))
+    assert of_kind(effects, ev.AskNoDither)
+    assert story.state.dither is None
+    record = replace(story.state.noisy[-1], state=NoisyState.STORED, finding=FINDING)
+    story.tell(ev.NoisyMade(record=record))
+    assert state_of(story) is NoisyState.GIVEN_UP
+
+
+def test_one_that_is_over_cannot_be_given_up(story):
+    finished(story)
+    with pytest.raises(CommandError, match="noisy-1 is stored"):
+        story.tell(ev.GiveUpNoisy(id="noisy-1"))
+    with pytest.raises(UnknownIdError, match="noisy-9"):
+        story.tell(ev.GiveUpNoisy(id="noisy-9"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"total_m": 11e-9}, "11 nm RMS in all, budget 8 nm"),
+        ({"modes": (600,)}, "found mode 600"),
+        ({"duration_s": 2.0}, "400 modes need windows of 3.2 s"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(story, changes, words):
+    with pytest.raises(CommandError, match=words):
+        story.tell(replace(ASK, **changes))
+    assert not story.state.noisy
+
+
+def test_more_than_the_budget_must_be_meant(story):
+    story.tell(replace(ASK, total_m=11e-9, over_budget=True))
+    assert story.state.gathering.total_m == pytest.approx(11e-9)
+
+
+def test_one_at_a_time_and_never_the_same_id(story):
+    finished(story)
+    with pytest.raises(CommandError, match="never reused"):
+        story.tell(ASK)
+    story.tell(replace(ASK, id="noisy-2"))
+    with pytest.raises(CommandError, match="noisy-2 is under way"):
+        story.tell(replace(ASK, id="noisy-3"))
+
+
+def test_an_operators_dither_is_not_cut_short(story):
+    story.tell(ev.StartDither(modes=(501,), amplitude_m=5e-9, frequency_hz=(250.0,)))
+    with pytest.raises(CommandError, match="is running; stop it first"):
+        story.tell(ASK)
+
+
+def test_an_open_loop_has_no_noisy_matrix():
+    story = Story(policy=STILL).meet(loop="open")
+    with pytest.raises(CommandError, match="loop closed"):
+        story.tell(ASK)
+
+
+def test_a_dither_left_by_the_service_before_this_one_is_stopped():
+    """Nobody sums it any more, and the service's own cannot begin beside it."""
+    story = Story().meet(dither_id="noisy-0")
+    assert story.asked(ev.AskNoDither)
+    story.effects.clear()
+    status(story, dither_id=None)
+    story.wait(5.0)
+    assert story.asked(ev.AskDither)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [ev.Approve(id="noisy-1"), ev.Publish(id="noisy-1"), ev.Reject(id="noisy-1")],
+)
+def test_no_command_makes_a_reconstructor_of_it(story, command):
+    finished(story).see()
+    with pytest.raises(UnknownIdError, match="noisy-1"):
+        story.tell(command)
+    assert not [e for e in story.asked(ev.SendMatrix) if e.id == "noisy-1"]
+    assert story.state.reconstructor("noisy-1") is None

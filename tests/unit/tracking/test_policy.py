@@ -1,0 +1,272 @@
+from dataclasses import replace
+
+import pytest
+
+from service.errors import ModelError
+from service.tracking import events as ev
+from service.tracking.dither_plan import lock_in_plan, plan_dither
+from service.tracking.products import MatrixState
+from service.tracking.state import Mode
+from tests.unit.tracking.situations import N_MODES, POLICY, START_NS, Story, moved, of_kind, rtc
+
+PARALYSING = [
+    "second-rtc",
+    "basis-mismatch",
+    "instrument-mismatch",
+    "loop-diverging",
+    "edge-slip",
+    "archive-failed",
+]
+
+
+@pytest.fixture
+def story():
+    return Story(Mode.AUTO).meet()
+
+
+OPEN = ({"loop": "open"}, {"loop": "partial", "gains": (0.0,) * N_MODES})
+"""With all gains 0 no mode is in the loop, whatever the RTC calls that."""
+
+
+OPEN = ({"loop": "open"}, {"loop": "partial", "gains": (0.0,) * N_MODES})
+"""With all gains 0 no mode is in the loop, whatever the RTC calls that."""
+
+
+class TestDither:
+    """When it is asked for, and which."""
+
+    @pytest.mark.parametrize("mode", list(Mode))
+    def test_it_is_asked_for_once_the_loop_is_closed_and_its_matrix_known(self, mode):
+        assert len(Story(mode).meet().asked(ev.AskDither)) == 1
+
+    @pytest.mark.parametrize("loop", OPEN)
+    def test_not_while_the_loop_is_not_closed(self, loop):
+        story = Story().meet(**loop)
+        story.wait(10)
+        assert not story.asked(ev.AskDither)
+
+    def test_not_while_the_matrix_is_unknown(self):
+        story = Story()
+        story.tell(ev.SessionStarted(session="s1"))
+        story.tell(ev.StatusSeen(rtc=rtc()))
+        story.wait(10)
+        assert not story.asked(ev.AskDither)
+
+    def test_not_when_the_settings_forbid_it(self):
+        story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
+        story.wait(10)
+        assert not story.asked(ev.AskDither)
+
+    def test_not_again_while_one_runs(self, story):
+        story.wait(30)
+        assert len(story.asked(ev.AskDither)) == 1
+
+    @pytest.mark.parametrize("name", PARALYSING)
+    def test_not_while_an_alarm_forbids_everything(self, name):
+        story = Story()
+        story.tell(ev.Trouble(name=name, text="found"))
+        story.meet()
+        story.tell(ev.Trouble(name=name, text="found"))
+        story.wait(10)
+        assert not story.effects
+        story.tell(ev.Trouble(name=name, text="gone", over=True))
+        assert story.asked(ev.FetchMatrix) or story.asked(ev.AskDither)
+
+    def test_one_left_behind_before_a_restart_is_stopped_first(self):
+        story = Story().meet(dither_id="dither-1")
+        assert story.asked(ev.AskNoDither)
+        assert not story.asked(ev.AskDither)
+        story.tell(ev.StatusSeen(rtc=rtc()), after_s=3)
+        assert story.asked(ev.AskDither)
+
+    def test_its_modes_are_above_those_the_loop_will_control(self):
+        dither = plan_dither(rtc(), POLICY, START_NS)
+        assert len(dither.modes) == len(set(dither.modes)) == 4
+        assert all(500 <= mode < N_MODES for mode in dither.modes)
+
+    def test_with_every_mode_controlled_it_takes_the_highest(self):
+        dither = plan_dither(rtc(N_MODES), POLICY, START_NS)
+        assert dither.modes == (590, 591, 592, 593)
+
+    def test_its_lines_lie_above_a_fifth_of_the_frame_rate_and_fit_a_window(self):
+        dither = plan_dither(rtc(), POLICY, START_NS)
+        assert all(200.0 < line < 350.0 for line in dither.frequency_hz)
+        assert all((line * POLICY.window_s).is_integer() for line in dither.frequency_hz)
+        sums = {a + b for a in dither.frequency_hz for b in dither.frequency_hz}
+        differences = {abs(a - b) for a in dither.frequency_hz for b in dither.frequency_hz}
+        assert not (sums | differences) & set(dither.frequency_hz)
+
+    def test_it_respects_the_limits_of_the_rtc(self):
+        dither = plan_dither(rtc(max_dither_m=1e-9, max_dither_modes=2), POLICY, START_NS)
+        assert dither.amplitude_m == (1e-9, 1e-9)
+        assert len(dither.modes) == len(dither.frequency_hz) == 2
+
+    def test_settings_overrule_the_services_choice_and_a_request_overrules_both(self):
+        policy = replace(POLICY, dither_modes=(7, 9), dither_frequencies_hz=(210.0, 260.0))
+        chosen = plan_dither(rtc(), policy, START_NS)
+        assert (chosen.modes, chosen.frequency_hz) == ((7, 9), (210.0, 260.0))
+        asked = plan_dither(
+            rtc(), policy, START_NS, modes=(3,), frequency_hz=(300.0,), amplitude_m=2e-9
+        )
+        assert (asked.modes, asked.frequency_hz, asked.amplitude_m) == ((3,), (300.0,), (2e-9,))
+
+    def test_the_first_window_waits_until_the_loop_has_settled(self):
+        dither = replace(plan_dither(rtc(), POLICY, START_NS), start_seq=1000)
+        plan = lock_in_plan(dither, rtc(), 2.0)
+        assert (plan.first_seq, plan.n_frames) == (1300, 2000)
+
+    def test_lines_of_a_slow_loop_have_no_room_for_their_side_bins(self):
+        slow = rtc(frame_rate_hz=60.0)
+        with pytest.raises(ModelError, match="room for the side bins"):
+            lock_in_plan(plan_dither(slow, POLICY, START_NS), slow, 2.0)
+
+
+class TestMargin:
+    """When the matrix in use is judged."""
+
+    def test_after_two_windows_and_then_every_fifteen_seconds(self):
+        story = Story(Mode.HOLD).meet()
+        assert not of_kind(story.see(), ev.JudgeMatrix)
+        assert of_kind(story.see(), ev.JudgeMatrix) == [ev.JudgeMatrix(id="initial")]
+        assert not of_kind(story.wait(15), ev.JudgeMatrix)
+        assert of_kind(story.wait(1), ev.JudgeMatrix)
+
+    def test_not_while_a_reconstructor_is_being_computed(self):
+        story = Story(Mode.HOLD).meet()
+        story.see(n_windows=2)
+        story.tell(ev.Refit())
+        assert not of_kind(story.wait(30), ev.JudgeMatrix)
+
+
+class TestUpdate:
+    """When a reconstructor is made without being asked for."""
+
+    def test_two_windows_must_agree_first(self, story):
+        assert not of_kind(story.see(), ev.MakeMatrix)
+        (made,) = of_kind(story.see(), ev.MakeMatrix)
+        assert made.n_modes == 400
+        assert "not made for a known registration" in made.why
+
+    def test_a_jump_starts_the_counting_again(self, story):
+        story.see()
+        assert not of_kind(story.see(moved(shift_x_subap=0.2)), ev.MakeMatrix)
+        assert of_kind(story.see(moved(shift_x_subap=0.2)), ev.MakeMatrix)
+
+    def test_only_one_is_made_at_a_time(self, story):
+        story.see(n_windows=10)
+        assert len(story.asked(ev.MakeMatrix)) == 1
+
+    def test_first_as_many_modes_as_now_then_the_target(self, story):
+        story.see(n_windows=2)
+        story.use("cm-1", 400)
+        assert not of_kind(story.wait(4), ev.MakeMatrix)
+        (more,) = of_kind(story.wait(2), ev.MakeMatrix)
+        assert more.n_modes == 500
+        assert "400 of 500" in more.why
+        story.use("cm-2", 500)
+        assert not of_kind(story.wait(120), ev.MakeMatrix)
+
+    def test_the_target_is_no_more_than_the_basis_has(self):
+        story = Story(policy=replace(POLICY, n_modes_target=1000)).meet()
+        story.see(n_windows=2)
+        story.use("cm-1")
+        assert of_kind(story.wait(10), ev.MakeMatrix)[0].n_modes == N_MODES
+
+    def settled(self):
+        story = Story(policy=replace(POLICY, n_modes_target=400)).meet()
+        story.see(n_windows=2)
+        story.use("cm-1")
+        story.wait(10)
+        return story
+
+    def test_noise_makes_no_new_reconstructor(self):
+        story = self.settled()
+        assert not of_kind(story.see(moved(shift_x_subap=0.005), n_windows=5), ev.MakeMatrix)
+
+    @pytest.mark.parametrize(
+        "by", [{"shift_x_subap": 0.03}, {"rotation_rad": 2e-3}, {"magnification": 0.003}]
+    )
+    def test_a_move_beyond_its_threshold_does(self, by):
+        story = self.settled()
+        (made,) = of_kind(story.see(moved(**by), n_windows=6), ev.MakeMatrix)
+        assert made.why.startswith("moved by")
+
+    @pytest.mark.parametrize("loop", OPEN)
+    def test_nothing_is_made_while_the_loop_is_not_closed(self, loop):
+        story = Story().meet()
+        story.tell(ev.StatusSeen(rtc=rtc(**loop)))
+        assert not of_kind(story.see(n_windows=5), ev.MakeMatrix)
+
+    @pytest.mark.parametrize("name", PARALYSING)
+    def test_nothing_is_made_while_an_alarm_forbids_it(self, story, name):
+        story.see()
+        story.tell(ev.Trouble(name=name, text="found"))
+        assert not story.see(n_windows=3)
+
+    def test_in_hold_nothing_is_made_by_itself(self):
+        story = Story(Mode.HOLD).meet()
+        story.see(n_windows=20)
+        assert not story.asked(ev.MakeMatrix)
+
+    @pytest.mark.parametrize(
+        "outcome", [MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED]
+    )
+    def test_after_a_failure_it_waits_half_a_minute(self, story, outcome):
+        story.see(n_windows=2)
+        if outcome is MatrixState.REFUSED:
+            story.make("cm-1", outcome)
+        else:
+            story.make("cm-1")
+            story.acknowledge("cm-1", outcome, "no")
+        assert not of_kind(story.wait(29), ev.MakeMatrix)
+        assert of_kind(story.wait(1), ev.MakeMatrix)
+
+    def test_an_operators_no_counts_for_half_a_minute_too(self):
+        story = Story(Mode.PROPOSE).meet()
+        story.see(n_windows=2)
+        story.make("cm-1")
+        story.tell(ev.Reject(id="cm-1"))
+        assert not of_kind(story.wait(29), ev.MakeMatrix)
+        assert of_kind(story.wait(1), ev.MakeMatrix)
+
+    def test_a_job_that_failed_is_not_asked_for_again_at_once(self, story):
+        (effect,) = of_kind(story.see(n_windows=2), ev.MakeMatrix)
+        assert not of_kind(story.tell(ev.JobFailed(effect=effect, text="died")), ev.MakeMatrix)
+        assert not of_kind(story.wait(4), ev.MakeMatrix)
+        assert of_kind(story.wait(1), ev.MakeMatrix)
+
+
+class TestProposals:
+    """A proposal waits, but not for ever and not in the way."""
+
+    def proposed(self):
+        story = Story(Mode.PROPOSE).meet()
+        story.see(n_windows=2)
+        story.make("cm-1")
+        return story
+
+    def test_while_it_fits_nothing_else_is_made(self):
+        story = self.proposed()
+        assert not of_kind(story.see(n_windows=50), ev.MakeMatrix)
+
+    def test_when_the_mirror_has_moved_another_is_made_and_replaces_it(self):
+        story = self.proposed()
+        assert of_kind(story.see(moved(shift_x_subap=0.1), n_windows=4), ev.MakeMatrix)
+        story.make("cm-2")
+        assert story.matrix_state("cm-1") is MatrixState.DISCARDED
+        assert not story.asked(ev.SendMatrix)
+
+    def test_in_auto_a_proposal_left_behind_stops_nothing(self):
+        story = self.proposed()
+        story.wait(10)
+        assert of_kind(story.tell(ev.SetMode(mode=Mode.AUTO)), ev.MakeMatrix)
+
+    def test_a_matrix_made_while_the_rtc_was_away_does_not_stop_the_next(self):
+        story = Story(Mode.AUTO).meet()
+        story.see(n_windows=2)
+        story.tell(ev.RtcVanished())
+        story.make("cm-1")
+        assert not story.asked(ev.SendMatrix)
+        story.wait(10)
+        story.meet(session="s2")
+        assert of_kind(story.see(n_windows=2), ev.MakeMatrix)

@@ -1,0 +1,114 @@
+"""A night goes on after a restart of the service."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.tracking import events as ev
+from service.tracking.registration import Validity
+from service.tracking.resume import resumed, saved_of
+from service.tracking.state import Level, Mode, TrackerState
+from tests.unit.tracking.situations import (
+    ALPHA,
+    POLICY,
+    PRECISE,
+    SECOND,
+    START_NS,
+    Story,
+    moved,
+    of_kind,
+)
+
+
+@pytest.fixture
+def before():
+    story = Story(Mode.AUTO).meet()
+    story.see(n_windows=5)
+    return story
+
+
+def restarted(before, away_s, **changes):
+    """The service this much later, with nothing but what the one before has saved."""
+    saved = saved_of(before.state, before.now_ns)
+    now_ns = before.now_ns + round(away_s * SECOND)
+    fresh = TrackerState(**({"system": "flao", "mode": Mode.AUTO} | changes))
+    again = Story(state=resumed(fresh, saved, POLICY, now_ns))
+    again.now_ns = now_ns
+    return again
+
+
+def test_nothing_is_saved_while_nothing_is_known():
+    assert saved_of(TrackerState(system="flao"), START_NS) is None
+
+
+def test_alpha_is_known_at_once_with_its_sigma_grown_by_the_time_away(before):
+    again = restarted(before, 100.0)
+    known = again.state.registration
+    assert known.alpha == before.state.registration.alpha
+    walked = POLICY.drift_rate**2 * 100.0
+    expected = np.sqrt(np.diag(before.state.registration.covariance) + walked + POLICY.floor**2)
+    np.testing.assert_allclose(known.sigma, expected)
+    assert known.restored_ns_utc == again.now_ns
+    assert again.state.log[0].text == "α of 100 s ago; initial was in use then"
+    assert again.state.dither_due_since_ns_utc == again.now_ns
+
+
+def test_nothing_is_made_from_it_until_windows_confirm_it(before):
+    again = restarted(before, 5.0)
+    assert again.state.registration.standing.validity is Validity.STALE
+    again.meet()
+    assert not of_kind(again.wait(20), ev.MakeMatrix)
+    assert not of_kind(again.see(), ev.MakeMatrix)
+    assert of_kind(again.see(), ev.MakeMatrix)
+
+
+def test_a_window_is_weighed_against_the_time_away(before):
+    """An hour: what was known counts for nothing beside a window."""
+    again = restarted(before, 3600.0).meet()
+    again.see(moved(shift_x_subap=0.05))
+    known = again.state.registration
+    assert known.alpha.shift_x_subap == pytest.approx(ALPHA.shift_x_subap + 0.05, abs=2e-4)
+    assert known.covariance[0, 0] == pytest.approx(PRECISE[0, 0], rel=0.01)
+
+
+def test_a_window_that_disagrees_is_a_suspected_jump_as_ever(before):
+    again = restarted(before, 5.0).meet()
+    again.see(moved(shift_x_subap=0.2))
+    assert "jump-suspected" in again.alarms
+
+
+def test_a_doubt_survives_but_the_window_that_raised_it_does_not(before):
+    before.see(moved(shift_x_subap=0.2))
+    again = restarted(before, 5.0)
+    assert again.state.registration.candidate is None
+    assert again.state.registration.standing.validity is Validity.INVALID
+    again.meet()
+    again.see()
+    assert again.state.registration.usable
+
+
+@pytest.mark.parametrize(
+    ("changes", "away_s", "reason"),
+    [
+        ({"system": "other"}, 5.0, "of system flao, this is other"),
+        ({"basis_id": "kl-300"}, 5.0, "of basis kl-594, the instrument file has kl-300"),
+        ({"config_id": "binned"}, 5.0, "of configuration pyramid-30"),
+        ({}, -3600.0, "3600 s in the future"),
+    ],
+)
+def test_what_does_not_fit_is_left_and_said(before, changes, away_s, reason):
+    again = restarted(before, away_s, **changes)
+    assert again.state.registration is None
+    (entry,) = again.state.log
+    assert entry.level is Level.WARNING
+    assert reason in entry.text
+
+
+def test_what_does_not_fit_the_rtc_that_comes_is_dropped(before):
+    known = replace(before.state.registration, basis_id="kl-300")
+    before.state = replace(before.state, registration=known)
+    again = restarted(before, 5.0)
+    assert again.state.registration is not None
+    again.meet()
+    assert again.state.registration is None

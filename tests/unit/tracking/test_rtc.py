@@ -1,0 +1,290 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.errors import CommandError
+from service.tracking import events as ev
+from service.tracking.products import MatrixState
+from service.tracking.state import Level, Mode
+from tests.unit.tracking.situations import POLICY, Story, estimate, of_kind, rtc
+
+
+@pytest.fixture
+def story():
+    """An RTC whose matrix is known, α from two windows, and nothing done by itself."""
+    story = Story(Mode.HOLD).meet()
+    story.see(n_windows=2)
+    return story
+
+
+def test_the_first_basis_seen_is_adopted_and_a_pinned_one_stays():
+    assert Story().meet().state.basis_id == "kl-594"
+    pinned = Story()
+    pinned.state = replace(pinned.state, basis_id="pinned")
+    assert pinned.meet().state.basis_id == "pinned"
+
+
+def test_a_matrix_nobody_knows_is_fetched_and_asked_for_again_only_after_three_seconds():
+    story = Story()
+    story.tell(ev.SessionStarted(session="s1"))
+    assert story.tell(ev.StatusSeen(rtc=rtc())) == (ev.FetchMatrix(id="initial"),)
+    assert not of_kind(story.wait(2), ev.FetchMatrix)
+    assert of_kind(story.wait(1), ev.FetchMatrix)
+
+
+def test_a_matrix_fetched_twice_is_on_the_shelf_once(story):
+    fetched = story.state.reconstructor("initial")
+    story.tell(ev.MatrixFetched(record=fetched))
+    assert [record.id for record in story.state.reconstructors] == ["initial"]
+
+
+def test_a_service_that_is_not_the_first_stands_by_until_the_first_has_gone(story):
+    story.tell(ev.ServicesMet(drives=False, others=("abc",)))
+    assert {"second-service", "standing-by"} <= story.alarms
+    story.effects.clear()
+    story.tell(ev.StatusSeen(rtc=rtc()))
+    story.see(n_windows=3)
+    story.wait(120.0)
+    assert not story.effects
+    for command in (ev.Refit(), ev.Rollback(), ev.StopDither(), ev.SetLoop(closed=False)):
+        with pytest.raises(CommandError, match="another service drives the RTC"):
+            story.tell(command)
+    story.tell(ev.ServicesMet(drives=True, others=()))
+    assert not {"second-service", "standing-by"} & story.alarms
+    assert "service.takes-over" in story.logged
+    story.wait(10.0)
+    assert story.asked(ev.AskDither)
+
+
+def test_the_first_of_two_services_drives_on_and_says_so(story):
+    story.tell(ev.ServicesMet(drives=True, others=("abc",)))
+    assert "second-service" in story.alarms
+    assert "standing-by" not in story.alarms
+    assert story.tell(ev.StopDither()) == (ev.AskNoDither(),)
+
+
+def test_an_open_loop_is_an_alarm_until_it_is_closed(story):
+    story.tell(ev.StatusSeen(rtc=rtc(loop="open")))
+    assert "loop-open" in story.alarms
+    story.tell(ev.StatusSeen(rtc=rtc()))
+    assert "loop-open" not in story.alarms
+
+
+def test_a_status_tells_which_matrix_is_in_use_even_when_its_acknowledgement_was_lost(story):
+    story.make("cm-1", wanted=True)
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    assert story.state.in_use == "cm-1"
+    assert story.matrix_state("cm-1") is MatrixState.APPLIED
+    assert story.matrix_state("initial") is MatrixState.SUPERSEDED
+
+
+def test_a_status_that_shows_a_reconstructor_in_use_ends_the_alarm_that_it_was_not_applied(story):
+    story.make("cm-1", wanted=True)
+    story.wait(5)
+    assert story.matrix_state("cm-1") is MatrixState.FAILED
+    assert "no-acknowledgement" in story.alarms
+    story.tell(ev.StatusSeen(rtc=rtc()))
+    assert "no-acknowledgement" in story.alarms
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    assert story.matrix_state("cm-1") is MatrixState.APPLIED
+    assert "no-acknowledgement" not in story.alarms
+    assert "in use after all" in story.state.reconstructor("cm-1").reason
+    assert story.logged[-1] == "reconstructor.applied"
+
+
+def test_so_does_one_that_shows_the_next_in_use(story):
+    story.make("cm-1", wanted=True)
+    story.wait(5)
+    story.make("cm-2", wanted=True)
+    assert "no-acknowledgement" in story.alarms
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-2")))
+    assert "no-acknowledgement" not in story.alarms
+    assert story.matrix_state("cm-1") is MatrixState.FAILED
+
+
+def test_but_not_one_that_shows_an_old_one(story):
+    story.use("cm-0")
+    story.make("cm-1", wanted=True)
+    story.wait(5)
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="initial")))
+    assert "no-acknowledgement" in story.alarms
+
+
+def test_a_vanished_rtc_is_an_alarm_that_ends_with_its_next_status(story):
+    story.tell(ev.RtcVanished())
+    assert story.state.rtc is None
+    assert "rtc-vanished" in story.alarms
+    story.meet(session="s2")
+    assert "rtc-vanished" not in story.alarms
+
+
+@pytest.mark.parametrize("event", [ev.RtcVanished(), ev.SessionStarted(session="s2")])
+def test_nothing_known_is_lost_with_the_rtc(story, event):
+    story.use("cm-1")
+    before = story.state
+    story.tell(event)
+    assert story.state.registration.alpha == before.registration.alpha
+    np.testing.assert_array_equal(
+        story.state.registration.covariance, before.registration.covariance
+    )
+    assert story.state.reconstructors == before.reconstructors
+    assert story.state.history == before.history
+
+
+def test_a_restarted_rtc_has_to_confirm_the_registration(story):
+    story.tell(ev.SessionStarted(session="s2"))
+    assert story.state.registration.n_windows == 0
+    assert (story.state.in_use, story.state.margin, story.state.dither) == (None, None, None)
+
+
+def test_a_restarted_rtc_has_lost_what_was_sent_to_it(story):
+    story.make("cm-1", wanted=True)
+    story.make("cm-2", wanted=True)
+    story.acknowledge("cm-2", MatrixState.STAGED)
+    story.tell(ev.SessionStarted(session="s2"))
+    assert story.matrix_state("cm-1") is MatrixState.FAILED
+    assert story.matrix_state("cm-2") is MatrixState.FAILED
+    assert story.state.reconstructor("cm-1").reason == "the RTC restarted"
+
+
+def test_a_window_of_the_session_before_is_not_used(story):
+    story.tell(ev.SessionStarted(session="s2"))
+    story.tell(ev.StatusSeen(rtc=rtc(session="s2")))
+    story.tell(ev.WindowFitted(estimate=estimate(session="s1")))
+    assert story.state.registration.n_windows == 0
+
+
+def test_a_missing_acknowledgement_fails_the_reconstructor_after_three_seconds(story):
+    story.make("cm-1", wanted=True)
+    story.tell(ev.Tick(), after_s=3.0)
+    assert story.matrix_state("cm-1") is MatrixState.PUBLISHED
+    story.tell(ev.Tick(), after_s=0.1)
+    assert story.matrix_state("cm-1") is MatrixState.FAILED
+    assert "no-acknowledgement" in story.alarms
+
+
+def test_a_staged_reconstructor_that_is_never_applied_fails_too(story):
+    story.make("cm-1", wanted=True)
+    story.acknowledge("cm-1", MatrixState.STAGED)
+    story.wait(4)
+    assert story.matrix_state("cm-1") is MatrixState.FAILED
+
+
+def test_a_computation_that_never_ends_is_given_up_after_a_minute(story):
+    story.tell(ev.Refit())
+    story.wait(60)
+    assert story.state.making_since_ns_utc is not None
+    story.wait(1)
+    assert story.state.making_since_ns_utc is None
+    assert "reconstructor.lost" in story.logged
+    story.tell(ev.Refit())
+
+
+@pytest.mark.parametrize("name", ["second-rtc", "basis-mismatch"])
+def test_an_alarm_the_link_repeats_is_over_after_fifteen_silent_seconds(story, name):
+    story.tell(ev.Trouble(name=name, text="found"))
+    story.wait(10)
+    story.tell(ev.Trouble(name=name, text="found again"))
+    story.wait(15)
+    assert name in story.alarms
+    story.wait(1)
+    assert name not in story.alarms
+
+
+def test_other_alarms_last_until_they_are_taken_back(story):
+    story.tell(ev.Trouble(name="instrument-mismatch", text="found"))
+    story.wait(60, every_s=10)
+    assert "instrument-mismatch" in story.alarms
+    story.tell(ev.Trouble(name="instrument-mismatch", text="fits", over=True))
+    assert "instrument-mismatch" not in story.alarms
+
+
+def test_something_noted_changes_only_the_log(story):
+    before = story.state
+    story.tell(ev.Noted(name="x", text="y", level=Level.WARNING))
+    assert story.state.log[-1].text == "y"
+    assert replace(story.state, log=()).alarms == replace(before, log=()).alarms
+    assert story.state.registration is before.registration
+
+
+class TestDither:
+    """The dither's life as the RTC tells it."""
+
+    @pytest.fixture
+    def story(self):
+        return Story(Mode.HOLD).meet()
+
+    def answer(self, story, *, accepted=True, reason="", dither_id=None):
+        return story.tell(
+            ev.DitherAnswered(
+                id=dither_id or story.state.dither.id,
+                accepted=accepted,
+                reason=reason,
+                start_seq=777 if accepted else None,
+            )
+        )
+
+    def test_an_accepted_dither_has_a_first_frame(self, story):
+        self.answer(story)
+        assert story.state.dither.start_seq == 777
+
+    def test_a_refused_dither_is_an_alarm_and_is_asked_for_again_after_ten_seconds(self, story):
+        self.answer(story, accepted=False, reason="busy: measuring")
+        assert story.state.dither is None
+        assert "busy: measuring" in story.state.alarms[0].text
+        assert not of_kind(story.wait(9), ev.AskDither)
+        assert of_kind(story.wait(1), ev.AskDither)
+        self.answer(story)
+        assert not story.alarms
+
+    def test_an_answer_to_another_dither_is_not_mistaken_for_it(self, story):
+        self.answer(story, dither_id="dither-0")
+        assert story.state.dither.start_seq is None
+
+    def test_a_dither_that_ended_is_replaced_by_the_next(self, story):
+        self.answer(story)
+        first = story.state.dither.id
+        story.tell(ev.StatusSeen(rtc=rtc(dither_id=first)), after_s=5)
+        assert story.state.dither.id == first
+        story.tell(ev.StatusSeen(rtc=rtc()), after_s=POLICY.dither_duration_s - 5)
+        assert "dither.ended" in story.logged
+        assert not story.alarms
+        assert story.state.dither.id != first
+
+    def test_a_status_older_than_the_dither_does_not_end_it(self, story):
+        self.answer(story)
+        story.tell(ev.StatusSeen(rtc=rtc()), after_s=2)
+        assert story.state.dither is not None
+        assert "dither.ended" not in story.logged
+
+
+class TestFailures:
+    """A job that failed is forgotten, so that it can be asked again."""
+
+    def test_a_matrix_that_could_not_be_made_is_asked_for_again(self):
+        story = Story().meet()
+        (effect,) = of_kind(story.see(n_windows=2), ev.MakeMatrix)
+        story.tell(ev.JobFailed(effect=effect, text="the worker process died"))
+        assert story.state.making_since_ns_utc is None
+        assert of_kind(story.wait(6), ev.MakeMatrix)
+        assert story.state.log[-1].level is Level.WARNING
+
+    def test_a_matrix_that_could_not_be_sent_has_failed(self, story):
+        (effect,) = story.make("cm-1", wanted=True)
+        story.tell(ev.JobFailed(effect=effect, text="the link is not open"))
+        assert story.matrix_state("cm-1") is MatrixState.FAILED
+        assert story.state.reconstructor("cm-1").reason == "the link is not open"
+
+    def test_a_dither_the_rtc_did_not_answer_is_asked_for_after_five_seconds(self, story):
+        effect = ev.AskDither(dither=story.state.dither)
+        story.tell(ev.JobFailed(effect=effect, text="no answer"))
+        assert story.state.dither is None
+        assert not of_kind(story.wait(4), ev.AskDither)
+        assert of_kind(story.wait(1), ev.AskDither)
+
+    def test_a_margin_that_could_not_be_judged_leaves_the_state_as_it_was(self, story):
+        before = story.state
+        story.tell(ev.JobFailed(effect=ev.JudgeMatrix(id="initial"), text="died"))
+        assert story.state.reconstructors == before.reconstructors
+        assert story.state.log[-1].name == "job.failed"

@@ -1,0 +1,114 @@
+"""What is taken for a jump, and what for a mirror that drifts as it always has."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.model.misregistration import Misregistration
+from service.telemetry.passive import PassiveEstimate
+from service.tracking import events as ev
+from service.tracking.state import Mode
+from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, estimate, rtc
+
+PER_MINUTE = np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005])
+NIGHT = replace(
+    POLICY,
+    drift_rate=PER_MINUTE / np.sqrt(60.0),
+    floor=np.array([0.005, 0.005, np.deg2rad(0.02), 0.001]),
+)
+WINDOW = np.array([0.0057, 0.0057, np.deg2rad(0.014), 0.0006])
+"""1 σ of 2.5 s at magnitude 10 on the diffractive telescope."""
+
+LOOK = np.array([0.01, 0.01, np.deg2rad(0.01), 0.0003])
+BIAS = np.array([0.06, -0.04, 0.0, 0.0])
+WINDOW_S, LOOK_S = 2.5, 4.0
+FLAGS = ("registration.jump-suspected", "registration.jump", "registration.passive-jump")
+
+
+class Sky:
+    """A mirror that drifts and jumps, windows and looks that average over their own time."""
+
+    def __init__(self, seed, *, jump=None, at_s=np.inf):
+        self.rng = np.random.default_rng(seed)
+        self.jump, self.at_s = np.zeros(4) if jump is None else jump, at_s
+        self.story = Story(Mode.HOLD, NIGHT).meet()
+        self.begin_ns = self.story.now_ns
+
+    def mean(self, end_s, over_s):
+        """Where the mirror was on average; it drifts by as much as it may."""
+        after = np.clip((end_s - self.at_s) / over_s, 0.0, 1.0)
+        return ALPHA.vector + PER_MINUTE / 60.0 * (end_s - over_s / 2) + after * self.jump
+
+    def window(self, end_s):
+        self.story.now_ns = self.begin_ns + round(end_s * SECOND)
+        read = self.mean(end_s, WINDOW_S) + WINDOW * self.rng.normal(size=4)
+        found = estimate(
+            Misregistration.from_vector(read),
+            t_ns=self.story.now_ns,
+            covariance=np.diag(WINDOW**2),
+        )
+        self.story.tell(ev.WindowFitted(estimate=found))
+
+    def look(self, end_s):
+        self.story.now_ns = self.begin_ns + round(end_s * SECOND)
+        read = self.mean(end_s, LOOK_S) + BIAS + LOOK * self.rng.normal(size=4)
+        found = PassiveEstimate(
+            alpha=Misregistration.from_vector(read),
+            covariance=np.diag(LOOK**2),
+            optical_gain=np.full(400, 0.6),
+            misfit=1.0,
+            step=np.zeros(4),
+        )
+        self.story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=self.story.now_ns)))
+        self.story.tell(ev.Watched(estimate=found, t_ns_utc=self.story.now_ns))
+
+    def flagged_s(self):
+        times = [
+            (e.t_ns_utc - self.begin_ns) / SECOND for e in self.story.state.log if e.name in FLAGS
+        ]
+        return times[0] - self.at_s if times else np.inf
+
+
+def test_a_drift_of_five_percent_a_minute_is_no_jump_however_it_is_watched():
+    """25 minutes of windows, then an hour and a half of looks with a window every half minute."""
+    busy, sparse = Sky(1), Sky(2)
+    for k in range(1, 601):
+        busy.window(k * WINDOW_S)
+    for k in range(1, 1351):
+        sparse.look(k * LOOK_S)
+        if k % 7 == 1:
+            sparse.window(k * LOOK_S + 0.5)
+    assert busy.flagged_s() == sparse.flagged_s() == np.inf
+
+
+@pytest.mark.parametrize(
+    "jump", [np.array([0.1, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, np.deg2rad(0.1), 0.0])]
+)
+def test_a_jump_is_flagged_by_windows_within_seconds_wherever_it_falls(jump):
+    """10 % of a subaperture or 0.1 deg: three windows at most, half of the time two."""
+    found = []
+    for seed in range(12):
+        at_s = 40.0 + WINDOW_S * seed / 12
+        sky = Sky(seed, jump=jump, at_s=at_s)
+        for k in range(1, 21):
+            sky.window(k * WINDOW_S)
+        found.append(sky.flagged_s())
+    assert min(found) > 0.0
+    assert np.median(found) <= 2 * WINDOW_S
+    assert max(found) <= 3 * WINDOW_S
+
+
+def test_a_jump_between_windows_is_flagged_by_the_looks():
+    """10 %, the bias learnt from windows before: two looks at most, half of the time within 5 s."""
+    found = []
+    for seed in range(12):
+        sky = Sky(seed, jump=np.array([0.1, 0.0, 0.0, 0.0]), at_s=100.0 + LOOK_S * seed / 12)
+        for k in range(1, 31):
+            sky.look(k * LOOK_S)
+            if k < 24:
+                sky.window(k * LOOK_S + 0.5)
+        found.append(sky.flagged_s())
+    assert min(found) > 0.0
+    assert np.median(found) <= 5.0
+    assert max(found) <= 2 * LOOK_S

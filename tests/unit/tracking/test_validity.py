@@ -1,0 +1,211 @@
+"""What α is worth as time passes and the telescope moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.tracking import events as ev
+from service.tracking.loop import Pointing
+from service.tracking.products import MatrixState
+from service.tracking.registration import Validity
+from service.tracking.state import Mode, TrackerState
+from tests.unit.tracking.situations import (
+    POLICY,
+    PRECISE,
+    SECOND,
+    Story,
+    moved,
+    of_kind,
+    rtc,
+    verdict,
+)
+
+BENDING = replace(
+    POLICY, flexure_per_degree=np.array([0.02, 0.02, 2e-4, 1e-4]), dither_enabled=False
+)
+HERE = Pointing(elevation_deg=60.0, azimuth_deg=100.0)
+
+
+@pytest.fixture
+def story():
+    story = Story(Mode.AUTO, BENDING).meet()
+    point(story, HERE)
+    story.see(n_windows=3)
+    return story
+
+
+def point(story, pointing):
+    return story.tell(ev.SetPointing(pointing=pointing))
+
+
+def worth(story):
+    return story.state.registration.standing.validity
+
+
+class TestTime:
+    """σ grows while nothing is measured."""
+
+    def test_it_grows_with_the_square_root_of_time(self, story):
+        before = story.state.registration
+        story.wait(30)
+        after = story.state.registration
+        expected = np.sqrt(before.sigma**2 + 30.0 * POLICY.drift_rate**2)
+        np.testing.assert_allclose(after.sigma, expected)
+        np.testing.assert_array_equal(after.covariance, before.covariance)
+
+    def test_the_rtcs_clock_counts_while_it_tells_the_time(self, story):
+        """A simulated RTC that needs 30 s for one second of its own."""
+        before = story.state.registration
+        story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=before.t_ns_utc + SECOND)))
+        story.wait(30)
+        expected = np.sqrt(before.sigma**2 + 1.0 * POLICY.drift_rate**2)
+        np.testing.assert_allclose(story.state.registration.sigma, expected)
+
+    def test_it_is_fresh_then_ageing_then_stale_then_invalid(self, story):
+        """Shifts: half of 5 % after (0.025/0.006)² = 17 s, 5 % after 69 s, 10 % after 278 s."""
+        seen = {}
+        for second in range(300):
+            seen.setdefault(worth(story), second)
+            story.wait(1)
+        assert list(seen) == list(Validity)
+        assert seen[Validity.AGEING] == pytest.approx(17, abs=2)
+        assert seen[Validity.STALE] == pytest.approx(69, abs=2)
+        assert seen[Validity.INVALID] == pytest.approx(278, abs=3)
+
+    def test_until_when_it_is_valid_is_told_beforehand(self, story):
+        until_ns = story.state.registration.standing.until_ns_utc
+        story.wait((until_ns - story.now_ns) / SECOND - 1)
+        assert worth(story) is Validity.AGEING
+        assert story.state.registration.standing.until_ns_utc == pytest.approx(until_ns, abs=1e6)
+        story.wait(3)
+        assert worth(story) is Validity.STALE
+        assert story.state.registration.standing.until_ns_utc is None
+
+    def test_what_never_drifts_never_goes_stale(self):
+        story = Story(Mode.AUTO, replace(POLICY, drift_rate=np.zeros(4))).meet()
+        story.see(n_windows=2)
+        story.wait(300)
+        assert worth(story) is Validity.FRESH
+        assert story.state.registration.standing.until_ns_utc is None
+
+    def test_stale_is_an_alarm_with_the_parameter_and_a_dither_is_due(self, story):
+        story.wait(80)
+        alarm = next(a for a in story.state.alarms if a.name == "estimate-stale")
+        assert "shift_x_subap has grown beyond 0.05" in alarm.text
+        assert story.state.dither_due_since_ns_utc is not None
+        story.see()
+        assert not story.alarms
+        assert story.state.dither_due_since_ns_utc is None
+
+    def test_an_alarm_that_lasts_says_the_same_all_the_time(self, story):
+        story.wait(80)
+        texts = set()
+        for _ in range(20):
+            story.wait(1)
+            texts |= {a.text for a in story.state.alarms}
+        assert len(texts) == 1
+
+    def test_an_open_loop_needs_no_alpha(self, story):
+        story.tell(ev.StatusSeen(rtc=rtc(loop="open")))
+        story.wait(80)
+        assert worth(story) is Validity.STALE
+        assert "estimate-stale" not in story.alarms
+
+    def test_a_margin_that_only_a_grown_sigma_takes_away_is_an_alarm_of_its_age(self, story):
+        edge = verdict(accepted=False, radius=0.7)
+        story.tell(ev.MarginJudged(id="initial", verdict=edge))
+        story.wait(10)
+        assert "estimate-stale" not in story.alarms
+        story.see()
+        short = verdict(accepted=False, radius=0.97)
+        story.tell(ev.MarginJudged(id="initial", verdict=short))
+        story.wait(0.2, every_s=0.2)
+        assert "estimate-stale" not in story.alarms
+        story.wait(5)
+        assert "stability gate" in next(
+            a.text for a in story.state.alarms if a.name == "estimate-stale"
+        )
+
+    def test_what_is_judged_is_judged_with_the_sigma_of_now(self, story):
+        story.wait(40)
+        total = story.state.registration.total_covariance
+        grown = PRECISE[0, 0] / 3 + 40 * POLICY.drift_rate[0] ** 2
+        assert total[0, 0] > grown
+
+
+class TestPointing:
+    """A telescope that moves bends."""
+
+    def test_a_change_of_elevation_adds_flexure_and_one_of_azimuth_none(self, story):
+        before = story.state.registration.sigma
+        point(story, replace(HERE, azimuth_deg=102.0))
+        story.wait(1)
+        turned = story.state.registration.sigma
+        np.testing.assert_allclose(turned, np.sqrt(before**2 + POLICY.drift_rate**2))
+        point(story, replace(HERE, elevation_deg=62.0))
+        story.wait(1)
+        bent = story.state.registration.sigma
+        added = 2.0 * POLICY.drift_rate**2 + (2.0 * BENDING.flexure_per_degree) ** 2
+        np.testing.assert_allclose(bent, np.sqrt(before**2 + added))
+
+    def test_the_next_window_is_believed_as_far_as_the_telescope_has_bent(self, story):
+        """Without it 8 % of a subaperture after 2 s would be a jump."""
+        point(story, replace(HERE, elevation_deg=64.0))
+        story.see(moved(shift_x_subap=0.08))
+        assert not story.alarms
+        shift = story.state.registration.alpha.shift_x_subap
+        assert shift == pytest.approx(0.2, abs=0.003)
+
+    def test_a_slew_makes_alpha_invalid_until_the_next_window(self, story):
+        point(story, replace(HERE, elevation_deg=48.0))
+        story.wait(1)
+        assert worth(story) is Validity.INVALID
+        assert story.state.dither_due_reason == (
+            "the telescope has moved by 12 deg since the last dithered window"
+        )
+        assert "estimate-stale" in story.alarms
+        assert not of_kind(story.make("cm-1"), ev.SendMatrix)
+        assert story.matrix_state("cm-1") is MatrixState.PROPOSED
+        story.see()
+        assert worth(story) is Validity.FRESH
+        assert story.state.registration.n_windows == 1
+
+    def test_a_turn_in_azimuth_is_a_slew_as_well(self, story):
+        point(story, replace(HERE, azimuth_deg=130.0))
+        story.wait(1)
+        assert "moved by 15 deg" in story.state.registration.standing.reason
+
+    def test_a_status_that_knows_it_overrules_what_was_told(self, story):
+        there = Pointing(elevation_deg=30.0, azimuth_deg=0.0)
+        story.tell(ev.StatusSeen(rtc=rtc(pointing=there)))
+        assert story.state.pointing == there
+        story.tell(ev.StatusSeen(rtc=rtc()))
+        assert story.state.pointing == there
+
+    def test_before_anybody_has_told_nothing_bends(self):
+        story = Story(Mode.AUTO, BENDING).meet()
+        story.see(n_windows=2)
+        point(story, replace(HERE, elevation_deg=10.0))
+        story.wait(1)
+        assert worth(story) is Validity.FRESH
+
+    @pytest.mark.parametrize(
+        ("other", "angle_deg"),
+        [
+            (Pointing(elevation_deg=60.0, azimuth_deg=100.0), 0.0),
+            (Pointing(elevation_deg=45.0, azimuth_deg=100.0), 15.0),
+            (Pointing(elevation_deg=60.0, azimuth_deg=460.0), 0.0),
+            (Pointing(elevation_deg=60.0, azimuth_deg=280.0), 60.0),
+        ],
+    )
+    def test_the_angle_between_two_directions_is_that_on_the_sky(self, other, angle_deg):
+        """Across the zenith: 2 x 30 deg."""
+        assert HERE.separation_deg(other) == pytest.approx(angle_deg, abs=1e-5)
+
+
+def test_nothing_is_due_while_nothing_is_known():
+    story = Story(state=TrackerState(system="flao"))
+    story.wait(100)
+    assert story.state.dither_due_since_ns_utc is None
+    assert not story.alarms

@@ -1,0 +1,326 @@
+"""Ordinary telemetry between dithers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.model.misregistration import Misregistration
+from service.telemetry.passive import PassiveEstimate
+from service.tracking import events as ev
+from service.tracking.registration import Source, Validity
+from service.tracking.state import Mode, TrackerState
+from service.tracking.windows import fit_begins_at
+from tests.unit.tracking.situations import (
+    ALPHA,
+    POLICY,
+    SECOND,
+    Story,
+    moved,
+    of_kind,
+    rtc,
+)
+
+SCATTER = np.array([0.003, 0.003, 1e-4, 1e-4])
+
+
+def watched(alpha, scatter=SCATTER):
+    return PassiveEstimate(
+        alpha=alpha,
+        covariance=np.diag(scatter**2),
+        optical_gain=np.full(400, 0.6),
+        misfit=1.0,
+        step=np.zeros(4),
+    )
+
+
+def watch(story, alpha, after_s=10.0, scatter=SCATTER):
+    """A look of the watchdog; the RTC's clock tells when."""
+    now_ns = story.now_ns + round(after_s * SECOND)
+    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=now_ns)))
+    return story.tell(ev.Watched(estimate=watched(alpha, scatter), t_ns_utc=now_ns), after_s)
+
+
+@pytest.fixture
+def story():
+    story = Story(Mode.AUTO).meet()
+    story.see(n_windows=3)
+    return story
+
+
+def learnt(story, off=0.06, n_looks=20):
+    """A night in which windows and looks alternate: the passive shift is off by so much."""
+    for _ in range(n_looks):
+        story.see(every_s=5.0)
+        watch(story, moved(shift_x_subap=off), after_s=5.0)
+    return story
+
+
+def test_it_only_reports_while_there_is_nothing_to_compare_with():
+    story = Story(Mode.AUTO).meet()
+    watch(story, Misregistration())
+    assert story.state.watchdog.consistent
+    assert "no dithered estimate" in story.state.watchdog.text
+    np.testing.assert_array_equal(story.state.watchdog.sigma, watched(ALPHA).sigma)
+    assert story.state.registration is None
+
+
+def test_while_alpha_is_unknown_each_look_begins_at_the_last_one():
+    story = Story(Mode.AUTO).meet()
+    assert fit_begins_at(story.state) is None
+    watch(story, moved(shift_x_subap=0.1))
+    assert fit_begins_at(story.state) == moved(shift_x_subap=0.1)
+    story.see()
+    assert fit_begins_at(story.state) == story.state.registration.alpha
+
+
+def test_a_reading_too_far_away_for_its_fit_is_worth_nothing_and_says_so():
+    """2 deg and 0.8 subapertures: the range of one linearised fit, about the nominal rotation."""
+    story = Story(Mode.AUTO).meet()
+    watch(story, moved(rotation_rad=np.deg2rad(3.0)))
+    assert np.isinf(story.state.watchdog.sigma).all()
+    assert "cannot tell" in story.state.watchdog.text
+    assert fit_begins_at(story.state) is None
+    turned = Story(Mode.AUTO, replace(POLICY, start=moved(rotation_rad=np.deg2rad(3.0)))).meet()
+    watch(turned, moved(rotation_rad=np.deg2rad(3.0)))
+    assert np.isfinite(turned.state.watchdog.sigma).all()
+
+
+def test_why_there_is_no_look_is_told_until_there_is_one(story):
+    story.tell(ev.Unwatched(text="no passive estimate: the loop is open"))
+    assert story.state.unwatched == "no passive estimate: the loop is open"
+    watch(story, ALPHA)
+    assert story.state.unwatched == ""
+
+
+def test_before_a_bias_is_learnt_a_shift_is_worth_ten_percent_and_says_so(story):
+    before = story.state.registration
+    watch(story, moved(shift_x_subap=0.06))
+    after = story.state.registration
+    assert np.all(story.state.watchdog.sigma[:2] >= 0.1)
+    assert after.alpha.shift_x_subap == pytest.approx(before.alpha.shift_x_subap, abs=0.005)
+    assert after.n_windows == before.n_windows
+    assert after.window_ns_utc == before.window_ns_utc
+
+
+def test_the_more_a_look_scatters_the_larger_its_bias_may_be_and_it_says_so(story):
+    """A bright star in 25 m/s: 20 % of a subaperture, seen at a scatter of 1.25 %, is no jump."""
+    scatter = SCATTER + np.array([0.0095, 0.0095, 0.0, 0.0])
+    before = story.state.registration
+    watch(story, moved(shift_x_subap=0.20), scatter=scatter)
+    expected = watched(ALPHA, scatter).sigma
+    np.testing.assert_allclose(story.state.watchdog.sigma, expected)
+    assert expected[0] == pytest.approx(0.16, abs=0.005)
+    assert story.state.watchdog.consistent
+    after = story.state.registration.alpha
+    assert after.shift_x_subap == pytest.approx(before.alpha.shift_x_subap, abs=0.005)
+
+
+def test_a_bias_of_which_nothing_is_known_is_not_taken_for_a_jump_of_the_mirror(story):
+    """40 % is 2.5 times the σ of a look that scatters by 1.25 %, and 3.8 that of a quiet one."""
+    far = moved(shift_x_subap=0.40, shift_y_subap=0.40)
+    watch(story, far, scatter=SCATTER + np.array([0.0095, 0.0095, 0.0, 0.0]))
+    assert "watchdog" not in story.alarms
+    quiet = Story(Mode.AUTO).meet()
+    quiet.see(n_windows=3)
+    watch(quiet, far)
+    assert "watchdog" in quiet.alarms
+
+
+def test_a_bias_that_was_learnt_is_not_excused_by_a_look_that_scatters_more(story):
+    """A tenth of a subaperture is a jump even while the scatter rises to three times as much."""
+    learnt(story)
+    watch(story, moved(shift_x_subap=0.16), after_s=4.0, scatter=3 * SCATTER)
+    assert "watchdog" in story.alarms
+    expected = watched(ALPHA, 3 * SCATTER).sigma
+    np.testing.assert_allclose(story.state.watchdog.sigma, expected)
+
+
+def test_the_bias_is_learnt_between_windows_and_shown(story):
+    known = learnt(story).state.registration
+    assert known.bias.offset[0] == pytest.approx(0.06, abs=0.004)
+    assert story.state.watchdog.bias[0] == pytest.approx(0.06, abs=0.004)
+    assert story.state.watchdog.sigma[0] < 0.02
+    assert known.alpha.shift_x_subap == pytest.approx(ALPHA.shift_x_subap, abs=0.003)
+
+
+def test_once_learnt_it_follows_a_drift_without_any_window(story):
+    """2 % of a subaperture in 40 s, four looks: followed to a quarter of it, and σ says so."""
+    learnt(story)
+    for k in range(1, 5):
+        watch(story, moved(shift_x_subap=0.06 + 0.005 * k))
+    known = story.state.registration
+    assert known.alpha.shift_x_subap == pytest.approx(ALPHA.shift_x_subap + 0.02, abs=0.005)
+    silent = story.policy.drift_rate[0] * np.sqrt(40.0)
+    assert known.sigma[0] < silent / 2
+    assert story.state.history[-1].source is Source.PASSIVE
+
+
+def test_how_well_the_model_fits_a_look_is_shown_and_in_the_history(story):
+    now_ns = story.now_ns + 4 * SECOND
+    look = replace(watched(ALPHA), misfit=1.7)
+    story.tell(ev.Watched(estimate=look, t_ns_utc=now_ns), after_s=4.0)
+    assert story.state.watchdog.misfit == 1.7
+    assert story.state.history[-1].misfit == 1.7
+
+
+class TestBark:
+    """An estimate that fits neither α nor what is known of its bias."""
+
+    @pytest.fixture
+    def barking(self, story):
+        learnt(story)
+        self.before = story.state.registration
+        watch(story, moved(shift_x_subap=0.30))
+        return story
+
+    def test_it_is_seen_and_a_dither_is_due(self, barking):
+        assert "watchdog" in barking.alarms
+        assert "registration.passive-jump" in barking.logged
+        assert barking.state.dither_due_since_ns_utc == barking.now_ns
+        assert "wind" in barking.state.dither_due_reason
+        assert not barking.state.watchdog.consistent
+
+    def test_alpha_stands_the_bias_is_forgotten_and_nothing_is_made_of_it(self, barking):
+        known = barking.state.registration
+        assert known.alpha == self.before.alpha
+        np.testing.assert_array_equal(known.bias.offset, 0.0)
+        assert known.standing.validity is Validity.INVALID
+        assert not of_kind(barking.wait(30), ev.MakeMatrix)
+        assert not of_kind(barking.make("cm-1"), ev.SendMatrix)
+
+    def test_another_look_does_not_end_the_doubt(self, barking):
+        watch(barking, moved(shift_x_subap=0.30))
+        assert barking.state.registration.standing.validity is Validity.INVALID
+        assert "watchdog" in barking.alarms
+
+    def test_a_window_at_the_old_place_ends_it(self, barking):
+        barking.see()
+        assert barking.state.registration.usable
+        assert barking.state.dither_due_since_ns_utc is None
+        assert not barking.alarms & {"watchdog", "estimate-stale"}
+
+    def test_a_window_far_away_is_a_jump_only_when_the_next_confirms_it(self, barking):
+        barking.see(moved(shift_x_subap=0.24))
+        assert "jump-suspected" in barking.alarms
+        barking.see(moved(shift_x_subap=0.24))
+        shift = barking.state.registration.alpha.shift_x_subap
+        assert shift == pytest.approx(ALPHA.shift_x_subap + 0.24, abs=0.005)
+
+
+class TestJump:
+    """While the sums still hold telemetry from before a jump."""
+
+    def test_they_are_not_used(self, story):
+        learnt(story)
+        there = moved(shift_x_subap=0.15)
+        story.see(there, n_windows=2)
+        before = story.state.registration
+        watch(story, moved(shift_x_subap=0.10))
+        assert story.state.registration.alpha == before.alpha
+        assert "both sides of a jump" in story.state.watchdog.text
+
+    def test_one_that_began_after_it_is(self, story):
+        learnt(story)
+        there = moved(shift_x_subap=0.15)
+        story.see(there, n_windows=2)
+        for used in (False, True):
+            story.see(there, every_s=1.0)
+            watch(story, moved(there, shift_x_subap=0.06), after_s=3.0)
+            assert (story.state.history[-1].source is Source.PASSIVE) is used
+
+    def test_nor_while_one_is_suspected(self, story):
+        story.see(moved(shift_x_subap=0.15))
+        before = story.state.registration
+        watch(story, moved(shift_x_subap=0.15))
+        assert story.state.registration.covariance is before.covariance
+
+
+def test_it_is_of_the_time_of_its_telemetry_not_of_when_the_worker_was_done(story):
+    end_ns = story.state.registration.t_ns_utc + 4 * SECOND
+    story.tell(ev.Watched(estimate=watched(ALPHA), t_ns_utc=end_ns), after_s=60.0)
+    assert story.state.registration.t_ns_utc == end_ns
+    assert story.state.registration.bias.looked_ns_utc == end_ns
+
+
+def test_a_registration_without_a_bias_knows_nothing_of_it(story):
+    story.state = replace(story.state, registration=replace(story.state.registration, bias=None))
+    watch(story, moved(shift_x_subap=0.08))
+    assert story.state.registration.bias.offset[0] > 0.05
+
+
+@pytest.mark.parametrize(
+    "changes", [{"n_controlled": 500}, {"leak": 0.99}, {"gains": (0.3,) * 400 + (0.0,) * 194}]
+)
+def test_another_loop_has_another_bias(story, changes):
+    learnt(story)
+    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns)))
+    assert story.state.registration.bias is not None
+    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns, **changes)))
+    assert story.state.registration.bias is None
+    assert story.state.registration.usable
+
+
+@pytest.mark.parametrize(("n_controlled", "kept"), [(400, True), (300, False)])
+def test_so_it_has_when_the_rtc_was_restarted_in_between(story, n_controlled, kept):
+    learnt(story)
+    story.tell(ev.SessionStarted(session="s2"))
+    story.tell(ev.StatusSeen(rtc=rtc(n_controlled, session="s2")))
+    assert (story.state.registration.bias is not None) is kept
+
+
+@pytest.mark.parametrize(("n_controlled", "kept"), [(400, True), (300, False)])
+def test_so_it_has_when_the_service_was(story, n_controlled, kept):
+    learnt(story)
+    left = replace(TrackerState(system="flao"), registration=story.state.registration)
+    after = Story(Mode.AUTO, state=left)
+    after.now_ns = story.now_ns
+    after.meet(n_controlled=n_controlled)
+    assert (after.state.registration.bias is not None) is kept
+
+
+def test_a_look_that_was_under_way_when_the_loop_changed_is_not_used(story):
+    learnt(story)
+    before = rtc().loop_numbers
+    story.tell(ev.StatusSeen(rtc=rtc(300, t_ns_utc=story.now_ns)))
+    look = ev.Watched(estimate=watched(ALPHA), t_ns_utc=story.now_ns, loop=before)
+    known = story.state.registration
+    story.tell(look, after_s=1.0)
+    assert story.state.registration.alpha == known.alpha
+    assert story.state.registration.bias is None
+    assert "the loop has changed" in story.state.unwatched
+
+
+@pytest.mark.parametrize("alarm", ["loop-diverging", "edge-slip", "commands-off-loop"])
+def test_a_look_at_a_loop_out_of_hand_moves_nothing(story, alarm):
+    learnt(story)
+    known = story.state.registration
+    story.tell(ev.Trouble(name=alarm, text="it is"))
+    watch(story, moved(shift_x_subap=0.08), after_s=4.0)
+    assert story.state.registration.alpha == known.alpha
+    assert "no measurement" in story.state.unwatched
+    story.tell(ev.Trouble(name=alarm, text="over", over=True))
+    watch(story, moved(shift_x_subap=0.06), after_s=4.0)
+    assert story.state.history[-1].source is Source.PASSIVE
+    assert story.state.unwatched == ""
+
+
+def test_a_bias_of_which_nothing_was_learnt_is_of_no_loop(story):
+    before = story.state.registration.bias
+    story.tell(ev.StatusSeen(rtc=rtc(300, t_ns_utc=story.now_ns)))
+    assert story.state.registration.bias is before
+
+
+def test_gains_that_follow_the_seeing_by_a_percent_unteach_no_bias(story):
+    learnt(story)
+    before = story.state.registration.bias
+    gains = (0.4 * 1.01,) * 400 + (0.0,) * 194
+    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns, gains=gains)))
+    assert story.state.registration.bias is before
+    late = ev.Watched(
+        estimate=watched(moved(shift_x_subap=0.06)),
+        t_ns_utc=story.now_ns + 4 * SECOND,
+        loop=rtc().loop_numbers,
+    )
+    story.tell(late, 4.0)
+    assert story.state.unwatched == ""

@@ -1,0 +1,127 @@
+"""What the RTC says it holds is compared with what was sent; one without a name is asked for."""
+
+from dataclasses import replace
+
+import pytest
+
+from service.errors import CommandError
+from service.tracking import events as ev
+from service.tracking.products import MatrixState
+from service.tracking.state import Mode
+from tests.unit.tracking.situations import Story, foreign, record, rtc
+
+SUM, OTHER = "a" * 64, "b" * 64
+
+
+def sent(story=None):
+    """A matrix on its way to the RTC, beside the one it brought."""
+    story = story or Story()
+    story.meet()
+    story.tell(ev.MatrixFetched(record=foreign()))
+    story.see(n_windows=2)
+    story.make("cm-1", MatrixState.PUBLISHED, sha256=SUM)
+    return story
+
+
+def answer(story, sha256, state=MatrixState.APPLIED, matrix_id="cm-1", frame_seq=1000):
+    applied = state is MatrixState.APPLIED
+    story.tell(
+        ev.Acknowledged(
+            id=matrix_id,
+            sha256=sha256,
+            state=state,
+            reason="",
+            frame_seq=frame_seq if applied else None,
+        )
+    )
+
+
+@pytest.mark.parametrize("state", [MatrixState.STAGED, MatrixState.APPLIED])
+def test_another_sum_than_was_sent_is_an_alarm_and_nothing_is_published_any_more(state):
+    story = sent()
+    answer(story, OTHER, state)
+    story.effects.clear()
+    assert story.matrix_state("cm-1") is MatrixState.FAILED
+    alarm = next(a for a in story.state.alarms if a.name == "wrong-matrix")
+    assert SUM in alarm.text
+    assert OTHER in alarm.text
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    assert story.state.in_use != "cm-1"
+    story.make("cm-2", MatrixState.PROPOSED)
+    with pytest.raises(CommandError, match="cm-1"):
+        story.tell(ev.Approve(id="cm-2"))
+    story.wait(60.0)
+    assert not story.asked(ev.SendMatrix)
+    assert not story.asked(ev.MakeMatrix)
+
+
+def test_the_same_sum_is_applied():
+    story = sent()
+    answer(story, SUM)
+    assert story.matrix_state("cm-1") is MatrixState.APPLIED
+    assert "wrong-matrix" not in story.alarms
+
+
+def test_a_wrong_matrix_is_read_back_and_is_over_when_it_is_right():
+    story = sent()
+    answer(story, OTHER)
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    story.wait(11.0)
+    assert ev.FetchMatrix(id="cm-1") in story.asked(ev.FetchMatrix)
+    story.tell(ev.MatrixFetched(record=record("cm-1", sha256=OTHER)))
+    assert "wrong-matrix" in story.alarms
+    story.tell(ev.MatrixFetched(record=record("cm-1", sha256=SUM)))
+    assert "wrong-matrix" not in story.alarms
+    assert story.state.in_use == "cm-1"
+
+
+def test_a_wrong_matrix_is_over_when_the_rtc_acknowledges_the_right_one_or_starts_over():
+    story = sent()
+    answer(story, OTHER)
+    answer(story, SUM, frame_seq=1001)
+    assert "wrong-matrix" not in story.alarms
+    assert story.state.in_use == "cm-1"
+    story = sent()
+    answer(story, OTHER)
+    story.tell(ev.SessionStarted(session="s2"))
+    assert "wrong-matrix" not in story.alarms
+    assert story.state.wrong_matrix is None
+
+
+def test_a_commit_the_rtc_could_not_read_is_rejected_though_it_names_none():
+    story = sent()
+    answer(story, None, MatrixState.REJECTED, matrix_id=None)
+    assert story.matrix_state("cm-1") is MatrixState.REJECTED
+    story.tell(ev.Acknowledged(id=None, state=MatrixState.REJECTED, reason="x", frame_seq=None))
+    assert "acknowledgement.unknown" in story.logged
+
+
+# ---------------------------------------------------------------- a matrix without a name
+
+
+def test_an_rtc_that_names_no_matrix_is_dithered_all_the_same_and_asked_now_and_then():
+    story = Story(Mode.AUTO)
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id=None)))
+    story.wait(25.0)
+    assert story.asked(ev.AskDither)
+    assert 2 <= len(story.asked(ev.FetchMatrix)) <= 4
+    assert set(story.asked(ev.FetchMatrix)) == {ev.FetchMatrix(id=None)}
+
+
+def test_what_it_answers_is_the_matrix_in_use():
+    story = Story(Mode.AUTO)
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id=None)))
+    story.tell(ev.MatrixFetched(record=foreign("theirs")))
+    assert story.state.in_use == "theirs"
+
+
+def test_an_rtc_that_does_not_offer_its_matrix_is_dithered_all_the_same():
+    story = Story(Mode.AUTO)
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="theirs")))
+    (fetch,) = story.asked(ev.FetchMatrix)
+    assert not story.asked(ev.AskDither)
+    story.tell(ev.JobFailed(effect=fetch, text="no answer on rtc/cm/applied"))
+    story.wait(2.0)
+    assert story.state.unfetched == "no answer on rtc/cm/applied"
+    assert story.asked(ev.AskDither)
+    assert replace(story.state, alarms=()).in_use is None

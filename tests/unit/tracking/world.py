@@ -1,0 +1,237 @@
+"""A story in which the world answers: an RTC that does as it is told, a worker that is quick."""
+
+from dataclasses import replace
+
+from service.telemetry.faraway import FarEstimate
+from service.tracking import events as ev
+from service.tracking.products import MatrixState, MeasureState, NoisyFinding, NoisyState
+from service.tracking.state import Mode
+from tests.unit.tracking.situations import (
+    ALPHA,
+    N_MODES,
+    POLICY,
+    PRECISE,
+    SECOND,
+    START_NS,
+    Story,
+    estimate,
+    foreign,
+    judged,
+    record,
+    rtc,
+    verdict,
+)
+
+RATE_HZ = 1000
+MEASURES_FOR_S = 6.0
+WINDOW_S = 2.0
+STEP_S = 0.5
+
+
+class World(Story):
+    """Time passes in steps of half a second; in each the RTC tells its status.
+
+    It plays dithers for as long as was asked, measures for ``MEASURES_FOR_S``, refuses what the
+    wire's busy is for, and begins a session whenever the loop opens or a measurement ends.
+    """
+
+    def __init__(self, mode=Mode.AUTO, policy=POLICY, **changes):
+        super().__init__(mode, policy)
+        self.session = 1
+        self.changes = changes
+        self.n_controlled = 400
+        self.gains = 0.4
+        self.loop = "closed"
+        self.cm_id = "initial"
+        self.playing = None
+        self.ramp_until_ns = 0
+        self.measured = None
+        self.pending = []
+        self.n_made = 0
+        self.told = []
+        self.since_window_s = 0.0
+        self.tell(ev.SessionStarted(session="s1"))
+        self.pass_(4.0)
+
+    def __copy__(self):
+        """Return a world that goes on by itself: states are frozen, the lists are not."""
+        other = object.__new__(type(self))
+        other.__dict__ |= self.__dict__
+        other.effects, other.pending, other.told = [*self.effects], [*self.pending], [*self.told]
+        return other
+
+    @property
+    def seq(self):
+        return (self.now_ns - START_NS) * RATE_HZ // SECOND
+
+    def status(self):
+        open_loop = self.loop == "open"
+        gains = (0.0,) * N_MODES
+        if not open_loop:
+            gains = (self.gains,) * self.n_controlled + (0.0,) * (N_MODES - self.n_controlled)
+        seen = {
+            "session": f"s{self.session}",
+            "loop": self.loop,
+            "gains": gains,
+            "n_controlled": self.n_controlled,
+            "cm_id": self.cm_id,
+            "dither_id": None if self.playing is None else self.playing.id,
+            "dither": None if self.playing is None else replace(self.playing, asked_ns_utc=0),
+            "seq": self.seq,
+            "t_ns_utc": self.now_ns,
+        }
+        return ev.StatusSeen(rtc=rtc(**(seen | self.changes)))
+
+    def tell(self, event, after_s=0.0):
+        effects = super().tell(event, after_s)
+        self.pending += effects
+        return effects
+
+    def pass_(self, seconds):
+        """Let time pass, and the world answer."""
+        for _ in range(round(seconds / STEP_S)):
+            self.now_ns += round(STEP_S * SECOND)
+            waiting, self.pending = self.pending, []
+            for effect in waiting:
+                for event in self.answers(effect):
+                    self.tell(event)
+            self.go_on()
+            self.tell(self.status())
+            self.tell(ev.Tick())
+        return self
+
+    def go_on(self):
+        """What the RTC has begun goes on, and ends."""
+        dither = self.playing
+        if dither is not None:
+            over = dither.start_seq + round(dither.duration_s * RATE_HZ)
+            if self.seq >= over:
+                self.playing = None
+        if self.measured is not None and self.now_ns >= self.measured[1]:
+            done, _ = self.measured
+            self.measured = None
+            self.begin_session(done.opens_loop)
+            if done.opens_loop and done.closed_before:
+                self.loop = "closed"
+            stored = replace(done, state=MeasureState.STORED, start_seq=9, n_slopes=1384)
+            self.tell(ev.MatrixMeasured(record=stored))
+        self.windows()
+
+    def windows(self):
+        """A window ends every two seconds of a dither that is read."""
+        self.since_window_s = 0.0 if self.playing is None else self.since_window_s + STEP_S
+        if self.since_window_s < WINDOW_S + STEP_S or self.state.dither is None:
+            return
+        self.since_window_s = STEP_S
+        fitted = estimate(ALPHA, t_ns=self.now_ns, session=f"s{self.session}")
+        if self.state.acquisition.looks_afar:
+            far = replace(fitted, modes=self.playing.modes, covariance=1e2 * PRECISE)
+            self.tell(ev.FarFitted(found=FarEstimate(estimate=far, unexplained=0.05, n_starts=1)))
+        elif self.loop != "open":
+            self.tell(ev.WindowFitted(estimate=fitted))
+
+    def begin_session(self, begins=True):
+        if begins:
+            self.session += 1
+            self.playing = None
+            self.ramp_until_ns = 0
+            self.tell(ev.SessionStarted(session=f"s{self.session}"))
+
+    @property
+    def busy(self):
+        """Why the mirror or the loop cannot be had, in the wire's words."""
+        if self.now_ns < self.ramp_until_ns:
+            return "busy: ramp"
+        return "" if self.measured is None else "busy: measuring"
+
+    def answers(self, effect):
+        """The world's answers to something that was asked of it."""
+        self.told.append(effect)
+        match effect:
+            case ev.AskDither(dither=dither):
+                busy = self.busy or ("busy: dither" if self.playing is not None else "")
+                if not busy:
+                    self.playing = replace(dither, start_seq=self.seq + 1)
+                start = None if busy else self.seq + 1
+                yield ev.DitherAnswered(
+                    id=dither.id, accepted=not busy, reason=busy, start_seq=start
+                )
+            case ev.AskNoDither():
+                self.playing = None
+            case ev.AskLoop() | ev.AskRamp():
+                yield from self.of_the_loop(effect)
+            case ev.AskMeasurement(record=asked):
+                busy = self.busy or ("busy: dither" if self.playing is not None else "")
+                if busy:
+                    refused = replace(asked, state=MeasureState.REFUSED, reason=busy)
+                    yield ev.MatrixMeasured(record=refused)
+                    return
+                self.measured = (asked, self.now_ns + round(MEASURES_FOR_S * SECOND))
+                if asked.opens_loop:
+                    self.loop = "open"
+                    self.begin_session()
+                running = replace(asked, state=MeasureState.RUNNING, start_seq=9)
+                yield ev.MatrixMeasured(record=running)
+            case _:
+                yield from self.of_matrices(effect)
+
+    def of_the_loop(self, effect):
+        opens = isinstance(effect, ev.AskLoop) and effect.closed is False
+        busy = "" if opens and self.measured is None else self.busy
+        if not busy and isinstance(effect, ev.AskRamp):
+            n_frames = len(effect.groups) * len(effect.gains) * effect.frames_per_gain
+            self.ramp_until_ns = self.now_ns + n_frames * SECOND // RATE_HZ
+        elif not busy:
+            self.n_controlled = effect.n_controlled or self.n_controlled
+            if effect.closed is not None and effect.closed is not (self.loop == "closed"):
+                self.loop = "closed" if effect.closed else "open"
+                self.begin_session(opens)
+        yield ev.LoopAnswered(id=effect.id, accepted=not busy, reason=busy)
+
+    def of_matrices(self, effect):
+        known, view = self.state.registration, self.state.rtc
+        match effect:
+            case ev.MakeMatrix() | ev.CopyMatrix() as asked:
+                self.n_made += 1
+                n_modes = asked.n_modes if isinstance(asked, ev.MakeMatrix) else 400
+                changes = {"n_modes": n_modes, "created_ns_utc": self.now_ns}
+                if known is not None:
+                    gains = getattr(asked, "gains", None)
+                    at = judged(known, view, n_modes)
+                    at = at if gains is None else replace(at, gains=gains[:n_modes])
+                    changes |= {"alpha": known.alpha, "judged": at}
+                made = record(f"cm-{self.n_made}", MatrixState.PROPOSED, **changes)
+                wanted = isinstance(asked, ev.CopyMatrix)
+                yield ev.MatrixMade(record=made, wanted=wanted)
+            case ev.FetchMatrix(id=name):
+                yield ev.MatrixFetched(record=foreign(name or self.cm_id))
+            case ev.JudgeMatrix(id=name):
+                yield ev.MarginJudged(id=name, verdict=verdict())
+            case ev.JudgeProposal(id=name, gains=gains, wanted=wanted):
+                at = replace(judged(known, view, len(gains)), gains=gains)
+                yield ev.ProposalJudged(id=name, verdict=verdict(), judged=at, wanted=wanted)
+            case ev.SendMatrix(id=name, n_modes=n_modes):
+                self.cm_id, self.n_controlled = name, n_modes
+                yield ev.Acknowledged(
+                    id=name, state=MatrixState.APPLIED, reason="", frame_seq=self.seq
+                )
+            case ev.FinishNoisy(record=asked):
+                yield ev.NoisyMade(record=replace(asked, state=NoisyState.STORED, finding=FOUND))
+            case _:
+                raise TypeError(f"nobody answers {effect!r}")
+
+
+FOUND = NoisyFinding(
+    n_slopes=1384,
+    n_frames=29_994,
+    n_missing=0,
+    snr=1.4,
+    alpha=ALPHA,
+    covariance=PRECISE,
+    optical_gain=0.6,
+    misfit=1.0,
+    cm_id="initial",
+    session="s1",
+    created_ns_utc=START_NS,
+    sha256="0" * 64,
+)

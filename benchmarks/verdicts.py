@@ -24,7 +24,7 @@ from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
-from service.control.recipe import Recipe, reconstruct
+from service.control.reconstructor import Recipe, reconstruct
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

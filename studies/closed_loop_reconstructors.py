@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
+from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, LoopSettings, judge
-from service.control.modal_gains import CalibrationGains
 from service.control.noise import noise_of_counts
-from service.control.recipe import Method, Recipe, reconstruct
-from service.control.regularised import Prior
+from service.control.reconstructor import Method, Prior, Recipe, reconstruct
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

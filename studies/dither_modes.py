@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.config import load_instrument
 from service.config.policy import policy_of
 from service.config.settings import Settings
-from service.control.dither_modes import SPAN, information, most_telling
+from service.control.dither import SPAN, information, most_telling
 from service.model.misregistration import PARAMETERS
 from service.model.modes import modal_basis
 from service.model.rtc import RtcInteractionModel

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.control.edge import Outer, edge_motion_m
+from service.control.gate import Outer, edge_motion_m, pole_radius
 from service.control.reconstructor import invert
-from service.control.stability import pole_radius
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.control.gain_table import REFERENCE_GAINS, REFERENCE_MODES, gain_table
+from service.control.gains import REFERENCE_GAINS, REFERENCE_MODES, gain_table
 from sim_rtc.options import parse_options
 from studies.optical_gain import RUN_GAIN, closed_loop, optical_gains, telescope_of
 

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.control.edge import FORGIVING_LEAK
+from service.control.gate import FORGIVING_LEAK
 from service.tracking import events as ev
 from service.tracking.state import Mode
 from service.worker import Compute, Workbench

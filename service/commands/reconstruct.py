@@ -18,9 +18,8 @@ from threadpoolctl import threadpool_limits
 from service.archive.store import write_whole
 from service.commands.terminal import check_folder, say, show_progress
 from service.config import load_instrument
-from service.control.modal_gains import CalibrationGains
-from service.control.recipe import Method, Provenance, Recipe, Source, reconstruct
-from service.control.regularised import Prior
+from service.control.gains import CalibrationGains
+from service.control.reconstructor import Method, Prior, Provenance, Recipe, Source, reconstruct
 from service.errors import ConfigurationError, MatrixError
 from service.files.light import read_light
 from service.files.product import (

@@ -11,8 +11,7 @@ from typing import Annotated, get_args, get_origin
 from pydantic import Field, model_validator
 
 from service.config.sources import Id, Table, Tuple, in_file, nearest, read_toml, validated
-from service.control.recipe import Method
-from service.control.reconstructor import MAX_CONDITION
+from service.control.reconstructor import MAX_CONDITION, Method
 from service.errors import ConfigurationError
 from service.tracking.state import Mode
 from service.wire import CHUNK_LIMIT

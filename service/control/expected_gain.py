@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.stability import loop_modes, pole_radius
+from service.control.gate import loop_modes, pole_radius
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -1,17 +1,27 @@
-"""The stability gate: what keeps a bad matrix off the telescope."""
+"""The stability gate: what keeps a bad matrix off the telescope.
+
+It asks two things of a loop, over the whole range in which α may be. Its poles must stay inside
+the unit circle with a margin. And slope noise must not move the outer ring of the mirror too far:
+poles do not see that the outermost actuators, half in the dark, are driven by noise. Where an
+excursion reaches a quarter of the wavelength the pyramid may lose the edge to the next fringe, and
+a loop without leak never brings it back. On the diffractive telescope every such loop slipped above
+300 nm per unit of slope noise, one at 201 nm and none below (docs/results/edge_slip.md), while pole
+radii said nothing.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.edge import Outer, edge_motion_m, why_slippery
-from service.control.stability import pole_radius
+from service.errors import ModelError
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
+Array = NDArray[np.float64]
 Coupling = NDArray[np.float32]
 
 NEAR = 0.02
@@ -96,7 +106,7 @@ def judge(
     Tries the estimate and the eight ends of the axes of its 3σ ellipsoid; ``covariance``
     ``(4, 4)`` includes the model-error floor. The bound is never tighter than half-way between
     the aligned loop and the edge of stability, or a slow loop could never be served at all. A
-    loop that is stable must not let its outer ring slip either (``service.control.edge``); as many
+    loop that is stable must not let its outer ring slip either (:func:`edge_motion_m`); as many
     modes as hold already may move it a little more, or the noise of α would cost modes. Modes
     without gain are not in the loop, and have no say: their command only fades.
     """
@@ -245,4 +255,130 @@ def _verdict(worst: float, aligned: float, bound: float, n_points: int) -> GateV
         bound=bound,
         n_points=n_points,
         reason=reason,
+    )
+
+
+OFF_DIAGONAL = 1e-5
+"""Of couplings computed in single precision, over the largest."""
+
+
+def loop_modes(coupling: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    """Return eigenvalues ``(n,)`` and vectors ``(n, n)`` of g R D; None: the modes themselves.
+
+    A new reconstructor leaves rounding beside the diagonal, and its eigenvectors mean nothing.
+    """
+    own = np.diag(coupling)
+    beside = np.abs(coupling - np.diag(own)).max(initial=0.0)
+    if beside <= OFF_DIAGONAL * np.abs(own).max(initial=0.0):
+        return own, None
+    return np.linalg.eig(coupling)
+
+
+def pole_radius(
+    loop_eigenvalues: NDArray[Any], *, leak: float = 1.0, delay_frames: float = 2.0
+) -> NDArray[np.float64]:
+    """Return the largest pole radius of each eigenvalue of ``gain R D G``, same shape.
+
+    The loop ``c[k+d] = leak c[k+d-1] - R s[k]`` has its poles at the roots of
+    ``z^d - leak z^(d-1) + λ``. A fractional delay is a share of each neighbouring whole one:
+    ``z^(n+1) - leak z^n + λ ((1 - f) z + f)`` for ``d = n + f``.
+
+    Raises
+    ------
+    ModelError
+        If the delay is below one frame: no loop can answer an exposure before it ends.
+    """
+    if delay_frames < 1.0:
+        raise ModelError(f"poles: found a delay of {delay_frames} frames; expected at least 1")
+    whole = int(np.floor(delay_frames))
+    share = delay_frames - whole
+    values = np.asarray(loop_eigenvalues, dtype=complex)
+    order = whole + (1 if share > 0.0 else 0)
+    companion = np.zeros((*values.shape, order, order), dtype=complex)
+    companion[..., range(1, order), range(order - 1)] = 1.0
+    companion[..., 0, 0] = leak
+    if share > 0.0:
+        companion[..., 0, order - 2] -= values * (1.0 - share)
+        companion[..., 0, order - 1] -= values * share
+    else:
+        companion[..., 0, order - 1] -= values
+    return np.asarray(np.abs(np.linalg.eigvals(companion)).max(axis=-1))
+
+
+def integrator_limit(eigenvalue_argument_rad: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the largest stable ``gain |λ|`` for two frames of delay and no leak.
+
+    ``2 sin((π/2 - |arg λ|) / 3)``; negative where no gain is stable. The closed form of
+    ``pole_radius`` < 1, kept as its check and for explaining a refusal.
+    """
+    return np.asarray(2.0 * np.sin((np.pi / 2 - np.abs(eigenvalue_argument_rad)) / 3.0))
+
+
+LIMIT_M = 195e-9
+"""Largest motion of an outer actuator per unit of slope noise that a loop without leak bears."""
+
+HELD_LIMIT_M = 199e-9
+"""The same of a loop that runs and holds with as many modes. No loop has slipped that close: the
+limit is a round figure, and to turn back for a nanometre of it costs 24 nm of wavefront where 45
+modes become 30."""
+
+FORGIVING_LEAK = 0.99
+"""A leak as strong as this brings a slipped segment back within a tenth of a second."""
+
+_N_FREQUENCIES = 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outer:
+    """The outermost ring of the mirror."""
+
+    actuators: NDArray[np.float64]
+    """``(n_outer, n_modes)`` position of each, metres, for a unit command of each mode."""
+
+
+def edge_motion_m(
+    reconstructor: NDArray[np.float32],
+    coupling: NDArray[np.float32],
+    gains: Array,
+    outer: Outer,
+    *,
+    leak: float,
+    delay_frames: float,
+) -> float:
+    """Return the largest RMS motion of an outer actuator for white slope noise of 1, metres.
+
+    ``coupling`` ``(n, n)`` is R D(α); ``gains`` ``(n,)`` is integrator times optical gain. In the
+    eigenbasis of ``g R D = V Λ V^-1`` the command answers noise by
+    ``H_i = z^-d / (1 - leak z^-1 + λ_i z^-d)``, so that its covariance is ``V (N o <H H*>) V*``
+    with ``N`` that of ``V^-1 g R n`` and the mean taken over the unit circle.
+    """
+    eigenvalues, vectors = loop_modes(gains[:, None] * coupling.astype(float))
+    commanded = gains[:, None] * reconstructor.astype(float)
+    # V^-1 S V^-H of the real n by n S: the slopes are many, and complex they would cost most of all
+    driven = commanded @ commanded.T
+    seen = outer.actuators[:, : len(gains)]
+    if vectors is not None:
+        driven = np.linalg.solve(vectors, np.linalg.solve(vectors, driven).conj().T)
+        seen = seen @ vectors
+    turns = np.pi * (np.arange(_N_FREQUENCIES) + 0.5) / _N_FREQUENCIES
+    delayed = np.exp(-1j * turns * delay_frames)[:, None]
+    response = delayed / (1.0 - leak * np.exp(-1j * turns)[:, None] + eigenvalues * delayed)
+    # conjugate pairs of eigenvalues make the other half of the circle the conjugate of this one
+    covariance = driven * (response.T @ response.conj() / _N_FREQUENCIES)
+    power = np.einsum("ai,ai->a", seen @ covariance, seen.conj()).real
+    return float(np.sqrt(power.max()))
+
+
+def why_slippery(motion_m: float, leak: float, *, holds: bool = False) -> str | None:
+    """Return why a loop with this motion of its edge must not be closed, or None.
+
+    ``holds``: it is closed already with as many modes and these gains, and does not slip.
+    """
+    limit_m = HELD_LIMIT_M if holds else LIMIT_M
+    if motion_m <= limit_m or leak <= FORGIVING_LEAK:
+        return None
+    return (
+        f"its outer ring would slip: {motion_m * 1e9:.0f} nm of motion per unit of slope noise, "
+        f"{limit_m * 1e9:.0f} at most without a leak of {FORGIVING_LEAK}; use fewer modes, a lower "
+        "gain or more leak"
     )

@@ -1,15 +1,31 @@
-"""From an interaction matrix to a reconstructor."""
+"""From an interaction matrix to a reconstructor, and what is written down about it.
+
+Two ways to invert. Truncated least squares (Heritier et al. 2018, section 2.2) needs nothing but
+the matrix. MAP, or generalised SVD, knows how strong each mode and the noise are:
+``R = (D^T Cn^-1 D + Cφ^-1)^-1 D^T Cn^-1`` (Gauss-Markov with a prior). It estimates every mode of
+the basis, also those the loop does not control: what they show in the slopes is then explained by
+them and does not alias into the controlled ones. With no noise and as many modes as are controlled
+it is the least-squares inverse.
+
+The recipe says how a reconstructor is made; the provenance says of what, so that whoever finds the
+matrix years later can make it again.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from service.control.gains import CalibrationGains
 from service.errors import ModelError
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+
+Array = NDArray[np.float64]
 
 MAX_CONDITION = 100.0
 """Singular values below the largest over this are left out: they would only amplify noise."""
@@ -87,3 +103,207 @@ def checked_columns(interaction_matrix: NDArray[Any], n_modes: int) -> NDArray[n
     if not np.all(np.isfinite(columns)):
         raise ModelError("reconstructor: the interaction matrix holds NaN or Inf")
     return columns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prior:
+    """What is known before any slope is: how large the modes are, and how noisy the slopes."""
+
+    variance_m2: Array
+    """``(n_basis,)`` expected variance of each mode, metres² OPD; a KL basis knows it."""
+
+    slope_noise: Array
+    """``(n_slopes,)`` 1 σ of each slope in one frame; 0 nowhere."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be divided by.
+
+        Raises
+        ------
+        ModelError
+            If a variance or a noise is not finite and positive.
+        """
+        for name, values in (("variance_m2", self.variance_m2), ("slope_noise", self.slope_noise)):
+            bad = np.flatnonzero(~(np.isfinite(values) & (values > 0.0)))
+            if values.ndim != 1 or len(bad):
+                where = f", first at {bad[0]}" if len(bad) else ""
+                raise ModelError(
+                    f"prior: {name}: found shape {values.shape} and {len(bad)} values that are not "
+                    f"positive{where}; expected one positive number each"
+                )
+
+
+def invert_with_prior(interaction_matrix: NDArray[Any], n_modes: int, prior: Prior) -> Inversion:
+    """Return the MAP reconstructor of the first ``n_modes`` modes.
+
+    As many modes are estimated as both matrix and prior know. Each row is scaled so that its own
+    mode comes back whole (the diagonal of ``R D`` is 1): a loop gain then means what it means with
+    any other reconstructor, and how much to trust a mode remains the gain's business.
+
+    Raises
+    ------
+    ModelError
+        As :func:`invert`; also if the prior is of other slopes or of fewer modes.
+
+    References
+    ----------
+    Gilles 2005, Appl. Opt. 44, 993; Correia et al. 2013, JOSA A 30, 1726.
+    """
+    n_estimated = min(interaction_matrix.shape[1], len(prior.variance_m2))
+    controlled = checked_columns(interaction_matrix, n_modes)
+    if n_modes > n_estimated or len(prior.slope_noise) != len(controlled):
+        raise ModelError(
+            f"reconstructor: found a prior of {len(prior.variance_m2)} modes and "
+            f"{len(prior.slope_noise)} slopes; expected at least {n_modes} and {len(controlled)}"
+        )
+    matrix = checked_columns(interaction_matrix, n_estimated)
+    amplitude = np.sqrt(prior.variance_m2[:n_estimated])
+    # in units of noise and of the prior both matrices are of order one: nothing overflows
+    white = matrix * amplitude / prior.slope_noise[:, None]
+    system = scipy.linalg.cho_factor(white.T @ white + np.eye(n_estimated))
+    estimate = scipy.linalg.cho_solve(system, white.T)[:n_modes] * amplitude[:n_modes, None]
+    estimate /= prior.slope_noise
+    estimate /= np.einsum("ij,ji->i", estimate, controlled)[:, None]
+    singular = scipy.linalg.svdvals(controlled)
+    return Inversion(
+        matrix=np.ascontiguousarray(estimate, dtype=np.float32),
+        condition_number=float(singular[0] / singular[-1]),
+        n_truncated=0,
+    )
+
+
+class Method(StrEnum):
+    """How an interaction matrix is inverted."""
+
+    SVD = "svd"
+    """Least squares; singular values too weak are left out."""
+
+    MAP = "map"
+    """Least squares weighted by noise, with the turbulence as prior."""
+
+
+class Source(StrEnum):
+    """Where an interaction matrix comes from."""
+
+    SYNTHETIC = "synthetic"
+    """Computed by the model for a registration."""
+
+    MEASURED = "measured"
+    """Read off a sensor, noise included."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Recipe:
+    """How to invert an interaction matrix."""
+
+    n_modes: int
+    """Modes to control: the first ones of the basis."""
+
+    method: Method = Method.SVD
+    """How."""
+
+    max_condition: float = MAX_CONDITION
+    """SVD: singular values below the largest over this are left out."""
+
+    prior: Prior | None = None
+    """MAP: what is known of modes and noise."""
+
+    def __post_init__(self) -> None:
+        """Refuse a recipe that lacks an ingredient.
+
+        Raises
+        ------
+        ModelError
+            If MAP has no prior.
+        """
+        if self.method is Method.MAP and self.prior is None:
+            raise ModelError("reconstructor: found method map without a prior; expected one")
+
+
+def reconstruct(interaction_matrix: NDArray[Any], recipe: Recipe) -> Inversion:
+    """Return the reconstructor of a single-pass interaction matrix ``(n_slopes, n_columns)``.
+
+    Raises
+    ------
+    ModelError
+        If the matrix cannot be inverted so: see the methods.
+    """
+    if recipe.method is Method.MAP and recipe.prior is not None:
+        return invert_with_prior(interaction_matrix, recipe.n_modes, recipe.prior)
+    return invert(interaction_matrix, recipe.n_modes, max_condition=recipe.max_condition)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Provenance:
+    """What a reconstructor was made of."""
+
+    source: Source
+    """Of the interaction matrix."""
+
+    recipe: Recipe
+    """How it was inverted."""
+
+    inversion: Inversion
+    """What came of it."""
+
+    alpha: Misregistration | None = None
+    """Registration of a synthetic matrix."""
+
+    covariance: NDArray[np.float64] | None = None
+    """``(4, 4)`` of that registration, numeric units."""
+
+    gains: CalibrationGains | None = None
+    """Folded into the columns; None: the model's own."""
+
+    reference_sha256: str | None = None
+    """Digest of the measured matrix that was fitted or inverted."""
+
+    reference_passes: int | None = None
+    """How often light met the mirror in it; the reconstructor is for one pass all the same."""
+
+    measured_illumination: bool = False
+    """Whether the model's pupil was lit as the flux map says."""
+
+    def attributes(self) -> dict[str, str | int | float | bool]:
+        """Return everything as flat, named, scalar facts: for file attributes and JSON."""
+        found: dict[str, str | int | float | bool] = {
+            "source": str(self.source),
+            "method": str(self.recipe.method),
+            "n_modes": self.recipe.n_modes,
+            "condition_number": self.inversion.condition_number,
+            "n_truncated": self.inversion.n_truncated,
+            "single_pass": True,
+            "measured_illumination": self.measured_illumination,
+        }
+        if self.recipe.method is Method.SVD:
+            found["max_condition"] = self.recipe.max_condition
+        elif self.recipe.prior is not None:
+            found["prior_n_modes"] = len(self.recipe.prior.variance_m2)
+            found["prior_wavefront_m"] = float(np.sqrt(self.recipe.prior.variance_m2.sum()))
+            found["prior_slope_noise"] = float(
+                np.sqrt(np.mean(np.square(self.recipe.prior.slope_noise)))
+            )
+        return found | self._registration() | self._reference()
+
+    def _registration(self) -> dict[str, str | int | float | bool]:
+        if self.alpha is None:
+            return {}
+        found: dict[str, str | int | float | bool] = dict(self.alpha.to_boundary())
+        if self.covariance is not None:
+            sigma = np.sqrt(np.diag(self.covariance)) * BOUNDARY_SCALE
+            found |= {
+                f"sigma_{name}": float(value) for name, value in zip(PARAMETERS, sigma, strict=True)
+            }
+        return found
+
+    def _reference(self) -> dict[str, str | int | float | bool]:
+        found: dict[str, str | int | float | bool] = {}
+        if self.reference_sha256 is not None:
+            found["reference_sha256"] = self.reference_sha256
+        if self.reference_passes is not None:
+            found["reference_passes"] = self.reference_passes
+        if self.gains is not None:
+            controlled = self.gains.measured[: self.recipe.n_modes]
+            found["n_gains_measured"] = int(controlled.sum())
+            found["n_gains_extended"] = int((~controlled).sum())
+        return found

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import __version__
-from service.control.recipe import Provenance
+from service.control.reconstructor import Provenance
 from service.errors import MatrixError
 from service.files.report import FitReport, document
 from service.model.instrument import Instrument

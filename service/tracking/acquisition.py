@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.control.edge import FORGIVING_LEAK
+from service.control.gate import FORGIVING_LEAK
 from service.errors import CommandError
 from service.telemetry.faraway import NOT_FOUND
 from service.tracking import events as ev

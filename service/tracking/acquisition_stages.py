@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.control.continuation import (
+from service.control.dither import (
     FEWEST_LINES,
     FINER,
     SMOOTH,
-    Reach,
+    Band,
     first_closed,
     lines_of,
     modes_of,
@@ -51,7 +51,7 @@ NOT_CAPTURED = ("the fit did not settle", "outside the capture range")
 """How the reasons of such windows begin."""
 
 
-def reach_of(stage: AcquisitionStage) -> Reach:
+def reach_of(stage: AcquisitionStage) -> Band:
     """Return the band of modes that is dithered in a stage with the loop open."""
     return SMOOTH if stage is AcquisitionStage.COARSE else FINER
 

@@ -7,10 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control import dithering
-from service.control.dither_modes import SPAN, most_telling
-from service.control.dithering import Demand, Schedule, clear_of, schedule
-from service.control.precision import tabulated
+from service.control import dither
+from service.control.dither import (
+    SPAN,
+    Demand,
+    Schedule,
+    clear_of,
+    most_telling,
+    schedule,
+    tabulated,
+)
 from service.errors import CommandError, ModelError
 from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan
 from service.telemetry.played import Asked
@@ -366,7 +372,7 @@ def wanted(
     demand = _demand(kappa, state, rtc, policy, now_ns)
     window_s = demand.window_s
     sittings = tuple(n * window_s for n in SITTING_LADDER)
-    sparse = replace(demand, window_s=dithering.sitting_s(kappa, demand, sittings))
+    sparse = replace(demand, window_s=dither.burst_s(kappa, demand, sittings))
     phase, reason, next_ns = _paced(state, sparse, policy, now_ns)
     demand = sparse if phase is DitherPhase.SPARSE else demand
     found = schedule(kappa, demand)
@@ -450,7 +456,7 @@ def _demand(
     lengths = window_lengths_s(policy)
     if rtc.magnitude is not None and rtc.magnitude >= FAINT_MAGNITUDE:
         lengths = tuple(s for s in lengths if s >= FAINT_WINDOW_S) or lengths[-1:]
-    return replace(demand, window_s=dithering.window_s(kappa, demand, USABLE, lengths))
+    return replace(demand, window_s=dither.window_s(kappa, demand, USABLE, lengths))
 
 
 def _lasting_s(phase: DitherPhase) -> float:

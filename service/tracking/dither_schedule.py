@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.control.precision import forgetting_mean, measured_ratio
+from service.control.dither import forgetting_mean, measured_ratio
 from service.telemetry.instrumental import WindowEstimate
 from service.telemetry.noisymatrix import RandomEstimate
 from service.tracking.alarms import Act, forbidding, logged, with_alarm, without_alarm

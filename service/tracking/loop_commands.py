@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from service.control.gain_table import GainTable, gain_table
+from service.control.gains import GainTable, gain_table
 from service.errors import CommandError
 from service.tracking import events as ev
 from service.tracking.alarms import logged

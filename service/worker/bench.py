@@ -9,12 +9,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.dither_modes import information
+from service.control.dither import information
 from service.control.expected_gain import ExpectedGain, Sky, Timing, beyond_m2, expected_gain
 from service.control.gate import GateVerdict, LoopSettings, judge
 from service.control.noise import noise_of_star
-from service.control.recipe import Method, Recipe, reconstruct
-from service.control.regularised import Prior
+from service.control.reconstructor import Method, Prior, Recipe, reconstruct
 from service.fit.dialect import LIKELY, Dialect, of_answer, of_reconstructor
 from service.fit.orientation import Setting
 from service.fit.start import far_starts

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.control.edge import Outer
+from service.control.gate import Outer
 from service.errors import ModelError
 from service.model.instrument import Influence, Instrument, Mirror
 from service.model.modes import ModalBasis

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.gate import GateVerdict
-from service.control.recipe import Method
-from service.control.reconstructor import MAX_CONDITION
+from service.control.reconstructor import MAX_CONDITION, Method
 from service.model.misregistration import Misregistration
 from service.telemetry.edge import Actuators
 

@@ -13,8 +13,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.gate import GateVerdict
-from service.control.stability import pole_radius
+from service.control.gate import GateVerdict, pole_radius
 from service.model.misregistration import Misregistration
 from sim_rtc.diffractive_plant import DiffractiveOptics
 from sim_rtc.plant import Optics, TelescopeOptics

@@ -8,9 +8,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.modal_gains import CalibrationGains
-from service.control.reconstructor import Inversion, invert
-from service.control.regularised import Prior, invert_with_prior
+from service.control.gains import CalibrationGains
+from service.control.reconstructor import Inversion, Prior, invert, invert_with_prior
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from studies.heritier2018 import telescope

@@ -7,9 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from service.control.gate import LoopSettings, judge
+from service.control.gate import LoopSettings, judge, pole_radius
 from service.control.reconstructor import invert
-from service.control.stability import pole_radius
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from tests.numerics import flao_matrix, flao_model

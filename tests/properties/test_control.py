@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from service.control.gate import integrator_limit, pole_radius
 from service.control.reconstructor import invert
-from service.control.stability import integrator_limit, pole_radius
 
 arguments = st.floats(-np.pi, np.pi)
 moduli = st.floats(1e-3, 3.0)

@@ -9,8 +9,8 @@ import pytest
 from service import __version__
 from service.__main__ import main
 from service.commands.arguments import command_line
-from service.control.recipe import Method as MakeMethod
-from service.control.recipe import Recipe
+from service.control.reconstructor import Method as MakeMethod
+from service.control.reconstructor import Recipe
 from service.fit.options import FitOptions
 from service.fit.options import Method as FitMethod
 from service.tracking.state import Mode

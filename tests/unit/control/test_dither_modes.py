@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from service.control.dither_modes import information, most_telling
+from service.control.dither import information, most_telling
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 

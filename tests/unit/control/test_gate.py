@@ -7,10 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.control.edge import FORGIVING_LEAK, HELD_LIMIT_M, LIMIT_M, Outer
-from service.control.gate import NEAR, LoopSettings, judge
+from service.control.gate import (
+    FORGIVING_LEAK,
+    HELD_LIMIT_M,
+    LIMIT_M,
+    NEAR,
+    LoopSettings,
+    Outer,
+    judge,
+    pole_radius,
+)
 from service.control.reconstructor import invert
-from service.control.stability import pole_radius
 from service.model.misregistration import Misregistration
 from tests.numerics import N_CONTROLLED, SOMEWHERE, small_linearisation, small_model
 

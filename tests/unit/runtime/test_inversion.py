@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from service.config.settings import load_settings
-from service.control.recipe import Method
-from service.control.reconstructor import invert
-from service.control.regularised import Prior, invert_with_prior
+from service.control.reconstructor import Method, Prior, invert, invert_with_prior
 from service.model.misregistration import Misregistration
 from service.worker import Workbench
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, loop_settings, small_instrument

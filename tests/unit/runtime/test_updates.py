@@ -8,8 +8,7 @@ import pytest
 from scipy.optimize import brentq
 
 from service.archive import Archive
-from service.control.edge import HELD_LIMIT_M, LIMIT_M
-from service.control.gate import LoopSettings
+from service.control.gate import HELD_LIMIT_M, LIMIT_M, LoopSettings
 from service.errors import CommandError
 from service.model.misregistration import Misregistration
 from service.runtime.actions import Actions, Publishing

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.control.continuation import FINER, SMOOTH, lines_of, modes_of
+from service.control.dither import FINER, SMOOTH, lines_of, modes_of
 from service.model.misregistration import Misregistration
 from service.telemetry.faraway import FarEstimate
 from service.telemetry.frames import FrameBlock

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from service.control.continuation import FINER, SMOOTH, lines_of, modes_of
+from service.control.dither import FINER, SMOOTH, lines_of, modes_of
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.telemetry.faraway import UNEXPLAINED, FarEstimate, Search, find

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.control.precision import tabulated
+from service.control.dither import tabulated
 from service.telemetry.passive import PassiveEstimate
 from service.tracking import events as ev
 from service.tracking.dither_plan import SETTLING_S, total_m

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from service.control.precision import tabulated
+from service.control.dither import tabulated
 from service.errors import CommandError
 from service.tracking import events as ev
 from service.tracking.dither_plan import (

@@ -7,10 +7,17 @@ import json
 import numpy as np
 import pytest
 
-from service.control.modal_gains import CalibrationGains
-from service.control.recipe import Method, Provenance, Recipe, Source, reconstruct
-from service.control.reconstructor import invert
-from service.control.regularised import Prior, invert_with_prior
+from service.control.gains import CalibrationGains
+from service.control.reconstructor import (
+    Method,
+    Prior,
+    Provenance,
+    Recipe,
+    Source,
+    invert,
+    invert_with_prior,
+    reconstruct,
+)
 from service.errors import ModelError
 from tests.numerics import N_CONTROLLED, N_MODES, SOMEWHERE, small_basis, small_linearisation
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.stability import integrator_limit, pole_radius
+from service.control.gate import integrator_limit, pole_radius
 
 
 def test_an_integrator_of_two_frames_loses_stability_at_a_gain_of_one():

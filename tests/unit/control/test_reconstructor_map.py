@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from service.control.gate import LoopSettings, judge
-from service.control.reconstructor import invert
-from service.control.regularised import Prior, invert_with_prior
+from service.control.reconstructor import Prior, invert, invert_with_prior
 from service.errors import ModelError
 from service.model.misregistration import Misregistration
 from tests.numerics import N_CONTROLLED, N_MODES, small_basis, small_linearisation

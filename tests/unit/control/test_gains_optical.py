@@ -1,12 +1,7 @@
 import numpy as np
 import pytest
 
-from service.control.gain_table import (
-    FACTOR_BOUNDS,
-    REFERENCE_GAINS,
-    REFERENCE_MODES,
-    gain_table,
-)
+from service.control.gains import FACTOR_BOUNDS, REFERENCE_GAINS, REFERENCE_MODES, gain_table
 from service.errors import ModelError
 
 HIGH = np.array([509, 527, 545, 563])

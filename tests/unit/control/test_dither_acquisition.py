@@ -5,11 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from service.control.continuation import (
-    BAND,
+from service.control.dither import (
     CLEARANCE_HZ,
     FEWEST_LINES,
     FINER,
+    LINE_BAND,
     MOST_LINES,
     SMOOTH,
     first_closed,
@@ -39,8 +39,8 @@ def test_every_line_has_whole_periods_and_room_for_its_noise(rate_hz):
     assert FEWEST_LINES <= len(lines) <= MOST_LINES
     assert all((2.0 * line) % 1.0 == 0.0 for line in lines)
     assert min(b - a for a, b in combinations(sorted(lines), 2)) >= CLEARANCE_HZ
-    assert BAND[0] * rate_hz <= min(lines)
-    assert max(lines) <= BAND[1] * rate_hz
+    assert LINE_BAND[0] * rate_hz <= min(lines)
+    assert max(lines) <= LINE_BAND[1] * rate_hz
 
 
 def test_no_line_is_made_by_three_others():

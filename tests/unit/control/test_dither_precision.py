@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.precision import (
+from service.control.dither import (
     RATIO_RANGE,
     TABLE,
     TABLE_MAGNITUDES,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.edge import (
+from service.control.gate import (
     FORGIVING_LEAK,
     HELD_LIMIT_M,
     LIMIT_M,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.control.dithering import Demand, Schedule, clear_of, schedule, sitting_s, window_s
+from service.control.dither import Demand, Schedule, burst_s, clear_of, schedule, window_s
 
 KAPPA = np.array([0.02, 0.02, np.deg2rad(0.08), 0.004]) * 1e-9
 """Magnitude 10 of the design study: 2 % of a subaperture in 1 s at 1 nm."""
@@ -71,7 +71,7 @@ def test_where_the_flexure_is_too_fast_nothing_is_spent_on_a_tenth_of_sigma():
     assert least[0] < found.sigma[0] <= 1.11 * least[0]
 
 
-def test_a_sitting_is_twice_as_precise_as_asked_so_that_it_may_stand_alone():
+def test_a_burst_is_twice_as_precise_as_asked_so_that_it_may_stand_alone():
     asked = demand(0.01)
     found = schedule(KAPPA, asked)
     noise = KAPPA / (found.total_m * np.sqrt(asked.window_s))
@@ -79,15 +79,15 @@ def test_a_sitting_is_twice_as_precise_as_asked_so_that_it_may_stand_alone():
 
 
 @pytest.mark.parametrize(("budget_nm", "length_s"), [(10.0, 2.0), (2.0, 5.0), (0.5, 60.0)])
-def test_a_small_budget_needs_long_sittings(budget_nm, length_s):
+def test_a_small_budget_needs_long_bursts(budget_nm, length_s):
     """2 % of a subaperture in 1 s at 1 nm: 0.5 % takes (4 / budget)² seconds."""
     asked = demand(0.005, budget_m=budget_nm * 1e-9, drift=1e-3 * SLOW)
-    assert sitting_s(KAPPA, asked, (2.0, 5.0, 10.0, 20.0, 60.0)) == length_s
+    assert burst_s(KAPPA, asked, (2.0, 5.0, 10.0, 20.0, 60.0)) == length_s
 
 
-def test_no_sitting_is_so_long_that_alpha_walks_away_inside_it():
+def test_no_burst_is_so_long_that_alpha_walks_away_inside_it():
     asked = demand(0.005, budget_m=0.5e-9, drift=20 * SLOW)
-    assert sitting_s(KAPPA, asked, (2.0, 5.0, 10.0, 20.0, 60.0)) == 20.0
+    assert burst_s(KAPPA, asked, (2.0, 5.0, 10.0, 20.0, 60.0)) == 20.0
 
 
 def test_without_pause_each_window_tells_what_one_alone_must():

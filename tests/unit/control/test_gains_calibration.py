@@ -1,16 +1,11 @@
-"""Calibration gain, optical gain and passes, each in its place."""
+"""Calibration gains and passes, each in its place."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from service.control.modal_gains import (
-    CalibrationGains,
-    loop_gains,
-    optical_gains,
-    single_pass,
-)
+from service.control.gains import CalibrationGains
 from service.control.reconstructor import invert
 from service.errors import ModelError
 from tests.numerics import N_MODES, small_linearisation
@@ -64,29 +59,6 @@ def test_the_second_pass_is_stated_and_stays_out_of_the_gains():
     once, twice = gains_of(np.ones(10), passes=1), gains_of(np.ones(10), passes=2)
     assert (once.passes, twice.passes) == (1, 2)
     np.testing.assert_array_equal(once.tuned(MATRIX), twice.tuned(MATRIX))
-    np.testing.assert_array_equal(single_pass(2 * MATRIX, 2), MATRIX)
-    np.testing.assert_array_equal(single_pass(MATRIX, 1), MATRIX)
-
-
-def test_loop_gains_undo_optical_gain_and_passes():
-    found = loop_gains(np.full(3, 0.4), np.array([0.5, 0.8, 1.0]), 2)
-    np.testing.assert_allclose(found, [0.4, 0.25, 0.2])
-
-
-def test_optical_gains_go_through_the_measured_ones_and_stay_beyond_them():
-    modes = np.array([9, 99, 2])
-    found = optical_gains(modes, np.array([0.6, 0.8, 0.5]), 200)
-    np.testing.assert_allclose(found[modes], [0.6, 0.8, 0.5])
-    np.testing.assert_allclose(found[[0, 199]], [0.5, 0.8])
-    assert np.all(np.diff(found) >= 0.0)
-    # half-way between modes 9 and 99 in the logarithm of the mode counted from 1: 10 and 100
-    assert found[round(np.sqrt(1000)) - 1] == pytest.approx(0.7, abs=0.005)
-
-
-@pytest.mark.parametrize("bad", [[0.5, 1.2], [0.0, 0.5], [np.nan, 0.5], []])
-def test_an_optical_gain_above_one_is_none(bad):
-    with pytest.raises(ModelError, match=r"expected values in \(0, 1\]"):
-        optical_gains(np.arange(len(bad)), np.array(bad), 10)
 
 
 @pytest.mark.parametrize(
@@ -108,10 +80,6 @@ def test_gains_that_cannot_be_are_refused(values, modes, text):
 def test_light_meets_the_mirror_once_or_twice():
     with pytest.raises(ModelError, match="found 3 passes; expected 1 or 2"):
         gains_of([1.0], passes=3)
-    with pytest.raises(ModelError, match="found 0 passes"):
-        single_pass(MATRIX, 0)
-    with pytest.raises(ModelError, match="found 4 passes"):
-        loop_gains(np.ones(2), np.ones(2), 4)
 
 
 def test_more_columns_than_the_gains_know_are_refused():

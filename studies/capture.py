@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.fit.bench import Bench
-from service.fit.fit import fit_matrix
+from service.fit.matrix import fit_matrix
+from service.fit.methods import SAME, land
+from service.fit.models import FitModels
 from service.fit.options import Fit, FitOptions
-from service.fit.reference import Reference
-from service.fit.search import SAME, land
-from service.fit.target import Target, oriented, target_of
+from service.fit.reference import Reference, Target, oriented, target_of
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
@@ -60,7 +59,12 @@ class Tally:
 
 
 def captured(
-    bench: Bench, target: Target, reference: Reference, truth: Array, starts: Array, mapper: Mapper
+    bench: FitModels,
+    target: Target,
+    reference: Reference,
+    truth: Array,
+    starts: Array,
+    mapper: Mapper,
 ) -> Tally:
     """Return what becomes of these starts ``(n_starts, 4)``."""
     places: list[tuple[Array, Fit]] = []
@@ -112,7 +116,7 @@ def main() -> int:
     with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
         for seed in range(FIRST_SEED, FIRST_SEED + given.matrices):
             truth, reference = matrix_of(instrument, given.truth, seed)
-            bench = Bench(instrument=instrument, basis=basis, mapper=pool.map)
+            bench = FitModels(instrument=instrument, basis=basis, mapper=pool.map)
             rng = np.random.default_rng(seed)
             starts = truth + rng.uniform(-1.0, 1.0, (each, 4)) * RANGE
             tally = captured(

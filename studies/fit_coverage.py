@@ -23,7 +23,7 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.fit.fit import fit_matrix
+from service.fit.matrix import fit_matrix
 from service.fit.options import FitOptions
 from service.fit.reference import Reference
 from service.model.instrument import Instrument

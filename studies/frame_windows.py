@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config.mirrors import grid
-from service.fit.fit import fit_matrix
+from service.fit.matrix import fit_matrix
 from service.fit.reference import Reference
 from service.model.instrument import (
     FrameWindows,

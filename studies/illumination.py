@@ -17,8 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.control.noise import noise_of_counts
-from service.fit.flux import CannotTell, find_pupil
-from service.fit.illumination import measured_illumination
+from service.fit.light import CannotTell, find_pupil, measured_illumination
 from service.model.interaction import InteractionModel, valid_subapertures
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis

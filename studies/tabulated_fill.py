@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt
 from threadpoolctl import threadpool_limits
 
 from service.config.instrument import load_instrument
-from service.fit.fit import fit_matrix
+from service.fit.matrix import fit_matrix
 from service.fit.options import Fit
 from service.fit.reference import Reference
 from service.model.filling import filled

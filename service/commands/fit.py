@@ -18,7 +18,7 @@ from service.files.product import fill_fit
 from service.files.report import document, table
 from service.files.run import fit_file
 from service.fit.options import FitOptions, Method
-from service.fit.turned_light import Arms
+from service.fit.pupil_rotation import Arms
 from service.model.instrument import Instrument
 
 ACCEPTED, REFUSED = 0, 1

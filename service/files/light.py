@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.files.container import opened
-from service.fit.flux import CannotTell, PupilPosition, find_pupil
-from service.fit.illumination import measured_illumination, relative_light
-from service.fit.turned_light import Arms, LightRotation, find_rotation
+from service.fit.light import (
+    CannotTell,
+    PupilPosition,
+    find_pupil,
+    measured_illumination,
+    relative_light,
+)
+from service.fit.pupil_rotation import Arms, LightRotation, find_rotation
 from service.model.instrument import Instrument
 from service.model.pupil import Illumination
 from service.model.slopes import turned_mask

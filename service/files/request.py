@@ -7,7 +7,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from service.fit.turned_light import Arms
+from service.fit.pupil_rotation import Arms
 from service.model.misregistration import PARAMETERS, Misregistration
 
 MOST_MODES = 100_000

@@ -15,7 +15,7 @@ from service.errors import MatrixError
 from service.files.product import instrument_sha256
 from service.files.recorded import FLUX_FRAME, Recorded, read_recorded
 from service.files.report import FitReport
-from service.fit.fit import fit_matrix
+from service.fit.matrix import fit_matrix
 from service.fit.options import FitOptions
 from service.fit.reference import Reference
 from service.model.instrument import FrameWindows, Instrument

@@ -19,9 +19,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from service.fit.lowest import Lowest, lowest_of
-from service.fit.reference import Reference
-from service.fit.target import Target, oriented, target_of
+from service.fit.models import LowOrder, low_order_of
+from service.fit.reference import Reference, Target, oriented, target_of
+from service.fit.solver import vertex
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, rotation, rtc_valid_subapertures
 from service.model.misregistration import Misregistration
@@ -203,7 +203,7 @@ def _wrapped(angle_rad: float) -> float:
 class _Turned:
     """What a coarse model says of the lowest orders at every rotation."""
 
-    lowest: Lowest
+    lowest: LowOrder
     """The lowest orders."""
 
     columns: Array
@@ -215,7 +215,7 @@ class _Turned:
     @classmethod
     def of(cls, model: InteractionModel, mapper: Mapper) -> _Turned:
         """Turn the smoothest shapes of a model's modes round."""
-        lowest = lowest_of(model)
+        lowest = low_order_of(model)
         jacobian = np.asarray(model.sensor_jacobian(Misregistration()), dtype=np.float64)
         points = model.pupil.points
 
@@ -236,7 +236,7 @@ class _Turned:
         correlation = (along / norm).mean(axis=0)
         best = int(np.argmax(correlation))
         before, at, after = np.take(correlation, [best - 1, best, best + 1], mode="wrap")
-        step = _parabola(before, at, after)
+        step = vertex(before, at, after)
         angle = ANGLES_RAD[best] + step * (ANGLES_RAD[1] - ANGLES_RAD[0])
         return Pose(
             order=order,
@@ -244,9 +244,3 @@ class _Turned:
             rotation_rad=_wrapped(float(angle)),
             correlation=float(at),
         )
-
-
-def _parabola(before: float, at: float, after: float) -> float:
-    """Return where a parabola through three equidistant values is highest, in steps."""
-    bend = 2.0 * at - before - after
-    return float((after - before) / (2.0 * bend)) if bend > 0.0 else 0.0

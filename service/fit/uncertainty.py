@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.fit.projection import Projection
+from service.fit.solver import Projection
 
 Array = NDArray[np.float64]
 

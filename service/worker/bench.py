@@ -15,9 +15,9 @@ from service.control.gate import GateVerdict, LoopSettings, judge
 from service.control.noise import noise_of_star
 from service.control.reconstructor import Method, Prior, Recipe, reconstruct
 from service.fit.dialect import LIKELY, Dialect, of_answer, of_reconstructor
+from service.fit.light import far_starts
 from service.fit.orientation import Setting
-from service.fit.start import far_starts
-from service.fit.target import oriented
+from service.fit.reference import oriented
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration

@@ -22,7 +22,7 @@ from typing_extensions import override
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.fit.target import oriented
+from service.fit.reference import oriented
 from service.model.interaction import rtc_valid_subapertures
 from service.model.slopes import Orientation, SlopeOrder, to_rtc
 from service.tracking.state import Mode

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from service.fit.fit import fit_matrix
+from service.fit.matrix import fit_matrix
 from service.fit.options import Fit, FitOptions
 from service.fit.reference import Reference
 from service.model.instrument import Instrument

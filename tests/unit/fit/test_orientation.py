@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.fit.fit import fit_matrix
+from service.fit.matrix import fit_matrix
 from service.fit.reference import Reference
 from service.model.misregistration import Misregistration
 from service.model.slopes import Orientation, SlopeOrder

@@ -1,23 +1,34 @@
-"""Where the pupil images lie on the sensor, from nothing but their mean light.
+"""The mean light of the four pupil images: where they lie, how evenly lit, where a fit starts.
 
 With the mirror as stop the outline and the obscuration move with the shift, so their edges are a
 start for a fit, before any matrix is looked at. The light inside the outline may be uneven: it is
 modelled as a smooth surface times what an even beam would show, diffraction included, and only the
 edges tell the position.
+
+Slopes weigh by the light of their subaperture (global normalisation), so an unevenness of 20 % is
+20 % of a slope: larger than everything a registration does to the matrix. The paper names the
+measured illumination as its next step. The pattern belongs to the beam, that is to the pupil's
+images: with the mirror as stop it moves with them, and the map is kept relative to where they lay
+when the light was counted. With a fixed telescope stop it stays on the sensor.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, Stop
 from service.model.interaction import instrument_pupil
+from service.model.misregistration import Misregistration
+from service.model.pupil import Illumination
 from service.model.pyramid import PyramidOptics, enough_modulation_points
+from service.model.slopes import Orientation
 
 Array = NDArray[np.float64]
 
@@ -94,7 +105,7 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
     ModelError
         If the counts are not four images of the instrument's size.
     """
-    images, bad = mended(counts, instrument)
+    images, bad = repaired(counts, instrument)
     light = float(images.mean())
     if not light > 0.0:
         return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
@@ -144,7 +155,7 @@ def even_images(optics: PyramidOptics, shift: tuple[float, float]) -> Array:
     return optics.images(shift).transpose(0, 2, 1, 3).reshape(4, n, n)
 
 
-def mended(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArray[np.bool_]]:
+def repaired(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArray[np.bool_]]:
     """Return the counts ``(4, n, n)`` with bad pixels replaced, and which were bad.
 
     A pixel is bad when it is no number or far from the median of the same place in all images,
@@ -257,3 +268,134 @@ def _polynomials(n: int, order: int) -> Array:
 
 def _pair(position: Array) -> tuple[float, float]:
     return float(position[0]), float(position[1])
+
+
+_LIT = 0.5
+"""Share of a full subaperture's light from which one tells how evenly the beam is lit."""
+
+_SMOOTHING_SUBAP = 1.0
+"""Of the map: a subaperture cannot tell what is finer than itself, and diffraction ripples."""
+
+_SPREAD_SUBAP = 1.0
+_MARGIN = 4
+"""Subapertures around the sensor's grid: the pupil may have moved when the map is used."""
+
+
+def measured_illumination(
+    counts: NDArray[Any], instrument: Instrument, position: PupilPosition
+) -> Illumination:
+    """Return how evenly the beam is lit, from the mean counts ``(4, n, n)``.
+
+    Each image is divided by that of an even beam at the same place, diffraction included; the
+    median of the four is robust to bad pixels and, to first order, to static aberrations, which
+    move light from one image to another. Its mean over the pupil is 1. Nothing is deconvolved:
+    scattered light hides a tenth of the unevenness, but undoing that also amplifies what the
+    aberrations left.
+
+    Raises
+    ------
+    ModelError
+        If the counts are not four images of the instrument's size, or dark.
+    """
+    images, _ = repaired(counts, instrument)
+    if not images.mean() > 0.0:
+        raise ModelError("illumination: found no light; expected the mean counts of the images")
+    shown = even_images(even_optics(instrument), (position.x_subap, position.y_subap))
+    lit = shown.sum(axis=0) > _LIT * np.percentile(shown.sum(axis=0), 75.0)
+    return _beam(_filled(_excess(images, shown, lit), lit), position)
+
+
+def relative_light(
+    counts: NDArray[Any], instrument: Instrument, position: PupilPosition
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the light over that of an even beam, ``(n, n)`` on the sensor, and where it is known.
+
+    Not smoothed: what is sharp in it, a spider's shadow, tells the rotation.
+
+    Raises
+    ------
+    ModelError
+        If the counts are not four images of the instrument's size.
+    """
+    images, _ = repaired(counts, instrument)
+    even = even_images(even_optics(instrument), (position.x_subap, position.y_subap)).sum(axis=0)
+    lit = even > _LIT * np.percentile(even, 75.0)
+    share = images.sum(axis=0) / np.where(lit, even, 1.0)
+    return np.where(lit, share / share[lit].mean(), 1.0), lit
+
+
+def _excess(images: Array, shown: Array, lit: NDArray[np.bool_]) -> Array:
+    """Return how much more light there is than shown ``(n, n)``, mean 1 where lit."""
+    ratio = images / images.mean(axis=(1, 2), keepdims=True) / np.where(lit, shown, 1.0)
+    excess = np.where(lit, np.median(ratio, axis=0), 0.0)
+    return np.asarray(excess / excess[lit].mean())
+
+
+def _filled(share: Array, lit: NDArray[np.bool_]) -> Array:
+    """Return the map, smoothed, with what lies outside the pupil continued from inside.
+
+    Normalised convolution, ever wider until everything is reached.
+    """
+    padded = np.pad(np.where(lit, share, 0.0), _MARGIN)
+    known = np.pad(lit.astype(np.float64), _MARGIN)
+
+    def spread(width: float) -> tuple[Array, Array]:
+        weight = scipy.ndimage.gaussian_filter(known, width, mode="constant")
+        light = scipy.ndimage.gaussian_filter(padded, width, mode="constant")
+        return light / np.maximum(weight, 1e-12), weight
+
+    filled, _ = spread(_SMOOTHING_SUBAP)
+    reached, width = known > 0.0, _SPREAD_SUBAP
+    while not reached.all():
+        wider, weight = spread(width)
+        new = ~reached & (weight > 1e-3)
+        filled = np.where(new, wider, filled)
+        reached = reached | new
+        width *= 2.0
+    return np.asarray(filled)
+
+
+def _beam(smooth: Array, position: PupilPosition) -> Illumination:
+    """Return the map with the beam's centre in its middle."""
+    rows, columns = np.indices(smooth.shape, dtype=np.float64)
+    places = [rows + position.y_subap, columns + position.x_subap]
+    centred = scipy.ndimage.map_coordinates(smooth, places, order=3, mode="nearest")
+    coordinates = np.arange(len(centred), dtype=np.float64) - (len(centred) - 1) / 2
+    return Illumination(coordinates=coordinates, intensity=np.maximum(centred, 0.0))
+
+
+FARTHEST_SUBAP = 3.0
+"""Pupil images further off than this are another instrument's."""
+
+_TURNS_RAD = np.deg2rad([5.0, -5.0])
+
+
+def far_starts(instrument: Instrument, flux: bytes | None) -> tuple[Misregistration, ...]:
+    """Return where to start from when nothing is known, the likeliest first.
+
+    With the mirror as stop the pupil images move with it, so that their mean light tells the
+    shift; rotation and magnification it does not tell. ``flux`` is as the RTC sends it, ``<f4``
+    ``[4, n, n]``, in its own axes: it is used where these are the conventions'.
+    """
+    nominal = instrument.start
+    turned = [replace(nominal, rotation_rad=nominal.rotation_rad + turn) for turn in _TURNS_RAD]
+    lit = _lit_start(instrument, nominal, flux)
+    return (*(() if lit is None else (lit,)), nominal, *turned)
+
+
+def _lit_start(
+    instrument: Instrument, nominal: Misregistration, flux: bytes | None
+) -> Misregistration | None:
+    own_axes = instrument.slopes.assumed_orientation == Orientation()
+    if flux is None or instrument.stop is not Stop.MIRROR or not own_axes:
+        return None
+    side = math.isqrt(len(flux) // 16)
+    try:
+        seen = find_pupil(np.frombuffer(flux, "<f4").reshape(4, side, side), instrument)
+    except ModelError:
+        return None
+    if not isinstance(seen, PupilPosition):
+        return None
+    if max(abs(seen.x_subap), abs(seen.y_subap)) > FARTHEST_SUBAP:
+        return None
+    return replace(nominal, shift_x_subap=seen.x_subap, shift_y_subap=seen.y_subap)

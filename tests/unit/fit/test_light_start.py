@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.fit.start import far_starts
+from service.fit.light import far_starts
 from service.model.instrument import SlopeRecipe, Stop
 from service.model.slopes import Orientation
 from tests.unit.fit.lamps import counts_of, small

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.fit.flux import CannotTell, PupilPosition, find_pupil
+from service.fit.light import CannotTell, PupilPosition, find_pupil
 from tests.unit.fit.lamps import (
     beam,
     counts_of,

@@ -14,7 +14,8 @@ import scipy
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.fit.flux import CannotTell, PupilPosition
+from service.fit.light import CannotTell, PupilPosition
+from service.fit.solver import vertex
 from service.model.pupil import Illumination
 
 Array = NDArray[np.float64]
@@ -128,7 +129,7 @@ def find_rotation(
     refusal = _refusal(angles, correlation, best)
     if refusal:
         return CannotTell(reason=refusal)
-    rotation_deg = angles[best] + _STEP_DEG * _vertex(correlation[best - 1 : best + 2])
+    rotation_deg = angles[best] + _STEP_DEG * vertex(*correlation[best - 1 : best + 2])
     slope = (turned[best + 1] - turned[best - 1]) / (2 * np.deg2rad(_STEP_DEG))
     scale = float(turned[best] @ seen / (turned[best] @ turned[best]))
     left = seen - scale * turned[best]
@@ -189,10 +190,3 @@ def _smooth_shapes(known: NDArray[np.bool_], order: int) -> Array:
 
 def _without(values: Array, shapes: Array) -> Array:
     return np.asarray(values - shapes @ (shapes.T @ values))
-
-
-def _vertex(three: Array) -> float:
-    """Return where the parabola through three values is highest, in steps from the middle one."""
-    below, middle, above = three
-    curvature = below - 2 * middle + above
-    return float(0.5 * (below - above) / curvature) if curvature < 0.0 else 0.0

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.fit.flux import PupilPosition, find_pupil
-from service.fit.illumination import measured_illumination, relative_light
+from service.fit.light import PupilPosition, find_pupil, measured_illumination, relative_light
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from tests.numerics import small_basis

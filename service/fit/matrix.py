@@ -9,20 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.fit.bench import Bench
-from service.fit.hypotheses import SUSPICIOUS, rivals
-from service.fit.joint import Solution, prior_of
-from service.fit.nuisance import Nuisances, nuisances_of
+from service.fit.methods import Landing, land, project_on_sensitivities, scan, settle, settle_at
+from service.fit.models import FitModels
 from service.fit.options import Fit, FitOptions, Method, ScanStep
 from service.fit.orientation import LEAST_CORRELATION, find_orientation
-from service.fit.paper import scan
-from service.fit.reference import Checked, Reference, checked
-from service.fit.remarks import remarks
-from service.fit.search import Landing, land, settle, settle_at
-from service.fit.sensitivity import project_on_sensitivities
-from service.fit.target import Target, oriented, target_of
+from service.fit.reference import Checked, Reference, Target, checked, oriented, target_of
+from service.fit.solver import Nuisances, Solution, nuisances_of
 from service.fit.uncertainty import pupil_regions, uncertainty
-from service.fit.verdict import Evidence, judged
+from service.fit.verdict import SUSPICIOUS, Evidence, alternatives, judged, remarks
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
 from service.model.misregistration import Misregistration
@@ -85,7 +79,7 @@ def fit_matrix(
     axes = _axes(instrument, usable, used, options, mapper)
     instrument = oriented(instrument, axes.order, axes.orientation)
     target = target_of(usable.reference, instrument)
-    bench = Bench(
+    models = FitModels(
         instrument=instrument, basis=used, illumination=options.illumination, mapper=mapper
     )
     tell("fit")
@@ -94,9 +88,9 @@ def fit_matrix(
     else:
         start = instrument.start.vector
         start[2] = axes.rotation_rad if axes.rotation_rad is not None else start[2]
-    found = _found(bench, target, start, options)
+    found = _found(models, target, start, options)
     tell("verdict")
-    return _answer(bench, found, usable, axes, told)
+    return _answer(models, found, usable, axes, told)
 
 
 def _silent(_: str) -> None:
@@ -184,23 +178,27 @@ class _Found:
     table: tuple[ScanStep, ...] | None = None
 
 
-def _found(bench: Bench, target: Target, start: Array, options: FitOptions) -> _Found:
-    nuisances = nuisances_of(options, target.valid)
+def _found(models: FitModels, target: Target, start: Array, options: FitOptions) -> _Found:
+    nuisances = nuisances_of(
+        target.valid, gain_map=options.gain_map, anamorphosis=options.anamorphosis
+    )
     match options.method:
         case Method.JOINT:
-            landing = land(bench, target, start)
-            solution, seen = settle(bench, target, landing.best.vector, nuisances)
+            landing = land(models, target, start)
+            solution, seen = settle(models, target, landing.best.vector, nuisances)
             return _Found(solution=solution, target=seen, nuisances=nuisances, landing=landing)
         case Method.SENSITIVITY:
-            solution, seen = project_on_sensitivities(bench, target, start, nuisances)
+            solution, seen = project_on_sensitivities(models, target, start, nuisances)
             return _Found(solution=solution, target=seen, nuisances=nuisances)
         case Method.PAPER:
-            vector, table = scan(bench, target, start)
-            solution, seen = settle_at(bench, target, vector, nuisances)
+            vector, table = scan(models, target, start)
+            solution, seen = settle_at(models, target, vector, nuisances)
             return _Found(solution=solution, target=seen, nuisances=nuisances, table=table)
 
 
-def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, told: SlopeOrder) -> Fit:
+def _answer(
+    models: FitModels, found: _Found, usable: Checked, axes: _Axes, told: SlopeOrder
+) -> Fit:
     solution, target = found.solution, found.target
     seen = solution.projection
     values = np.concatenate([np.zeros(4), solution.nuisances])
@@ -213,7 +211,7 @@ def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, told: Slo
     sure = uncertainty(
         seen,
         values,
-        prior_of(found.nuisances.sigma),
+        found.nuisances.prior,
         regions,
         shift_subap=float(np.hypot(*solution.vector[:2])),
         residual_fraction=residual_fraction,
@@ -225,12 +223,12 @@ def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, told: Slo
         gains=seen.gains,
         uncertainty=sure,
         landing=found.landing,
-        others=rivals(bench, target, solution, found.nuisances)
+        others=alternatives(models, target, solution, found.nuisances)
         if residual_fraction > SUSPICIOUS
         else (),
         axes=axes.refusal,
         passes=usable.reference.passes,
-        stroke_known=bench.instrument.mirror.stroke_known,
+        stroke_known=models.instrument.mirror.stroke_known,
     )
     accepted, verdict = judged(evidence)
     return Fit(
@@ -250,7 +248,7 @@ def _answer(bench: Bench, found: _Found, usable: Checked, axes: _Axes, told: Slo
         verdict=verdict,
         remarks=remarks(evidence, solution, target, told=told, found=axes.order),
         left_out=usable.left_out + _rows_left_out(target),
-        n_evaluations=bench.counter.n,
+        n_evaluations=models.counter.n,
         synthetic=solution.matrix,
         measured=target.matrix,
         valid=target.valid,

@@ -22,14 +22,22 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.model.instrument import Mirror
 from service.model.modes import karhunen_loeve_basis
-from service.telemetry import lockin, loopcheck, passive, randomdither, vibration
-from service.telemetry.edge import Actuators, EdgeHealth, EdgeWatch, edge_watch, observe_edge
-from service.telemetry.frames import FrameBlock
-from service.telemetry.health import LoopHealth, observe
+from service.telemetry import lockin, loopcheck, passive, random_dither
+from service.telemetry.frames import FrameBlock, Loop
+from service.telemetry.health import (
+    Actuators,
+    EdgeHealth,
+    EdgeWatch,
+    LoopHealth,
+    VibrationMonitor,
+    edge_watch,
+    observe,
+    observe_edge,
+)
 from service.telemetry.lockin import LockIn, LockInPlan
-from service.telemetry.loopcheck import LoopCheck, LoopTerms
+from service.telemetry.loopcheck import LoopCheck
 from service.telemetry.passive import Passive
-from service.telemetry.randomdither import RandomDither, RandomPlan
+from service.telemetry.random_dither import RandomDither, RandomPlan
 
 N_SLOPES, N_MODES, N_CONTROLLED = 1408, 594, 400
 RATE_HZ = 1000.0
@@ -129,7 +137,7 @@ def _random(modes: tuple[int, ...]) -> RandomDither:
 
 
 def _random_fed(state: RandomDither, block: FrameBlock) -> RandomDither:
-    return randomdither.accumulate(state, block)[0]
+    return random_dither.accumulate(state, block)[0]
 
 
 def _watchers() -> Iterator[Part]:
@@ -148,7 +156,7 @@ def _watchers() -> Iterator[Part]:
         begin=EdgeHealth(),
         feed=lambda state, block: observe_edge(state, block, watch),
     )
-    terms = LoopTerms(
+    terms = Loop(
         cm_id="cm",
         reconstructor=np.ones((N_CONTROLLED, N_SLOPES), np.float32),
         gains=np.full(N_CONTROLLED, 0.5, np.float32),
@@ -161,8 +169,10 @@ def _watchers() -> Iterator[Part]:
         begin=LoopCheck(),
         feed=lambda state, block: loopcheck.observe(state, block, terms),
     )
-    listening = vibration.Vibrations(views=vibration.views_of(N_SLOPES))
-    yield Part(name="vibrations", begin=listening, feed=vibration.listen)
+    monitor = VibrationMonitor.begin(N_SLOPES)
+    yield Part(
+        name="vibrations", begin=monitor, feed=lambda state, block: state.update(block, LINES_HZ)
+    )
 
 
 def _edge_watch(mirror: object, strokes: Array, variance: Array) -> EdgeWatch:

@@ -25,8 +25,8 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from service.telemetry.edge import Actuators, EdgeHealth, edge_watch, observe_edge
 from service.telemetry.frames import FrameBlock
+from service.telemetry.health import Actuators, EdgeHealth, edge_watch, observe_edge
 from sim_rtc.assembly import build_telescope
 from sim_rtc.feed import BATCH_FRAMES
 from sim_rtc.loop import ModalLoop

@@ -22,10 +22,16 @@ from service.archive.products import NoisyArchive
 from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.estimates import finished, work_out
-from service.telemetry import randomdither
-from service.telemetry.noisymatrix import RandomEstimate, noisy_matrix
-from service.telemetry.randomdither import Correlated, RandomDither, RandomPlan, joined
-from service.telemetry.span import WindowRefused
+from service.telemetry import random_dither
+from service.telemetry.random_dither import (
+    Correlated,
+    RandomDither,
+    RandomEstimate,
+    RandomPlan,
+    joined,
+    noisy_matrix,
+)
+from service.telemetry.windows import WindowRefused
 from service.tracking.products import NoisyRecord, NoisyState
 from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, Workbench
@@ -124,7 +130,7 @@ def _windows(
             if batches[0].seq0 >= state.plan.first_seq:
                 errors_nm += error.rms_nm(batches)
             for block in blocks_of(batches, telescope):
-                state, ended = randomdither.accumulate(state, block)
+                state, ended = random_dither.accumulate(state, block)
                 for window in ended:
                     n_done += 1
                     yield window, float(np.sqrt(np.mean(np.square(errors_nm))))

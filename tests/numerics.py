@@ -24,8 +24,7 @@ from service.model.instrument import (
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from service.telemetry.frames import FrameBlock
-from service.telemetry.instrumental import Loop
+from service.telemetry.frames import FrameBlock, Loop
 from service.telemetry.lockin import LockInPlan
 
 Array = NDArray[Any]

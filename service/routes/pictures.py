@@ -10,7 +10,7 @@ from service.files.uploads import FitJob
 from service.link.statistics import LinkStatistics
 from service.routes.service import Alpha, Pace, Rtc, Snapshot
 from service.routes.views import view
-from service.telemetry.estimator import Determines
+from service.telemetry.estimate import Determines
 from service.tracking.events import GainGroup
 from service.tracking.loop import DitherView, LoopCommand, Pointing
 from service.tracking.products import (

@@ -25,10 +25,11 @@ from service.runtime.streams import (
     with_rtc,
 )
 from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import Spectra, WindowRefused
+from service.telemetry.lockin import Spectra
 from service.telemetry.passive import Passive
 from service.telemetry.played import LOUDER, Finding
-from service.telemetry.randomdither import Correlated
+from service.telemetry.random_dither import Correlated
+from service.telemetry.windows import WindowRefused
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.alarms import OFF_LOOP, WRONG_LOOP, WRONG_UNIT, Act, forbidding
@@ -199,8 +200,8 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
         found.append(ev.DitherSilent(id=dither.id, silent_s=silent_s))
     if dither is not None and streams.played is not None:
         found += _misplayed(dither.id, streams.played, state)
-    lines = () if streams.hearing is None else streams.hearing.lines_hz
-    if streams.hearing is not None and lines != state.vibrations_hz:
+    lines = () if streams.vibrations is None else streams.vibrations.lines_hz
+    if streams.vibrations is not None and lines != state.vibrations_hz:
         found.append(ev.Vibrations(lines_hz=lines))
     for name, trouble, over in troubles(streams):
         known = any(alarm.name == name for alarm in state.alarms)

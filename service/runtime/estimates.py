@@ -16,13 +16,12 @@ from service.fit.dialect import setting_written
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
-from service.telemetry import lockin, randomdither
-from service.telemetry.estimator import Window
-from service.telemetry.instrumental import Loop
-from service.telemetry.lockin import Spectra, WindowRefused
-from service.telemetry.noisymatrix import RandomEstimate, noisy_matrix
+from service.telemetry import lockin, random_dither
+from service.telemetry.frames import Loop
+from service.telemetry.lockin import Spectra
 from service.telemetry.passive import Passive
-from service.telemetry.randomdither import Correlated
+from service.telemetry.random_dither import Correlated, RandomEstimate, noisy_matrix
+from service.telemetry.windows import Telemetry, WindowRefused
 from service.tracking import events as ev
 from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
 from service.tracking.events import Event
@@ -89,7 +88,7 @@ def _joined(one: Spectra | Correlated, other: Spectra | Correlated) -> Spectra |
     if isinstance(one, Spectra) and isinstance(other, Spectra):
         return lockin.joined(one, other)
     if isinstance(one, Correlated) and isinstance(other, Correlated) and _alike(one, other):
-        return randomdither.joined(one, other)
+        return random_dither.joined(one, other)
     return None
 
 
@@ -240,7 +239,7 @@ async def listened(
     return events
 
 
-def lost(window: Window, reason: str) -> Event:
+def lost(window: Telemetry, reason: str) -> Event:
     """Return what becomes of a window that cannot be fitted."""
     refused = WindowRefused(reason=reason, t_ns_utc=window.t_end_ns_utc)
     return ev.WindowLost(refused=refused)
@@ -281,7 +280,7 @@ class NoisySums:
         total = self._total if self._id == record.id else None
         self._id = record.id
         try:
-            self._total = window if total is None else randomdither.joined(total, window)
+            self._total = window if total is None else random_dither.joined(total, window)
         except ModelError:  # the RTC has started anew: what came before is of another loop
             self._total = window
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from service.control.expected_gain import Timing
 from service.control.gate import LoopSettings
-from service.telemetry.loopcheck import LoopTerms
+from service.telemetry.frames import Loop
 from service.tracking.alarms import Act, forbidding
 from service.tracking.loop import RtcView, same_gains
 from service.tracking.loop_commands import table_of
@@ -57,12 +57,12 @@ def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None
     return n_modes if same_gains(gains[:n_modes], rtc.gains[:n_modes]) else None
 
 
-def terms_of(rtc: RtcView, cm_id: str, matrix: NDArray[np.float32]) -> LoopTerms | None:
+def terms_of(rtc: RtcView, cm_id: str, matrix: NDArray[np.float32]) -> Loop | None:
     """Return the loop that a reconstructor closes; None: it is open, or another's."""
     fits = matrix.shape[1] == rtc.n_slopes and len(matrix) <= rtc.n_modes
     if rtc.loop == "open" or not fits:
         return None
-    return LoopTerms(
+    return Loop(
         cm_id=cm_id,
         reconstructor=matrix,
         gains=np.array(rtc.gains[: len(matrix)], np.float32),

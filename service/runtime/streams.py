@@ -9,17 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.runtime.loops import terms_of
-from service.telemetry import lockin, loopcheck, looplaw, passive, randomdither
-from service.telemetry.edge import EdgeHealth, EdgeWatch, edge_watch, observe_edge
-from service.telemetry.frames import FrameBlock
-from service.telemetry.health import LoopHealth, observe
-from service.telemetry.lockin import LockIn, Spectra, WindowRefused
-from service.telemetry.loopcheck import LoopCheck, LoopTerms, Obedience
-from service.telemetry.looplaw import LoopLaw
+from service.telemetry import lockin, loopcheck, passive, random_dither
+from service.telemetry.frames import FrameBlock, Loop
+from service.telemetry.health import (
+    EdgeHealth,
+    EdgeWatch,
+    LoopHealth,
+    VibrationMonitor,
+    edge_watch,
+    observe,
+    observe_edge,
+)
+from service.telemetry.lockin import LockIn, Spectra
+from service.telemetry.loopcheck import LoopCheck, LoopLaw, Obedience
 from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, measured
-from service.telemetry.randomdither import Correlated, RandomDither
-from service.telemetry.vibration import Hearing, heard, hearing
+from service.telemetry.random_dither import Correlated, RandomDither
+from service.telemetry.windows import WindowRefused
 from service.tracking.dither_plan import SETTLING_S, asked_of, lock_in_plan, random_plan
 from service.tracking.loop import DitherKind, DitherView, RtcView, same_rate
 from service.worker import Description
@@ -82,8 +88,8 @@ class Streams:
     dither_silent_s: float = 0.0
     """For how long the last frames should have held it and did not."""
 
-    hearing: Hearing | None = None
-    """Of vibrations; None: no RTC is there."""
+    vibrations: VibrationMonitor | None = None
+    """None: no RTC is there."""
 
     passive: Passive | None = None
     health: LoopHealth = field(default_factory=LoopHealth)
@@ -117,7 +123,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
         return replace(
             streams,
             loop=None,
-            hearing=None,
+            vibrations=None,
             passive=None,
             lock_in=None,
             random=None,
@@ -149,9 +155,9 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
         since_ns_utc=streams.heard_ns_utc,
     )
     if before is None or not same_rate(before.frame_rate_hz, rtc.frame_rate_hz):
-        ears = hearing(rtc.n_slopes)
         streams = replace(streams, lock_in=None, random=None, dither=None)
-        return replace(streams, hearing=ears, passive=memory)
+        monitor = VibrationMonitor.begin(rtc.n_slopes)
+        return replace(streams, vibrations=monitor, passive=memory)
     return _cut(replace(streams, passive=memory), rtc)
 
 
@@ -189,7 +195,7 @@ def with_matrix(streams: Streams, cm_id: str, matrix: NDArray[np.float32]) -> St
     return replace(streams, matrices=(*others, (cm_id, matrix))[-MATRICES_KEPT:])
 
 
-def _terms(streams: Streams, cm_id: str | None) -> LoopTerms | None:
+def _terms(streams: Streams, cm_id: str | None) -> Loop | None:
     """Return the loop that a reconstructor closes; None: it is open, or not known."""
     matrix = next((matrix for known, matrix in streams.matrices if known == cm_id), None)
     if streams.rtc is None or cm_id is None or matrix is None:
@@ -207,7 +213,7 @@ def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:
     terms = _terms(streams, rtc.cm_id)
     if terms is None or streams.law.cm_id != rtc.cm_id:
         return streams
-    law, found = looplaw.judged(streams.law, terms, rtc.seq)
+    law, found = loopcheck.judged(streams.law, terms, rtc.seq)
     if found is None:
         return replace(streams, law=law)
     if found.wrong:
@@ -272,15 +278,15 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     terms = _terms(streams, block.cm_id)
     if terms is not None:
         check = loopcheck.observe(streams.check, block, terms)
-        streams = replace(streams, check=check, law=looplaw.follow(streams.law, block, terms))
+        streams = replace(streams, check=check, law=loopcheck.follow(streams.law, block, terms))
     streams = _listening(streams, rtc, block)
     streams, ended = _dithered(streams, rtc, block)
     if ended:
         streams = replace(streams, loop=rtc)  # the next one begins with the gains of now
     windows = [_obeying(streams, window) for window in ended]
-    if streams.hearing is not None and len(streams.in_loop):
+    if streams.vibrations is not None and len(streams.in_loop):
         lines = () if streams.dither is None else streams.dither.frequency_hz
-        streams = replace(streams, hearing=heard(streams.hearing, block, lines))
+        streams = replace(streams, vibrations=streams.vibrations.update(block, lines))
     if streams.passive is not None and len(streams.in_loop):
         streams = replace(
             streams, passive=passive.accumulate(streams.passive, _moving(streams, block))
@@ -316,7 +322,7 @@ def _dithered(
         over = _beyond_the_dither(streams, rtc, lock_in)
         return replace(streams, lock_in=None if over else lock_in), spectra
     if streams.random is not None:
-        random, correlated = randomdither.accumulate(streams.random, block)
+        random, correlated = random_dither.accumulate(streams.random, block)
         over = _beyond_the_dither(streams, rtc, random)
         return replace(streams, random=None if over else random), correlated
     return streams, ()
@@ -361,7 +367,7 @@ def _beyond_the_dither(streams: Streams, rtc: RtcView, reading: LockIn | RandomD
     if dither is None or window is None:
         return False
     stop_seq = (dither.start_seq or 0) + round(dither.duration_s * rtc.frame_rate_hz)
-    return window.span.first_seq + reading.plan.n_frames > stop_seq
+    return window.first_seq + reading.plan.n_frames > stop_seq
 
 
 def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:

@@ -28,7 +28,7 @@ from service.runtime.recording import Recorder
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, waiting_for
 from service.runtime.workers import WorkerPool
 from service.telemetry.lockin import Spectra
-from service.telemetry.randomdither import Correlated
+from service.telemetry.random_dither import Correlated
 from service.tracking import events as ev
 from service.tracking.alarms import new_lines
 from service.tracking.events import Command, Effect, Event

@@ -1,8 +1,8 @@
-"""Telemetry frames as the estimators see them."""
+"""Telemetry frames as the estimators see them, and the loop that made them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,3 +44,82 @@ class FrameBlock:
     def n_frames(self) -> int:
         """Number of rows."""
         return int(self.slopes.shape[0])
+
+    @property
+    def next_seq(self) -> int:
+        """Sequence number of the frame after the last row."""
+        return self.first_seq + self.n_frames
+
+    @property
+    def next_t_ns(self) -> int:
+        """End of exposure of the frame after the last row."""
+        return self.t0_ns_utc + self.n_frames * self.dt_ns
+
+    def rows(self, start: int, stop: int) -> FrameBlock:
+        """Return these rows as a block: a view."""
+        some = slice(start, stop)
+        return replace(
+            self,
+            first_seq=self.first_seq + start,
+            t0_ns_utc=self.t0_ns_utc + start * self.dt_ns,
+            slopes=self.slopes[some],
+            commands_m=self.commands_m[some],
+            dither_m=None if self.dither_m is None else self.dither_m[some],
+        )
+
+    def last(self, n: int) -> FrameBlock:
+        """Return the last ``n`` rows, copied: a view would keep the whole block."""
+        view = self.rows(max(self.n_frames - n, 0), self.n_frames)
+        return replace(
+            view,
+            slopes=view.slopes.copy(),
+            commands_m=view.commands_m.copy(),
+            dither_m=None if view.dither_m is None else view.dither_m.copy(),
+        )
+
+    def without_dither(self) -> FrameBlock:
+        """Return the same frames with the integrator's own commands."""
+        if self.dither_m is None:
+            return self
+        return replace(self, commands_m=self.commands_m - self.dither_m, dither_m=None)
+
+    def follows(self, before: FrameBlock) -> bool:
+        """Return whether this block goes on where another ends."""
+        return (self.session, self.dt_ns, self.first_seq) == (
+            before.session,
+            before.dt_ns,
+            before.next_seq,
+        )
+
+
+def joined_frames(blocks: tuple[FrameBlock, ...]) -> FrameBlock:
+    """Return blocks of which each follows the one before as one.
+
+    Without dither columns where one of them has none.
+    """
+    if len(blocks) == 1:
+        return blocks[0]
+    dither = [block.dither_m for block in blocks if block.dither_m is not None]
+    return replace(
+        blocks[0],
+        slopes=np.concatenate([block.slopes for block in blocks]),
+        commands_m=np.concatenate([block.commands_m for block in blocks]),
+        dither_m=np.concatenate(dither) if len(dither) == len(blocks) else None,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Loop:
+    """The control loop that runs: ``c[k+d] = leak c[k+d-1] - gain R s[k]``."""
+
+    reconstructor: NDArray[np.float32]
+    """``(n_controlled, n_slopes)`` metres per slope; row i commands mode i."""
+
+    gains: NDArray[np.floating]
+    """``(n_controlled,)``."""
+
+    leak: float
+    delay_frames: float
+    frame_rate_hz: float
+    cm_id: str | None = None
+    """Of the reconstructor; None: the RTC does not know."""

@@ -1,17 +1,30 @@
-"""Is the loop holding? Watched on the commands of the highest controlled modes.
+"""Whether the loop holds, whether the mirror's edge is where it was, and what vibrates.
 
-A mis-registered loop goes unstable in its highest modes first, while slopes and wavefront error
-look healthy almost to the end.
+**The loop** is watched on the commands of the highest controlled modes: a mis-registered loop goes
+unstable there first, while slopes and wavefront error look healthy almost to the end.
+
+**The outer ring** of the mirror is watched on the commands as well. A segment at the edge of the
+pupil can slip by wavelengths and stay there: the sensor sees little light across it, its slopes
+look healthy, and only the command shows the step. On the diffractive telescope the slowly averaged
+position of the outermost actuators stays below 2.2 times what turbulence asks of them in every loop
+that held. A slip takes it to 7 to 18, or leaves it at 3 for seconds while the wavefront is lost
+already (docs/results/edge_slip.md).
+
+**Vibrations** are lines in the slopes; no dither is put on one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from service.telemetry.frames import FrameBlock
+
+Array = NDArray[Any]
 
 DIVERGING_RATIO = 10.0
 """Times the expected turbulence that the upper half of the controlled modes may reach."""
@@ -79,3 +92,251 @@ def _absurd(health: LoopHealth, levels: NDArray[np.float64]) -> bool:
         return health.absurd and bool(beyond[-1])
     before = levels[: int(np.argmax(beyond))]
     return not health.diverging and not bool((before > DIVERGING_RATIO).any())
+
+
+SLIPPED_RATIO = 4.5
+"""Averaged position of an outer actuator, in σ of turbulence, that no healthy loop shows."""
+
+SUSPECT_RATIO = 2.5
+"""What no healthy loop shows for longer than ``SUSPECT_FOR_S``; below it, a ring that had slipped
+is back."""
+
+SUSPECT_FOR_S = 0.5
+
+LOW_MODES = 30
+"""Left out: tip, tilt and their like move the whole mirror by more than any slip."""
+
+LOOK_FRAMES = 50
+"""One of so many frames is looked at, however long a block is."""
+
+_EDGE_MEMORY_S = 0.25
+"""Turbulence of higher modes has forgotten itself after this; a slip has not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Actuators:
+    """Where the actuators are, and how far each mode moves them."""
+
+    positions: NDArray[np.float64]
+    """``(n_actuators, 2)`` in any unit."""
+
+    strokes: NDArray[np.float64]
+    """``(n_actuators, n_modes)`` position for a unit command of each mode."""
+
+    @property
+    def outer(self) -> NDArray[np.bool_]:
+        """``(n_actuators,)`` within 4 % of the largest radius: one ring of FLAO's fourteen."""
+        radius = np.hypot(*self.positions.T)
+        return np.asarray(radius > 0.96 * radius.max())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeWatch:
+    """Where the actuators of one mirror stand for a modal command, in σ of turbulence."""
+
+    outer: NDArray[np.float32]
+    """``(n_outer, n_modes)`` of the outermost ring; zero for modes left out."""
+
+    inner: NDArray[np.float32]
+    """``(n_inner, n_modes)`` of all others: they tell how strong the turbulence is tonight."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeHealth:
+    """Forgetting means of what the two parts of the mirror do."""
+
+    position: NDArray[np.float32] | None = None
+    """``(n_outer,)`` averaged position, in σ of the turbulence the basis was made for."""
+
+    turbulence: float = 1.0
+    """RMS of the inner actuators in the same unit."""
+
+    ratio: float = 0.0
+    """Largest averaged position of an outer actuator over ``turbulence``."""
+
+    suspect_s: float = 0.0
+    """For how long the ratio has been above ``SUSPECT_RATIO``."""
+
+    slipped: bool = False
+
+
+def edge_watch(
+    actuators: Actuators, mode_variance_m2: NDArray[np.float64], in_loop: NDArray[np.intp]
+) -> EdgeWatch | None:
+    """Return what to watch in a loop of these modes; None when they are too few to say.
+
+    The same when nothing is known of the turbulence in the modes.
+    """
+    used, high = np.zeros(len(mode_variance_m2)), in_loop[in_loop >= LOW_MODES]
+    used[high] = 1.0
+    expected = np.sqrt(actuators.strokes**2 @ (used * mode_variance_m2))
+    if len(high) <= LOW_MODES or expected.min() <= 0.0:
+        return None
+    shapes = (actuators.strokes * used / expected[:, None]).astype(np.float32)
+    outer = actuators.outer
+    return EdgeWatch(outer=shapes[outer], inner=shapes[~outer])
+
+
+def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
+    """Return the health after one more block, of which a frame now and then is looked at."""
+    start = 0
+    while start < block.n_frames:
+        stop = min(start + LOOK_FRAMES, block.n_frames)
+        lasted_s = (stop - start) * block.dt_ns * 1e-9
+        health = _seen(health, block.commands_m[stop - 1], lasted_s, watch)
+        start = stop
+    return health
+
+
+def _seen(
+    health: EdgeHealth, command: NDArray[np.float32], lasted_s: float, watch: EdgeWatch
+) -> EdgeHealth:
+    """Return the health after a command that stands for so much time."""
+    outer, inner = watch.outer @ command, watch.inner @ command
+    fade = float(np.exp(-lasted_s / _EDGE_MEMORY_S))
+    position = (1.0 - fade) * outer
+    if health.position is not None:
+        position += fade * health.position
+    power = fade * health.turbulence**2 + (1.0 - fade) * float(np.mean(inner**2))
+    turbulence = float(np.sqrt(power))
+    ratio = float(np.abs(position).max()) / max(turbulence, 1e-3)
+    suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0
+    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_FOR_S
+    return EdgeHealth(
+        position=position,
+        turbulence=turbulence,
+        ratio=ratio,
+        suspect_s=suspect_s,
+        slipped=slipped or (health.slipped and suspect_s > 0.0),
+    )
+
+
+SEGMENT_FRAMES = 1024
+"""Length of a spectrum: 1 Hz per bin at 1 kHz."""
+
+MIN_SEGMENTS = 8
+"""Fewer spectra scatter too much for a line to be told from noise."""
+
+LINE_RATIO = 8.0
+"""Power of a line over its neighbourhood's median: a mean of eight spectra of noise never gets
+there, so that what does is worth moving a dither for."""
+
+LOOK_SEGMENTS = 4
+"""Spectra between two looks for lines: a look costs as much as hundreds of frames."""
+
+_NEIGHBOURHOOD = 20
+_MEMORY_SEGMENTS = 32.0
+_N_PATTERNS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SlopeSpectra:
+    """Mean spectra of a few combinations of slopes."""
+
+    views: NDArray[np.float32]
+    """``(n_views, n_slopes)``: tip, tilt, and patterns that every other mode is seen by."""
+
+    power: NDArray[np.float64] | None = None
+    """``(n_views, n_bins)`` forgetting mean."""
+
+    n_segments: int = 0
+    frame_rate_hz: float = 0.0
+    next_seq: int = -1
+    session: str = ""
+    collected: NDArray[np.float32] | None = None
+    """``(n, n_views)`` of the segment under way."""
+
+    def with_frames(self, block: FrameBlock) -> SlopeSpectra:
+        """Return the spectra after a block; a gap or a new session starts the segment anew."""
+        rows = (block.slopes @ self.views.T).astype(np.float32)
+        unbroken = (block.session, block.first_seq) == (self.session, self.next_seq)
+        if unbroken and self.collected is not None:
+            rows = np.vstack([self.collected, rows])
+        spectra = self
+        while len(rows) >= SEGMENT_FRAMES:
+            spectra = spectra._with_segment(rows[:SEGMENT_FRAMES])
+            rows = rows[SEGMENT_FRAMES:]
+        return replace(
+            spectra,
+            frame_rate_hz=1e9 / block.dt_ns,
+            session=block.session,
+            next_seq=block.next_seq,
+            collected=rows,
+        )
+
+    def lines_hz(self, known_hz: tuple[float, ...] = ()) -> tuple[float, ...]:
+        """Return the vibration lines, lowest first, without those known: the dither's own.
+
+        A bin is a line when in any view it stands ``LINE_RATIO`` above the median of its
+        neighbourhood and is the highest within two bins. Below 2 % of the frame rate turbulence
+        falls too steeply for a neighbourhood to tell, and no dither goes there.
+        """
+        if self.power is None or self.n_segments < MIN_SEGMENTS:
+            return ()
+        around = (1, 2 * _NEIGHBOURHOOD + 1)
+        typical = scipy.ndimage.median_filter(self.power, around, mode="mirror")
+        highest = scipy.ndimage.maximum_filter(self.power, (1, 5), mode="constant")
+        peaks = (self.power > LINE_RATIO * typical) & (self.power == highest)
+        step = self.frame_rate_hz / SEGMENT_FRAMES
+        found = [step * k for k in np.flatnonzero(peaks.any(axis=0)) if k > _NEIGHBOURHOOD]
+        return tuple(
+            float(f) for f in found if all(abs(f - known) > 3.0 * step for known in known_hz)
+        )
+
+    def _with_segment(self, rows: Array) -> SlopeSpectra:
+        window = np.hanning(SEGMENT_FRAMES)[:, None]
+        power = np.abs(np.fft.rfft((rows - rows.mean(axis=0)) * window, axis=0)).T ** 2
+        share = max(1.0 / (self.n_segments + 1), 1.0 / _MEMORY_SEGMENTS)
+        if self.power is not None:
+            power = (1.0 - share) * self.power + share * power
+        return replace(self, power=power, n_segments=self.n_segments + 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class VibrationMonitor:
+    """What vibrates while no dither plays, and under one: feed it blocks with ``update``.
+
+    Apart, because only a pause tells a vibration from a dither that plays on it.
+    """
+
+    quiet: SlopeSpectra
+    dithered: SlopeSpectra
+    dither_hz: tuple[float, ...] = ()
+    """Lines of the dither that ``dithered`` was seen under."""
+
+    lines_hz: tuple[float, ...] = ()
+    """Vibration lines as of the last look, lowest first."""
+
+    @classmethod
+    def begin(cls, n_slopes: int) -> VibrationMonitor:
+        """Return the monitor of slopes of which nothing has been seen yet.
+
+        It looks at the mean x and y slopes, and at fixed patterns of random signs.
+        """
+        half = n_slopes // 2
+        views = np.zeros((2 + _N_PATTERNS, n_slopes), np.float32)
+        views[0, :half] = views[1, half:] = 1.0 / np.sqrt(half)
+        signs = np.random.default_rng(1).choice([-1.0, 1.0], size=(_N_PATTERNS, n_slopes))
+        views[2:] = signs / np.sqrt(n_slopes)
+        return cls(quiet=SlopeSpectra(views=views), dithered=SlopeSpectra(views=views))
+
+    def update(self, block: FrameBlock, dither_hz: tuple[float, ...]) -> VibrationMonitor:
+        """Return it after a block played under these dither lines; lines are sought now and then.
+
+        Another dither's spectra begin anew.
+        """
+        quiet, dithered = self.quiet, self.dithered
+        if block.dither_m is None:
+            quiet, dither_hz = quiet.with_frames(block), self.dither_hz
+        else:
+            if dither_hz != self.dither_hz:
+                dithered = SlopeSpectra(views=dithered.views)
+            dithered = dithered.with_frames(block)
+        before = self.quiet.n_segments + self.dithered.n_segments
+        n_segments = quiet.n_segments + dithered.n_segments
+        state = replace(self, quiet=quiet, dithered=dithered, dither_hz=dither_hz)
+        if n_segments == before or n_segments % LOOK_SEGMENTS:
+            return state
+        lines = quiet.lines_hz()
+        under = dithered.lines_hz((*dither_hz, *lines))
+        return replace(state, lines_hz=tuple(sorted((*lines, *under))))

@@ -1,4 +1,10 @@
-"""Streaming demodulation of telemetry at the dither's frequencies and beside them."""
+"""Registration from windows of sines: demodulation at the lines, then a fit of what stands there.
+
+Telemetry is demodulated, as it comes, at the dither's frequencies and beside them, where the noise
+is read off. The command carries turbulence, so regressing slopes on commands is biased (by 6 % of a
+subaperture on a faint star). What the closed loop makes of the known dither alone is therefore the
+instrumental variable; only its correlation with the slopes is used.
+"""
 
 from __future__ import annotations
 
@@ -8,48 +14,37 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.errors import ModelError
-from service.telemetry.frames import FrameBlock
-from service.telemetry.span import Steps, Window, advanced, cut
-from service.telemetry.span import WindowRefused as WindowRefused
+from service.model.interaction import Linearisation
+from service.model.misregistration import Misregistration
+from service.telemetry.estimate import DitheredEstimate
+from service.telemetry.frames import FrameBlock, Loop, joined_frames
+from service.telemetry.windows import CHUNK_FRAMES, Telemetry, Window, WindowCutter, WindowPlan
+from service.telemetry.windows import WindowRefused as WindowRefused
 
 Array = NDArray[Any]
 
 SIDE_OFFSETS_HZ = np.concatenate([np.arange(-20.0, -2.0), np.arange(3.0, 21.0)])
 """Where the noise is measured, relative to each dither line: 36 bins; 6 were too few."""
 
-CHUNK_FRAMES = 512
-"""Frames multiplied at once: the sums, 2 MB, are read from memory once for all of them."""
-
 CUT_PERIODS = 0.01
 """Of a line, by which a window may be too long or too short: a rate of the RTC's that differs by
 parts per million. The Hann window keeps what that costs below 1e-4 of the amplitude."""
 
-MIN_AMPLITUDE_RATIO = 0.5
-MAX_AMPLITUDE_RATIO = 1.5
-"""A dither weaker or stronger than these shares of its request was not applied as asked."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LockInPlan:
-    """What is demodulated: one sinusoid on each of a few modes."""
+class LockInPlan(WindowPlan):
+    """What is demodulated: one sinusoid on each of a few modes.
 
-    modes: tuple[int, ...]
-    """0-based basis indices."""
+    A window is an integer number of periods of every frequency.
+    """
 
     frequencies_hz: tuple[float, ...]
     """One for each mode."""
 
-    amplitude_m: tuple[float, ...]
-    """RMS of each sinusoid, metres OPD."""
-
     frame_rate_hz: float
-    n_frames: int
-    """Length of a window: an integer number of periods of every frequency."""
-
-    first_seq: int
-    """No window starts before this frame: the dither is on and the loop has settled."""
 
     def __post_init__(self) -> None:
         """Refuse a plan whose lines or side bins would leave the spectrum or be cut short.
@@ -86,19 +81,14 @@ class LockInPlan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Spectra:
-    """One window of telemetry at the plan's bins: sums of ``h_k x_k exp(-i w k)``, Hann h."""
+class Spectra(Telemetry):
+    """One window of telemetry at the plan's bins: sums of ``h_k x_k exp(-i w k)``, Hann h.
+
+    Frames that never came count as zeros, which the side bins notice. Of joined windows it is the
+    mean.
+    """
 
     plan: LockInPlan
-    session: str
-    cm_id: str | None
-    first_seq: int
-    t_end_ns_utc: int
-    """End of exposure of the last frame."""
-
-    n_missing: int
-    """Frames that never came; they count as zeros, which the side bins notice."""
-
     slopes: NDArray[np.complex64]
     """``(n_lines, 1 + n_side, n_slopes)``."""
 
@@ -108,9 +98,6 @@ class Spectra:
     dither: NDArray[np.complex64]
     """``(n_lines, n_modes)`` its known dither part at the lines, metres."""
 
-    n_windows: int = 1
-    """Windows, one after the other, that this is the mean of."""
-
     @property
     def window_s(self) -> float:
         """Seconds of telemetry in it."""
@@ -118,16 +105,8 @@ class Spectra:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LockIn:
-    """Windows under way: feed it blocks with ``accumulate``."""
-
-    plan: LockInPlan
-    window: Window[_Sums] | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Sums:
-    """Sums so far, and the rows that wait to be added to them."""
+class LockInSums:
+    """Sums so far, and the frames that wait to be added to them."""
 
     slopes: Array
     """``(2 * n_bins, n_slopes)``: real parts of every bin, then imaginary ones; so the others."""
@@ -138,30 +117,77 @@ class _Sums:
     dither: Array
     """``(2 * n_lines, n_modes)``."""
 
-    waiting: tuple[_Rows, ...] = ()
+    waiting: tuple[FrameBlock, ...] = ()
+    """Each follows the one before."""
 
-    @property
-    def n_waiting(self) -> int:
-        """Frames that wait."""
-        return sum(len(rows.slopes) for rows in self.waiting)
+    place: int = 0
+    """In the window, of the first frame that waits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Rows:
-    """Contiguous frames of a window."""
+class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
+    """Windows of sines under way."""
 
-    first: int
-    """Their place in the window."""
+    @override
+    def begin(self, block: FrameBlock) -> LockInSums:
+        """Return empty sums for frames like these."""
+        n_bins, n_modes = self.plan.bins_hz.size, block.commands_m.shape[1]
+        return LockInSums(
+            slopes=np.zeros((2 * n_bins, block.slopes.shape[1]), np.float32),
+            commands=np.zeros((2 * n_bins, n_modes), np.float32),
+            dither=np.zeros((2 * len(self.plan.modes), n_modes), np.float32),
+        )
 
-    slopes: Array
-    commands: Array
-    dither: Array
+    @override
+    def add(self, sums: LockInSums, block: FrameBlock, place: int) -> LockInSums:
+        """Return the sums with a block that begins at this place of the window."""
+        for start in range(0, block.n_frames, CHUNK_FRAMES):
+            part = block.rows(start, min(start + CHUNK_FRAMES, block.n_frames))
+            if sums.waiting and not part.follows(sums.waiting[-1]):
+                sums = self._projected(sums)
+            first = sums.place if sums.waiting else place + start
+            sums = replace(sums, waiting=(*sums.waiting, part), place=first)
+            if sum(waiting.n_frames for waiting in sums.waiting) >= CHUNK_FRAMES:
+                sums = self._projected(sums)
+        return sums
+
+    @override
+    def close(self, window: Window[LockInSums]) -> Spectra | WindowRefused:
+        """Return the finished window, or why its dither is not the one asked for."""
+        plan, sums = self.plan, self._projected(window.sums)
+        dither = _complex(sums.dither, len(plan.modes))
+        weight = 0.5 * plan.n_frames / np.sqrt(2.0)
+        applied = np.abs(dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
+        reason = plan.refusal(applied, tuple(f"{line} Hz" for line in plan.frequencies_hz))
+        if reason is not None:
+            return WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
+        return Spectra(
+            plan=plan,
+            slopes=_complex(sums.slopes, *plan.bins_hz.shape),
+            commands=_complex(sums.commands, *plan.bins_hz.shape),
+            dither=dither,
+            **window.telemetry,
+        )
+
+    def _projected(self, sums: LockInSums) -> LockInSums:
+        """Return the sums with the frames that waited in them."""
+        if not sums.waiting:
+            return sums
+        block = joined_frames(sums.waiting)
+        phasors = _phasors(self.plan, sums.place, block.n_frames)
+        # real products: the columns are real
+        parts = np.concatenate([phasors.real, phasors.imag])
+        lines = parts[:: self.plan.bins_hz.shape[1]]
+        # no block without dither columns comes this far
+        dither = block.commands_m if block.dither_m is None else block.dither_m
+        return LockInSums(
+            slopes=sums.slopes + parts @ block.slopes,
+            commands=sums.commands + parts @ block.commands_m,
+            dither=sums.dither + lines @ dither,
+        )
 
 
-def accumulate(lock_in: LockIn, block: FrameBlock) -> tuple[LockIn, list[Spectra | WindowRefused]]:
-    """Add a block of frames; return the new state and the windows that ended in it."""
-    window, ended = cut(lock_in.plan, lock_in.window, block, _STEPS)
-    return replace(lock_in, window=window), ended
+accumulate = LockIn.accumulate
 
 
 def joined(one: Spectra, other: Spectra) -> Spectra | None:
@@ -191,68 +217,19 @@ def joined(one: Spectra, other: Spectra) -> Spectra | None:
     )
 
 
-def _begin(plan: LockInPlan, block: FrameBlock) -> _Sums:
-    n_bins, n_modes = plan.bins_hz.size, block.commands_m.shape[1]
-    return _Sums(
-        slopes=np.zeros((2 * n_bins, block.slopes.shape[1]), np.float32),
-        commands=np.zeros((2 * n_bins, n_modes), np.float32),
-        dither=np.zeros((2 * len(plan.modes), n_modes), np.float32),
-    )
-
-
-def _add(plan: LockInPlan, window: Window[_Sums], block: FrameBlock, rows: slice) -> Window[_Sums]:
-    # no block without dither columns comes this far
-    dither = block.commands_m[:0] if block.dither_m is None else block.dither_m
-    sums = window.sums
-    while rows.start < rows.stop:
-        part = slice(rows.start, min(rows.stop, rows.start + CHUNK_FRAMES))
-        new = _Rows(
-            first=block.first_seq + part.start - window.span.first_seq,
-            slopes=block.slopes[part],
-            commands=block.commands_m[part],
-            dither=dither[part],
-        )
-        window = replace(window, span=advanced(window.span, block, part))
-        sums = replace(sums, waiting=(*sums.waiting, new))
-        if sums.n_waiting >= CHUNK_FRAMES:
-            sums = _projected(plan, sums)
-        rows = slice(part.stop, rows.stop)
-    return replace(window, sums=sums)
-
-
-def _projected(plan: LockInPlan, sums: _Sums) -> _Sums:
-    """Return the sums with the rows that waited in them."""
-    if not sums.waiting:
-        return sums
-    turning = _turning(plan)
-    phasors = np.concatenate([_phasors(plan, turning, rows) for rows in sums.waiting], axis=1)
-    lines = phasors[:: plan.bins_hz.shape[1]]
-    slopes, commands, dither = (
-        np.concatenate([getattr(rows, name) for rows in sums.waiting])
-        for name in ("slopes", "commands", "dither")
-    )
-    # real products: the columns are real
-    parts = np.concatenate([phasors.real, phasors.imag])
-    return _Sums(
-        slopes=sums.slopes + parts @ slopes,
-        commands=sums.commands + parts @ commands,
-        dither=sums.dither + np.concatenate([lines.real, lines.imag]) @ dither,
-    )
-
-
 @lru_cache(maxsize=4)
 def _turning(plan: LockInPlan) -> Array:
-    """Return ``exp(-i w k)`` of every bin, ``(n_bins, CHUNK_FRAMES)``, from k = 0."""
-    turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, np.arange(CHUNK_FRAMES))
+    """Return ``exp(-i w k)`` of every bin, ``(n_bins, 2 * CHUNK_FRAMES)``, from k = 0."""
+    turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, np.arange(2 * CHUNK_FRAMES))
     return np.asarray(np.exp(-2j * np.pi * turns), np.complex64)
 
 
-def _phasors(plan: LockInPlan, turning: Array, rows: _Rows) -> Array:
-    """Return ``h_k exp(-i w k)`` of these rows, ``(n_bins, n_rows)``."""
-    index = rows.first + np.arange(len(rows.slopes))
+def _phasors(plan: LockInPlan, place: int, n_frames: int) -> Array:
+    """Return ``h_k exp(-i w k)`` of frames from this place of a window, ``(n_bins, n_frames)``."""
+    index = place + np.arange(n_frames)
     hann = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / plan.n_frames)
-    start = np.exp(-2j * np.pi * rows.first * plan.bins_hz.ravel() / plan.frame_rate_hz)
-    phasors = turning[:, : len(index)] * start.astype(np.complex64)[:, None]
+    start = np.exp(-2j * np.pi * place * plan.bins_hz.ravel() / plan.frame_rate_hz)
+    phasors = _turning(plan)[:, :n_frames] * start.astype(np.complex64)[:, None]
     return np.asarray(phasors * hann.astype(np.float32))
 
 
@@ -262,34 +239,221 @@ def _complex(parts: Array, *shape: int) -> Array:
     return np.asarray((real + 1j * imaginary).reshape(*shape, -1))
 
 
-def _close(plan: LockInPlan, window: Window[_Sums]) -> Spectra | WindowRefused:
-    """Return the finished window, or why its dither is not the one asked for."""
-    sums = _projected(plan, window.sums)
-    dither = _complex(sums.dither, len(plan.modes))
-    weight = 0.5 * plan.n_frames / np.sqrt(2.0)
-    applied = np.abs(dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
-    ratio = applied / np.array(plan.amplitude_m)
-    if ratio.min() < MIN_AMPLITUDE_RATIO or ratio.max() > MAX_AMPLITUDE_RATIO:
-        weak = ratio.min() < MIN_AMPLITUDE_RATIO
-        worst = int(ratio.argmin() if weak else ratio.argmax())
-        see = "see whether the RTC clips it" if weak else "see the RTC's units"
-        return WindowRefused(
-            reason=f"mode {plan.modes[worst]} carries {applied[worst] * 1e9:.2f} nm of dither at "
-            f"{plan.frequencies_hz[worst]} Hz, {plan.amplitude_m[worst] * 1e9:.2f} nm were asked "
-            f"for: {see}",
-            t_ns_utc=window.span.next_t_ns,
-        )
-    return Spectra(
-        plan=plan,
-        session=window.span.session,
-        cm_id=window.span.cm_id,
-        first_seq=window.span.first_seq,
-        t_end_ns_utc=window.span.next_t_ns - window.dt_ns,
-        n_missing=window.span.n_missing,
-        slopes=_complex(sums.slopes, *plan.bins_hz.shape),
-        commands=_complex(sums.commands, *plan.bins_hz.shape),
-        dither=dither,
+N_STEPS = 5
+"""Gauss-Newton steps inside one linearisation: gains and α are multiplied with one another."""
+
+_MOST_TERMS = 40
+"""Of a series; one that needs more is given up, and the loop's equations are solved."""
+
+_GROWN = 10.0
+"""A term this much larger than the first is one of a series that does not end."""
+
+_ROUNDING = 1e-7
+"""Of single precision."""
+
+MAX_LAG_FRAMES = 0.2
+"""A larger lag between slopes and commands: the columns are not aligned as the wire demands."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WindowEstimate(DitheredEstimate):
+    """What one window of sines says of the registration.
+
+    Gains and lags are of the lines: complex, for a lag turns a line's phase. The misfit is the
+    residual power at the lines over that at the side bins.
+    """
+
+    dither_m: float = 0.0
+    """RMS of all lines together as they were on the mirror, metres OPD; 0: not known."""
+
+    window_s: float = 0.0
+    """Length of the window, seconds; 0: not known."""
+
+
+def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> WindowEstimate:
+    """Estimate α from one window, to first order about the linearisation.
+
+    Solves ``Re(F(Z)* F(C)^T) x = Re(F(Z)* r)`` by Gauss-Newton for α and one complex gain per
+    line; C the command at the line, Z the instrument, ``F(v) = [γ S_j v, D v, i D v]``,
+    ``r = S - γ D(α) C``. When ``step`` is not small the caller linearises anew at the estimate.
+    """
+    matrix = linearisation.matrix
+    coupling = loop.reconstructor @ matrix
+    slopes = spectra.slopes[:, 0]
+    seen = _images(linearisation, spectra.commands[:, 0])
+    known = _apply(matrix, _instrument(spectra, coupling, loop, np.ones(len(slopes))))
+    gains = np.array(
+        [_projected_gain(s, c[0], z) for s, c, z in zip(slopes, seen, known, strict=True)]
+    )
+    known = _images(linearisation, _instrument(spectra, coupling, loop, gains))
+    step = np.zeros(4)
+    for _ in range(N_STEPS):
+        normal, score = _normal_equations(slopes, seen, known, gains, step)
+        change = np.linalg.solve(normal, score)
+        step = step + change[:4]
+        gains = gains + change[4::2] + 1j * change[5::2]
+    normal, _ = _normal_equations(slopes, seen, known, gains, step)
+    spread, misfit = _side_bins(spectra, linearisation, seen, known, gains, step)
+    inverse = np.linalg.inv(normal)
+    every = inverse @ spread @ inverse.T
+    covariance = every[:4, :4]
+    turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
+    return WindowEstimate(
+        alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
+        covariance=(covariance + covariance.T) / 2,
+        optical_gain=gains,
+        lag_frames=-np.angle(gains) / turns,
+        misfit=misfit,
+        step=step,
+        t_ns_utc=spectra.t_end_ns_utc,
+        cm_id=spectra.cm_id,
+        session=spectra.session,
+        modes=spectra.plan.modes,
+        gain_sigma=_modulus_sigma(gains, every[4:, 4:]),
+        dither_m=_total_dither_m(spectra),
+        window_s=spectra.window_s,
     )
 
 
-_STEPS = Steps(begin=_begin, add=_add, close=_close)
+def closed_loop_response(
+    dither: Array, matrix: Array, loop: Loop, frequency_hz: float, gain: complex
+) -> Array:
+    """Return the total command ``(n_modes,)`` that a dither of this complex amplitude leads to.
+
+    ``Z = [I + g R D γ e^{-iwd} / (1 - leak e^{-iw})]^{-1} U``, solved in the controlled modes.
+    """
+    coupling = loop.reconstructor @ matrix
+    found = _responses(dither[None], coupling, loop, (frequency_hz,), np.array([gain]))
+    return np.asarray(found[0])
+
+
+def _instrument(spectra: Spectra, coupling: Array, loop: Loop, gains: Array) -> Array:
+    """Return ``(n_lines, n_modes)`` the command each line's dither alone would cause."""
+    return _responses(spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains)
+
+
+def _responses(
+    dither: Array, coupling: Array, loop: Loop, frequencies_hz: tuple[float, ...], gains: Array
+) -> Array:
+    """Return ``closed_loop_response`` of every line from R D ``(n_controlled, n_modes)``.
+
+    The instrument need not be better known than D: single precision is enough, and so is the
+    series ``1 - F + F^2 - ...`` where it converges, as it does above a sixth of the frame rate.
+    """
+    n = len(coupling)
+    w = 2 * np.pi * np.array(frequencies_hz) / loop.frame_rate_hz
+    integrator = np.exp(-1j * w * loop.delay_frames) / (1.0 - loop.leak * np.exp(-1j * w))
+    answer = (np.outer(loop.gains[:n], integrator * gains)).astype(np.complex64)
+    own = np.ascontiguousarray(coupling[:, :n])
+    first = -answer * _apply(coupling, dither).T
+    reply = _summed(first, answer, own)
+    if reply is None:
+        around = answer.T[:, :, None] * own + np.eye(n, dtype=np.complex64)
+        reply = np.linalg.solve(around, first.T[:, :, None])[:, :, 0].T
+    total = dither.astype(complex)
+    total[:, :n] += reply.T
+    return total
+
+
+def _summed(first: Array, answer: Array, coupling: Array) -> Array | None:
+    """Return ``(1 + F)^-1 first`` as a series, ``F = answer * coupling``; None: not that way."""
+    reply, largest = first, np.abs(first).max(initial=0.0)
+    for _ in range(_MOST_TERMS):
+        before, reply = reply, first - answer * _apply(coupling, reply.T).T
+        change, size = (np.abs(x).max(initial=0.0) for x in (reply - before, reply))
+        if change <= _ROUNDING * size:  # zeros are settled, too
+            return np.asarray(reply)
+        if not change < _GROWN * largest:
+            return None
+    return None
+
+
+def _images(linearisation: Linearisation, vectors: Array) -> Array:
+    """Return what the sensor makes of modal vectors, ``(n_lines, 5, n_slopes)``.
+
+    Index 0 is D v, then the four derivatives of D applied to v.
+    """
+    operators = (linearisation.matrix, *linearisation.derivatives)
+    return np.stack([_apply(operator, vectors) for operator in operators], axis=1, dtype=complex)
+
+
+def _apply(operator: Array, vectors: Array) -> Array:
+    """Return ``operator @ v`` for complex rows v and a real operator, ``(n_vectors, n_slopes)``."""
+    single = vectors.astype(np.complex64)
+    both = operator @ np.concatenate([single.real, single.imag]).T
+    return np.asarray((both[:, : len(single)] + 1j * both[:, len(single) :]).T)
+
+
+def _modulus_sigma(gains: Array, covariance: Array) -> Array:
+    """Return ``(n_lines,)`` 1 σ of ``|γ|``, from the covariance of every gain's two parts."""
+    found = []
+    for line, gain in enumerate(gains):
+        part = slice(2 * line, 2 * line + 2)
+        along = np.array([gain.real, gain.imag]) / abs(gain)
+        found.append(np.sqrt(along @ covariance[part, part] @ along))
+    return np.array(found)
+
+
+def _total_dither_m(spectra: Spectra) -> float:
+    """Return the RMS of all lines together, from the dither columns of the window."""
+    amplitudes = np.abs(spectra.dither).max(axis=1) * np.sqrt(2.0) / (0.5 * spectra.plan.n_frames)
+    return float(np.sqrt(np.sum(amplitudes**2)))
+
+
+def _projected_gain(slopes: Array, seen: Array, known: Array) -> complex:
+    """Return ``<D Z, S> / <D Z, D C>``: the first guess of the complex gain."""
+    return complex(np.vdot(known, slopes) / np.vdot(known, seen))
+
+
+def _regressors(images: Array, gain: complex, step: Array) -> Array:
+    """Return ``(6, n_slopes)``: four derivatives by α, then by the two parts of the gain."""
+    response = images[0] + step @ images[1:]
+    return np.vstack([gain * images[1:], response, 1j * response])
+
+
+def _unknowns(line: int) -> Array:
+    """Return where the six unknowns of a line stand among all: α is common, the gain its own."""
+    return np.array([0, 1, 2, 3, 4 + 2 * line, 5 + 2 * line])
+
+
+def _normal_equations(
+    slopes: Array, seen: Array, known: Array, gains: Array, step: Array
+) -> tuple[Array, Array]:
+    """Return ``M`` and ``b`` of the instrumental-variable step over all lines."""
+    n = 4 + 2 * len(gains)
+    normal, score = np.zeros((n, n)), np.zeros(n)
+    for line, gain in enumerate(gains):
+        conjugate = _regressors(known[line], gain, step).conj()
+        response = _regressors(seen[line], gain, step)
+        residual = slopes[line] - gain * response[4]
+        at = _unknowns(line)
+        normal[np.ix_(at, at)] += (conjugate @ response.T).real
+        score[at] += (conjugate @ residual).real
+    return normal, score
+
+
+def _side_bins(
+    spectra: Spectra,
+    linearisation: Linearisation,
+    seen: Array,
+    known: Array,
+    gains: Array,
+    step: Array,
+) -> tuple[Array, float]:
+    """Return the covariance of the score, from the bins beside the lines, and the misfit.
+
+    What remains there after the same model is noise with the very spectrum the lines suffer from.
+    """
+    n = 4 + 2 * len(gains)
+    spread = np.zeros((n, n))
+    misfit = []
+    matrix = linearisation.matrix_by(step)
+    for line, gain in enumerate(gains):
+        explained = gain * _apply(matrix, spectra.commands[line, 1:])
+        residual = spectra.slopes[line, 1:] - explained
+        score = _regressors(known[line], gain, step).conj() @ residual.T
+        at = _unknowns(line)
+        spread[np.ix_(at, at)] += 0.5 * (score @ score.conj().T).real / score.shape[1]
+        left = spectra.slopes[line, 0] - gain * _regressors(seen[line], gain, step)[4]
+        misfit.append(np.sum(np.abs(left) ** 2) / np.mean(np.sum(np.abs(residual) ** 2, axis=1)))
+    return spread, float(np.mean(misfit))

@@ -1,13 +1,20 @@
-"""Do the commands obey the loop? ``c[k+d] = leak c[k+d-1] - g R s[k]``, watched on a few frames.
+"""Whether the commands obey the loop that the RTC tells: ``c[k+d] = leak c[k+d-1] - g R s[k]``.
 
 Telemetry holds the commands after clipping, and names the reconstructor, gains and delay that made
 them. Where they do not follow from the slopes the mirror is saturated, or the RTC's account of
 itself is wrong.
 
-Both sides are differenced twice: what else moves the mirror (turbulence played on it by day, a
-vibration) is slow, the sensor's noise is not. Then a mode that takes the share r of the steps it
-is asked for shows r, whatever the turbulence does. A command that stays exactly where it was though
-it was asked to move is at a limit.
+**Every mode, on a few frames** (``observe``, ``obedience``). Both sides are differenced twice: what
+else moves the mirror (turbulence played on it by day, a vibration) is slow, the sensor's noise is
+not. Then a mode that takes the share r of the steps it is asked for shows r, whatever the
+turbulence does. A command that stays exactly where it was though it was asked to move is at a
+limit.
+
+**A few modes, on every frame** (``follow``, ``judged``): ``c[k+1] = leak c[k] - sum_d h_d (R
+s)[k+1-d]``. An RTC that does what it says leaves nothing over: its commands follow from slopes and
+commands before them to the last digit. So the leak, the gain and the delay that a few modes show
+are known far better than they need be, whatever turbulence and noise are; where something is left
+over (clipping, turbulence played on the mirror, another matrix) nothing is said here.
 """
 
 from __future__ import annotations
@@ -19,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.telemetry.frames import FrameBlock
+from service.telemetry.frames import FrameBlock, Loop, joined_frames
 
 Array = NDArray[Any]
 
@@ -60,21 +67,33 @@ _TAPS = 3
 
 _SPANS_NAMED = 6
 
+MODES_WATCHED = 12
+"""Spread over those in the loop."""
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopTerms:
-    """The loop as the RTC's account has it."""
+KEPT_FRAMES = 640
+"""Frames remembered."""
 
-    cm_id: str
-    reconstructor: NDArray[np.float32]
-    """``(n_controlled, n_slopes)`` metres per slope, of this ``cm_id``."""
+ENOUGH_FRAMES = 240
+"""Frames with all before them that they follow from; fewer say nothing."""
 
-    gains: NDArray[np.float32]
-    """``(n_controlled,)``."""
+JUDGED_EVERY = 200
+"""Frames between two verdicts."""
 
-    leak: float
-    delay_frames: float
-    frame_rate_hz: float
+MORE_TAPS = 4
+"""Frames looked back beyond the delay told: it may be longer, or the mirror lag."""
+
+EXPLAINED = 0.002
+"""Largest share of the steps' power that a mode may leave over to be believed."""
+
+LEAK_TOLERANCE = 0.004
+GAIN_TOLERANCE = 0.15
+"""Relative: gains may follow the seeing between two status messages."""
+
+DELAY_TOLERANCE = 0.75
+"""Frames: a mirror that takes 0.7 of one to rise is none of the loop's delay."""
+
+_STILL_LAW_M = 1e-13
+"""The same of the few modes of every frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -164,28 +183,30 @@ class Obedience:
         )
 
 
-def observe(check: LoopCheck, block: FrameBlock, terms: LoopTerms) -> LoopCheck:
+def observe(check: LoopCheck, block: FrameBlock, loop: Loop) -> LoopCheck:
     """Return the check after one more block, as far as it is of this loop."""
-    n_delay = int(terms.delay_frames)
-    if n_delay > LARGEST_DELAY_FRAMES or block.cm_id != terms.cm_id:
+    n_delay = int(loop.delay_frames)
+    if n_delay > LARGEST_DELAY_FRAMES or block.cm_id != loop.cm_id:
         return replace(check, tail=None)
-    if check.cm_id != terms.cm_id:  # frames of another matrix come before the status that tells it
-        check = LoopCheck(from_seq=check.from_seq, cm_id=terms.cm_id)
+    if check.cm_id != loop.cm_id:  # frames of another matrix come before the status that tells it
+        check = LoopCheck(from_seq=check.from_seq, cm_id=loop.cm_id)
     depth = n_delay + _STEPS + _TAPS - 1
-    tail = check.tail if check.tail is not None and _follows(check.tail, block) else None
-    stride = max(1, round(terms.frame_rate_hz / SAMPLES_PER_S))
+    tail = check.tail
+    if tail is not None and not _goes_on(tail, block):
+        tail = None
+    stride = max(1, round(loop.frame_rate_hz / SAMPLES_PER_S))
     waiting = list(check.waiting)
     for row in range(-block.first_seq % stride, block.n_frames, stride):
-        frames = _frames_before(tail, block, row, depth)
-        if frames is not None and frames.first_seq >= check.from_seq:
-            waiting.append(_sample(frames, terms))
-    check = replace(check, tail=_joined(tail, block, depth), waiting=tuple(waiting))
-    return _multiplied(check, terms) if len(waiting) >= BATCH else check
+        frames = _last(tail, block.rows(0, row + 1), depth)
+        if frames.n_frames == depth and frames.first_seq >= check.from_seq:
+            waiting.append(_sample(frames, loop))
+    check = replace(check, tail=_last(tail, block, depth), waiting=tuple(waiting))
+    return _multiplied(check, loop) if len(waiting) >= BATCH else check
 
 
 def obedience(
     check: LoopCheck,
-    terms: LoopTerms,
+    loop: Loop,
     first_seq: int,
     last_seq: int,
     enough: int = ENOUGH_SAMPLES,
@@ -197,9 +218,9 @@ def obedience(
     The delay's part of a frame, and a mirror's lag, are fitted to all modes together: a lag is no
     disobedience.
     """
-    if check.cm_id != terms.cm_id:
+    if check.cm_id != loop.cm_id:
         return check, None
-    check = _multiplied(check, terms)
+    check = _multiplied(check, loop)
     seq = np.concatenate([batch.seq for batch in check.batches] or [np.empty(0, int)])
     chosen = (seq >= first_seq) & (seq <= last_seq)
     if np.count_nonzero(chosen) < enough:
@@ -207,7 +228,7 @@ def obedience(
     asked = np.concatenate([b.asked_m for b in check.batches], axis=1)[:, chosen].astype(float)
     taken = np.concatenate([b.taken_m for b in check.batches])[chosen].astype(float)
     held = np.concatenate([b.held for b in check.batches])[chosen].mean(axis=0)
-    return check, _judged(asked, taken, held, terms)
+    return check, _judged(asked, taken, held, loop)
 
 
 def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
@@ -217,12 +238,12 @@ def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
     return (int(seq[0]), int(seq[-1])) if len(seq) == ENOUGH_SAMPLES else None
 
 
-def _judged(asked: Array, taken: Array, held: Array, terms: LoopTerms) -> Obedience:
-    weights = _lag(asked, taken, terms)
+def _judged(asked: Array, taken: Array, held: Array, loop: Loop) -> Obedience:
+    weights = _lag(asked, taken, loop)
     obeys = np.abs(_shares(np.tensordot(weights, asked, axes=1), taken)[0] - 1.0) < TOLERANCE
     if obeys.any():
         # those that do not must not decide how late the others are
-        weights = _lag(asked[:, :, obeys], taken[:, obeys], terms)
+        weights = _lag(asked[:, :, obeys], taken[:, obeys], loop)
     model = np.tensordot(weights, asked, axes=1)
     share, error = _shares(model, taken)
     asked_for = np.einsum("km,km->m", model, model) > len(model) * _STILL_M**2
@@ -236,7 +257,7 @@ def _judged(asked: Array, taken: Array, held: Array, terms: LoopTerms) -> Obedie
         share=np.where(asked_for, share, np.nan),
         held=held,
         disobeys=off & asked_for,
-        cm_id=terms.cm_id,
+        cm_id=loop.cm_id or "unknown",
     )
 
 
@@ -248,12 +269,12 @@ def _shares(model: Array, taken: Array) -> tuple[Array, Array]:
     return common / power, np.sqrt(left / power / (len(model) - 1))
 
 
-def _lag(asked: Array, taken: Array, terms: LoopTerms) -> Array:
+def _lag(asked: Array, taken: Array, loop: Loop) -> Array:
     """Return ``(_TAPS,)`` weights of the frames, adding up to 1: how late the modes are.
 
     Fitted with every mode counting alike; where the fit is no delay the status' word stands.
     """
-    late = terms.delay_frames - int(terms.delay_frames)
+    late = loop.delay_frames - int(loop.delay_frames)
     scale = np.sqrt(np.einsum("lkm,lkm->m", asked, asked) + len(taken) * _STILL_M**2)
     inputs, seen = (asked / scale).reshape(_TAPS, -1), (taken / scale).ravel()
     fitted = np.linalg.lstsq(inputs @ inputs.T, inputs @ seen)[0]
@@ -262,70 +283,28 @@ def _lag(asked: Array, taken: Array, terms: LoopTerms) -> Array:
     return np.array([1.0 - late, late, 0.0])
 
 
-def _follows(tail: FrameBlock, block: FrameBlock) -> bool:
-    """Return whether a block goes on where the tail ends, made by the same matrix."""
-    after = tail.t0_ns_utc + tail.n_frames * tail.dt_ns
-    return (
-        (tail.session, tail.cm_id, tail.dt_ns) == (block.session, block.cm_id, block.dt_ns)
-        and tail.first_seq + tail.n_frames == block.first_seq
-        and abs(block.t0_ns_utc - after) <= block.dt_ns / 2
-    )
+def _last(tail: FrameBlock | None, block: FrameBlock, n: int) -> FrameBlock:
+    """Return the last ``n`` frames of both, or as many as there are, the dither taken off."""
+    part = block.last(n).without_dither()
+    if tail is None or part.n_frames == n:
+        return part
+    return joined_frames((tail, part)).last(n)
 
 
-def _frames_before(
-    tail: FrameBlock | None, block: FrameBlock, row: int, depth: int
-) -> FrameBlock | None:
-    """Return the ``depth`` frames that end with this row; None: not all are there."""
-    start = row + 1 - depth
-    if start >= 0:
-        return _rows(block, start, row + 1)
-    if tail is None or tail.n_frames < -start:
-        return None
-    return _joined(tail, _rows(block, 0, row + 1), depth)
+def _goes_on(tail: FrameBlock, block: FrameBlock) -> bool:
+    """Return whether a block goes on where the tail ends, by the clock too and one matrix."""
+    late_ns = abs(block.t0_ns_utc - tail.next_t_ns)
+    return block.follows(tail) and block.cm_id == tail.cm_id and late_ns <= block.dt_ns / 2
 
 
-def _rows(block: FrameBlock, start: int, stop: int) -> FrameBlock:
-    rows = slice(start, stop)
-    return replace(
-        block,
-        first_seq=block.first_seq + start,
-        t0_ns_utc=block.t0_ns_utc + start * block.dt_ns,
-        slopes=block.slopes[rows],
-        commands_m=block.commands_m[rows],
-        dither_m=None if block.dither_m is None else block.dither_m[rows],
-    )
-
-
-def _joined(tail: FrameBlock | None, block: FrameBlock, depth: int) -> FrameBlock:
-    """Return the last ``depth`` frames of both, the dither taken off the commands."""
-    block = _own(_rows(block, max(block.n_frames - depth, 0), block.n_frames))
-    missing = depth - block.n_frames
-    if tail is None or missing <= 0:
-        return block
-    before = _own(_rows(tail, max(tail.n_frames - missing, 0), tail.n_frames))
-    return replace(
-        before,
-        slopes=np.concatenate([before.slopes, block.slopes]),
-        commands_m=np.concatenate([before.commands_m, block.commands_m]),
-    )
-
-
-def _own(block: FrameBlock) -> FrameBlock:
-    """Return the frames with the integrator's own commands."""
-    if block.dither_m is None:
-        return block
-    return replace(block, commands_m=block.commands_m - block.dither_m, dither_m=None)
-
-
-def _sample(frames: FrameBlock, terms: LoopTerms) -> _Sample:
-    frames = _own(frames)
-    commands = frames.commands_m[-_STEPS - 1 :, : len(terms.gains)]
+def _sample(frames: FrameBlock, loop: Loop) -> _Sample:
+    commands = frames.commands_m[-_STEPS - 1 :, : len(loop.gains)]
     slopes = frames.slopes
     return _Sample(
         seq=frames.first_seq + frames.n_frames - 1,
         # the frames reach back over the delay, the differences and the taps
         slopes=np.stack([_twice(slopes[tap : tap + _STEPS]) for tap in reversed(range(_TAPS))]),
-        steps_m=_twice(commands[1:] - np.float32(terms.leak) * commands[:-1]),
+        steps_m=_twice(commands[1:] - np.float32(loop.leak) * commands[:-1]),
         held=commands[-1] == commands[-2],
     )
 
@@ -335,14 +314,14 @@ def _twice(rows: Array) -> Array:
     return np.asarray(rows[2] - 2 * rows[1] + rows[0])
 
 
-def _multiplied(check: LoopCheck, terms: LoopTerms) -> LoopCheck:
+def _multiplied(check: LoopCheck, loop: Loop) -> LoopCheck:
     if not check.waiting:
         return check
     slopes = np.stack([sample.slopes for sample in check.waiting], axis=1)
-    asked = (terms.reconstructor @ slopes.reshape(-1, slopes.shape[-1]).T).T
+    asked = (loop.reconstructor @ slopes.reshape(-1, slopes.shape[-1]).T).T
     batch = _Batch(
         seq=np.array([sample.seq for sample in check.waiting]),
-        asked_m=(-terms.gains * asked).reshape(_TAPS, len(check.waiting), -1),
+        asked_m=(-loop.gains.astype(np.float32) * asked).reshape(_TAPS, len(check.waiting), -1),
         taken_m=np.array([sample.steps_m for sample in check.waiting]),
         held=np.array([sample.held for sample in check.waiting]),
     )
@@ -360,3 +339,164 @@ def _spans(modes: Array) -> str:
         for run in runs[:_SPANS_NAMED]
     ]
     return ", ".join(spans) + (", ..." if len(runs) > _SPANS_NAMED else "")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopLaw:
+    """Frames of a loop that has not changed: feed it blocks with ``follow``."""
+
+    from_seq: int = 0
+    """Frames before this may have been made by another loop."""
+
+    cm_id: str | None = None
+    """The matrix that made them."""
+
+    modes: NDArray[np.intp] | None = None
+    """``(n_watched,)``; None: nothing was fed yet."""
+
+    seq: NDArray[np.int64] | None = None
+    """``(n_frames,)`` oldest first, holes where frames were lost."""
+
+    commands_m: Array | None = None
+    """``(n_frames, n_watched)`` the integrator's own: no dither."""
+
+    seen_m: Array | None = None
+    """``(n_frames, n_watched)`` R s."""
+
+    judged_seq: int = -JUDGED_EVERY
+    """Up to here a verdict has been given."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundLaw:
+    """What the frames say of the loop, and what was told."""
+
+    leak: float
+    gain: float
+    """Over the gain told; negative: of the other sign."""
+
+    delay_frames: float
+    wrong: str = ""
+    """What disagrees, found and told; empty: nothing does."""
+
+
+def follow(law: LoopLaw, block: FrameBlock, loop: Loop) -> LoopLaw:
+    """Return the law after one more block, as far as it is of this loop."""
+    if block.first_seq < law.from_seq:
+        return law
+    if law.cm_id != block.cm_id or law.seq is None:
+        # the first frames of a matrix follow from slopes that another one multiplied
+        law = _begun(law, block.cm_id, loop)
+    if law.modes is None or not len(law.modes):
+        return law
+    own = block.commands_m[:, law.modes]
+    if block.dither_m is not None:
+        own = own - block.dither_m[:, law.modes]
+    seen = block.slopes @ loop.reconstructor[law.modes].T
+    seq = np.arange(block.first_seq, block.first_seq + block.n_frames)
+    return replace(
+        law,
+        seq=_kept(law.seq, seq),
+        commands_m=_kept(law.commands_m, own),
+        seen_m=_kept(law.seen_m, seen),
+    )
+
+
+def judged(law: LoopLaw, loop: Loop, last_seq: int) -> tuple[LoopLaw, FoundLaw | None]:
+    """Return what the frames up to one say of the loop; None: nothing, or nothing new."""
+    modes, commands, seen = law.modes, law.commands_m, law.seen_m
+    if law.seq is None or modes is None or commands is None or seen is None:
+        return law, None
+    if last_seq - law.judged_seq < JUDGED_EVERY:
+        return law, None
+    n_taps = int(loop.delay_frames) + MORE_TAPS
+    at = np.flatnonzero(law.seq <= last_seq)[n_taps:]
+    # a frame counts where none of those before it was lost
+    at = at[law.seq[at] - law.seq[at - n_taps] == n_taps]
+    if len(at) < ENOUGH_FRAMES:
+        return law, None
+    law = replace(law, judged_seq=int(law.seq[at[-1]]))
+    commands, seen = commands.astype(float), seen.astype(float)
+    fits = [_fitted(commands[:, m], seen[:, m], at, n_taps) for m in range(len(modes))]
+    clear = [number for number, fit in enumerate(fits) if fit is not None]
+    if 2 * len(clear) < len(fits) or not clear:
+        return law, None
+    gains = loop.gains[modes[clear]].astype(float)
+    return law, _compared([fit for fit in fits if fit is not None], gains, loop)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Fit:
+    """The law of one mode."""
+
+    leak: float
+    leak_sigma: float
+    gain: float
+    delay_frames: float
+
+
+def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fit | None:
+    """Return the law of one mode; None: it does not follow one, or does not move."""
+    target, before = commands[at], commands[at - 1]
+    if np.std(target - before) < _STILL_LAW_M:
+        return None
+    inputs = np.column_stack(
+        [before, *(seen[at - tap] for tap in range(1, n_taps + 1)), np.ones(len(at))]
+    )
+    scale = np.linalg.norm(inputs, axis=0)
+    scale[scale == 0.0] = 1.0
+    weights, _, _, _ = np.linalg.lstsq(inputs / scale, target)
+    left = float(np.sum((target - inputs / scale @ weights) ** 2))
+    if left > EXPLAINED * float(np.sum((target - before) ** 2)):
+        return None
+    spread = np.linalg.pinv((inputs / scale).T @ (inputs / scale)) * left / len(at)
+    taps = -(weights / scale)[1:-1]
+    gain = float(taps.sum())
+    late = float(taps @ np.arange(1, n_taps + 1)) / gain if gain else np.inf
+    return _Fit(
+        leak=float(weights[0] / scale[0]),
+        leak_sigma=float(np.sqrt(spread[0, 0]) / scale[0]),
+        gain=gain,
+        delay_frames=late,
+    )
+
+
+def _compared(fits: list[_Fit], gains: Array, loop: Loop) -> FoundLaw:
+    leak = float(np.median([fit.leak for fit in fits]))
+    sigma = float(np.median([fit.leak_sigma for fit in fits]))
+    ratios = np.array([fit.gain for fit in fits]) / gains
+    gain, spread = float(np.median(ratios)), float(np.median(np.abs(ratios - np.median(ratios))))
+    late = float(np.median([fit.delay_frames for fit in fits]))
+    wrong = []
+    if abs(leak - loop.leak) > LEAK_TOLERANCE + SIGNIFICANCE * sigma:
+        wrong.append(f"leak {leak:.3f} found, {loop.leak:.3f} told")
+    tolerance = GAIN_TOLERANCE + SIGNIFICANCE * min(spread, abs(gain)) / np.sqrt(len(fits))
+    if abs(gain - 1.0) > tolerance:
+        wrong.append(f"gain {gain:.3g} times the one told{_hint(gain)}")
+    if abs(late - loop.delay_frames) > DELAY_TOLERANCE:
+        wrong.append(f"delay {late:.2f} frames found, {loop.delay_frames:.2f} told")
+    return FoundLaw(leak=leak, gain=gain, delay_frames=late, wrong="; ".join(wrong))
+
+
+def _hint(gain: float) -> str:
+    """Return what a gain that no loop has looks like."""
+    if gain < 0.0:
+        return ": slopes or commands have the other sign than the matrix that the RTC names"
+    decades = np.log10(gain)
+    for decade, unit in ((9, "nanometres"), (6, "micrometres"), (3, "millimetres")):
+        if abs(abs(decades) - decade) < 1.0:
+            whose = "commands" if decades > 0 else "the matrix's commands"
+            return f": {whose} look like {unit}, metres of OPD are expected"
+    return ""
+
+
+def _begun(law: LoopLaw, cm_id: str | None, loop: Loop) -> LoopLaw:
+    in_loop = np.flatnonzero(loop.gains > 0.0)
+    chosen = np.unique(np.linspace(0, len(in_loop) - 1, MODES_WATCHED).round().astype(int))
+    return LoopLaw(
+        from_seq=law.from_seq, cm_id=cm_id, modes=in_loop[chosen] if len(in_loop) else in_loop
+    )
+
+
+def _kept(kept: Array | None, new: Array) -> Array:
+    return new[-KEPT_FRAMES:] if kept is None else np.concatenate([kept, new])[-KEPT_FRAMES:]

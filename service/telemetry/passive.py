@@ -1,4 +1,11 @@
-"""The watchdog: what ordinary telemetry, without a dither, says of the registration.
+"""What ordinary telemetry, without a dither, says of the registration.
+
+Turbulence sits below a tenth of the frame rate, and there commands and slopes have it in common: a
+regression of one on the other is biased, by a third of a subaperture on a bright star in 20 m/s.
+Above it moves mostly the sensor's own noise, which the loop returns as commands ``d`` frames later:
+a dither that costs nothing. A filter that lets only that pass makes an instrument (in the sense of
+instrumental variables) of the commands, and sums over every frame make a noisy interaction matrix
+of it: a measurement to fit a model to, never a matrix to control with.
 
 The turbulence that is left in the filtered commands biases the shifts by the wind, steadily, and no
 integration removes it: docs/results/passive.md has by how much.
@@ -6,20 +13,56 @@ integration removes it: docs/results/passive.md has by how much.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import ModelError
+from service.fit.solver import Columns
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from service.telemetry.estimator import PASSIVE, Determines
-from service.telemetry.highpass import high_pass
-from service.telemetry.passivesums import Passive as Passive
-from service.telemetry.passivesums import accumulate as accumulate
+from service.telemetry.estimate import Estimate
+from service.telemetry.frames import FrameBlock, joined_frames
+from service.telemetry.windows import CHUNK_FRAMES
 
 Array = NDArray[Any]
+
+N_TAPS = 11
+"""Longer filters know turbulence from noise no better, and lose more frames at every gap."""
+
+CORNER = 0.08
+"""Of the frame rate. Above 0.1 a bright star leaves too little signal; below 0.06 a wind of 20 m/s
+is let in."""
+
+LEAST_DELAY_FRAMES = 2
+"""With less the instrument may not look ahead, and a tenth of the signal is left."""
+
+_LOOP_GAIN = 0.35
+"""Of a loop at gain 0.6 and an optical gain of 0.6: where its noise is amplified."""
+
+_TURBULENCE_SLOPE = 34.0 / 3.0
+"""Of the squared temporal spectrum of a mode above its corner: twice 17/3 (Conan et al. 1995)."""
+
+_LOWEST = 0.015
+"""Of the frame rate: below it turbulence is as strong as here."""
+
+TAPER_FRAMES = 32
+"""Frames over which a run of telemetry fades in after a gap, and out before the next. Turbulence is
+a thousand times stronger than the noise that is looked for: a sum of their products that is cut off
+is worse than none. Runs of less than twice as many frames are left out."""
+
+MOST_OTHER_MODES = 8
+"""Modes outside the loop that a dither of sines may move; where more move it is turbulence or
+random signs, which the filtered commands have nothing in common with."""
+
+SAMPLES_KEPT = 64
+"""Filtered frames kept, from which the fit learns how noisy slopes are."""
+
+SAMPLE_FRAMES = 128
+"""One sample in as many frames."""
 
 BIAS_FLOOR = np.array([0.10, 0.10, np.deg2rad(0.05), 0.001])
 """1 σ nobody may go below without a dither: the wind's bias, and the model's own error."""
@@ -34,27 +77,81 @@ MIN_FRAMES_PER_MODE = 5
 MIN_SAMPLES = 8
 """Fewer filtered frames do not tell how noisy the slopes are."""
 
+_REACH = N_TAPS - 1
+"""Frames besides its own that a filtered one is made of."""
+
 _RIDGE = 1e-6
 _STILL_RIDGE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PassiveEstimate:
-    """What ordinary telemetry says of the registration."""
+class HighPass:
+    """A finite filter of commands: ``z_k = sum_j taps_j c_{k + ahead - j}``."""
 
-    alpha: Misregistration
-    covariance: NDArray[np.float64]
-    """``(4, 4)`` numeric units, of the scatter alone: the bias is not in it."""
+    taps: NDArray[np.float32]
+    """``(n_taps,)``, the largest 1 either way; they add up to 0."""
 
-    optical_gain: NDArray[np.float64]
-    """``(n_modes,)`` free gain of each mode against the model."""
+    ahead: int
+    """Frames after k that z_k depends on: their commands do not know the noise of frame k."""
 
-    misfit: float
-    """Residual power over what the slopes' noise explains; 1: the model explains the data. NaN: too
-    young to tell."""
+    def __call__(self, commands: Array) -> Array:
+        """Return ``(n_rows - n_taps + 1, n_modes)`` of contiguous commands ``(n_rows, n_modes)``.
 
-    step: NDArray[np.float64]
-    """``(4,)`` distance from the linearisation, numeric units."""
+        Row i belongs to frame ``i + behind``.
+        """
+        newest = len(self.taps) - 1
+        n_rows = len(commands) - newest
+        out = self.taps[0] * commands[newest : newest + n_rows]
+        for j in range(1, len(self.taps)):
+            out += self.taps[j] * commands[newest - j : newest - j + n_rows]
+        return np.asarray(out)
+
+    @property
+    def behind(self) -> int:
+        """Frames before k that z_k depends on."""
+        return len(self.taps) - 1 - self.ahead
+
+
+@cache
+def high_pass(delay_frames: float) -> HighPass:
+    """Return the filter for a loop of this delay.
+
+    It makes ``E[z c]``, the response to the sensor's noise, as large as it can be for the noise of
+    ``sum z s``, turbulence counted as noise that is ``CORNER`` away from being as strong: with a
+    loop's reply to white noise, ``P = 1 / |1 - z^-1 + g z^-d|^2``, taps solve ``M a = v``, where
+    ``v`` is the inverse transform of P and ``M`` that of ``P (1 + W)``.
+
+    Raises
+    ------
+    ModelError
+        If the delay is shorter than ``LEAST_DELAY_FRAMES``.
+    """
+    if delay_frames < LEAST_DELAY_FRAMES:
+        raise ModelError(
+            f"passive estimate: found a delay of {delay_frames:g} frames, expected at least "
+            f"{LEAST_DELAY_FRAMES}: a loop as quick answers noise before it can be told from the "
+            "response"
+        )
+    ahead = int(delay_frames) - 1
+    turns = (np.arange(4096) + 0.5) / 8192
+    z = np.exp(-2j * np.pi * turns)
+    power = 1.0 / np.abs(1.0 - 0.999 * z + _LOOP_GAIN * z ** round(delay_frames)) ** 2
+    turbulence = (CORNER / np.maximum(turns, _LOWEST)) ** _TURBULENCE_SLOPE
+    shifted = np.exp(-2j * np.pi * np.outer(np.arange(N_TAPS) - ahead, turns))
+    signal = (shifted * power).real.mean(axis=1)
+    noise = ((shifted * power * (1.0 + turbulence)) @ shifted.conj().T).real / len(turns)
+    taps = np.linalg.solve(noise, signal)
+    taps -= taps.mean()
+    return HighPass(taps=(taps / np.abs(taps).max()).astype(np.float32), ahead=ahead)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PassiveEstimate(Estimate):
+    """What ordinary telemetry says of the registration.
+
+    The covariance is of the scatter alone: the bias is not in it. A misfit of NaN: too young to
+    tell.
+    """
 
     @property
     def bias_excess(self) -> NDArray[np.float64]:
@@ -66,14 +163,152 @@ class PassiveEstimate:
         """``(4,)`` 1 σ in numeric units where nothing is known of the bias."""
         return np.asarray(np.sqrt(np.diag(self.covariance) + BIAS_FLOOR**2 + self.bias_excess))
 
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Passive:
+    """Forgetting sums over filtered commands: feed it blocks with ``accumulate``."""
+
+    n_modes: int
+    """Controlled modes: the only ones that move by themselves."""
+
+    memory_frames: float
+    """Frames after which a sample's weight has fallen to 1/e."""
+
+    delay_frames: float = 2.0
+    """Of the loop; with less than two nothing is summed."""
+
+    cross: NDArray[np.float32] | None = None
+    """``(n_slopes, n_modes)`` sum of s z^T, metres; z are the filtered commands."""
+
+    moved: NDArray[np.float32] | None = None
+    """``(n_modes, n_modes)`` sum of c z^T, metres²."""
+
+    power: NDArray[np.float32] | None = None
+    """``(n_modes, n_modes)`` sum of z z^T, metres²."""
+
+    n_effective: float = 0.0
+    """Frames in the sums, forgetting included."""
+
+    samples: tuple[tuple[Array, Array], ...] = ()
+    """Filtered slopes ``(n_slopes,)`` and commands ``(n_modes,)`` of single frames."""
+
+    tail: FrameBlock | None = None
+    """The last frames, as many as the filter reaches back."""
+
+    waiting: tuple[FrameBlock, ...] = ()
+    """Frames that are not multiplied yet and, before them, those that the filter reaches back to;
+    each block follows the one before."""
+
+    n_others: int = 0
+    """Modes outside the loop that move in them."""
+
+    begun: bool = False
+    """Whether frames of this run have been multiplied."""
+
+    since_ns_utc: int = 0
+    """No frame in the sums is older, by the RTC's clock; 0: not known."""
+
     @property
-    def determines(self) -> Determines:
-        """Which of the four parameters it can tell."""
-        return PASSIVE
+    def n_waiting(self) -> int:
+        """Frames that the filter reaches both ends of and that are not multiplied yet."""
+        return max(sum(block.n_frames for block in self.waiting) - _REACH, 0)
+
+    @property
+    def why_unusable(self) -> str | None:
+        """Return why this loop's telemetry says nothing, or None."""
+        if self.delay_frames >= LEAST_DELAY_FRAMES:
+            return None
+        return (
+            f"no passive estimate: the loop's delay is {self.delay_frames:g} frames, "
+            f"{LEAST_DELAY_FRAMES} are needed to tell the mirror's response from noise"
+        )
+
+
+def accumulate(state: Passive, block: FrameBlock) -> Passive:
+    """Add a block of frames.
+
+    A dither of controlled modes is as good as their own motion. What moves outside the loop is
+    taken out of the instrument, where its response would pass for that of controlled modes.
+    """
+    if state.why_unusable is not None:
+        return state
+    block = replace(block, dither_m=None)
+    if state.tail is not None and not block.follows(state.tail):
+        state = replace(_ended(state), tail=None)
+    before = () if state.tail is None else (state.tail,)
+    n_others = len(_others(state, *before, block))
+    if state.n_waiting and n_others != state.n_others:
+        # a dither begins or ends: what it is taken out of must hold it from end to end
+        state = _ended(state)
+    state = _sampled(state, *before, block)
+    tail = block if block.n_frames >= _REACH else joined_frames((*before, block))
+    waiting = (*(state.waiting or before), block)
+    state = replace(state, tail=tail.last(_REACH), waiting=waiting, n_others=n_others)
+    if state.n_waiting < CHUNK_FRAMES + TAPER_FRAMES:
+        return state
+    frames = joined_frames(waiting)
+    state = _summed(state, frames.rows(0, frames.n_frames - TAPER_FRAMES), last=False)
+    return replace(state, waiting=(frames.last(_REACH + TAPER_FRAMES),), begun=True)
+
+
+def _ended(state: Passive) -> Passive:
+    """Return the state after the end of a run: what waits fades out, or was too short to count."""
+    if state.n_waiting >= (1 if state.begun else 2 * TAPER_FRAMES):
+        state = _summed(state, joined_frames(state.waiting), last=True)
+    return replace(state, waiting=(), begun=False)
+
+
+def _others(state: Passive, *blocks: FrameBlock) -> NDArray[np.intp]:
+    """Return which modes outside the loop move; none where more do than any dither of sines."""
+    moves = [block.commands_m[:, state.n_modes :].any(axis=0) for block in blocks]
+    others = state.n_modes + np.flatnonzero(np.any(moves, axis=0))
+    return others[:0] if len(others) > MOST_OTHER_MODES else others
+
+
+def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:
+    """Keep one filtered frame in ``SAMPLE_FRAMES``."""
+    first, n_rows = blocks[0].first_seq, sum(block.n_frames for block in blocks) - _REACH
+    if n_rows < 1 or first // SAMPLE_FRAMES == (first + n_rows) // SAMPLE_FRAMES:
+        return state
+    head = joined_frames(tuple(block.rows(0, N_TAPS) for block in blocks)).rows(0, N_TAPS)
+    chosen = high_pass(state.delay_frames)
+    filtered = chosen(head.commands_m[:, : state.n_modes])[0]
+    sample = (chosen.taps[::-1] @ head.slopes, filtered)
+    return replace(state, samples=(*state.samples, sample)[-SAMPLES_KEPT:])
+
+
+def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
+    """Add frames to the sums: the first of a run, the last, or some between."""
+    chosen, commands = high_pass(state.delay_frames), frames.commands_m
+    # those that the filter reaches both ends of
+    now = slice(chosen.behind, frames.n_frames - chosen.ahead)
+    before = slice(now.start - 1, now.stop - 1)
+    filtered, n = chosen(commands[:, : state.n_modes]), frames.n_frames - _REACH
+    others = _others(state, frames)
+    if len(others):
+        moving = np.hstack([commands[now][:, others], commands[before][:, others]])
+        filtered -= moving @ np.linalg.lstsq(moving, filtered, rcond=1e-6)[0]
+    weight = np.ones((n, 1), np.float32)
+    rise = np.sin(np.pi / 2 * (np.arange(TAPER_FRAMES) + 0.5) / TAPER_FRAMES)[:, None] ** 2
+    if not state.begun:
+        weight[:TAPER_FRAMES] *= rise[:n]
+    if last:
+        weight[-TAPER_FRAMES:] *= rise[::-1][-n:]
+    filtered *= weight
+    cross = frames.slopes[now].T @ filtered
+    moved = commands[now, : state.n_modes].T @ filtered
+    power = filtered.T @ filtered
+    fade = np.float32(np.exp(-n / state.memory_frames))
+    if state.cross is not None and state.moved is not None and state.power is not None:
+        cross += fade * state.cross
+        moved += fade * state.moved
+        power += fade * state.power
+    n_effective = float(fade) * state.n_effective + float(weight.sum())
+    return replace(state, cross=cross, moved=moved, power=power, n_effective=n_effective)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NoisyMatrix:
+class PassiveMatrix:
     """What the telemetry makes of the interaction matrix."""
 
     matrix: NDArray[np.float64]
@@ -83,7 +318,7 @@ class NoisyMatrix:
     """``(n_modes, n_modes)`` covariance of the columns' errors, for slopes with noise of 1."""
 
 
-def noisy_matrix(state: Passive) -> NoisyMatrix | None:
+def passive_matrix(state: Passive) -> PassiveMatrix | None:
     """Return the noisy interaction matrix, or None when the telemetry is too young.
 
     ``D = (sum s z^T) (sum c z^T)^-1``, as z is independent of the noise of its frame. The errors of
@@ -100,7 +335,7 @@ def noisy_matrix(state: Passive) -> NoisyMatrix | None:
     # enough of the mean for a mode that never moves
     ridge = np.diag(_RIDGE * own + _STILL_RIDGE * own.mean())
     inverse = np.linalg.inv(state.moved.astype(np.float64) + ridge)
-    return NoisyMatrix(
+    return PassiveMatrix(
         matrix=state.cross.astype(np.float64) @ inverse,
         shape=inverse.T @ state.power.astype(np.float64) @ inverse,
     )
@@ -109,40 +344,33 @@ def noisy_matrix(state: Passive) -> NoisyMatrix | None:
 def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     """Fit α and a free gain per mode to the noisy matrix; None when too few frames came.
 
-    Variable projection (Kaufman 1975): ``g_j = D_j.Y_j / D_j.D_j``,
-    ``J_jk = g_j (I - P_j) dD_j/dα_k``, each mode weighted by its noise. The errors of the columns
-    are not independent (Q), nor are those of the slopes (S): fast turbulence looks like modes. With
-    both, ``Cov = A^-1 (J w) (S x Q) (J w)^T A^-1``; the residual tells S.
+    By :mod:`service.fit.solver`, each mode weighted by its noise. The errors of the columns are not
+    independent (Q), nor are those of the slopes (S): fast turbulence looks like modes. With both,
+    ``Cov = A^-1 (J w) (S x Q) (J w)^T A^-1``; the residual tells S.
     """
-    found = noisy_matrix(state)
+    found = passive_matrix(state)
     if found is None:
         return None
     modes = slice(0, state.n_modes)
-    matrix = linearisation.matrix[:, modes].astype(np.float64)
     noise = np.diag(found.shape)
     # a mode that never moves has no noise, and no weight
     least = noise[noise > 0.0].min()
-    weight = np.where(noise > 0.0, least / np.maximum(noise, least), 0.0)
-    norm = np.einsum("sm,sm->m", matrix, matrix)
-    gains = np.einsum("sm,sm->m", matrix, found.matrix) / norm
-    jacobian = []
-    for derivative in linearisation.derivatives[:, :, modes].astype(np.float64):
-        along = np.einsum("sm,sm->m", matrix, derivative) / norm
-        jacobian.append((gains * (derivative - along * matrix)).ravel())
-    flat = np.array(jacobian)
-    heavy = (flat.reshape(4, *matrix.shape) * weight).reshape(4, -1)
-    residual = (found.matrix - gains * matrix).ravel()
-    normal = np.linalg.inv(flat @ heavy.T)
-    step = normal @ (heavy @ residual)
-    left = (residual - step @ flat).reshape(matrix.shape)
-    freedom = (len(matrix) - 1) * (weight @ noise) - 4 * least
-    variance = float(np.einsum("sm,sm,m->", left, left, weight) / freedom)
-    scores = _patterns(left, noise).T @ heavy.reshape(4, *matrix.shape)
+    weights = np.where(noise > 0.0, least / np.maximum(noise, least), 0.0)
+    every = np.ones(len(found.matrix), dtype=np.bool_)
+    seen = Columns(matrix=found.matrix, weights=weights, rows=every).project(
+        linearisation.matrix[:, modes], linearisation.derivatives[:, :, modes]
+    )
+    normal = np.linalg.inv(seen.normal)
+    step = normal @ seen.scores.sum(axis=1)
+    left = seen.residual - np.tensordot(step, seen.jacobian, axes=1)
+    freedom = (len(left) - 1) * (weights @ noise) - 4 * least
+    variance = float(np.sum(left**2, axis=0) @ weights / freedom)
+    scores = _patterns(left, noise).T @ (seen.jacobian * weights)
     spread = (scores @ found.shape).reshape(4, -1) @ scores.reshape(4, -1).T
     return PassiveEstimate(
         alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
         covariance=variance * normal @ spread @ normal,
-        optical_gain=gains,
+        optical_gain=seen.gains,
         misfit=variance / _slope_variance(state, found.matrix),
         step=step,
     )

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 from service.control.gate import FORGIVING_LEAK
 from service.errors import CommandError
-from service.telemetry.faraway import NOT_FOUND
+from service.telemetry.openloop import NOT_FOUND
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import (
     abort,

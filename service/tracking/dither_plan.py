@@ -20,7 +20,7 @@ from service.control.dither import (
 from service.errors import CommandError, ModelError
 from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan
 from service.telemetry.played import Asked
-from service.telemetry.randomdither import FRAMES_PER_MODE, RandomPlan
+from service.telemetry.random_dither import FRAMES_PER_MODE, RandomPlan
 from service.tracking.loop import DitherKind, DitherView, RtcView
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import ModeSet

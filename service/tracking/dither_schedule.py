@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from service.control.dither import forgetting_mean, measured_ratio
-from service.telemetry.instrumental import WindowEstimate
-from service.telemetry.noisymatrix import RandomEstimate
+from service.telemetry.lockin import WindowEstimate
+from service.telemetry.random_dither import RandomEstimate
 from service.tracking.alarms import Act, forbidding, logged, with_alarm, without_alarm
 from service.tracking.dither import ROUNDING, calm_ns_utc, own_sine, stopped, without_unwanted
 from service.tracking.dither_plan import (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
-from service.telemetry.wind import Drift, Joint, begin_joint, predicted
+from service.telemetry.kalman import Drift, Joint, begin_joint, predicted
 from service.tracking.alarms import without_alarm
 from service.tracking.jumps import last_of
 from service.tracking.policy import SECOND_NS, Policy

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
+from service.telemetry.kalman import JUMP_THRESHOLD, Joint
 from service.telemetry.passive import BIAS_FLOOR
-from service.telemetry.wind import JUMP_THRESHOLD, Joint
 from service.tracking.loop import Pointing
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Earlier, Registration, Seen

@@ -14,11 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.telemetry.estimator import DitheredEstimate, model_error
-from service.telemetry.instrumental import MAX_LAG_FRAMES
-from service.telemetry.noisymatrix import RandomEstimate
-from service.telemetry.passive import PassiveEstimate
-from service.telemetry.wind import (
+from service.telemetry.estimate import DitheredEstimate, model_error
+from service.telemetry.kalman import (
     JUMP_THRESHOLD,
     Joint,
     allowing,
@@ -30,6 +27,9 @@ from service.telemetry.wind import (
     with_dithered,
     with_passive,
 )
+from service.telemetry.lockin import MAX_LAG_FRAMES
+from service.telemetry.passive import PassiveEstimate
+from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import missed
 from service.tracking.alarms import (

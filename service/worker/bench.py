@@ -25,11 +25,11 @@ from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo
 from service.prepared import Prepared
 from service.telemetry import passive
-from service.telemetry.faraway import NOT_FOUND, FarEstimate, Search, find
-from service.telemetry.instrumental import Loop, WindowEstimate, fit_window
-from service.telemetry.lockin import Spectra, WindowRefused
-from service.telemetry.noisymatrix import RandomEstimate, fit_random
-from service.telemetry.randomdither import Correlated
+from service.telemetry.frames import Loop
+from service.telemetry.lockin import Spectra, WindowEstimate, fit_window
+from service.telemetry.openloop import NOT_FOUND, FarEstimate, FarSearch, find
+from service.telemetry.random_dither import Correlated, RandomEstimate, fit_random
+from service.telemetry.windows import WindowRefused
 from service.worker.instruments import actuators_of, check_controllable, outer_of
 from service.worker.margin import InUse, Margin
 from service.worker.records import Compute, Description, Made
@@ -224,7 +224,7 @@ class Workbench:
         far, near = self._far[modes]
         starts = (start,) if start is not None else far_starts(self._model.instrument, flux)
         try:
-            return find(spectra, Search(far=far, near=near, nominal=self._start, starts=starts))
+            return find(spectra, FarSearch(far=far, near=near, nominal=self._start, starts=starts))
         except np.linalg.LinAlgError as error:
             return WindowRefused(reason=f"{NOT_FOUND}: {error}", t_ns_utc=spectra.t_end_ns_utc)
 

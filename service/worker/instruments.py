@@ -7,7 +7,7 @@ from service.errors import ModelError
 from service.model.instrument import Influence, Instrument, Mirror
 from service.model.modes import ModalBasis
 from service.model.rtc import RtcInteractionModel
-from service.telemetry.edge import Actuators
+from service.telemetry.health import Actuators
 
 
 def actuators_of(model: RtcInteractionModel) -> Actuators | None:

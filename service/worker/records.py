@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.control.gate import GateVerdict
 from service.control.reconstructor import MAX_CONDITION, Method
 from service.model.misregistration import Misregistration
-from service.telemetry.edge import Actuators
+from service.telemetry.health import Actuators
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

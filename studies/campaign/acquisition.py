@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import BOUNDARY_SCALE
-from service.telemetry.faraway import FarEstimate
+from service.telemetry.openloop import FarEstimate
 from service.tracking.events import FarFitted
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode

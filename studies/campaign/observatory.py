@@ -25,7 +25,7 @@ from service.runtime.engine import Engine
 from service.runtime.estimates import fitted, listened, lost, watched
 from service.runtime.supervisor import WATCH_INTERVAL_S
 from service.telemetry.lockin import Spectra
-from service.telemetry.randomdither import Correlated
+from service.telemetry.random_dither import Correlated
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.events import Command, Effect, Event

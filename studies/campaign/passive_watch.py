@@ -14,9 +14,7 @@ from service.config.policy import policy_of
 from service.model.misregistration import Misregistration
 from service.runtime.streams import PASSIVE_MEMORY_S
 from service.telemetry import lockin
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra, WindowRefused
-from service.telemetry.passive import Passive, accumulate
-from service.telemetry.wind import (
+from service.telemetry.kalman import (
     Drift,
     Joint,
     allowing,
@@ -25,6 +23,9 @@ from service.telemetry.wind import (
     with_dithered,
     with_passive,
 )
+from service.telemetry.lockin import LockIn, LockInPlan, Spectra
+from service.telemetry.passive import Passive, accumulate
+from service.telemetry.windows import WindowRefused
 from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, Workbench
 from sim_rtc.assembly import Telescope

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from service.telemetry.estimator import model_error
+from service.telemetry.estimate import model_error
 from studies.campaign.plan import Estimator
 
 Array = NDArray[np.float64]

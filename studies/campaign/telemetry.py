@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from service.telemetry import lockin, passive, randomdither
+from service.telemetry import lockin, passive, random_dither
 from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra, WindowRefused
+from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.passive import Passive
-from service.telemetry.randomdither import Correlated, RandomDither, RandomPlan
+from service.telemetry.random_dither import Correlated, RandomDither, RandomPlan
+from service.telemetry.windows import WindowRefused
 from service.wire import DitherAction, DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer import RealTimeComputer
@@ -51,7 +52,7 @@ class Arriving:
     def _dithered(self, plan: Plan) -> Iterator[Window]:
         sums: Any = RandomDither(plan=plan) if isinstance(plan, RandomPlan) else LockIn(plan=plan)
         random = isinstance(plan, RandomPlan)
-        accumulate: Any = randomdither.accumulate if random else lockin.accumulate
+        accumulate: Any = random_dither.accumulate if random else lockin.accumulate
         waited, strikes_at = 0, float(plan.first_seq + plan.n_frames / 2)
         for blocks in self._blocks(plan.first_seq):
             for block in blocks:

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.telemetry import lockin, wind
+from service.telemetry import kalman, lockin
 from service.telemetry.health import LoopHealth, observe
 from tests.numerics import block_of, part, sines
 
@@ -72,11 +72,11 @@ covariances = st.builds(covariance, st.integers(0, 2**32 - 1), st.floats(1e-4, 1
 def test_the_filters_covariance_stays_symmetric_and_positive(mean, prior, measurements):
     """Joseph's form, whatever arrives, dithered and passive in turn; 1e-9 of its largest axis is
     rounding."""
-    drift = wind.Drift(alpha_rate=np.full(4, 1e-3))
-    found = wind.begin_joint(mean, prior)
+    drift = kalman.Drift(alpha_rate=np.full(4, 1e-3))
+    found = kalman.begin_joint(mean, prior)
     for measured, noise in measurements:
-        found = wind.predicted(found, drift, 1.0)
-        found = wind.with_passive(wind.with_dithered(found, measured, noise), measured, noise)
+        found = kalman.predicted(found, drift, 1.0)
+        found = kalman.with_passive(kalman.with_dithered(found, measured, noise), measured, noise)
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     power = np.linalg.eigvalsh(found.covariance)
     assert power[0] > -1e-9 * power[-1]
@@ -84,8 +84,8 @@ def test_the_filters_covariance_stays_symmetric_and_positive(mean, prior, measur
 
 @given(vectors, covariances, vectors, covariances)
 def test_a_measurement_never_adds_uncertainty(mean, prior, measured, noise):
-    begun = wind.begin_joint(mean, prior)
-    found = wind.with_dithered(begun, measured, noise).alpha_covariance
+    begun = kalman.begin_joint(mean, prior)
+    found = kalman.with_dithered(begun, measured, noise).alpha_covariance
     slack = 1e-9 * np.trace(prior + noise)
     assert np.linalg.eigvalsh(prior - found)[0] > -slack
     assert np.linalg.eigvalsh(noise - found)[0] > -slack
@@ -94,18 +94,18 @@ def test_a_measurement_never_adds_uncertainty(mean, prior, measured, noise):
 @given(vectors, covariances, vectors, covariances)
 def test_the_innovation_does_not_depend_on_the_units(mean, prior, measured, noise):
     units = np.diag([100.0, 0.01, 57.3, 3.0])
-    plain = wind.begin_joint(mean, prior)
-    scaled = wind.begin_joint(units @ mean, units @ prior @ units)
+    plain = kalman.begin_joint(mean, prior)
+    scaled = kalman.begin_joint(units @ mean, units @ prior @ units)
     there, noisier = units @ measured, units @ noise @ units
     np.testing.assert_allclose(
-        wind.dithered_innovation(scaled, there, noisier),
-        wind.dithered_innovation(plain, measured, noise),
+        kalman.dithered_innovation(scaled, there, noisier),
+        kalman.dithered_innovation(plain, measured, noise),
         rtol=1e-6,
         atol=1e-12,
     )
     np.testing.assert_allclose(
-        wind.with_dithered(scaled, there, noisier).alpha,
-        units @ wind.with_dithered(plain, measured, noise).alpha,
+        kalman.with_dithered(scaled, there, noisier).alpha,
+        units @ kalman.with_dithered(plain, measured, noise).alpha,
         rtol=1e-5,
         atol=1e-6,
     )

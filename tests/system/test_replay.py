@@ -12,8 +12,8 @@ from service.link.intake import Intake
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime import translate
 from service.runtime.engine import Engine
-from service.telemetry.instrumental import Loop as FitLoop
-from service.telemetry.instrumental import WindowEstimate
+from service.telemetry.frames import Loop as FitLoop
+from service.telemetry.lockin import WindowEstimate
 from service.tracking import events as ev
 from service.tracking.policy import Policy
 from service.tracking.state import Mode, TrackerState

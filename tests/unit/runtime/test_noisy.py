@@ -12,7 +12,7 @@ from service.model.misregistration import Misregistration
 from service.runtime.actions import Actions, Publishing
 from service.runtime.estimates import NoisySums
 from service.telemetry.frames import FrameBlock
-from service.telemetry.randomdither import RandomDither, RandomPlan, accumulate
+from service.telemetry.random_dither import RandomDither, RandomPlan, accumulate
 from service.tracking import events as ev
 from service.tracking.alarms import with_alarm
 from service.tracking.products import NoisyRecord, NoisyState

@@ -10,7 +10,7 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.runtime.engine import shape_mismatch
 from service.runtime.streams import Streams, fed, taken, with_rtc
-from service.telemetry.edge import LOW_MODES
+from service.telemetry.health import LOW_MODES
 from service.tracking import events as ev
 from service.tracking.registration import Source
 from service.tracking.state import Mode

@@ -9,7 +9,7 @@ from service.control.gate import judge
 from service.model.misregistration import Misregistration
 from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import working_point
-from service.telemetry.instrumental import Loop
+from service.telemetry.frames import Loop
 from service.worker import Workbench
 from service.worker.sensor import FOLLOWED, STRENGTHS
 from tests.unit.runtime.small import (

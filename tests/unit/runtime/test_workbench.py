@@ -8,9 +8,9 @@ import pytest
 from service.model.misregistration import Misregistration
 from service.model.rtc import RtcInteractionModel
 from service.telemetry import passive
-from service.telemetry.frames import FrameBlock
-from service.telemetry.instrumental import Loop
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra, WindowRefused, accumulate
+from service.telemetry.frames import FrameBlock, Loop
+from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
+from service.telemetry.windows import WindowRefused
 from service.worker import Workbench, run_job
 from tests.unit.runtime.small import (
     COMPUTE,

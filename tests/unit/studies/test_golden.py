@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.telemetry.noisymatrix import RandomEstimate
+from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
 from service.tracking.state import Mode, TrackerState
 from studies.campaign.golden import INSTRUMENT, Teller, first_difference, nights_in, read, written

@@ -14,10 +14,10 @@ from service.telemetry.lockin import (
     LockIn,
     LockInPlan,
     Spectra,
-    WindowRefused,
     accumulate,
     joined,
 )
+from service.telemetry.windows import WindowRefused
 from tests.numerics import DT_NS, FRAME_RATE_HZ, T0_NS, block_of, part, sines
 
 N_FRAMES = 1000

@@ -6,7 +6,7 @@ import numpy as np
 
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
-from service.telemetry.instrumental import WindowEstimate
+from service.telemetry.lockin import WindowEstimate
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.loop import RtcView

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.telemetry.noisymatrix import RandomEstimate
+from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
 from service.tracking.dither_plan import total_m
 from service.tracking.loop import DitherKind

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from service.model.misregistration import Misregistration
-from service.telemetry.estimator import MODEL_ERROR
-from service.telemetry.lockin import WindowRefused
+from service.telemetry.estimate import MODEL_ERROR
+from service.telemetry.windows import WindowRefused
 from service.tracking import events as ev
 from service.tracking.estimate import HISTORY_LENGTH
 from service.tracking.state import Level, Mode

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from service.telemetry.faraway import FarEstimate
+from service.telemetry.openloop import FarEstimate
 from service.tracking import events as ev
 from service.tracking.products import MatrixState, MeasureState, NoisyFinding, NoisyState
 from service.tracking.state import Mode

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.telemetry.looplaw import KEPT_FRAMES, LoopLaw, follow, judged
+from service.telemetry.loopcheck import KEPT_FRAMES, LoopLaw, follow, judged
 from tests.unit.telemetry.test_loopcheck import GAINS, INVERSE, blocks, closed_loop, terms
 
 

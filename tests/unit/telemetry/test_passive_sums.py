@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from service.model.misregistration import Misregistration
-from service.telemetry.passive import fit, noisy_matrix
-from service.telemetry.passivesums import (
-    CHUNK_FRAMES,
+from service.telemetry.passive import (
     SAMPLES_KEPT,
     TAPER_FRAMES,
     Passive,
     accumulate,
+    fit,
+    passive_matrix,
 )
+from service.telemetry.windows import CHUNK_FRAMES
 from tests.numerics import (
     N_CONTROLLED,
     N_MODES,
@@ -95,7 +96,7 @@ def test_old_frames_are_forgotten():
     state = fed(quiet(Misregistration(), 0, 3000), 100, state)
     assert state.n_effective == pytest.approx(1306, rel=0.05)
     state = fed(quiet(SOMEWHERE, 3000, 6600), 100, state)
-    found = noisy_matrix(state).matrix
+    found = passive_matrix(state).matrix
     expected = small_model().interaction_matrix(SOMEWHERE)[:, :N_CONTROLLED]
     assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected)
 
@@ -105,8 +106,8 @@ def test_a_constant_offset_of_slopes_and_commands_hardly_matters():
     block = random_block(4000)
     slopes = block.commands_m @ small_model().interaction_matrix(SOMEWHERE).T
     lifted = block_of(slopes + 0.25, block.commands_m + np.float32(2e-8), None)
-    plain = noisy_matrix(fed(block_of(slopes, block.commands_m, None), 200)).matrix
-    offset = noisy_matrix(fed(lifted, 200)).matrix
+    plain = passive_matrix(fed(block_of(slopes, block.commands_m, None), 200)).matrix
+    offset = passive_matrix(fed(lifted, 200)).matrix
     assert np.linalg.norm(plain - offset) < 0.01 * np.linalg.norm(plain)
 
 

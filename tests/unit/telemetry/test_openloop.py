@@ -9,9 +9,9 @@ import pytest
 from service.control.dither import FINER, SMOOTH, lines_of, modes_of
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.telemetry.faraway import UNEXPLAINED, FarEstimate, Search, find
 from service.telemetry.lockin import LockIn, LockInPlan, accumulate
-from service.telemetry.span import WindowRefused
+from service.telemetry.openloop import UNEXPLAINED, FarEstimate, FarSearch, find
+from service.telemetry.windows import WindowRefused
 from tests.numerics import (
     FRAME_RATE_HZ,
     N_MODES,
@@ -70,7 +70,7 @@ def model(modes, sampling):
 
 def look(spectra, *starts):
     modes = spectra.plan.modes
-    search = Search(
+    search = FarSearch(
         far=model(modes, 1), near=model(modes, 2), nominal=NOMINAL, starts=starts or (NOMINAL,)
     )
     return find(spectra, search)
@@ -136,5 +136,5 @@ def test_columns_a_frame_apart_are_refused():
 
 def test_without_a_start_nothing_is_found():
     modes = plan().modes
-    nowhere = Search(far=model(modes, 1), near=model(modes, 2), nominal=NOMINAL, starts=())
+    nowhere = FarSearch(far=model(modes, 1), near=model(modes, 2), nominal=NOMINAL, starts=())
     assert isinstance(find(window(FAR), nowhere), WindowRefused)

@@ -9,16 +9,18 @@ import pytest
 
 from service.errors import ModelError
 from service.model.interaction import Linearisation
-from service.telemetry import randomdither
-from service.telemetry.lockin import WindowRefused
-from service.telemetry.noisymatrix import RandomEstimate, fit_random, noisy_matrix
-from service.telemetry.randomdither import (
+from service.telemetry import random_dither
+from service.telemetry.random_dither import (
     Correlated,
     RandomDither,
+    RandomEstimate,
     RandomPlan,
     accumulate,
+    fit_random,
     joined,
+    noisy_matrix,
 )
+from service.telemetry.windows import WindowRefused
 from tests.numerics import (
     N_MODES,
     SOMEWHERE,
@@ -115,7 +117,7 @@ EVERY = tuple(range(N_MODES))
 @pytest.fixture
 def many(monkeypatch):
     """Modes so few that the small instrument has many."""
-    monkeypatch.setattr(randomdither, "MANY_MODES", 30)
+    monkeypatch.setattr(random_dither, "MANY_MODES", 30)
 
 
 @pytest.mark.usefixtures("many")

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from service.config.mirrors import rings
 from service.model.instrument import KarhunenLoeve
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from service.telemetry.edge import (
+from service.telemetry.health import (
     SLIPPED_RATIO,
     SUSPECT_RATIO,
     Actuators,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.telemetry.highpass import N_TAPS, high_pass
+from service.telemetry.passive import N_TAPS, high_pass
 
 
 def response(delay_frames: float, turns: float) -> complex:

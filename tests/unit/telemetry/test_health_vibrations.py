@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from service.telemetry.vibration import (
+from service.telemetry.health import (
     MIN_SEGMENTS,
     SEGMENT_FRAMES,
-    Vibrations,
-    heard,
-    hearing,
-    lines_hz,
-    listen,
-    views_of,
+    SlopeSpectra,
+    VibrationMonitor,
 )
 from tests.numerics import block_of, part
 
@@ -34,22 +30,22 @@ def slopes(seed: int, vibrations: dict[float, float], n_segments: int = 12) -> n
     return noise
 
 
-def listened(rows: np.ndarray, batch: int = 50) -> Vibrations:
+def listened(rows: np.ndarray, batch: int = 50) -> SlopeSpectra:
     block = block_of(rows, np.zeros((len(rows), 1)), None)
-    state = Vibrations(views=views_of(N_SLOPES))
+    state = VibrationMonitor.begin(N_SLOPES).quiet
     for start in range(0, len(rows), batch):
-        state = listen(state, part(block, start, min(start + batch, len(rows))))
+        state = state.with_frames(part(block, start, min(start + batch, len(rows))))
     return state
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_noise_alone_has_no_line(seed):
-    assert lines_hz(listened(slopes(seed, {}))) == ()
+    assert listened(slopes(seed, {})).lines_hz() == ()
 
 
 def test_lines_are_found_to_a_bin():
     """Bins are 0.98 Hz wide; a sine between two of them shows in either."""
-    found = lines_hz(listened(slopes(1, {61.0: 0.5, 240.0: 0.3})))
+    found = listened(slopes(1, {61.0: 0.5, 240.0: 0.3})).lines_hz()
     assert len(found) == 2
     np.testing.assert_allclose(found, [61.0, 240.0], atol=1.0)
 
@@ -58,27 +54,27 @@ def test_the_steep_end_of_turbulence_is_no_line():
     rng = np.random.default_rng(3)
     # a loop's own overshoot at 5 Hz, where turbulence bends
     steep = lfilter([1.0], [1.0, -1.993, 0.994], rng.normal(size=(12 * 1024, N_SLOPES)), axis=0)
-    assert lines_hz(listened(steep)) == ()
+    assert listened(steep).lines_hz() == ()
 
 
 def test_the_dithers_own_lines_are_not_vibrations():
-    found = lines_hz(listened(slopes(1, {61.0: 0.5, 240.0: 0.3})), known_hz=(240.0,))
+    found = listened(slopes(1, {61.0: 0.5, 240.0: 0.3})).lines_hz(known_hz=(240.0,))
     np.testing.assert_allclose(found, [61.0], atol=1.0)
 
 
 def test_nothing_is_said_before_enough_has_been_heard():
     young = listened(slopes(1, {61.0: 0.5}, n_segments=MIN_SEGMENTS - 1))
-    assert lines_hz(young) == ()
+    assert young.lines_hz() == ()
 
 
 def test_a_gap_starts_the_segment_anew():
     rows = slopes(1, {}, n_segments=2)
     block = block_of(rows, np.zeros((len(rows), 1)), None)
-    state = Vibrations(views=views_of(N_SLOPES))
-    state = listen(state, part(block, 0, 1000))
-    state = listen(state, part(block, 1010, 2010))
+    state = VibrationMonitor.begin(N_SLOPES).quiet
+    state = state.with_frames(part(block, 0, 1000))
+    state = state.with_frames(part(block, 1010, 2010))
     assert state.n_segments == 0
-    assert listen(state, part(block, 2010, 2048)).n_segments == 1
+    assert state.with_frames(part(block, 2010, 2048)).n_segments == 1
 
 
 DITHER_HZ = (211.0, 239.0)
@@ -89,7 +85,7 @@ def overheard(parts: list[tuple[dict[str, float], bool, int]]) -> tuple[float, .
 
     The dither's lines show in the slopes as any vibration does.
     """
-    state, first = hearing(N_SLOPES), 0
+    state, first = VibrationMonitor.begin(N_SLOPES), 0
     for seed, (vibrations, dithered, n_segments) in enumerate(parts):
         lines = vibrations | (dict.fromkeys(DITHER_HZ, 0.3) if dithered else {})
         rows = slopes(seed, lines, n_segments)
@@ -97,7 +93,7 @@ def overheard(parts: list[tuple[dict[str, float], bool, int]]) -> tuple[float, .
         block = replace(block_of(rows, np.zeros((len(rows), 1)), dither), first_seq=first)
         for start in range(0, len(rows), 50):
             piece = part(block, start, min(start + 50, len(rows)))
-            state = heard(state, piece, DITHER_HZ if dithered else ())
+            state = state.update(piece, DITHER_HZ if dithered else ())
         first += len(rows)
     return state.lines_hz
 

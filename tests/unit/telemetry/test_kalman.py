@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.telemetry.passive import BIAS_FLOOR, BIAS_OVER_SCATTER
-from service.telemetry.wind import (
+from service.telemetry.kalman import (
     JUMP_THRESHOLD,
     Drift,
     Joint,
@@ -22,6 +21,7 @@ from service.telemetry.wind import (
     with_dithered,
     with_passive,
 )
+from service.telemetry.passive import BIAS_FLOOR, BIAS_OVER_SCATTER
 
 DITHERED = np.diag(np.array([0.008, 0.008, np.deg2rad(0.02), 0.0008]) ** 2)
 SCATTER = np.diag(np.array([0.003, 0.003, np.deg2rad(0.01), 0.0003]) ** 2)

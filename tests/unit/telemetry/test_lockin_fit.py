@@ -10,14 +10,17 @@ import pytest
 
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from service.telemetry import instrumental
-from service.telemetry.instrumental import (
+from service.telemetry import lockin
+from service.telemetry.lockin import (
     MAX_LAG_FRAMES,
+    LockIn,
+    LockInPlan,
+    Spectra,
     WindowEstimate,
+    accumulate,
     closed_loop_response,
     fit_window,
 )
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
 from tests.numerics import (
     DT_NS,
     FRAME_RATE_HZ,
@@ -57,7 +60,7 @@ class Case:
     plan: LockInPlan
 
     @property
-    def loop(self) -> instrumental.Loop:
+    def loop(self) -> lockin.Loop:
         return small_loop(gain=self.gain)
 
 
@@ -142,7 +145,7 @@ def test_the_command_as_its_own_instrument_is_biased(monkeypatch):
     """What the instrument is for: the command carries turbulence and noise of its own."""
     right = errors(FAINT, settled(FAINT, faint_windows()))
     monkeypatch.setattr(
-        instrumental, "_instrument", lambda spectra, *_: spectra.commands[:, 0].astype(complex)
+        lockin, "_instrument", lambda spectra, *_: spectra.commands[:, 0].astype(complex)
     )
     wrong = errors(FAINT, settled(FAINT, faint_windows()))
     assert np.abs(in_sigma_of_the_mean(wrong)).max() > 5.0

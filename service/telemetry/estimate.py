@@ -1,0 +1,109 @@
+"""What telemetry says of the registration, whichever way it was looked at.
+
+Every estimator cuts telemetry into windows, or forgets the old of it, in constant memory. Its fit
+says what it found of α, how sure it is by the scatter of the data themselves, and how well the
+model explains them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.misregistration import PARAMETERS, Misregistration
+
+MODEL_ERROR = 15.0
+"""Variance of α per unit of misfit above 1, over that of its scatter: what the model leaves over is
+smooth across the pupil and pulls at α more than noise of the same power. From campaigns on the
+diffractive telescope, two truths and two models (docs/results/night.md)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Determines:
+    """Which of the four parameters a kind of estimate can tell."""
+
+    parameters: tuple[str, ...]
+    """Names, as of ``PARAMETERS``."""
+
+    text: str
+    """What an operator should know of the others, and of what it costs."""
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Names of those it cannot tell, or not as well as a registration needs."""
+        return tuple(name for name in PARAMETERS if name not in self.parameters)
+
+
+LOCK_IN = Determines(
+    parameters=PARAMETERS,
+    text="sines on a few modes: all four, whatever the wind; lines must be clear of vibrations, "
+    "and the reconstructor in use must be known",
+)
+
+RANDOM = Determines(
+    parameters=PARAMETERS,
+    text="random signs on chosen modes or on all: all four, and the noisy interaction matrix; "
+    "robust to lines and gaps, needs no reconstructor, refused when the mirror answers a frame "
+    "late",
+)
+
+PASSIVE = Determines(
+    parameters=("rotation_deg", "magnification"),
+    text="no dither: rotation and magnification; shifts carry the wind's bias, 10 % of a "
+    "subaperture or more unless a dither has taught it; needs a closed loop, a delay of two frames "
+    "or more, and telemetry with few gaps",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """What one look at telemetry says of the registration."""
+
+    alpha: Misregistration
+    covariance: NDArray[np.float64]
+    """``(4, 4)`` numeric units, from the scatter of the data; no model error in it."""
+
+    optical_gain: NDArray[Any]
+    """``(n,)`` gain of the sensor on each mode looked at, against the model; complex with a lag."""
+
+    misfit: float
+    """Residual power over what noise explains; 1: the model explains the data."""
+
+    step: NDArray[np.float64]
+    """``(4,)`` distance from the linearisation to the estimate, numeric units."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DitheredEstimate(Estimate):
+    """One window's estimate, which may enter the registration."""
+
+    lag_frames: NDArray[np.float64]
+    """How far slopes lag commands; 0 when the columns are aligned as the wire demands."""
+
+    t_ns_utc: int
+    """End of the window."""
+
+    cm_id: str | None
+    """The reconstructor in use."""
+
+    session: str
+    """The RTC's session."""
+
+    modes: tuple[int, ...] = ()
+    """0-based basis index of each gain; empty: not known."""
+
+    gain_sigma: NDArray[np.float64] | None = None
+    """``(n,)`` 1 σ of each gain's modulus; None: not known."""
+
+
+def model_error(covariance: NDArray[Any], misfit: float) -> NDArray[Any]:
+    """Return ``(4,)`` the 1 σ by which the model leads a window astray, numeric units.
+
+    As much as it leaves unexplained: bright stars show what a faint one's noise hides, and neither
+    needs to be told which telescope it is. It does not average down, for the next window has the
+    same.
+    """
+    return np.sqrt(MODEL_ERROR * max(misfit - 1.0, 0.0) * np.diag(covariance))

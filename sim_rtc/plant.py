@@ -15,15 +15,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from service.model.instrument import Instrument, Stop
-from service.model.interaction import (
-    instrument_pupil,
-    normalised_jacobian,
-    rotation,
-    valid_subapertures,
-)
+from service.model.interaction import normalised_jacobian, rotation, valid_subapertures
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
-from service.model.pupil import PupilGrid
+from service.model.pupil import PupilGrid, instrument_pupil
 from service.model.pyramid import PyramidOptics
 from sim_rtc.flow import PhaseResponse
 from sim_rtc.imperfections import (

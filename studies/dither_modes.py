@@ -15,9 +15,9 @@ from service.config import load_instrument
 from service.config.policy import policy_of
 from service.config.settings import Settings
 from service.control.dither import SPAN, information, most_telling
+from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import PARAMETERS
 from service.model.modes import modal_basis
-from service.model.rtc import RtcInteractionModel
 
 FIRST = (400, 500)
 """Modes from here on are not controlled."""

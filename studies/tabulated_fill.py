@@ -22,12 +22,12 @@ from service.config.instrument import load_instrument
 from service.fit.matrix import fit_matrix
 from service.fit.options import Fit
 from service.fit.reference import Reference
-from service.model.filling import filled
 from service.model.instrument import Instrument, Stop, TabulatedModes
 from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
 from service.model.pyramid import Mapper
+from service.model.tabulated import filled
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -32,8 +32,8 @@ from service.files.recorded import file_sha256
 from service.files.report import orientation_words
 from service.files.request import parse_alpha
 from service.model.instrument import Instrument
+from service.model.interaction import RtcInteractionModel
 from service.model.modes import modal_basis
-from service.model.rtc import RtcInteractionModel
 
 SAMPLING = 4
 """Pupil points per subaperture, and detector nodes: the finest of the design's table that takes

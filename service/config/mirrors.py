@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from service.config.instrument_schema import MirrorTable
 from service.config.sources import Place, read_dataset, refuse
 from service.errors import ConfigurationError
-from service.model.filling import known_samples
 from service.model.instrument import BasisKind, Influence, Mirror, TabulatedModes
 from service.model.tabulated import (
     ENOUGH_POINTS_PER_SUBAPERTURE,
     LEAST_POINTS_PER_SUBAPERTURE,
+    known_samples,
 )
 
 _KINDS = ("layout", "modes", "influence_functions")

@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument, Stop
-from service.model.interaction import instrument_pupil
 from service.model.misregistration import Misregistration
-from service.model.pupil import Illumination
+from service.model.pupil import Illumination, instrument_pupil
 from service.model.pyramid import PyramidOptics, enough_modulation_points
 from service.model.slopes import Orientation
 

@@ -1,4 +1,9 @@
-"""The interaction matrix D(α) = K(shift) Φ(rotation, magnification), and how it moves with α."""
+"""The interaction matrix D(α) = K(shift) Φ(rotation, magnification), and how it moves with α.
+
+Rows stand in the order and signs of conventions.md, or as one RTC lists its slopes: what travels to
+and from the RTC (telemetry, measured matrices, reconstructors) stays as it is, and only the model
+speaks two languages.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +15,14 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.model.instrument import Instrument, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import Basis
-from service.model.pupil import Illumination, PupilGrid, annular_pupil
-from service.model.pyramid import (
-    Mapper,
-    Nodes,
-    PyramidOptics,
-    Response,
-    enough_modulation_points,
-)
-from service.model.slopes import Normalisation, rtc_mask, turned_mask
+from service.model.pupil import Illumination, annular_pupil, instrument_pupil
+from service.model.pyramid import Mapper, Nodes, PyramidOptics, Response, enough_modulation_points
+from service.model.slopes import Normalisation, rtc_mask, to_rtc, turned_mask
 from service.model.workingpoint import Halo
 
 Array = NDArray[Any]
@@ -242,16 +242,6 @@ class InteractionModel:
         return self._by_rows(lambda rows: rows @ shapes, gradient)
 
 
-def instrument_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
-    """Return the instrument's pupil on a grid of ``sampling`` points per subaperture."""
-    return annular_pupil(
-        n_subapertures=instrument.wfs.n_subapertures,
-        diameter_subap=instrument.wfs.pupil_diameter,
-        obscuration_ratio=instrument.obscuration_ratio,
-        sampling=sampling,
-    )
-
-
 def valid_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
     """Return the mask ``(n, n)`` [y, x] in our axes: the instrument's own, or by flux at α = 0."""
     own = instrument.wfs.valid_subapertures
@@ -301,23 +291,25 @@ def reference_slopes(
 
     Signs of conventions.md. ``images`` is ``(2, n, 2, n)``.
     """
-    differences, flux = _light(images, valid, normalisation)
+    differences, flux = differences_of(images, valid, normalisation)
     return differences / flux, float(flux.mean())
 
 
-def _light(
+def differences_of(
     images: Array, valid: NDArray[np.bool_], normalisation: Normalisation
 ) -> tuple[Array, Array]:
-    """Return x then y differences of the four images, and the flux that normalises them.
+    """Return x then y differences of four images ``(..., 2, n, 2, n)``, and what normalises them.
 
-    The flux is ``(1,)``, the mean per valid subaperture, or ``(n_slopes,)``, each one's own.
+    The differences are ``(..., n_slopes)``. The flux is ``(..., 1)``, the mean per valid
+    subaperture, or ``(..., n_slopes)``, each one's own.
     """
-    by_x, by_y = images.sum(axis=0), images.sum(axis=2)
-    x = (by_x[:, 0] - by_x[:, 1])[valid]
-    y = (by_y[0] - by_y[1])[valid]
-    flux = by_y.sum(axis=0)[valid]
-    local = normalisation is Normalisation.LOCAL
-    return np.concatenate([x, y]), np.tile(flux, 2) if local else flux.mean(keepdims=True)
+    by_x, by_y = images.sum(axis=-4), images.sum(axis=-2)
+    x = (by_x[..., 0, :] - by_x[..., 1, :])[..., valid]
+    y = (by_y[..., 0, :, :] - by_y[..., 1, :, :])[..., valid]
+    flux = by_y.sum(axis=-3)[..., valid]
+    if normalisation is Normalisation.LOCAL:
+        return np.concatenate([x, y], axis=-1), np.concatenate([flux, flux], axis=-1)
+    return np.concatenate([x, y], axis=-1), flux.mean(axis=-1, keepdims=True)
 
 
 def normalised_jacobian(response: Response, valid: NDArray[np.bool_]) -> Array:
@@ -325,7 +317,7 @@ def normalised_jacobian(response: Response, valid: NDArray[np.bool_]) -> Array:
 
     Of a response to shapes: their slopes, ``(n_slopes, n_shapes)``.
     """
-    differences, flux = _light(response.images, valid, response.normalisation)
+    differences, flux = differences_of(response.images, valid, response.normalisation)
     jacobian = response.gradient - _times(differences / flux, response.flux_gradient)
     jacobian /= flux[:, None].astype(jacobian.dtype)
     return np.asarray(jacobian)
@@ -333,8 +325,8 @@ def normalised_jacobian(response: Response, valid: NDArray[np.bool_]) -> Array:
 
 def normalised_derivative(at_rest: Response, moving: Response, valid: NDArray[np.bool_]) -> Array:
     """Return the rate of ``normalised_jacobian`` when the images move, by the product rule."""
-    differences, flux = _light(at_rest.images, valid, at_rest.normalisation)
-    difference_rate, flux_rate = _light(moving.images, valid, at_rest.normalisation)
+    differences, flux = differences_of(at_rest.images, valid, at_rest.normalisation)
+    difference_rate, flux_rate = differences_of(moving.images, valid, at_rest.normalisation)
     slopes = differences / flux
     slope_rate = (difference_rate - slopes * flux_rate) / flux
     rate = moving.gradient - _times(slopes, moving.flux_gradient)
@@ -370,3 +362,32 @@ class _Last(Generic[Value]):
         if self.value is None or key != self.key:
             self.key, self.value = key, compute()
         return self.value
+
+
+class RtcInteractionModel(InteractionModel):
+    """Interaction matrices whose rows stand as the RTC lists its slopes.
+
+    What travels to and from the RTC (telemetry, measured matrices, reconstructors) stays as it is;
+    only the model speaks two languages.
+    """
+
+    @override
+    def interaction_matrix(self, alpha: Misregistration) -> Array:
+        """Return D(α), ``(n_slopes, n_modes)``, rows in the RTC's order and signs."""
+        return self._listed(super().interaction_matrix(alpha))
+
+    @override
+    def derivatives(self, alpha: Misregistration) -> Array:
+        """Return dD/dα ``(4, n_slopes, n_modes)``, rows in the RTC's order and signs."""
+        return np.stack([self._listed(matrix) for matrix in super().derivatives(alpha)])
+
+    @override
+    def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
+        """Return which of the RTC's slopes lie near unknown surface, ``(n_slopes,)``."""
+        marks = self._listed(super().unknown_rows(alpha).astype(np.float32))
+        return np.asarray(marks != 0.0)
+
+    def _listed(self, rows: Array) -> Array:
+        recipe = self.instrument.slopes
+        mask = rtc_mask(self.valid, recipe.assumed_orientation)
+        return to_rtc(rows, recipe.order, recipe.assumed_orientation, mask)

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import BasisKind, Instrument, Mirror, TabulatedModes
 from service.model.mirror import Surface, mirror_surface
-from service.model.pupil import PupilGrid
+from service.model.pupil import PupilGrid, instrument_pupil
 from service.model.tabulated import tabulated_basis
 from service.model.turbulence import (
     expected_variance,
     piston_free,
-    pupil_of,
     pupil_statistics,
 )
 
@@ -205,7 +204,7 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
     strokes, variance = _diagonalise(
         gram, covariance, _parity_sectors(mirror.positions_m), turbulence.n_modes
     )
-    strokes = _unit_rms(strokes, surface, influence, pupil_of(instrument, _NORM_SAMPLING))
+    strokes = _unit_rms(strokes, surface, influence, instrument_pupil(instrument, _NORM_SAMPLING))
     strokes = _tilts_along_axes(strokes, mirror.positions_m)
     strokes = _fix_signs(strokes, mirror.positions_m)
     return ModalBasis(

@@ -9,6 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.model.instrument import Instrument
 
 _EDGE_NODES = 32
 """Gauss-Legendre nodes across a cell: area fractions good to about 1e-4."""
@@ -113,6 +114,16 @@ def annular_pupil(
     amplitude -= _disc_fraction(coordinates, radius * obscuration_ratio, sampling)
     return PupilGrid(
         sampling=sampling, coordinates=coordinates, amplitude=np.clip(amplitude, 0.0, 1.0)
+    )
+
+
+def instrument_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
+    """Return the instrument's evenly lit pupil, ``sampling`` points per subaperture."""
+    return annular_pupil(
+        n_subapertures=instrument.wfs.n_subapertures,
+        diameter_subap=instrument.wfs.pupil_diameter,
+        obscuration_ratio=instrument.obscuration_ratio,
+        sampling=sampling,
     )
 
 

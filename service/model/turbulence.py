@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from service.model.instrument import Instrument, KarhunenLoeve
-from service.model.pupil import PupilGrid, annular_pupil
+from service.model.pupil import instrument_pupil
 
 Array = NDArray[np.float64]
 
@@ -43,16 +43,6 @@ def von_karman_covariance(separation_m: Array, turbulence: KarhunenLoeve) -> Arr
     return np.asarray(phase * (REFERENCE_WAVELENGTH_M / (2 * np.pi)) ** 2)
 
 
-def pupil_of(instrument: Instrument, sampling: int) -> PupilGrid:
-    """Return the instrument's evenly lit pupil, ``sampling`` points per subaperture."""
-    return annular_pupil(
-        n_subapertures=instrument.wfs.n_subapertures,
-        diameter_subap=instrument.wfs.pupil_diameter,
-        obscuration_ratio=instrument.obscuration_ratio,
-        sampling=sampling,
-    )
-
-
 def piston_free(shapes: Array, weights: Array) -> Array:
     """Return shapes ``(n_points, n_shapes)`` without their mean under these weights."""
     return np.asarray(shapes - weights @ shapes)
@@ -67,7 +57,7 @@ def pupil_statistics(
     a convolution of every weighted shape with B(r), done exactly on a padded grid: the dense
     n_points² matrix is never formed.
     """
-    pupil = pupil_of(instrument, _COVARIANCE_SAMPLING)
+    pupil = instrument_pupil(instrument, _COVARIANCE_SAMPLING)
     weights = pupil.weights
     shapes = piston_free(render(pupil.points), weights)
     weighted = shapes * weights[:, None]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
-from service.model.interaction import rtc_valid_subapertures
+from service.model.interaction import differences_of, rtc_valid_subapertures
 from service.model.slopes import Normalisation
 
 Array = NDArray[np.float64]
@@ -168,10 +168,8 @@ def slopes_per_unit(
     ModelError
         If a valid subaperture, or all of them together, sees no light.
     """
-    differences, flux = _light(rest[None], valid)
-    changes, flux_changes = _light(images, valid)
-    if normalisation is Normalisation.GLOBAL:
-        flux, flux_changes = (f.mean(axis=1, keepdims=True) for f in (flux, flux_changes))
+    differences, flux = differences_of(rest, valid, normalisation)
+    changes, flux_changes = differences_of(images, valid, normalisation)
     if flux.min() <= 0.0:
         raise ModelError(
             f"flux frame: found {flux.min():g} counts in a valid subaperture, expected light in all"
@@ -263,11 +261,3 @@ def _axis(centre_px: float, n: int, pixels: int, length: int, name: str) -> tupl
         np.arange(first, last + 1), running, k=_SPLINE_DEGREE
     )
     return slice(first, last), np.diff(spline(np.clip(edges, first, last)), axis=0)
-
-
-def _light(images: Array, valid: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return differences ``(m, 2 * n_valid)`` of images ``(m, 2, n, 2, n)``, and fluxes twice."""
-    by_x, by_y = images.sum(axis=1), images.sum(axis=3)
-    differences = [by_x[:, :, 0] - by_x[:, :, 1], by_y[:, 0] - by_y[:, 1]]
-    flux = by_y.sum(axis=1)[:, valid]
-    return np.concatenate([d[:, valid] for d in differences], axis=1), np.tile(flux, (1, 2))

@@ -19,9 +19,8 @@ from service.fit.light import far_starts
 from service.fit.orientation import Setting
 from service.fit.reference import oriented
 from service.model.instrument import Instrument
-from service.model.interaction import Linearisation
+from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo
 from service.prepared import Prepared
 from service.telemetry import passive

@@ -5,8 +5,8 @@ from __future__ import annotations
 from service.control.gate import Outer
 from service.errors import ModelError
 from service.model.instrument import Influence, Instrument, Mirror
+from service.model.interaction import RtcInteractionModel
 from service.model.modes import ModalBasis
-from service.model.rtc import RtcInteractionModel
 from service.telemetry.health import Actuators
 
 

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.instrument import Instrument
-from service.model.interaction import Linearisation
+from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import Halo, working_point
 
 Array = NDArray[np.float64]

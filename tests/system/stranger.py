@@ -53,9 +53,9 @@ def small_telescope(shift_x_subap=0.0, shift_y_subap=0.0, rotation_deg=0.0, magn
     accuracy is claimed on it.
     """
     from service.config import load_instrument
+    from service.model.interaction import RtcInteractionModel
     from service.model.misregistration import Misregistration
     from service.model.modes import modal_basis
-    from service.model.rtc import RtcInteractionModel
 
     instrument = load_instrument(str(INSTRUMENT))
     basis = modal_basis(instrument)

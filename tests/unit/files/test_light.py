@@ -5,7 +5,6 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from tests.unit.fit.test_turned_light import SHIFT, TRIPOD, arms, shaded, turned
 
 from service.config import load_instrument
 from service.errors import MatrixError
@@ -18,6 +17,7 @@ from service.model.slopes import Orientation
 from sim_rtc.diffractive_plant import DiffractivePlant
 from tests.data.tiny.make import ALPHA, HERE, ORIENTATION, SEED
 from tests.unit.fit.lamps import beam, counts_of, flao, gaussian
+from tests.unit.fit.test_pupil_rotation import SHIFT, TRIPOD, arms, shaded, turned
 
 
 def oriented(orientation):

@@ -9,8 +9,7 @@ import numpy as np
 
 from service.config.instrument import load_instrument
 from service.model.instrument import Instrument, Stop
-from service.model.interaction import instrument_pupil
-from service.model.pupil import Illumination
+from service.model.pupil import Illumination, instrument_pupil
 from service.model.pyramid import PyramidOptics
 from tests.numerics import small_instrument
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.unit.fit.test_illumination import at
 
 from service.errors import ModelError
 from service.fit.light import CannotTell, PupilPosition, measured_illumination, relative_light
 from service.fit.pupil_rotation import Arms, LightRotation, find_rotation
 from tests.unit.fit.lamps import beam, counts_of, flao, gaussian
+from tests.unit.fit.test_light_illumination import at
 
 SHIFT = (-0.4, 0.3)
 HERE = at(*SHIFT)

@@ -10,14 +10,10 @@ import numpy as np
 import pytest
 
 from service.model.instrument import Stop
-from service.model.interaction import (
-    InteractionModel,
-    instrument_pupil,
-    reference_slopes,
-    rotation,
-)
+from service.model.interaction import InteractionModel, reference_slopes, rotation
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
+from service.model.pupil import instrument_pupil
 from service.model.pyramid import PyramidOptics
 from tests.numerics import (
     SOMEWHERE,

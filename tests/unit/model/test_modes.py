@@ -10,8 +10,8 @@ from service.config.mirrors import grid, rings
 from service.errors import ModelError
 from service.model import modes
 from service.model.instrument import Influence
-from service.model.interaction import instrument_pupil
 from service.model.modes import ModalBasis, karhunen_loeve_basis
+from service.model.pupil import instrument_pupil
 from tests.numerics import N_MODES, flao_basis, small_basis, small_instrument
 
 STEEPEST = 1e-6

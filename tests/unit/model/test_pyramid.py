@@ -9,7 +9,8 @@ import pytest
 
 from service.errors import ModelError
 from service.model.instrument import Pyramid
-from service.model.interaction import InteractionModel, instrument_pupil
+from service.model.interaction import InteractionModel
+from service.model.pupil import instrument_pupil
 from service.model.pyramid import Nodes, PyramidOptics, enough_modulation_points
 from tests.numerics import small_basis, small_instrument, small_model
 

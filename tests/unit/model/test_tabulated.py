@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.filling import filled, known_samples, padded
 from service.model.instrument import TabulatedModes
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from service.model.tabulated import MARGIN_SUBAP, TabulatedBasis
+from service.model.tabulated import MARGIN_SUBAP, TabulatedBasis, filled, known_samples, padded
 from tests.numerics import N_MODES, small_basis, small_instrument
 
 SUBAPERTURE_M = 8.0 / 12

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.control.gate import judge
+from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.rtc import RtcInteractionModel
 from service.model.workingpoint import working_point
 from service.telemetry.frames import Loop
 from service.worker import Workbench

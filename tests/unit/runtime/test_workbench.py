@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.rtc import RtcInteractionModel
 from service.telemetry import passive
 from service.telemetry.frames import FrameBlock, Loop
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate

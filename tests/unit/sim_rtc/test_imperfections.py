@@ -3,8 +3,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from service.model.interaction import instrument_pupil
 from service.model.misregistration import Misregistration
+from service.model.pupil import instrument_pupil
 from sim_rtc.diffractive_plant import DiffractiveOptics, DiffractivePlant
 from sim_rtc.imperfections import SETS, Imperfections, SlopeErrors, distorted, non_common_path
 from sim_rtc.plant import LinearPlant

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from service.model.instrument import Stop
-from service.model.interaction import InteractionModel, instrument_pupil
+from service.model.interaction import InteractionModel
 from service.model.mirror import ThinPlate
 from service.model.misregistration import Misregistration
+from service.model.pupil import instrument_pupil
 from sim_rtc.mirror import MirrorFaults, misplaced
 from sim_rtc.plant import Imperfections, LinearPlant, optical_gain, uneven
 

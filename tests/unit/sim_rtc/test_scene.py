@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
-from service.model.interaction import instrument_pupil
 from service.model.misregistration import Misregistration
+from service.model.pupil import instrument_pupil
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
 from sim_rtc.plant import LinearPlant

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.model.interaction import InteractionModel
-from service.model.rtc import RtcInteractionModel
+from service.model.interaction import InteractionModel, RtcInteractionModel
 from service.model.slopes import Orientation, SlopeOrder, SlopeRecipe, to_conventions
 from tests.numerics import SOMEWHERE, small_basis, small_instrument
 

@@ -33,7 +33,7 @@ from service.telemetry.frames import Loop
 from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan, Spectra, fit_window
 from service.tracking.state import Mode
 from service.tracking.updates import JUDGE_INTERVAL_S
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Observatory
 
 N_MODES = 594
@@ -75,7 +75,7 @@ def main() -> None:
         return
     with threadpool_limits(1):
         instrument = load_instrument("flao-lbt")
-        bench = Workbench(instrument, Compute(threads=1))
+        bench = OpticsWorker(instrument, Compute(threads=1))
         model = InteractionModel(instrument, karhunen_loeve_basis(instrument))
         near, aligned = model.linearise(ALPHA), model.interaction_matrix(IN_USE)
         # the workbench has its own, once
@@ -111,7 +111,7 @@ def _print_steady(seconds: float, words: str) -> None:
     """Print what each kind of job costs per second of telemetry, once everything has settled."""
     settings = load_settings(None, {}, {})
     with threadpool_limits(1):
-        bench = Workbench(
+        bench = OpticsWorker(
             load_instrument("flao-lbt"), Compute(threads=1, cache=usual_folder(os.environ))
         )
         night = Observatory(words.split(), policy_of(settings), Mode.AUTO, bench, with_poles=False)
@@ -130,7 +130,7 @@ def _print_steady(seconds: float, words: str) -> None:
 
 
 def _jobs(
-    bench: Workbench, near: Linearisation, aligned: Array, matrix: NDArray[np.float32]
+    bench: OpticsWorker, near: Linearisation, aligned: Array, matrix: NDArray[np.float32]
 ) -> Iterator[Job]:
     """Yield the two jobs that are the measure, then those that decide on updates."""
     n_modes, covariance = len(matrix), np.diag(SIGMA**2)

@@ -34,7 +34,7 @@ from service.telemetry.random_dither import (
 from service.telemetry.windows import WindowRefused
 from service.tracking.products import NoisyRecord, NoisyState
 from service.wire import DitherAction, DitherKind, DitherRequest
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer import RealTimeComputer
 from sim_rtc.feed import Ahead
@@ -57,7 +57,7 @@ def main() -> None:
     with threadpool_limits(1):
         telescope = build_telescope(options, instrument)
         true = telescope.optics.start().alpha
-        bench = Workbench(instrument, Compute(threads=1))
+        bench = OpticsWorker(instrument, Compute(threads=1))
         total: Correlated | None = None
         start = Misregistration()
         for window, wavefront_nm in _windows(given, telescope, options.frame_rate_hz):
@@ -188,7 +188,7 @@ def _signal(total: Correlated) -> dict[str, Any]:
 
 
 def _archive(
-    given: argparse.Namespace, total: Correlated, bench: Workbench, start: Misregistration
+    given: argparse.Namespace, total: Correlated, bench: OpticsWorker, start: Misregistration
 ) -> None:
     """Archive the matrix as the service does, and draw it."""
     found, instrument = work_out(bench, total, start), load_instrument("flao-lbt")

@@ -20,7 +20,7 @@ from service.config.policy import policy_of
 from service.control.gate import FORGIVING_LEAK
 from service.tracking import events as ev
 from service.tracking.state import Mode
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Observatory
 from studies.campaign.system_measures import wavefront_rms_nm
 
@@ -37,7 +37,7 @@ TOLD = ("modes.", "reconstructor.refused", "margin")
 
 
 def night_of(
-    given: argparse.Namespace, motion: list[str], settings: dict[str, object], bench: Workbench
+    given: argparse.Namespace, motion: list[str], settings: dict[str, object], bench: OpticsWorker
 ) -> Observatory:
     """Return a night that has just begun."""
     words = [
@@ -56,7 +56,7 @@ def night_of(
     return Observatory(words, policy, Mode.AUTO, bench)
 
 
-def drift(given: argparse.Namespace, bench: Workbench) -> None:
+def drift(given: argparse.Namespace, bench: OpticsWorker) -> None:
     """Print, for both rules, how many matrices a drifting mirror takes and what is left."""
     motion = ["--drift=0.04,-0.03,0.05,0"]
     for name, settings in POLICIES.items():
@@ -74,7 +74,7 @@ def drift(given: argparse.Namespace, bench: Workbench) -> None:
         _tell(night)
 
 
-def leak(given: argparse.Namespace, bench: Workbench) -> None:
+def leak(given: argparse.Namespace, bench: OpticsWorker) -> None:
     """Print what becomes of the modes while the leak is too weak for so many, and after."""
     night = night_of(given, [], {}, bench)
     night.advance(given.seconds / 4)
@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     with threadpool_limits(1):
-        bench = Workbench(load_instrument(given.instrument), Compute(threads=1))
+        bench = OpticsWorker(load_instrument(given.instrument), Compute(threads=1))
         for name in given.nights:
             NIGHTS[name](given, bench)
             sys.stdout.flush()

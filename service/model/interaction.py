@@ -98,6 +98,10 @@ class InteractionModel:
         self._response: _Last[Response] = _Last()
         self._modes: _Last[Array] = _Last()
 
+    def forget(self) -> None:
+        """Give back the memory of the last response and the last rendered modes."""
+        self._response, self._modes = _Last(), _Last()
+
     @property
     def n_slopes(self) -> int:
         """Twice the number of valid subapertures."""

@@ -29,7 +29,7 @@ from service.tracking.reconstructors import commanded_gains, extended_gains
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
 from service.wire import LoopRequest, checksum, layout_of
-from service.worker import InUse, Workbench
+from service.worker import InUse, OpticsWorker
 
 UNKNOWN_PARENT = "unknown"
 """Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""
@@ -155,7 +155,7 @@ class Actions:
         rtc, registration = _there(state), _registered(state)
         gains = (effect.gains or extended_gains(rtc, effect.n_modes))[: effect.n_modes]
         made = await self._workers.call(
-            Workbench.make,
+            OpticsWorker.make,
             registration.alpha,
             registration.total_covariance,
             loop_settings(rtc, gains, registration, n_holding=modes_that_hold(state, gains)),
@@ -235,7 +235,7 @@ class Actions:
                 timing=timing(rtc, len(matrix), registration),
                 magnitude=rtc.magnitude,
             )
-            margin = await self._workers.call(Workbench.margin, question)
+            margin = await self._workers.call(OpticsWorker.margin, question)
         finally:
             self._judging.discard(effect.id)
         judged = judged_now(rtc, gains, registration)
@@ -256,7 +256,7 @@ class Actions:
     ) -> GateVerdict:
         n_holding = modes_that_hold(state, gains)
         return await self._workers.call(
-            Workbench.judge,
+            OpticsWorker.judge,
             matrix,
             registration.alpha,
             registration.total_covariance,

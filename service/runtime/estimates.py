@@ -30,7 +30,7 @@ from service.tracking.products import NoisyFinding, NoisyRecord, NoisyState, Rec
 from service.tracking.state import Level, TrackerState
 from service.tracking.windows import fit_begins_at
 from service.wire import checksum
-from service.worker import Workbench, run_job
+from service.worker import OpticsWorker, run_job
 
 MatrixOf = Callable[[str], NDArray[np.float32]]
 """Returns a reconstructor ``(n_modes, n_slopes)`` by id; UnknownIdError if nobody has it."""
@@ -114,7 +114,7 @@ async def _correlated(window: Correlated, state: TrackerState, workers: WorkerPo
     known = state.registration
     try:
         start = None if known is None else known.alpha
-        outcome = await workers.call(Workbench.fit_random, window, start)
+        outcome = await workers.call(OpticsWorker.fit_random, window, start)
     except PyrcalError as error:
         return lost(window, str(error))
     if isinstance(outcome, WindowRefused):
@@ -141,7 +141,7 @@ async def _demodulated(
             frame_rate_hz=rtc.frame_rate_hz,
         )
         start = None if known is None else known.alpha
-        outcome = await workers.call(Workbench.fit, spectra, loop, start)
+        outcome = await workers.call(OpticsWorker.fit, spectra, loop, start)
     except PyrcalError as error:
         return lost(spectra, str(error))
     if isinstance(outcome, WindowRefused):
@@ -169,7 +169,7 @@ async def _found(spectra: Spectra, state: TrackerState, workers: WorkerPort) -> 
     """Return where a window with the loop open puts the mirror, or why it does not."""
     flux = None if state.rtc is None else state.rtc.flux
     try:
-        outcome = await workers.call(Workbench.find, spectra, state.acquisition.alpha, flux)
+        outcome = await workers.call(OpticsWorker.find, spectra, state.acquisition.alpha, flux)
     except PyrcalError as error:
         return lost(spectra, str(error))
     if isinstance(outcome, WindowRefused):
@@ -191,7 +191,7 @@ async def watched(
         return None
     end_ns = last.t0_ns_utc + (last.n_frames - 1) * last.dt_ns
     try:
-        estimate = await workers.call(Workbench.watch, sums, fit_begins_at(state))
+        estimate = await workers.call(OpticsWorker.watch, sums, fit_begins_at(state))
     except PyrcalError as error:
         return ev.Noted(name="watchdog.failed", text=str(error), level=Level.WARNING)
     if estimate is None:
@@ -223,13 +223,13 @@ async def listened(
     known = state.registration
     try:
         dialect = await workers.call(
-            Workbench.listen, matrix, None if known is None else known.alpha
+            OpticsWorker.listen, matrix, None if known is None else known.alpha
         )
     except PyrcalError as error:
         return [ev.Noted(name="slopes.unknown", text=str(error), level=Level.WARNING)]
     events: list[Event] = []
     if dialect.found is not None and dialect.adopted:
-        workers.first = partial(run_job, Workbench.adopt, dialect.found)
+        workers.first = partial(run_job, OpticsWorker.adopt, dialect.found)
         text = f'orientation "auto": found {setting_written(dialect.found)} by {record.id}'
         events.append(ev.Noted(name="slopes.adopted", text=text))
     raised = any(alarm.name == WRONG_MATRIX for alarm in state.alarms)
@@ -306,7 +306,7 @@ class NoisySums:
         return ev.NoisyMade(record=record)
 
 
-def work_out(bench: Workbench, total: Correlated, start: Misregistration | None) -> Found:
+def work_out(bench: OpticsWorker, total: Correlated, start: Misregistration | None) -> Found:
     """Return the matrix, its noise, what the model makes of it; runs in the worker."""
     noisy = noisy_matrix(total)
     outcome = bench.fit_random(total, start)

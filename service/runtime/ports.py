@@ -12,7 +12,7 @@ from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import Command, Manifest, Reply
-from service.worker import Done, Workbench
+from service.worker import Done, OpticsWorker
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -44,7 +44,7 @@ class WorkerPort(Protocol):
     """What every new worker does before anything else; None: nothing."""
 
     async def call(
-        self, job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
+        self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """Run a method of the workbench and return its result."""
 

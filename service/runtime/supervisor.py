@@ -36,7 +36,7 @@ from service.tracking.policy import Policy
 from service.tracking.products import MeasureState
 from service.tracking.state import Level, TrackerState, Waiting
 from service.wire import TEXT_LIMIT, AlarmMessage
-from service.worker import Description, Workbench
+from service.worker import Description, OpticsWorker
 
 POLL_S = 0.1
 """Longest time telemetry waits to be taken in: frames held for a hole ring no bell."""
@@ -179,10 +179,10 @@ class Supervisor:
         """Return what the model expects of telemetry; a worker that dies is replaced."""
         for _ in range(DESCRIBE_ATTEMPTS - 1):
             try:
-                return await self._workers.call(Workbench.describe)
+                return await self._workers.call(OpticsWorker.describe)
             except WorkerError as error:
                 self._note("worker.lost", str(error), Level.WARNING)
-        return await self._workers.call(Workbench.describe)
+        return await self._workers.call(OpticsWorker.describe)
 
     async def _listen(self) -> None:
         """Take in what the link has: events first, for frames mean nothing without them."""

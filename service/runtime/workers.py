@@ -15,7 +15,7 @@ from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
-from service.worker import Apart, Done, Workbench, Worker, run_job
+from service.worker import Apart, Done, OpticsWorker, Worker, run_job
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -96,7 +96,7 @@ class WorkerPool:
                 self._admit()
 
     async def call(
-        self, job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
+        self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """Run a method of the workbench and return its result.
 

@@ -4,10 +4,9 @@ A compute thread beside the ingest raises its latency thirty-fold; a nice'd proc
 alone.
 """
 
-from service.worker.bench import Workbench
-from service.worker.margin import InUse, Margin
+from service.worker.optics_worker import OpticsWorker
 from service.worker.process import Apart, Done, Worker, begin_early, run_job, start_worker
-from service.worker.records import Compute, Description, Made
+from service.worker.records import Compute, Description, InUse, Made, Margin
 
 __all__ = [
     "Apart",
@@ -17,7 +16,7 @@ __all__ = [
     "InUse",
     "Made",
     "Margin",
-    "Workbench",
+    "OpticsWorker",
     "Worker",
     "begin_early",
     "run_job",

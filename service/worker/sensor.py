@@ -71,6 +71,11 @@ class Sensor:
         return self._n_controlled is None
 
     @property
+    def models(self) -> tuple[RtcInteractionModel, ...]:
+        """The models of both responses."""
+        return (self.flat,) if self._model is self.flat else (self.flat, self._model)
+
+    @property
     def strength(self) -> float:
         """Variance of the residual over that expected at the instrument's r0."""
         return 0.0 if self.is_flat else self._strength

@@ -29,7 +29,7 @@ from service.telemetry.openloop import FarEstimate
 from service.tracking.events import FarFitted
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from studies.campaign.acquisition_table import table
 from studies.campaign.observatory import Observatory
 from studies.campaign.system_nights import GAINS
@@ -154,9 +154,9 @@ def _far(found: FarEstimate, night: Observatory) -> Row:
 
 
 @cache
-def _bench(instrument: str, sampling: int) -> Workbench:
+def _bench(instrument: str, sampling: int) -> OpticsWorker:
     compute = Compute(threads=1, pupil_sampling=sampling, detector_nodes=sampling)
-    return Workbench(load_instrument(instrument), compute)
+    return OpticsWorker(load_instrument(instrument), compute)
 
 
 def main() -> int:

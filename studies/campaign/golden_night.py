@@ -25,7 +25,7 @@ from service.tracking.products import (
 from service.tracking.state import Mode, TrackerState
 from service.wire import Command as Order
 from service.wire import DitherAction, DitherRequest, Reply
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from studies.campaign.golden import Entry, Teller
 from studies.campaign.golden_codec import encoded
 from studies.campaign.observatory import Latencies, Observatory
@@ -129,7 +129,7 @@ class GoldenNight(Observatory):
 
     dome: GoldenDome
 
-    def __init__(self, plan: Plan, bench: Workbench) -> None:
+    def __init__(self, plan: Plan, bench: OpticsWorker) -> None:
         self._teller: Teller | None = None
         self._settings = {**SETTINGS, **plan.settings}
         self._plan = plan

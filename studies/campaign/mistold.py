@@ -27,7 +27,7 @@ from service.model.interaction import rtc_valid_subapertures
 from service.model.slopes import Orientation, SlopeOrder, to_rtc
 from service.tracking.state import Mode
 from service.wire import LoopRequest, Status
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Observatory
 from studies.campaign.strange_rtc import Dialect, StrangeDome, StrangeLink
 
@@ -157,7 +157,7 @@ def play(case: Case, given: argparse.Namespace) -> Row:
     begun = time.process_time()
     with threadpool_limits(1):
         working = settings.compute.working_point_modes if given.plant == "diffractive" else None
-        bench = Workbench(pinned, Compute(threads=1, working_point_modes=working))
+        bench = OpticsWorker(pinned, Compute(threads=1, working_point_modes=working))
         night = Observatory(
             words,
             policy_of(settings),

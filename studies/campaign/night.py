@@ -22,7 +22,7 @@ from service.telemetry.lockin import Spectra, WindowEstimate
 from service.telemetry.passive import Passive, PassiveEstimate
 from service.telemetry.random_dither import Correlated, RandomEstimate
 from service.telemetry.windows import WindowRefused
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.feed import Ahead
 from sim_rtc.options import parse_options
@@ -55,7 +55,7 @@ def play(night: Night, keep: Path | None = None) -> list[dict[str, Any]]:
     with threadpool_limits(1):
         rows, known = [], Misregistration()
         # of this night alone: it follows the seeing, and rows must not depend on other nights
-        bench = Workbench(
+        bench = OpticsWorker(
             load_instrument("flao-lbt"),
             Compute(threads=1, working_point_modes=night.working_point_modes),
         )
@@ -137,7 +137,7 @@ def loop_of(telescope: Telescope) -> Loop:
     )
 
 
-def _estimated(night: Night, seen: Seen, start: Misregistration, bench: Workbench) -> Outcome:
+def _estimated(night: Night, seen: Seen, start: Misregistration, bench: OpticsWorker) -> Outcome:
     window = seen.window
     if isinstance(window, WindowRefused):
         return window

@@ -32,7 +32,7 @@ from service.tracking.events import Command, Effect, Event
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.state import Mode, TrackerState
 from service.wire import CHUNK_LIMIT, Manifest
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from studies.campaign.observatory_checks import Publication, Swap, published, true_radius
 from studies.campaign.observatory_dome import Dome
 from studies.campaign.observatory_link import OwnHands, Shelf, ShortLink
@@ -102,7 +102,7 @@ class Observatory:
         options: Sequence[str],
         policy: Policy,
         mode: Mode,
-        workbench: Workbench,
+        workbench: OpticsWorker,
         *,
         latencies: Latencies | None = None,
         pole_radius_bound: float = 0.95,

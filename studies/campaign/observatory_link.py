@@ -15,7 +15,7 @@ from service.archive.store import Provenance
 from service.errors import PyrcalError, UnknownIdError, WorkerError
 from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
-from service.worker import Done, Workbench
+from service.worker import Done, OpticsWorker
 from sim_rtc.reconstructors import Outcome, Staging, Verdict
 from studies.campaign.observatory_dome import Dome
 
@@ -87,7 +87,7 @@ class ShortLink:
 class OwnHands:
     """A worker that is no process of its own: the workbench itself."""
 
-    def __init__(self, workbench: Workbench) -> None:
+    def __init__(self, workbench: OpticsWorker) -> None:
         self.first: Callable[[], Done[None]] | None = None
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
         """Processor time of the jobs, seconds, by name."""
@@ -98,7 +98,7 @@ class OwnHands:
         self._workbench = workbench
 
     async def call(
-        self, job: Callable[Concatenate[Workbench, P], R], *args: P.args, **kwargs: P.kwargs
+        self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
     ) -> R:
         """Run a method of the workbench now; what goes wrong is said as the worker would."""
         before_s = time.process_time()

@@ -27,7 +27,7 @@ from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.passive import Passive, accumulate
 from service.telemetry.windows import WindowRefused
 from service.wire import DitherAction, DitherKind, DitherRequest
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer import RealTimeComputer
 from studies.campaign.night import loop_of
@@ -66,9 +66,9 @@ class PassiveNight:
 
 
 @cache
-def bench() -> Workbench:
+def bench() -> OpticsWorker:
     """One model per process."""
-    return Workbench(load_instrument("flao-lbt"), Compute(threads=1))
+    return OpticsWorker(load_instrument("flao-lbt"), Compute(threads=1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -27,7 +27,7 @@ from service.config.policy import policy_of
 from service.tracking.alarms import new_lines
 from service.tracking.events import Event
 from service.tracking.state import Mode, TrackerState
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Latencies, Observatory
 
 Row = dict[str, Any]
@@ -119,8 +119,8 @@ def play(plant: str, sky: str, worker: str, seed: int, seconds: float) -> Row:
 
 
 @cache
-def _workbench(instrument: str) -> Workbench:
-    return Workbench(load_instrument(instrument), Compute(threads=1))
+def _workbench(instrument: str) -> OpticsWorker:
+    return OpticsWorker(load_instrument(instrument), Compute(threads=1))
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -31,7 +31,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState, MeasurePattern
 from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Latencies, Observatory
 from studies.campaign.observatory_dome import Moment
 from studies.campaign.strange_rtc import DIALECTS, Mischief, StrangeDome, StrangeLink
@@ -284,8 +284,8 @@ def _settings(*, listening: bool) -> dict[str, object]:
 
 
 @cache
-def _bench(instrument: str) -> Workbench:
-    return Workbench(load_instrument(instrument), Compute(threads=1))
+def _bench(instrument: str) -> OpticsWorker:
+    return OpticsWorker(load_instrument(instrument), Compute(threads=1))
 
 
 def table(rows: Sequence[Row]) -> str:

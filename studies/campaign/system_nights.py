@@ -24,7 +24,7 @@ from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.tracking.state import Mode
 from service.wire import DitherRequest
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Observatory
 from studies.campaign.observatory_dome import replayed
 from studies.campaign.system_cases import Case, Plan
@@ -63,7 +63,7 @@ def play(plan: Plan) -> Row:
     with threadpool_limits(1):
         settings = load_settings(None, {}, _settings(plan))
         # of this night alone: at the working point it follows the seeing
-        bench = Workbench(
+        bench = OpticsWorker(
             load_instrument(plan.instrument),
             Compute(threads=1, working_point_modes=settings.compute.working_point_modes),
         )

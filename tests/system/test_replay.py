@@ -18,7 +18,7 @@ from service.tracking import events as ev
 from service.tracking.policy import Policy
 from service.tracking.state import Mode, TrackerState
 from service.wire import decode_manifest
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from sim_rtc.record import Kind, Recording
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
@@ -40,7 +40,7 @@ class Tracker:
     """The service without network, processes and clocks: time is that of the recording."""
 
     def __init__(self, instrument):
-        self.bench = Workbench(instrument, Compute(threads=1))
+        self.bench = OpticsWorker(instrument, Compute(threads=1))
         self.engine = Engine(TrackerState(system=instrument.name, mode=Mode.HOLD), POLICY, self)
         self.engine.prepared(self.bench.describe())
         self.now_s = 0.0

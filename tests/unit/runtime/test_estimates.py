@@ -9,7 +9,7 @@ from service.runtime.estimates import Backlog, watched
 from service.telemetry import passive
 from service.tracking import events as ev
 from service.tracking.state import Mode
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from tests.numerics import block_of
 from tests.unit.telemetry.test_lockin import run, telemetry
 from tests.unit.tracking.situations import ALPHA, Story
@@ -23,7 +23,7 @@ class Worker:
         self.begun_at = []
 
     async def call(self, job, sums, start):
-        assert job is Workbench.watch
+        assert job is OpticsWorker.watch
         self.begun_at.append(start)
         return look(ALPHA)
 

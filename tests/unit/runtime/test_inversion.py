@@ -9,14 +9,14 @@ import numpy as np
 from service.config.settings import load_settings
 from service.control.reconstructor import Method, Prior, invert, invert_with_prior
 from service.model.misregistration import Misregistration
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, loop_settings, small_instrument
 
 NOISE = 0.2
 
 
 def made_with(**settings):
-    bench = Workbench(small_instrument(), replace(COMPUTE, **settings))
+    bench = OpticsWorker(small_instrument(), replace(COMPUTE, **settings))
     made = bench.make(Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95)
     return bench._model, made
 

@@ -7,7 +7,7 @@ import pytest
 
 from service.control.expected_gain import Timing
 from service.model.misregistration import Misregistration
-from service.worker import InUse, Workbench
+from service.worker import InUse, OpticsWorker
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, loop_settings, small_instrument
 
 ALPHA = Misregistration(shift_x_subap=0.05, rotation_rad=0.002)
@@ -15,7 +15,7 @@ ALPHA = Misregistration(shift_x_subap=0.05, rotation_rad=0.002)
 
 @pytest.fixture(scope="module")
 def bench():
-    return Workbench(small_instrument(), COMPUTE)
+    return OpticsWorker(small_instrument(), COMPUTE)
 
 
 @pytest.fixture

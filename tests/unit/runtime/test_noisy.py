@@ -17,7 +17,7 @@ from service.tracking import events as ev
 from service.tracking.alarms import with_alarm
 from service.tracking.products import NoisyRecord, NoisyState
 from service.tracking.state import TrackerState
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from tests.unit.runtime.small import COMPUTE, small_instrument
 from tests.unit.tracking.situations import rtc
 
@@ -46,7 +46,7 @@ class NearCrew:
     """Runs jobs here and now, on the real workbench."""
 
     def __init__(self):
-        self.bench = Workbench(small_instrument(), COMPUTE)
+        self.bench = OpticsWorker(small_instrument(), COMPUTE)
 
     async def call(self, job, *args):
         return job(self.bench, *args)

@@ -15,7 +15,7 @@ from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode, TrackerState
-from service.worker import Workbench, start_worker
+from service.worker import OpticsWorker, start_worker
 from studies.campaign.observatory import Observatory
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 from tests.unit.runtime.test_supervisor import running
@@ -48,7 +48,7 @@ def test_alpha_is_tracked_and_no_healthy_loop_is_opened(turned):
     given = {"control.n_modes_target": N_CONTROLLED, "acquisition.auto": True}
     policy = policy_of(load_settings(None, {}, given))
     with threadpool_limits(1):
-        bench = Workbench(load_instrument(str(turned)), COMPUTE)
+        bench = OpticsWorker(load_instrument(str(turned)), COMPUTE)
         night = Observatory(words, policy, Mode.AUTO, bench, with_poles=False)
         night.advance(10.0)
     assert night.state.acquisition.stage is AcquisitionStage.IDLE

@@ -14,7 +14,7 @@ from service.telemetry.health import LOW_MODES
 from service.tracking import events as ev
 from service.tracking.registration import Source
 from service.tracking.state import Mode
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from studies.campaign.observatory import Observatory
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
 from tests.unit.runtime.test_streams import DESCRIPTION, MANY, N_MANY, RING, driven
@@ -34,7 +34,7 @@ def night():
         "--alpha=0.05,-0.03,0.1,1.002",
     ]
     with threadpool_limits(1):
-        bench = Workbench(small_instrument(), COMPUTE)
+        bench = OpticsWorker(small_instrument(), COMPUTE)
         policy = policy_of(load_settings(None, {}, given))
         night = Observatory(words, policy, Mode.AUTO, bench, with_poles=False)
         night.advance(2.0)

@@ -15,7 +15,7 @@ from service.tracking import events as ev
 from service.tracking.reconstructors import restored
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode, TrackerState
-from service.worker import Compute, Workbench
+from service.worker import Compute, OpticsWorker
 from studies.campaign.acquisition import Start
 from studies.campaign.observatory import Observatory
 from tests.unit.tracking.situations import START_NS
@@ -152,7 +152,7 @@ class Restartable(Observatory):
 @pytest.fixture(scope="module")
 def bench():
     compute = Compute(threads=1, pupil_sampling=3, detector_nodes=3)
-    return Workbench(load_instrument(str(SMALL)), compute)
+    return OpticsWorker(load_instrument(str(SMALL)), compute)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.workingpoint import working_point
 from service.telemetry.frames import Loop
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from service.worker.sensor import FOLLOWED, STRENGTHS
 from tests.unit.runtime.small import (
     COMPUTE,
@@ -26,7 +26,7 @@ AT_WORK = replace(COMPUTE, working_point_modes=N_CONTROLLED)
 
 @pytest.fixture
 def bench():
-    return Workbench(small_instrument(), AT_WORK)
+    return OpticsWorker(small_instrument(), AT_WORK)
 
 
 def on_sky(strength):
@@ -38,13 +38,13 @@ def on_sky(strength):
         r0_m=instrument.modes.r0_m * strength**-0.6,
         sampling=COMPUTE.pupil_sampling,
     )
-    other = Workbench(instrument, COMPUTE)
+    other = OpticsWorker(instrument, COMPUTE)
     other._model = RtcInteractionModel(instrument, other._model.basis, halo=halo)
     return other
 
 
 def still():
-    n_slopes = Workbench(small_instrument(), COMPUTE).describe().n_slopes
+    n_slopes = OpticsWorker(small_instrument(), COMPUTE).describe().n_slopes
     return Loop(
         reconstructor=np.zeros((N_CONTROLLED, n_slopes), np.float32),
         gains=np.zeros(90),
@@ -73,12 +73,12 @@ def test_what_follows_the_residual_is_nearer_the_truth_than_what_does_not(bench)
         return np.abs(estimate.alpha.vector - ALPHA.vector) / SIGMA
 
     followed = error(bench.fit(window, still(), ALPHA))
-    flat = error(Workbench(small_instrument(), COMPUTE).fit(window, still(), ALPHA))
+    flat = error(OpticsWorker(small_instrument(), COMPUTE).fit(window, still(), ALPHA))
     assert np.linalg.norm(followed) < 0.3 * np.linalg.norm(flat)
 
 
 def test_a_sensor_without_a_residual_is_taken_for_one(bench):
-    window = dithered_window(Workbench(small_instrument(), COMPUTE), ALPHA, noise=1e-6)
+    window = dithered_window(OpticsWorker(small_instrument(), COMPUTE), ALPHA, noise=1e-6)
     estimate = bench.fit(window, still(), ALPHA)
     assert bench._sensor.strength == STRENGTHS[0]
     np.testing.assert_allclose(estimate.alpha.vector, ALPHA.vector, atol=5e-4)
@@ -97,7 +97,7 @@ def test_gains_that_hardly_differ_cost_no_linearisation(bench):
 
 
 def test_a_flat_response_follows_nothing():
-    sensor = Workbench(small_instrument(), COMPUTE)._sensor
+    sensor = OpticsWorker(small_instrument(), COMPUTE)._sensor
     sensor.linearise(ALPHA)
     assert not sensor.follow(MODES, np.full(4, 0.3 + 0j))
     assert sensor.strength == 0.0
@@ -106,7 +106,7 @@ def test_a_flat_response_follows_nothing():
 
 def test_gains_are_counted_once_when_a_loop_is_judged(bench):
     """The gate sees the response at work, whether told so by the model or by the gains."""
-    still_bench = Workbench(small_instrument(), COMPUTE)
+    still_bench = OpticsWorker(small_instrument(), COMPUTE)
     made = still_bench.make(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95)
     near = bench._sensor.near(ALPHA)
     at_work = replace(loop_settings(), optical_gain=bench._sensor.ratio()[:N_CONTROLLED])

@@ -409,7 +409,7 @@ class TestVibrations:
         streams = with_rtc(streams, replace(RTC, loop="open"))
         for number in range(130):
             streams, _ = fed(streams, self.shaken(100 * number))
-        assert streams.hearing.lines_hz == ()
+        assert streams.vibrations.lines_hz == ()
 
 
 class TestLooks:

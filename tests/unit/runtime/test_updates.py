@@ -19,7 +19,7 @@ from service.tracking.products import MatrixState
 from service.tracking.registration import ModeGain
 from service.tracking.state import Alarm
 from service.tracking.worth import fewer_than
-from service.worker import Workbench, start_worker
+from service.worker import OpticsWorker, start_worker
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
 from tests.unit.runtime.test_actions import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
 from tests.unit.tracking.situations import START_NS, rtc
@@ -124,7 +124,7 @@ class TestFewer:
 
 @pytest.fixture(scope="module")
 def bench():
-    return Workbench(small_instrument(), COMPUTE)
+    return OpticsWorker(small_instrument(), COMPUTE)
 
 
 @pytest.fixture(scope="module")

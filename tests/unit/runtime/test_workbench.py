@@ -11,7 +11,7 @@ from service.telemetry import passive
 from service.telemetry.frames import FrameBlock, Loop
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
 from service.telemetry.windows import WindowRefused
-from service.worker import Workbench, run_job
+from service.worker import OpticsWorker, run_job
 from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,
@@ -30,7 +30,7 @@ AMPLITUDE_M = 2e-8
 
 @pytest.fixture(scope="module")
 def bench():
-    return Workbench(small_instrument(), COMPUTE)
+    return OpticsWorker(small_instrument(), COMPUTE)
 
 
 @pytest.fixture(scope="module")
@@ -108,10 +108,10 @@ def test_no_distance_from_the_last_linearisation_keeps_a_fit_from_settling(bench
 
 def test_a_second_workbench_finds_the_first_linearisation_prepared(tmp_path, monkeypatch):
     compute = replace(COMPUTE, cache=tmp_path)
-    first = Workbench(small_instrument(), compute)
+    first = OpticsWorker(small_instrument(), compute)
     described = first.describe()
     monkeypatch.setattr(RtcInteractionModel, "linearise", lambda *_: pytest.fail("again"))
-    second = Workbench(small_instrument(), compute)
+    second = OpticsWorker(small_instrument(), compute)
     again = second.describe()
     np.testing.assert_array_equal(again.mode_information, described.mode_information)
     np.testing.assert_array_equal(
@@ -193,4 +193,4 @@ def test_the_watchdog_says_nothing_of_nothing(bench):
 
 def test_a_job_outside_a_worker_process_is_a_programming_error():
     with pytest.raises(RuntimeError, match="not in a worker process"):
-        run_job(Workbench.describe)
+        run_job(OpticsWorker.describe)

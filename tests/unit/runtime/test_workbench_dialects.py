@@ -13,7 +13,7 @@ from service.model.interaction import InteractionModel, rtc_valid_subapertures
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Normalisation, Orientation, SlopeOrder, SlopeRecipe, to_rtc
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, loop_settings, small_instrument
 from tests.unit.runtime.test_workbench import dithered_window, open_loop
 
@@ -40,7 +40,7 @@ def instrument():
 
 @pytest.fixture(scope="module")
 def bench(instrument):
-    return Workbench(instrument, COMPUTE)
+    return OpticsWorker(instrument, COMPUTE)
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +82,9 @@ def test_its_reconstructor_takes_slopes_as_it_lists_them(bench, seen):
 def test_what_can_only_be_fitted_offline_is_refused(instrument):
     unknown = replace(instrument, mirror=replace(instrument.mirror, stroke_known=False))
     with pytest.raises(ModelError, match=r"found mirror\.stroke = unknown"):
-        Workbench(unknown, COMPUTE)
+        OpticsWorker(unknown, COMPUTE)
     with pytest.raises(ModelError, match=r"found wfs\.input = frames"):
-        Workbench(replace(instrument, frames=FrameWindows()), COMPUTE)
+        OpticsWorker(replace(instrument, frames=FrameWindows()), COMPUTE)
 
 
 class Mistold:
@@ -94,8 +94,8 @@ class Mistold:
         self.setting = SlopeOrder(order), Orientation(**axes)
         small = small_instrument()
         told = replace(small, slopes=SlopeRecipe(orientation=Orientation()))
-        self.told = Workbench(told, COMPUTE)
-        self.auto = Workbench(small, COMPUTE)
+        self.told = OpticsWorker(told, COMPUTE)
+        self.auto = OpticsWorker(small, COMPUTE)
         model = InteractionModel(small, modal_basis(small))
         mask = rtc_valid_subapertures(small)
         self.seen = to_rtc(model.interaction_matrix(ALPHA_SMALL), *self.setting, mask)

@@ -9,7 +9,7 @@ from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, accumulate
 from service.telemetry.openloop import FarEstimate
 from service.telemetry.windows import WindowRefused
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from tests.unit.fit.lamps import counts_of
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
@@ -20,7 +20,7 @@ FAR = Misregistration(
 
 @pytest.fixture(scope="module")
 def bench():
-    return Workbench(small_instrument(), COMPUTE)
+    return OpticsWorker(small_instrument(), COMPUTE)
 
 
 def window(bench, reach=SMOOTH, *, seed=1, noise=1e-3):

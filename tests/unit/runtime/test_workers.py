@@ -10,50 +10,50 @@ import pytest
 from service.errors import WorkerError
 from service.runtime import workers as crew_module
 from service.runtime.workers import WorkerPool
-from service.worker import Workbench, begin_early, run_job, start_worker
+from service.worker import OpticsWorker, begin_early, run_job, start_worker
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 pytestmark = pytest.mark.timeout(60)
 
 
-def process_id(_bench: Workbench) -> int:
+def process_id(_bench: OpticsWorker) -> int:
     return os.getpid()
 
 
-def niceness(_bench: Workbench) -> int:
+def niceness(_bench: OpticsWorker) -> int:
     return os.nice(0)
 
 
-def interrupted(_bench: Workbench) -> str:
+def interrupted(_bench: OpticsWorker) -> str:
     """Survive what Ctrl-C sends to the whole process group."""
     os.kill(os.getpid(), signal.SIGINT)
     return "still here"
 
 
-def asleep(_bench: Workbench) -> None:
+def asleep(_bench: OpticsWorker) -> None:
     time.sleep(60.0)
 
 
-def napping(_bench: Workbench) -> None:
+def napping(_bench: OpticsWorker) -> None:
     time.sleep(1.2)
 
 
-def endless(_bench: Workbench) -> None:
+def endless(_bench: OpticsWorker) -> None:
     while True:
         pass
 
 
-def killed(_bench: Workbench) -> None:
+def killed(_bench: OpticsWorker) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def spinning(_bench: Workbench) -> None:
+def spinning(_bench: OpticsWorker) -> None:
     end_s = time.process_time() + 0.2
     while time.process_time() < end_s:
         pass
 
 
-def failing(_bench: Workbench) -> None:
+def failing(_bench: OpticsWorker) -> None:
     raise ValueError("a bug in a job")
 
 
@@ -84,7 +84,7 @@ async def test_nobody_is_hired_before_there_is_work(workers, hired):
 async def test_jobs_share_one_worker_and_its_workbench(workers):
     first, second = await asyncio.gather(workers.call(process_id), workers.call(process_id))
     assert first == second
-    assert (await workers.call(Workbench.describe)).n_modes == 90
+    assert (await workers.call(OpticsWorker.describe)).n_modes == 90
 
 
 async def test_a_killed_worker_costs_one_job_and_the_next_one_works(workers, hired):
@@ -176,11 +176,11 @@ async def test_what_nobody_waits_for_any_more_is_not_finished(workers, hired):
     assert await workers.call(process_id) == hired[1].pid
 
 
-def remembering(bench: Workbench) -> None:
+def remembering(bench: OpticsWorker) -> None:
     bench.told = "first"
 
 
-def remembered(bench: Workbench) -> str | None:
+def remembered(bench: OpticsWorker) -> str | None:
     return getattr(bench, "told", None)
 
 

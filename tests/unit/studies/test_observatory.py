@@ -13,7 +13,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
-from service.worker import Workbench
+from service.worker import OpticsWorker
 from studies.campaign.observatory import Latencies, Observatory
 from studies.campaign.observatory_checks import Outcome, Swap, published, true_radius
 from studies.campaign.observatory_dome import START_NS, Dome, replayed
@@ -40,7 +40,7 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def bench():
-    return Workbench(small_instrument(), COMPUTE)
+    return OpticsWorker(small_instrument(), COMPUTE)
 
 
 @pytest.fixture(scope="module")

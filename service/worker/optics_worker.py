@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +26,22 @@ from service.model.misregistration import Misregistration
 from service.model.workingpoint import Halo
 from service.prepared import Prepared
 from service.telemetry import passive
+from service.telemetry.estimate import DitheredEstimate
 from service.telemetry.frames import Loop
 from service.telemetry.lockin import Spectra, WindowEstimate, fit_window
 from service.telemetry.openloop import NOT_FOUND, FarEstimate, FarSearch, find
 from service.telemetry.random_dither import Correlated, RandomEstimate, fit_random
 from service.telemetry.windows import WindowRefused
-from service.worker.instruments import actuators_of, check_controllable, outer_of
-from service.worker.margin import InUse, Margin
-from service.worker.records import Compute, Description, Made
+from service.worker.records import (
+    Compute,
+    Description,
+    InUse,
+    Made,
+    Margin,
+    actuators_of,
+    check_controllable,
+    outer_of,
+)
 from service.worker.sensor import REACH, Sensor, length, near_enough
 
 MAX_APPROACHES = 5
@@ -51,7 +61,10 @@ FIT_RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
 """An estimate further than this from its start has diverged (numeric units)."""
 
 
-class Workbench:
+Dithered = TypeVar("Dithered", bound=DitheredEstimate)
+
+
+class OpticsWorker:
     """The optical model and the last linearisation, kept between jobs.
 
     Telemetry, and the stability of a loop, are of the sensor as it works; what is published is the
@@ -93,6 +106,12 @@ class Workbench:
         self._start = instrument.start
         self._margin: tuple[InUse, Margin] | None = None
         self._far: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
+
+    def tidy(self) -> None:
+        """Give back the memory of what a job leaves and the next one hardly ever needs."""
+        models = (self._coarse, *itertools.chain.from_iterable(self._far.values()))
+        for model in (*self._sensor.models, *models):
+            model.forget()
 
     def describe(self) -> Description:
         """Return what telemetry must look like, and prepare for the first fit."""
@@ -237,12 +256,7 @@ class Workbench:
                 if isinstance(estimate, WindowRefused):
                     return estimate
                 if near_enough(estimate.step, estimate.covariance):
-                    ratio = self._sensor.ratio()[list(estimate.modes)]
-                    return replace(
-                        estimate,
-                        optical_gain=estimate.optical_gain * ratio,
-                        gain_sigma=estimate.gain_sigma * ratio,
-                    )
+                    return self._against_flat(estimate)
                 begun = start or self._start
                 if np.any(np.abs(estimate.alpha.vector - begun.vector) > FIT_RANGE):
                     break
@@ -258,7 +272,7 @@ class Workbench:
         """
         return self._model.interaction_matrix(alpha or self._start)
 
-    def _against_flat(self, estimate: WindowEstimate) -> WindowEstimate:
+    def _against_flat(self, estimate: Dithered) -> Dithered:
         """Return the estimate with its gains relative to the flat response, not that at work."""
         ratio = self._sensor.ratio()[list(estimate.modes)]
         sigma = estimate.gain_sigma

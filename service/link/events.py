@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from service.tracking.events import Event
 from service.wire import Acknowledgement, MeasuredManifest, Status
 
 QUEUE_LENGTH: Final = 1024
@@ -18,90 +19,6 @@ QUEUE_LENGTH: Final = 1024
 
 BURST_S: Final = 10.0
 """The same complaint is reported once in this time, however often it is counted."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusReceived:
-    """The RTC's account of its loop."""
-
-    status: Status
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AcknowledgementReceived:
-    """The RTC's word on a reconstructor."""
-
-    acknowledgement: Acknowledgement
-    known: bool
-    """Whether this process has published or offered a matrix of that id."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SessionChanged:
-    """The RTC starts over: windows, pending commands and staged matrices are void."""
-
-    old: str | None
-    """None: the first session seen."""
-
-    new: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RtcAppeared:
-    """The RTC's liveliness token is there."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RtcVanished:
-    """The RTC's liveliness token is gone."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SecondRtc:
-    """Two sessions send at the same time: one RTC too many in this system."""
-
-    current: str
-    other: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServicesChanged:
-    """Other services of this system came or went, or who drives has changed."""
-
-    drives: bool
-    """Whether this service drives the RTC."""
-
-    others: tuple[str, ...]
-    """The others, the first one first."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IdsAdopted:
-    """Nothing was pinned, so the first basis and configuration seen are expected from now on."""
-
-    basis_id: str
-    config_id: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BasisMismatch:
-    """The RTC works with another basis or sensor configuration than expected."""
-
-    expected: tuple[str, str]
-    """Basis and configuration."""
-
-    found: tuple[str, str]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MalformedMessage:
-    """A message that broke the contract and was not used; one event for a burst of them."""
-
-    kind: str
-    """frames, status, ack, im, reply."""
-
-    text: str
-    """What was found and what was expected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -113,19 +30,8 @@ class MeasuredMatrix:
     """``(n_slopes, n_modes_measured)``, slope per metre OPD; None: see the manifest's reason."""
 
 
-LinkEvent = (
-    StatusReceived
-    | AcknowledgementReceived
-    | SessionChanged
-    | RtcAppeared
-    | RtcVanished
-    | SecondRtc
-    | ServicesChanged
-    | IdsAdopted
-    | BasisMismatch
-    | MalformedMessage
-    | MeasuredMatrix
-)
+LinkEvent = Status | Acknowledgement | MeasuredMatrix | Event
+"""What the RTC says of itself and of reconstructors, or what that means to the tracker."""
 
 
 class Bursts:

@@ -12,25 +12,13 @@ from typing import Final
 
 from service.errors import WireError
 from service.link.endpoint import Endpoint
-from service.link.events import (
-    AcknowledgementReceived,
-    BasisMismatch,
-    Bursts,
-    EventQueue,
-    IdsAdopted,
-    LinkEvent,
-    MalformedMessage,
-    RtcAppeared,
-    RtcVanished,
-    SecondRtc,
-    SessionChanged,
-    StatusReceived,
-    Wakeup,
-)
+from service.link.events import Bursts, EventQueue, LinkEvent, Wakeup
 from service.link.ring import LEAP, FrameCounts, FrameRing
 from service.link.rivals import SessionWatch
 from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
 from service.telemetry.frames import FrameBlock
+from service.tracking import events as ev
+from service.tracking.state import Level
 from service.wire import (
     FRAMES_PER_BATCH,
     Acknowledgement,
@@ -187,7 +175,7 @@ class Intake:
             self._last_status_s = now_s
             self._expected(status.basis_id, status.config_id, now_s)
             self._shape = (status.n_slopes, status.n_modes)
-            self._queue.put(StatusReceived(status=status))
+            self._queue.put(status)
 
     def acknowledgement(self, acknowledgement: Acknowledgement, *, known: bool) -> None:
         """Take the RTC's word on a reconstructor."""
@@ -196,8 +184,7 @@ class Intake:
             self._counted["unknown"] += not known
             if self._admit("ack", acknowledgement.session, 1, now_s):
                 self._tally.add("ack", USED, 1, now_s)
-                event = AcknowledgementReceived(acknowledgement=acknowledgement, known=known)
-                self._queue.put(event)
+                self._queue.put(acknowledgement)
         self._wakeup.ring()
 
     def liveliness(self, *, alive: bool) -> None:
@@ -206,7 +193,8 @@ class Intake:
             self._rtc_alive = alive
             if not alive:
                 self._sessions.leave()
-        self.event(RtcAppeared() if alive else RtcVanished())
+        appeared = ev.Noted(name="rtc.appeared", text="the RTC is there")
+        self.event(appeared if alive else ev.RtcVanished())
 
     def malformed(self, kind: str, error: WireError) -> None:
         """Count a message that was not used, and report the first of a burst."""
@@ -215,7 +203,8 @@ class Intake:
             self._tally.add(kind, MALFORMED, 1, now_s, str(error))
             due = self._bursts.opens(f"malformed {kind}", now_s)
         if due:
-            self.event(MalformedMessage(kind=kind, text=str(error)))
+            text = f"{kind}: {error}"
+            self.event(ev.Noted(name="message.malformed", text=text, level=Level.WARNING))
 
     def failed(self, kind: str) -> bool:
         """Count a fault of the service itself; return whether it is the first of a burst."""
@@ -346,13 +335,14 @@ class Intake:
             self._shape, self._begun_s = None, now_s
             self._last_status_s, self._essentials = None, ()
             self._tally.begin()
-            self._queue.put(SessionChanged(old=admission.previous, new=session))
+            self._queue.put(ev.SessionStarted(session=session))
         if not admission.accepted:
             text = f"session {session}, while session {current} sends"
             self._tally.add(kind, "session", n, now_s, text)
         rival = admission.rival
         if rival is not None and current and self._bursts.opens(f"second {rival}", now_s):
-            self._queue.put(SecondRtc(current=current, other=rival))
+            told = f"two RTCs send at once, sessions {current} and {rival}: stop one of them"
+            self._queue.put(ev.Trouble(name="second-rtc", text=told))
         return admission.accepted
 
     def _expected(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
@@ -360,12 +350,17 @@ class Intake:
         if self._basis_id is None or self._config_id is None:
             self._basis_id = self._basis_id or basis_id
             self._config_id = self._config_id or config_id
-            self._queue.put(IdsAdopted(basis_id=self._basis_id, config_id=self._config_id))
+            told = f"basis {self._basis_id}, configuration {self._config_id}"
+            self._queue.put(ev.Noted(name="ids.adopted", text=told))
         expected, found = (self._basis_id, self._config_id), (basis_id, config_id)
         if found == expected:
             return None
         if self._bursts.opens("ids", now_s):
-            self._queue.put(BasisMismatch(expected=expected, found=found))
+            told = (
+                f"the RTC's basis and configuration are {' and '.join(found)}, expected "
+                f"{' and '.join(expected)}: no estimate, no publication until they agree"
+            )
+            self._queue.put(ev.Trouble(name="basis-mismatch", text=told))
         which = "basis" if basis_id != self._basis_id else "config"
         return which, f"{' and '.join(found)}, expected {' and '.join(expected)}"
 

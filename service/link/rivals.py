@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final
 
 from service.link import session as link
-from service.link.events import ServicesChanged
+from service.tracking.events import ServicesMet
 from service.wire import Keys, Role
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ REMEMBERED: Final = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Admission:
+class Admitted:
     """What to do with a message of some session."""
 
     accepted: bool
@@ -66,17 +66,17 @@ class SessionWatch:
         self._previous: str | None = None
         self._rivals: dict[str, float] = {}
 
-    def admit(self, session: str, now_s: float) -> Admission:
+    def admit(self, session: str, now_s: float) -> Admitted:
         """Judge a message by its session, and remember that it was heard."""
         if session == self.current:
             self._heard_s, self._left = now_s, False
-            return Admission(accepted=True, rival=self._rival(now_s))
+            return Admitted(accepted=True, rival=self._rival(now_s))
         if self.current is None or self._left or now_s - self._heard_s >= SILENCE_S:
             return self._begun(session, now_s)
         echo = session == self._previous and now_s - self._since_s < SILENCE_S
         if not echo and len(self._rivals) < REMEMBERED:
             self._rivals.setdefault(session, now_s)
-        return Admission(accepted=False)
+        return Admitted(accepted=False)
 
     def leave(self) -> None:
         """Note that the RTC has said goodbye: unless it speaks again, its session is over."""
@@ -87,12 +87,12 @@ class SessionWatch:
         quiet = now_s - self._heard_s > GRACE_S / 2
         return next(reversed(self._rivals), None) if quiet else None
 
-    def _begun(self, session: str, now_s: float) -> Admission:
+    def _begun(self, session: str, now_s: float) -> Admitted:
         self._previous, self.current = self.current, session
         self._heard_s = self._since_s = now_s
         self._left = False
         self._rivals.clear()
-        return Admission(accepted=True, previous=self._previous, changed=True)
+        return Admitted(accepted=True, previous=self._previous, changed=True)
 
     def _rival(self, now_s: float) -> str | None:
         """Return a session heard so long ago that this message is no straggler; forget it."""
@@ -161,7 +161,7 @@ class Standby:
         keys: Keys,
         *,
         drive: Callable[[zenoh.Session], list[object]],
-        report: Callable[[ServicesChanged], None],
+        report: Callable[[ServicesMet], None],
     ) -> None:
         """Take no place yet.
 
@@ -268,7 +268,7 @@ class Standby:
             met = (drives, self._order.others(time.monotonic()))
             news, self._met = met != self._met, met
         if news:
-            self._report(ServicesChanged(drives=met[0], others=met[1]))
+            self._report(ServicesMet(drives=met[0], others=met[1]))
 
 
 def _name_of(key: str) -> str:

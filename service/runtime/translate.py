@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.link import events as heard
+from service.link.events import LinkEvent, MeasuredMatrix
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.tracking import events as ev
 from service.tracking.loop import DitherKind, DitherView, Pointing, RtcView
@@ -13,7 +13,7 @@ from service.tracking.products import (
     MeasureState,
     ReconstructorRecord,
 )
-from service.tracking.state import Level, TrackerState, Waiting
+from service.tracking.state import TrackerState, Waiting
 from service.wire import (
     TEXT_LIMIT,
     Acknowledgement,
@@ -29,43 +29,17 @@ from service.wire import (
 )
 
 
-def event_of(event: heard.LinkEvent) -> ev.Event | None:
+def event_of(heard: LinkEvent) -> ev.Event | None:
     """Return what the tracker makes of something heard on the link; None: nothing."""
-    match event:
-        case heard.StatusReceived(status=status):
-            return ev.StatusSeen(rtc=rtc_view(status))
-        case heard.AcknowledgementReceived(acknowledgement=acknowledgement):
-            return _acknowledged(acknowledgement)
-        case heard.SessionChanged(new=new):
-            return ev.SessionStarted(session=new)
-        case heard.ServicesChanged(drives=drives, others=others):
-            return ev.ServicesMet(drives=drives, others=others)
-        case heard.RtcVanished():
-            return ev.RtcVanished()
-        case heard.RtcAppeared():
-            return ev.Noted(name="rtc.appeared", text="the RTC is there")
-        case _:
-            return _trouble(event)
-
-
-def _trouble(event: heard.LinkEvent) -> ev.Event | None:
-    match event:
-        case heard.SecondRtc(current=current, other=other):
-            text = f"two RTCs send at once, sessions {current} and {other}: stop one of them"
-            return ev.Trouble(name="second-rtc", text=text)
-        case heard.BasisMismatch(expected=expected, found=found):
-            text = (
-                f"the RTC's basis and configuration are {found[0]} and {found[1]}, expected "
-                f"{expected[0]} and {expected[1]}: no estimate, no publication until they agree"
-            )
-            return ev.Trouble(name="basis-mismatch", text=text)
-        case heard.IdsAdopted(basis_id=basis_id, config_id=config_id):
-            text = f"basis {basis_id}, configuration {config_id}"
-            return ev.Noted(name="ids.adopted", text=text)
-        case heard.MalformedMessage(kind=kind, text=text):
-            return ev.Noted(name="message.malformed", text=f"{kind}: {text}", level=Level.WARNING)
-        case _:
+    match heard:
+        case Status():
+            return ev.StatusSeen(rtc=rtc_view(heard))
+        case Acknowledgement():
+            return _acknowledged(heard)
+        case MeasuredMatrix():
             return None
+        case _:
+            return heard
 
 
 def rtc_view(status: Status) -> RtcView:

@@ -11,7 +11,7 @@ from typing_extensions import override
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import LinkError, PyrcalError
-from service.link import events as heard
+from service.link.events import LinkEvent
 from service.tracking import events as ev
 from service.tracking.events import Command, Effect, Event
 from service.tracking.policy import Policy
@@ -23,8 +23,8 @@ from service.tracking.products import (
     NoisyState,
 )
 from service.tracking.state import Mode, TrackerState
+from service.wire import Acknowledgement, DitherAction, DitherRequest, Reply
 from service.wire import Command as Order
-from service.wire import DitherAction, DitherRequest, Reply
 from service.worker import OpticsWorker
 from studies.campaign.golden import Entry, Teller
 from studies.campaign.golden_codec import encoded
@@ -253,8 +253,8 @@ class GoldenNight(Observatory):
             super()._hear_status()
 
     @override
-    def _hear(self, event: heard.LinkEvent) -> None:
-        told = isinstance(event, heard.AcknowledgementReceived)
+    def _hear(self, event: LinkEvent) -> None:
+        told = isinstance(event, Acknowledgement)
         if not (told and Mischief.NO_ACK in self.dome.mischief):
             super()._hear(event)
 

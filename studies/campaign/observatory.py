@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import PyrcalError
-from service.link import events as heard
+from service.link.events import LinkEvent
 from service.runtime.actions import Actions, Publishing
 from service.runtime.engine import Engine
 from service.runtime.estimates import fitted, listened, lost, watched
@@ -197,16 +197,15 @@ class Observatory:
 
     def restart_rtc(self) -> None:
         """Let the RTC begin again with the matrix it started the night with."""
-        old = self.dome.computer.snapshot().session
         self.dome.restart()
         self._link.void()
-        self._hear(heard.SessionChanged(old=old, new=self.dome.computer.snapshot().session))
+        self._hear(ev.SessionStarted(session=self.dome.computer.snapshot().session))
 
     def _begin(self) -> None:
         self._post(ev.Noted(name="service.ready", text="a night in simulated time"))
-        self._hear(heard.RtcAppeared())
+        self._hear(ev.Noted(name="rtc.appeared", text="the RTC is there"))
         session = self.dome.computer.snapshot().session
-        self._hear(heard.SessionChanged(old=None, new=session))
+        self._hear(ev.SessionStarted(session=session))
         self._every(self.latencies.status_s, self._hear_status)
         self._every(self.latencies.tick_s, lambda: self._post(ev.Tick()))
         self._every(self.latencies.watch_interval_s, self._watch)
@@ -235,16 +234,16 @@ class Observatory:
         while self._agenda and self._agenda[0].t_ns <= self.dome.now_ns:
             heapq.heappop(self._agenda).happen()
 
-    def _hear(self, event: heard.LinkEvent) -> None:
+    def _hear(self, event: LinkEvent) -> None:
         self._engine.hear(event)
 
     def _hear_status(self) -> None:
-        self._hear(heard.StatusReceived(status=self.dome.status()))
+        self._hear(self.dome.status())
 
     def _acknowledged(self) -> None:
         for answer in self._link.swapped():
             self._note_swap()
-            self._hear(heard.AcknowledgementReceived(acknowledgement=answer, known=True))
+            self._hear(answer)
 
     def _note_swap(self) -> None:
         rtc = self.dome.computer.snapshot()
@@ -350,7 +349,7 @@ class Observatory:
 
     def _deliver(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         for answer in self._link.deliver(manifest, matrix):
-            self._hear(heard.AcknowledgementReceived(acknowledgement=answer, known=True))
+            self._hear(answer)
 
     def _done(self, event: Event | None) -> None:
         if event is not None:

@@ -26,11 +26,11 @@ from typing_extensions import override
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.errors import PyrcalError
-from service.link import events as heard
+from service.link.events import LinkEvent
 from service.tracking import events as ev
 from service.tracking.products import MatrixState, MeasurePattern
 from service.tracking.state import Mode
-from service.wire import Loop, LoopRequest
+from service.wire import Acknowledgement, Loop, LoopRequest
 from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Latencies, Observatory
 from studies.campaign.observatory_dome import Moment
@@ -120,8 +120,8 @@ class StrangeNight(Observatory):
             super()._hear_status()
 
     @override
-    def _hear(self, event: heard.LinkEvent) -> None:
-        told = isinstance(event, heard.AcknowledgementReceived)
+    def _hear(self, event: LinkEvent) -> None:
+        told = isinstance(event, Acknowledgement)
         if not (told and Mischief.NO_ACK in self.dome.mischief):
             super()._hear(event)
 

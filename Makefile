@@ -1,7 +1,7 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test check paper clean FORCE
+.PHONY: help setup demo test test-long check paper clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -16,15 +16,18 @@ $(STAMP): FORCE
 endif
 
 help:
-	@grep -E '^[a-z]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /:\t/' | expand -t 8
+	@grep -E '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /:\t/' | expand -t 8
 
 setup: $(STAMP) ## install pyrcal and its tools into .venv
 
 demo: $(STAMP) ## service and simulated RTC together; ARGS="--seconds 60" and the like
 	@.venv/bin/pyrcal demo $(ARGS)
 
-test: $(STAMP) ## run the tests; ARGS go to pytest
-	@$(PY) -m pytest -n 2 $(ARGS)
+test: $(STAMP) ## all that a change needs, what is known soonest first; ARGS go to pytest
+	@$(PY) -m pytest -n 2 -m 'not long and not slow' $(ARGS)
+
+test-long: $(STAMP) ## the other tests: what takes minutes of real time
+	@$(PY) -m pytest -n 2 -m 'long and not slow' $(ARGS)
 
 check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff check .

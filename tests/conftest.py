@@ -27,6 +27,9 @@ ORDER = ("tests/unit/", "tests/properties/", "tests/physics/", "tests/system/")
 REAL_TIME = ("tests/system/test_demo.py", "tests/system/test_sim_rtc.py")
 """The full instrument at 1 kHz: one after the other, on one worker."""
 
+SHARED = ("tests/system/test_broken_messages.py",)
+"""Its tests share a service; every other system test has its own, and may run anywhere."""
+
 
 @pytest.fixture(autouse=True)
 def log_of_its_own():
@@ -51,11 +54,14 @@ def _place(nodeid):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Hand out whole modules in order, what is to run in real time to one worker."""
+    """Hand out whole modules in order, and system tests one by one."""
 
-    class ByModule(LoadScopeScheduling):
+    class InOrder(LoadScopeScheduling):
         def _split_scope(self, nodeid):
-            return "real time" if nodeid.startswith(REAL_TIME) else nodeid.split("::")[0]
+            if nodeid.startswith(REAL_TIME):
+                return "real time"
+            alone = nodeid.startswith("tests/system/") and not nodeid.startswith(SHARED)
+            return nodeid if alone else nodeid.split("::")[0]
 
     config.option.loadscopereorder = False
-    return ByModule(config, log)
+    return InOrder(config, log)

@@ -90,6 +90,7 @@ def test_one_frame_with_a_leap_of_its_number_is_named_and_telemetry_goes_on(nigh
     assert night.state["ready"]
 
 
+@pytest.mark.long
 def test_a_sequence_that_starts_over_in_its_session_is_named_and_the_service_not_ready(night, rtc):
     time.sleep(1.0)
     rtc.on_frames = lambda header, *rows: (header | {"seq0": header["seq0"] % 50}, *rows)
@@ -147,6 +148,7 @@ def test_frames_that_are_not_finite_are_named_within_three_seconds(night, rtc):
     named(night, alarms, "frames-unused", "nonfinite")
 
 
+@pytest.mark.long
 def test_statuses_that_break_the_contract_are_named_and_missed(night, rtc):
     rtc.on_status = lambda status: status | {"leak": 1.5}
     named(night, alarms, "messages-refused", "leak is 1.5")
@@ -154,6 +156,7 @@ def test_statuses_that_break_the_contract_are_named_and_missed(night, rtc):
     assert night.client.get("/readyz").status_code == 503
 
 
+@pytest.mark.long
 def test_frames_without_any_status_are_named(night):
     with stranger(night, "mute") as rtc:
         rtc.on_status = lambda _: None
@@ -164,6 +167,7 @@ def test_frames_without_any_status_are_named(night):
         wait_for(lambda: "status" not in waits(night), 5.0, "it is waited for no more")
 
 
+@pytest.mark.long
 def test_an_rtc_that_pauses_is_waited_for(night, rtc):
     rtc.on_frames = lambda *_: None
     named(night, waits, "frames", "no frames", 3.0 + SLACK_S)
@@ -178,6 +182,7 @@ def test_an_rtc_that_is_not_there_is_waited_for(night):
     assert night.client.get("/readyz").status_code == 200
 
 
+@pytest.mark.long
 def test_a_loop_whose_matrix_has_no_name_is_registered_all_the_same(night):
     with stranger(night, "nameless") as rtc:
         rtc.told = {"cm_id": None}
@@ -188,6 +193,7 @@ def test_a_loop_whose_matrix_has_no_name_is_registered_all_the_same(night):
         wait_for(lambda: night.state["windows_accepted"] > before + 1, 40.0, "windows of a dither")
 
 
+@pytest.mark.long
 def test_another_sum_in_an_acknowledgement_is_an_alarm_until_the_matrix_is_read_back(night):
     response, variance_m2 = small_telescope(shift_x_subap=0.1)
     assumed, _ = small_telescope()
@@ -201,6 +207,7 @@ def test_another_sum_in_an_acknowledgement_is_an_alarm_until_the_matrix_is_read_
         assert n_sent == 1
 
 
+@pytest.mark.long
 def test_five_hundred_statuses_a_second_end_no_window_and_leave_rest_alone(night, rtc):
     rtc.status_hz = 50.0
     pumped = 0
@@ -221,6 +228,7 @@ def test_five_hundred_statuses_a_second_end_no_window_and_leave_rest_alone(night
     assert night.state["windows_accepted"] > before
 
 
+@pytest.mark.long
 def test_a_second_service_stands_by_and_the_rtc_hears_of_one_alone(night):
     response, variance_m2 = small_telescope(shift_x_subap=0.1)
     assumed, _ = small_telescope()

@@ -12,7 +12,7 @@ from service.model.misregistration import PARAMETERS
 from tests.system.night import a_night, children_of, session_members, wait_for
 from tests.system.pace import patience
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(300)]
 
 TOLERANCE = dict(zip(PARAMETERS, (0.02, 0.02, 0.05, 0.002), strict=True))
 

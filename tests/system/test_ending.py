@@ -14,7 +14,7 @@ from tests.system.night import INSTRUMENT, a_night, session_members, wait_for
 from tests.system.pace import patience
 from tests.system.stranger import Stranger, small_telescope
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(120)]
 
 BOTH = [signal.SIGINT, signal.SIGTERM]
 

@@ -9,7 +9,7 @@ import pytest
 from tests.system.night import ALPHA, N_START, N_TARGET, a_night, wait_for
 from tests.system.test_service import check_registration
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 
 TELEMETRY = (
     "lost@18:0.3,0.6",

@@ -107,6 +107,7 @@ def an_archive():
     return buffer.getvalue()
 
 
+@pytest.mark.long
 def test_the_service_fits_what_is_uploaded_and_keeps_nothing(night):
     found = finished(night, night.client.post("/v1/fits", content=an_archive()))
     assert found.status_code == httpx.codes.OK, found.text
@@ -138,6 +139,7 @@ def check_two_gigabytes_are_refused_unread(night):
     assert not list((night.directory / "data" / "uploads").iterdir())
 
 
+@pytest.mark.long
 def test_two_gigabytes_are_refused_and_a_running_fit_does_not_delay_the_end(night):
     check_two_gigabytes_are_refused_unread(night)
     (process,) = night.processes

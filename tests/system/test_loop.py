@@ -7,7 +7,7 @@ import pytest
 
 from tests.system.night import N_START, a_night, wait_for
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(120)]
 
 
 @pytest.fixture

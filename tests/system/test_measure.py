@@ -14,7 +14,7 @@ from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from tests.system.night import ALPHA, INSTRUMENT, N_START, a_night, wait_for
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(180)]
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from sim_rtc.record import Kind, Recording
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 
 WINDOW_S = 1.0
 POLICY = Policy(

@@ -109,6 +109,7 @@ def endless():
         yield b" " * 1_000_000
 
 
+@pytest.mark.long
 def test_endless_bodies_and_half_open_requests_cost_next_to_nothing(night):
     (process,) = night.processes
     before_mb = resident_mb(process.popen.pid)

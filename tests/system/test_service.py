@@ -84,6 +84,7 @@ def test_in_auto_the_registration_is_found_and_the_loop_served_first_its_modes_t
     assert "Traceback" not in service.log
 
 
+@pytest.mark.long
 def test_in_propose_the_operator_decides(night):
     night.service("propose")
     night.rtc()
@@ -114,6 +115,7 @@ def test_in_propose_the_operator_decides(night):
     assert night.state["in_use"] == copy["id"]
 
 
+@pytest.mark.long
 def test_an_rtc_that_is_killed_and_restarted_is_calibrated_again(night):
     night.service("auto")
     rtc = night.rtc()
@@ -157,6 +159,7 @@ def test_a_service_that_is_killed_and_restarted_picks_up_where_it_was(night):
     assert matrix.status_code == 200
 
 
+@pytest.mark.long
 def test_an_rtc_that_was_there_first_is_served(night):
     rtc = night.rtc()
     time.sleep(4.0)
@@ -271,6 +274,7 @@ def test_a_stranger_on_the_network_cannot_stop_the_telemetry(night):
     assert night.state["link"]["frames_lost"] == 0
 
 
+@pytest.mark.long
 def test_an_rtc_of_another_instrument_is_named_and_gets_nothing(night):
     night.service("auto")
     night.rtc(instrument=other_instrument(night, n_modes="80"))
@@ -281,6 +285,7 @@ def test_an_rtc_of_another_instrument_is_named_and_gets_nothing(night):
     assert not [record for record in night.shelf if record["published_ns_utc"]]
 
 
+@pytest.mark.long
 def test_an_rtc_of_another_basis_than_the_pinned_one_is_named_and_gets_nothing(night):
     pinned = other_instrument(night, name='"small"\nbasis_id = "kl-of-last-year"')
     night.service("auto", pinned)
@@ -292,6 +297,7 @@ def test_an_rtc_of_another_basis_than_the_pinned_one_is_named_and_gets_nothing(n
     assert not [record for record in night.shelf if record["published_ns_utc"]]
 
 
+@pytest.mark.long
 def test_a_loop_that_diverges_is_recognised_and_named(night):
     night.service("auto")
     night.rtc("--gain", "1.2")
@@ -300,6 +306,7 @@ def test_a_loop_that_diverges_is_recognised_and_named(night):
     assert not [record for record in night.shelf if record["published_ns_utc"]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_it_ends_in_good_order_while_the_model_is_still_being_prepared(night, number):
     service = night.service(instrument="flao-lbt", wait=False)
@@ -310,6 +317,7 @@ def test_it_ends_in_good_order_while_the_model_is_still_being_prepared(night, nu
     wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
 
 
+@pytest.mark.long
 def test_ctrl_c_in_a_terminal_reaches_the_worker_too_and_still_ends_in_good_order(night):
     service = night.service("hold")
     os.killpg(service.popen.pid, signal.SIGINT)

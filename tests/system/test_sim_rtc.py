@@ -212,6 +212,7 @@ def rtc(tmp_path_factory):
         listener.close()
 
 
+@pytest.mark.long
 def test_a_connection_left_over_under_its_name_does_not_silence_it_for_ever():
     """What is left when both ends stood still and zenoh reconnected twice at once."""
     port = free_port()
@@ -501,6 +502,7 @@ def test_opening_the_loop_zeroes_the_integrator_and_begins_a_session(rtc):
     assert rtc.next_status().loop == "closed"
 
 
+@pytest.mark.long
 def test_it_waits_for_the_service_outlives_it_and_ends_cleanly():
     port = free_port()
     process = start_rtc(port, "--alpha", "-0.1,0.05,0.1,1.002", "--quiet")

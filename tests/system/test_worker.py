@@ -11,7 +11,7 @@ from tests.system.night import a_night, session_members, wait_for
 from tests.system.pace import Deadline
 from tests.system.stranger import Stranger, small_telescope
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(180)]
 
 
 @pytest.fixture

@@ -22,10 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         _leave_when_asked(0 if words[:1] == ["run"] else 130)
     options = command_line().parse_args(with_negative_numbers(words))
-    if arguments is None and options.command == "run":
-        from service.worker import begin_early
-
-        begin_early()
+    options.own_process = arguments is None
     try:
         command = import_module(f"service.commands.{options.command}")
         if arguments is None and options.command != "run":

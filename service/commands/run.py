@@ -1,4 +1,4 @@
-"""``pyrcal run``: the service, and the only place that wires its parts together."""
+"""``pyrcal run``: what the user decides, read and checked before the service is put together."""
 
 from __future__ import annotations
 
@@ -6,41 +6,17 @@ import argparse
 import asyncio
 import contextlib
 import logging
-import multiprocessing
 import os
-import signal
-import socket
 import sys
-import threading
-import time
-from collections.abc import Iterator
 from typing import TextIO, cast
 
 import structlog
-import uvicorn
 from structlog.typing import EventDict
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
-from service.api import create_app
-from service.archive import Archive
-from service.config import Settings, load_instrument, load_settings, packaged_instrument
-from service.config.policy import policy_of
-from service.errors import ConfigurationError, PyrcalError, shown
-from service.files.uploads import UploadFitter
-from service.model.instrument import Instrument
-from service.prepared import usual_folder
-from service.routes.admission import Hosts, server_config
-from service.rtc_bridge import Bridge, Endpoint
-from service.runtime.actions import Actions, Publishing
-from service.runtime.recording import taken_up
-from service.runtime.supervisor import Supervisor
-from service.runtime.uploads import FitLimits, FitQueue
-from service.runtime.workers import WorkerPool
-from service.tracking.measuring import MEASUREMENTS_KEPT, NOISY_KEPT
-from service.tracking.reconstructors import restored
-from service.tracking.state import TrackerState
-from service.worker import Compute, start_worker
+from service.config import load_instrument, load_settings
+from service.errors import shown
 
 _OPTIONS = {
     "instrument": "service.instrument",
@@ -52,14 +28,6 @@ _OPTIONS = {
     "port": "api.port",
 }
 """Command-line options that stand for a settings key."""
-
-REQUESTS_WITHIN_S = 2
-"""Requests under way when the service is asked to stop may take this long: an upload would take
-longer."""
-
-END_WITHIN_S = 4.5
-"""After this what holds the service up is named, and left behind: five seconds is what operators
-and process managers wait."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -74,12 +42,18 @@ def main(options: argparse.Namespace) -> int:
             given[key] = [given[key]]
     settings = load_settings(options.config, os.environ, given)
     instrument = load_instrument(settings.service.instrument)
+    from service.worker import begin_early  # the rest of the program takes seconds to import
+
+    if options.own_process:
+        begin_early()
+    from service.commands.serve import serve
+
     # the event loop's own products are small; a second BLAS thread would only fight the RTC link
     threadpool_limits(1)
     log_to_the_terminal()
     for remark in instrument.remarks:
         structlog.get_logger().warning("instrument.remark", text=remark)
-    return asyncio.run(_serve(settings, instrument))
+    return asyncio.run(serve(settings, instrument))
 
 
 def log_to_the_terminal() -> None:
@@ -133,207 +107,3 @@ class _IntoStructlog(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         log = structlog.get_logger()
         log.log(record.levelno, record.getMessage(), exc_info=record.exc_info or None)
-
-
-async def _serve(settings: Settings, instrument: Instrument) -> int:
-    """Open everything, run until asked to stop or the service fails, close everything."""
-    system = settings.service.system or instrument.name
-    workers = WorkerPool(lambda: start_worker(instrument, _compute(settings)))
-    archive = Archive(settings.service.data_dir)
-    with _listener(settings.api.host, settings.api.port) as listener:
-        archive.open()
-        with archive, Bridge(_endpoint(settings, system)) as bridge:
-            bridge.expect(instrument.basis_id, instrument.config_id)
-            supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
-            desk = _desk(settings, instrument)
-            hosts = Hosts(bound=settings.api.host, allowed=settings.api.allowed_hosts)
-            try:
-                return await _until_stopped(supervisor, desk, listener, hosts)
-            finally:
-                workers.close()
-
-
-async def _until_stopped(
-    supervisor: Supervisor, desk: FitQueue, listener: socket.socket, hosts: Hosts
-) -> int:
-    desk.open()
-    app = create_app(supervisor, desk, hosts=hosts)
-    config = server_config(app, timeout_graceful_shutdown=REQUESTS_WITHIN_S)
-    server = _Server(config)
-    ending = _Ending()
-    host, port = listener.getsockname()[:2]
-    structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
-    work = asyncio.create_task(supervisor.run())
-    web = asyncio.create_task(server.serve(sockets=[listener]))
-    asked = asyncio.create_task(ending.asked.wait())
-    await asyncio.wait({work, web, asked}, return_when=asyncio.FIRST_COMPLETED)
-    failed = work.done() or web.done()
-    ending.begin()
-    server.should_exit = True
-    for task in (work, asked):
-        task.cancel()
-    outcomes = await asyncio.gather(work, web, return_exceptions=True)
-    await desk.close()
-    for outcome in outcomes:
-        _explain(outcome)
-    return 1 if failed else 0
-
-
-def _explain(outcome: BaseException | None) -> None:
-    """Log why the service failed; what it refused on purpose ends as one line.
-
-    Raises
-    ------
-    PyrcalError
-        The refusal itself.
-    """
-    while isinstance(outcome, BaseExceptionGroup):
-        outcome = outcome.exceptions[0]
-    if isinstance(outcome, PyrcalError):
-        raise outcome
-    if isinstance(outcome, Exception):
-        structlog.get_logger().error("service.failed", exc_info=outcome)
-
-
-class _Server(uvicorn.Server):
-    """A uvicorn that leaves signals alone: it would raise them again before all is closed."""
-
-    @override
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield
-
-
-class _Ending:
-    """Hears SIGINT and SIGTERM, once, and sees to it that the end comes."""
-
-    def __init__(self) -> None:
-        self.asked = asyncio.Event()
-        self._begun = False
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(self._ask))
-
-    def _ask(self) -> None:
-        self.begin()
-        self.asked.set()
-
-    def begin(self) -> None:
-        """Begin the end: it is not begun twice, and cannot be put off."""
-        if self._begun:
-            return
-        self._begun = True
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
-        guard = threading.Timer(END_WITHIN_S, _leave_behind)
-        guard.daemon = True
-        guard.start()
-
-
-def _leave_behind() -> None:
-    """End the process with what still holds it up; what is on the disk is whole at any moment."""
-    held = [thread.name for thread in threading.enumerate() if not thread.daemon]
-    structlog.get_logger().error("service.ended-late", threads=held)
-    for child in multiprocessing.active_children():
-        child.kill()
-    os._exit(1)
-
-
-def _listener(host: str, port: int) -> socket.socket:
-    """Bind the REST port first: a busy one must be said in one line before anything starts."""
-    try:
-        listener = socket.create_server((host, port))
-    except OSError as error:
-        raise ConfigurationError(
-            f"api.port: cannot listen on {host}:{port}: {error.strerror or error}; "
-            "choose another with --port"
-        ) from error
-    return listener
-
-
-def _supervisor(
-    settings: Settings,
-    instrument: Instrument,
-    system: str,
-    bridge: Bridge,
-    workers: WorkerPool,
-    archive: Archive,
-) -> Supervisor:
-    actions = Actions(
-        bridge=bridge,
-        workers=workers,
-        archive=archive,
-        instrument=instrument,
-        publishing=Publishing(
-            system=system,
-            chunk_bytes=settings.zenoh.chunk_bytes,
-            pole_radius_bound=settings.control.pole_radius_bound,
-        ),
-        clock_ns=time.time_ns,
-    )
-    policy = policy_of(settings)
-    state = TrackerState(
-        system=system,
-        mode=settings.service.mode,
-        reconstructors=restored(archive.records()),
-        measurements=archive.measured.records()[-MEASUREMENTS_KEPT:],
-        noisy=archive.noisy.records()[-NOISY_KEPT:],
-        basis_id=instrument.basis_id,
-        config_id=instrument.config_id,
-    )
-    return Supervisor(
-        state=taken_up(archive, state, policy, time.time_ns()),
-        policy=policy,
-        bridge=bridge,
-        workers=workers,
-        archive=archive,
-        actions=actions,
-    )
-
-
-def _desk(settings: Settings, instrument: Instrument) -> FitQueue:
-    """Return the desk for fits of uploads; an uploaded instrument is read like any other."""
-    most_bytes = settings.fits.upload_limit_mb * 1_000_000
-    return FitQueue(
-        folder=settings.service.data_dir / "uploads",
-        fit=UploadFitter(
-            own=instrument,
-            load_instrument=load_instrument,
-            packaged_instrument=packaged_instrument,
-            most_bytes=most_bytes,
-            threads=settings.compute.threads,
-        ),
-        limits=FitLimits(
-            most_bytes=most_bytes,
-            waiting=settings.fits.waiting,
-            seconds=settings.fits.time_limit_s,
-            nice=settings.compute.nice,
-            memory_mb=settings.fits.memory_limit_mb,
-        ),
-        clock_ns=time.time_ns,
-    )
-
-
-def _endpoint(settings: Settings, system: str) -> Endpoint:
-    return Endpoint(
-        system=system,
-        listen=settings.zenoh.listen,
-        connect=settings.zenoh.connect,
-        chunk_bytes=settings.zenoh.chunk_bytes,
-    )
-
-
-def _compute(settings: Settings) -> Compute:
-    table = settings.compute
-    return Compute(
-        threads=table.threads,
-        nice=table.nice,
-        pupil_sampling=table.pupil_sampling,
-        detector_nodes=table.detector_nodes,
-        working_point_modes=table.working_point_modes,
-        method=settings.control.method,
-        max_condition=settings.control.max_condition,
-        slope_noise=settings.control.slope_noise,
-        wind_m_s=settings.control.wind_m_s,
-        cache=settings.service.cache_dir or usual_folder(os.environ),
-    )

@@ -179,7 +179,7 @@ def test_an_rtc_that_pauses_is_waited_for(night, rtc):
 
 def test_an_rtc_that_is_not_there_is_waited_for(night):
     named(night, waits, "rtc", "no RTC is there", 5.0)
-    assert night.client.get("/readyz").status_code == 200
+    wait_for(lambda: night.client.get("/readyz").status_code == 200, 5.0, "it is ready")
 
 
 @pytest.mark.long

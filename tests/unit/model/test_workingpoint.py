@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -16,6 +17,11 @@ ALIGNED = Misregistration()
 @pytest.fixture(scope="module")
 def flao_halo():
     return working_point(load_instrument("flao-lbt"), n_controlled=400, sampling=3)
+
+
+@functools.cache
+def small_halo(r0_m):
+    return working_point(small_instrument(), n_controlled=30, r0_m=r0_m, sampling=3)
 
 
 def small_matrix(halo):
@@ -40,7 +46,7 @@ def test_nearly_nine_tenths_of_the_light_stay_on_the_grid(flao_halo):
 
 
 def test_without_residual_the_source_is_the_modulation_circle():
-    perfect = working_point(small_instrument(), n_controlled=30, r0_m=50.0, sampling=3)
+    perfect = small_halo(50.0)
     assert perfect.core_weight > 0.99
     np.testing.assert_allclose(gains(perfect), 1.0, atol=0.03)
 
@@ -52,10 +58,7 @@ def test_a_halo_of_no_light_changes_nothing():
 
 
 def test_worse_seeing_lowers_the_optical_gain_of_every_mode():
-    good, bad = (
-        gains(working_point(small_instrument(), n_controlled=30, r0_m=r0, sampling=3))
-        for r0 in (0.4, 0.15)
-    )
+    good, bad = (gains(small_halo(r0_m)) for r0_m in (0.4, 0.15))
     assert np.all(bad < good)
     assert np.all((bad > 0.0) & (good < 1.0))
 
@@ -68,7 +71,7 @@ def test_no_loop_or_no_r0_is_refused(n_controlled, r0_m):
 
 def shift_derivative_error(n_nodes):
     """How far the analytic shift derivative is from central differences, relative."""
-    halo = working_point(small_instrument(), n_controlled=30, r0_m=0.2, sampling=3)
+    halo = small_halo(0.2)
     model = InteractionModel(
         small_instrument(), small_basis(), halo=halo, detector_nodes=n_nodes, dtype=np.float64
     )
@@ -89,7 +92,7 @@ def test_the_derivatives_follow_the_matrix_at_the_working_point_too():
 
 
 def test_long_rings_need_their_points_more_than_short_ones():
-    halo = working_point(small_instrument(), n_controlled=30, r0_m=0.2, sampling=3)
+    halo = small_halo(0.2)
     n_rings = len(halo.n_points)
     even = dataclasses.replace(halo, n_points=(sum(halo.n_points) // n_rings,) * n_rings)
     finer = dataclasses.replace(halo, n_points=tuple(4 * n for n in halo.n_points))

@@ -1,19 +1,23 @@
 """An instrument small enough that a job takes milliseconds, and the loop that goes with it."""
 
+import os
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from service.config import load_instrument
 from service.control.gate import LoopSettings
+from service.prepared import usual_folder
 from service.worker import Compute
 
 INSTRUMENT = Path(__file__).with_name("small.toml")
-COMPUTE = Compute(threads=1, nice=0)
+COMPUTE = Compute(threads=1, nice=0, cache=usual_folder(os.environ))
 N_CONTROLLED = 45
 SIGMA = np.array([0.003, 0.003, 1e-4, 3e-4])
 
 
+@cache
 def small_instrument():
     return load_instrument(str(INSTRUMENT))
 

@@ -1,6 +1,7 @@
 """The working point that follows the optical gains, in the sensor and in the work done with it."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.workingpoint import working_point
 from service.telemetry.frames import Loop
-from service.worker import OpticsWorker
+from service.worker import OpticsWorker, sensor
 from service.worker.sensor import FOLLOWED, STRENGTHS
 from tests.unit.runtime.small import (
     COMPUTE,
@@ -24,15 +25,24 @@ from tests.unit.runtime.test_workbench import ALPHA, MODES, dithered_window
 AT_WORK = replace(COMPUTE, working_point_modes=N_CONTROLLED)
 
 
+@pytest.fixture(autouse=True)
+def each_working_point_once(monkeypatch):
+    monkeypatch.setattr(sensor, "working_point", once)
+
+
 @pytest.fixture
 def bench():
     return OpticsWorker(small_instrument(), AT_WORK)
 
 
+once = cache(working_point)
+"""Each takes a second or two."""
+
+
 def on_sky(strength):
     """A bench whose sensor is that of a residual of another strength, for good."""
     instrument = small_instrument()
-    halo = working_point(
+    halo = once(
         instrument,
         n_controlled=N_CONTROLLED,
         r0_m=instrument.modes.r0_m * strength**-0.6,

@@ -18,7 +18,7 @@ from benchmarks.peers import hcipy_slopes
 from service.config import load_instrument
 from service.model.interaction import InteractionModel, reference_slopes
 from service.model.modes import karhunen_loeve_basis
-from sim_rtc.diffractive import DiffractivePyramid, centred_pupil
+from sim_rtc.telescope.diffractive import DiffractivePyramid, centred_pupil
 
 MODES = (0, 1, 2, 5, 20, 50, 100, 200, 300, 399)
 STROKE_M = 20e-9

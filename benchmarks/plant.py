@@ -27,10 +27,10 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.wire import encode_frames
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.diffractive_plant import DiffractiveOptics
-from sim_rtc.feed import BATCH_FRAMES, message_frames
-from sim_rtc.messages import frames_of
+from sim_rtc.computer.feed import BATCH_FRAMES, message_frames
+from sim_rtc.computer.telemetry import frames_of
 from sim_rtc.options import parse_options
+from sim_rtc.telescope.diffractive import DiffractiveOptics
 
 _PEER = Path(__file__).with_name("plant_oopao.py")
 _PEER_SAMPLINGS = (2, 4)

@@ -18,18 +18,15 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.errors import ConfigurationError, PyrcalError
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.clock import FrameClock, Pace
-from sim_rtc.computer import RealTimeComputer
-from sim_rtc.faults import FaultPlan
-from sim_rtc.feed import Ahead, message_frames
-from sim_rtc.link import Link, Rehearsal
+from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.feed import Ahead, message_frames
+from sim_rtc.computer.telemetry import Batch, FrameClock, Pace
+from sim_rtc.faults import ComputerFaults, FaultPlan
+from sim_rtc.link.link import Link, Rehearsal
+from sim_rtc.link.record import Recorder, Recording
+from sim_rtc.link.replay import Replay
 from sim_rtc.options import Options, parse_options
-from sim_rtc.record import Recorder, Recording
-from sim_rtc.replay import Replay
-from sim_rtc.sabotage import Sabotage
-from sim_rtc.snapshot import write_snapshot
-from sim_rtc.telemetry import Batch
-from sim_rtc.truth import TruthRecorder
+from sim_rtc.truth import TruthRecorder, write_snapshot
 
 _REPORT_PERIOD_S = 10.0
 _WORRYING_DELAY_S = 0.5
@@ -48,8 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, stop)
     try:
-        if options.rehearsal.replay is not None:
-            return _replay(options.rehearsal.replay, options, stopped)
+        if options.replay is not None:
+            return _replay(options.replay, options, stopped)
         instrument = load_instrument(options.instrument)
         _check_writable(options.truth)
         # Nested threading makes small products slower, and the service needs the other core.
@@ -77,10 +74,10 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         computer = telescope.computer(iter(ahead))
         computer.prepare()
         clock = FrameClock(start_ns_utc=time.time_ns(), dt_ns=round(1e9 / options.frame_rate_hz))
-        plan, recorder = FaultPlan(options.rehearsal.faults), None
-        if options.rehearsal.record is not None:
+        plan, recorder = FaultPlan(options.faults), None
+        if options.record is not None:
             system = computer.identity.system
-            recorder = stack.enter_context(Recorder(options.rehearsal.record, system=system))
+            recorder = stack.enter_context(Recorder(options.record, system=system))
         link = stack.enter_context(
             Link(
                 computer,
@@ -89,7 +86,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
                 detector=telescope.detector,
                 magnitude=options.magnitude,
                 batch_frames=batch_frames,
-                elevation=options.sky.elevation,
+                elevation=options.elevation,
                 rehearsal=Rehearsal(plan=plan, recorder=recorder, seed=options.seed),
             )
         )
@@ -99,7 +96,9 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
                 options.truth, weights=telescope.weights, clock=clock, options=options
             )
             truth = stack.enter_context(truth_recorder)
-        sabotage = Sabotage(plan, computer, clock=clock, pace=pace, absence=link.absence)
+        computer_faults = ComputerFaults(
+            plan, computer, clock=clock, pace=pace, absence=link.absence
+        )
         last_batch = float("inf")
         if options.seconds is not None:
             last_batch = round(options.seconds * options.frame_rate_hz / batch_frames)
@@ -110,7 +109,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.snapshot().session)
         while not stopped.is_set() and n_batches < last_batch:
             pace.wait(stopped)
-            sabotage.before_batch(n_batches * batch_frames / options.frame_rate_hz, stopped)
+            computer_faults.before_batch(n_batches * batch_frames / options.frame_rate_hz, stopped)
             batch = computer.next_batch()
             link.offer(batch)
             if truth is not None:

@@ -11,32 +11,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, KarhunenLoeve, TabulatedModes
+from service.model.mirror import mirror_surface
 from service.model.modes import ModalBasis, analytic_basis
+from service.model.slopes import Normalisation, Orientation, SlopeOrder
 from service.prepared import Prepared, usual_folder
-from sim_rtc.beforehand import identity_of, initial_reconstructor
-from sim_rtc.computer import RealTimeComputer
-from sim_rtc.detector import Detector
-from sim_rtc.devices import (
-    binned_basis,
-    build_detector,
-    build_drive,
-    build_feed,
-    build_plant,
-    build_schedule,
-    build_sky,
-)
-from sim_rtc.dither import DitherLimits
-from sim_rtc.drive import MirrorDrive
-from sim_rtc.feed import BATCH_FRAMES, Block, Feed
-from sim_rtc.gains import by_group
-from sim_rtc.motion import MovingOptics, background_executor
+from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
+from sim_rtc.computer.gains import by_group
+from sim_rtc.computer.reconstructors import identity_of, initial_reconstructor
+from sim_rtc.computer.telemetry import DitherLimits, Identity, LoopSettings, Reconstructor
 from sim_rtc.options import Options
-from sim_rtc.pixels import binned
-from sim_rtc.plant import Plant, TelescopeOptics
-from sim_rtc.playable import check_playable
-from sim_rtc.reconstructors import Reconstructor
-from sim_rtc.telemetry import Identity, LoopSettings
+from sim_rtc.telescope.atmosphere import fried_parameter_m, frozen_layers
+from sim_rtc.telescope.detector import Detector, PixelDetector, binned
+from sim_rtc.telescope.diffractive import DiffractivePlant
+from sim_rtc.telescope.influence import read_influence
+from sim_rtc.telescope.linear import LinearPlant
+from sim_rtc.telescope.mirror import MirrorDrive
+from sim_rtc.telescope.plant import Departures, Optics, Plant
+from sim_rtc.telescope.registration import (
+    MovingOptics,
+    Schedule,
+    background_executor,
+    random_registration,
+)
+from sim_rtc.telescope.scene import PlayedTurbulence, SceneKind
+from sim_rtc.telescope.sky import Sky, Turbulence, Vibrations
 
 STROKE_M = 10e-6
 """Largest command of one mode, metres RMS OPD: seven times the tilt of median seeing."""
@@ -102,20 +102,19 @@ def build_telescope(
     ConfigurationError
         If the instrument is not simulated, or more modes are to be controlled than it has.
     """
-    check_playable(instrument)
+    check_supported(instrument)
     n_modes = instrument.modes.n_modes
     if options.n_controlled > n_modes:
         raise ConfigurationError(
             f"--n-controlled: found {options.n_controlled}; {instrument.name} has {n_modes} modes"
         )
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
-    binning = options.devices.binning
-    basis = binned_basis(instrument, _modes(instrument), binning)
-    instrument = binned(instrument, binning)
+    basis = binned_basis(instrument, _modes(instrument), options.binning)
+    instrument = binned(instrument, options.binning)
     plant = build_plant(options, instrument, basis, plant_rng)
     sky = build_sky(options, instrument, basis, plant, sky_rng)
 
-    def prepare(optics: TelescopeOptics) -> None:
+    def prepare(optics: Optics) -> None:
         for _, response in optics.responses if sky.played is None else ():
             sky.turbulence.prepare(response)
 
@@ -126,7 +125,7 @@ def build_telescope(
         prepare=prepare,
     )
     detector = build_detector(options, instrument, plant, optics.start())
-    double_pass = options.sky.scene.passes == 2
+    double_pass = options.scene.passes == 2
     identity = replace(identity_of(instrument, plant.valid), double_pass=double_pass)
     return Telescope(
         feed=build_feed(options, plant, sky, optics, detector, noise_rng, batch_frames),
@@ -146,3 +145,174 @@ def build_telescope(
         mode_to_actuator=basis.mode_to_actuator,
         drive=build_drive(options, instrument, basis),
     )
+
+
+def build_plant(
+    options: Options, instrument: Instrument, basis: ModalBasis, rng: np.random.Generator
+) -> Plant:
+    """Return the plant of these options, for an instrument that is binned already.
+
+    Raises
+    ------
+    ConfigurationError
+        If pixels are to be binned on a plant that cannot, or actuators to fail that the mirror does
+        not have, or the influence functions are not of this mirror.
+    """
+    file = options.influence
+    made: Departures = {
+        "rng": rng,
+        "imperfections": options.imperfections,
+        "scene": options.scene,
+        "faults": options.mirror_faults,
+        "influence": None if file is None else read_influence(file, instrument),
+    }
+    if options.plant == "diffractive":
+        return DiffractivePlant(instrument, basis, binning=options.binning, **made)
+    if options.binning > 1:
+        raise ConfigurationError(
+            "--preset: a binned sensor needs --plant diffractive; found --plant linear"
+        )
+    return LinearPlant(instrument, basis, **made)
+
+
+def build_sky(
+    options: Options,
+    instrument: Instrument,
+    basis: ModalBasis,
+    plant: Plant,
+    rng: np.random.Generator,
+) -> Sky:
+    """Return what comes to the sensor of this plant, and what is played on its mirror."""
+    scene, seeing = options.scene, options.seeing
+    layers = frozen_layers(
+        options.layers,
+        points_m=plant.points_m,
+        pitch_m=plant.pitch_m,
+        turbulence=KarhunenLoeve(
+            r0_m=fried_parameter_m(seeing.start_arcsec), outer_scale_m=options.outer_scale_m
+        ),
+        rng=rng,
+    )
+    vibrations = Vibrations(
+        options.vibrations,
+        points=plant.points_m,
+        weights=plant.weights,
+        frame_rate_hz=options.frame_rate_hz,
+        rng=rng.spawn(1)[0],
+    )
+    played = None
+    if scene.kind is SceneKind.DAYTIME:
+        modes = basis.render(plant.points_m / instrument.subaperture_m).astype(np.float32)
+        played = PlayedTurbulence(modes, plant.weights, passes=scene.passes)
+    return Sky(turbulence=Turbulence(layers, seeing), vibrations=vibrations, played=played)
+
+
+def build_drive(options: Options, instrument: Instrument, basis: ModalBasis) -> MirrorDrive | None:
+    """Return what limits and slows the mirror; None for a linear plant's ideal one."""
+    if options.plant == "linear" and not options.needs_drive:
+        return None
+    return MirrorDrive(
+        instrument.analytic_mirror,
+        basis.mode_to_actuator,
+        frame_rate_hz=options.frame_rate_hz,
+        rise_s=options.rise_ms * 1e-3,
+        limits=options.mirror_limits,
+    )
+
+
+def binned_basis(instrument: Instrument, basis: ModalBasis, binning: int) -> ModalBasis:
+    """Return the same modes in the larger subapertures of a binned sensor.
+
+    They are found with the finest ones: coarser, they could not be told from one another.
+    """
+    if binning == 1:
+        return basis
+    surface = mirror_surface(instrument.analytic_mirror, binned(instrument, binning).subaperture_m)
+    coefficients = surface.coefficients(basis.mode_to_actuator)
+    return replace(basis, surface=surface, coefficients=coefficients)
+
+
+def build_schedule(options: Options, instrument: Instrument, rng: np.random.Generator) -> Schedule:
+    """Return how the registration moves; one that was not given begins near the nominal one."""
+    return Schedule(
+        start=options.alpha or random_registration(rng, instrument.start.rotation_rad),
+        drift=options.drift,
+        flexure=options.flexure,
+        walk=replace(options.walk, seed=int(rng.integers(2**63))),
+        jumps=options.jumps,
+    )
+
+
+def build_detector(
+    options: Options, instrument: Instrument, plant: Plant, optics: Optics
+) -> Detector:
+    """Return the detector under the light of these optics."""
+    return Detector(
+        instrument,
+        images=optics.images,
+        valid=plant.valid,
+        magnitude=options.magnitude,
+        frame_rate_hz=options.frame_rate_hz,
+        camera=options.camera,
+        silent=plant.slope_errors.silent,
+    )
+
+
+def build_feed(
+    options: Options,
+    plant: Plant,
+    sky: Sky,
+    optics: MovingOptics,
+    detector: Detector,
+    rng: np.random.Generator,
+    batch_frames: int = BATCH_FRAMES,
+) -> Feed:
+    """Return what feeds the loop: slopes of a linear plant, phases for any other.
+
+    ``batch_frames`` are a linear plant's: of any other a frame takes milliseconds.
+    """
+    source: Source = {
+        "sky": sky,
+        "optics": optics,
+        "frame_rate_hz": options.frame_rate_hz,
+        "jump_times_s": tuple(jump.time_s for jump in options.jumps),
+        "rng": rng,
+    }
+    if options.plant == "diffractive":
+        pixels = PixelDetector(
+            electrons_per_light=detector.electrons_per_frame, camera=options.camera
+        )
+        return PhaseFeed(detector=pixels, **source)
+    return OpenLoopFeed(
+        sensor_opd_m=plant.sensor_opd_m, detector=detector, batch_frames=batch_frames, **source
+    )
+
+
+def check_supported(instrument: Instrument) -> None:
+    """Refuse an instrument whose mirror or telemetry is not simulated.
+
+    Raises
+    ------
+    ConfigurationError
+        If the modes are a table, the mirror is seen from behind, or the slopes are other than the
+        conventions' own.
+    """
+    slopes = instrument.slopes
+    found = {
+        "measured modes (mirror.modes, mirror.influence_functions)": isinstance(
+            instrument.mirror, TabulatedModes
+        ),
+        "mirror.parity = -1": instrument.mirror.y_sign < 0,
+        'wfs.input = "frames"': instrument.frames is not None,
+        f'slopes.order = "{slopes.order}"': slopes.order is not SlopeOrder.XY,
+        "another slopes.orientation": slopes.assumed_orientation != Orientation(),
+        f'slopes.normalisation = "{slopes.normalisation}"': (
+            slopes.normalisation is not Normalisation.GLOBAL
+        ),
+    }
+    for name, is_so in found.items():
+        if is_so:
+            raise ConfigurationError(
+                f"{instrument.name}: found {name}; the simulated telescope has actuators, seen "
+                "from the front, and sends slopes as conventions have them"
+            )

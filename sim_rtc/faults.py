@@ -1,19 +1,32 @@
 """Faults on request: what an RTC, a sensor or a network does at its worst, on a schedule.
 
 ``KIND@T[:ARGUMENTS]`` begins a fault at T seconds of loop time. The plan only knows what is to
-happen when; the wire's faults are carried out in :mod:`sim_rtc.wire_faults`, the computer's in
-:mod:`sim_rtc.sabotage`, those of reconstructors in :mod:`sim_rtc.intake`.
+happen when; those of the computer and of telemetry on its way are carried out here, those of
+reconstructors in :mod:`sim_rtc.link.intake`.
 """
 
 from __future__ import annotations
 
 import argparse
 import textwrap
-from dataclasses import dataclass
+import threading
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, Protocol
 
+import numpy as np
+import structlog
+from numpy.typing import NDArray
 from typing_extensions import override
+
+from service.wire import Command, FrameHeader, Loop, LoopRequest, Reply, encode_frames
+from sim_rtc.computer.telemetry import FrameClock, Pace, new_session
+
+_log = structlog.get_logger("sim_rtc")
+Array32 = NDArray[np.float32]
 
 
 class FaultKind(StrEnum):
@@ -190,3 +203,213 @@ def manual() -> str:
 
 def _refusal(text: str, expected: str) -> argparse.ArgumentTypeError:
     return argparse.ArgumentTypeError(f"found {text!r}; expected {expected}")
+
+
+_NEVER_FRAMES = 2**40
+
+
+class Target(Protocol):
+    """What of the computer the faults act on."""
+
+    def execute(self, command: Command) -> Reply:
+        """Carry out a command."""
+
+    def restart(self) -> None:
+        """Begin a session from frame 0 with the matrix of the start."""
+
+    def limit_stroke(self, stroke_m: float | None) -> None:
+        """Clip commands at this, metres RMS; None: as at the start."""
+
+    def delay_dithers(self, n_frames: int) -> None:
+        """Let dithers to come begin so many frames after the announced one."""
+
+
+class ComputerFaults:
+    """Carries out the plan between two batches, in the loop's thread."""
+
+    def __init__(
+        self,
+        plan: FaultPlan,
+        target: Target,
+        *,
+        clock: FrameClock,
+        pace: Pace,
+        absence: Callable[[], AbstractContextManager[None]],
+    ) -> None:
+        """Take the parts.
+
+        Parameters
+        ----------
+        plan
+            What is to happen when.
+        target
+            The computer.
+        clock, pace
+            Of its frames.
+        absence
+            Context in which the RTC is not to be seen on the network.
+        """
+        self._plan = plan
+        self._target = target
+        self._clock = clock
+        self._pace = pace
+        self._absence = absence
+        self._waiting = list(plan.faults)
+        self._lasting: list[Fault] = []
+
+    def before_batch(self, time_s: float, stopped: threading.Event) -> None:
+        """Begin and end what is due at this loop time; a stall waits here."""
+        self._plan.now_s = time_s
+        while self._lasting and min(f.end_s for f in self._lasting) <= time_s:
+            over = min(self._lasting, key=lambda fault: fault.end_s)
+            self._lasting.remove(over)
+            self._end(over)
+        while self._waiting and self._waiting[0].time_s <= time_s:
+            fault = self._waiting.pop(0)
+            _log.warning("fault", fault=str(fault), text="as asked for")
+            self._lasting.append(fault)
+            self._begin(fault, stopped)
+
+    def _begin(self, fault: Fault, stopped: threading.Event) -> None:
+        match fault.kind:
+            case FaultKind.STALL:
+                stopped.wait(fault.value("SECONDS"))
+            case FaultKind.PAUSE:
+                self._rest(fault.value("SECONDS"), stopped)
+            case FaultKind.RESTART:
+                self._restart(fault.value("SECONDS"), stopped)
+            case FaultKind.CLOCK:
+                self._clock.step(round(1e9 * fault.value("STEP")))
+            case _:
+                self._change(fault)
+
+    def _change(self, fault: Fault) -> None:
+        """Begin what lasts until ``_end``."""
+        match fault.kind:
+            case FaultKind.OPEN:
+                self._command(fault, Loop.OPEN)
+            case FaultKind.SATURATION:
+                self._target.limit_stroke(1e-9 * fault.value("STROKE_NM"))
+            case FaultKind.DITHER_LOST:
+                self._target.delay_dithers(_NEVER_FRAMES)
+            case FaultKind.DITHER_LATE:
+                self._target.delay_dithers(round(1e9 * fault.value("DELAY") / self._clock.dt_ns))
+            case _:
+                pass
+
+    def _end(self, fault: Fault) -> None:
+        match fault.kind:
+            case FaultKind.OPEN:
+                self._command(fault, Loop.CLOSED)
+            case FaultKind.SATURATION:
+                self._target.limit_stroke(None)
+            case FaultKind.DITHER_LOST | FaultKind.DITHER_LATE:
+                self._target.delay_dithers(0)
+            case _:
+                pass
+
+    def _restart(self, seconds: float, stopped: threading.Event) -> None:
+        with self._absence():
+            self._rest(seconds, stopped)
+            self._target.restart()
+            self._clock.restart(time.time_ns())
+
+    def _rest(self, seconds: float, stopped: threading.Event) -> None:
+        """Do nothing, as a computer that hangs: no frame is made up for afterwards."""
+        stopped.wait(seconds)
+        self._clock.step(round(1e9 * seconds))
+        self._pace.forgive(seconds)
+
+    def _command(self, fault: Fault, loop: Loop) -> None:
+        self._target.execute(LoopRequest(id=f"fault-{fault.kind}", loop=loop))
+
+
+Sendable = tuple[bytes, bytes]
+"""Payload and attachment of one batch."""
+
+_OTHER_BASIS = "another-basis"
+_NONSENSE = b"\xc1 no header of frames"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Held:
+    """A batch that waits for its time."""
+
+    due_s: float
+    message: Sendable
+
+
+class WireFaults:
+    """Turns each batch into what is really sent, in that order; for one thread."""
+
+    def __init__(self, plan: FaultPlan, rng: np.random.Generator) -> None:
+        self._plan = plan
+        self._rng = rng
+        self._held: list[_Held] = []
+        self._frozen: Array32 | None = None
+        self._overtaken: list[Sendable] = []
+        self._second_session = new_session()
+        self._n_garbled = 0
+
+    def messages(self, header: FrameHeader, rows: Array32, time_s: float) -> list[Sendable]:
+        """Return what is sent now: this batch or what has become of it, and what was held."""
+        due = [held.message for held in self._held if held.due_s <= time_s]
+        self._held = [held for held in self._held if held.due_s > time_s]
+        header, rows = self._damaged(header, rows, time_s)
+        sent = due + self._on_the_way(self._garbled(encode_frames(header, rows), time_s), time_s)
+        if self._plan.active(FaultKind.SECOND, time_s):
+            other = replace(header, session=self._second_session)
+            sent.append(encode_frames(other, rows))
+        return sent
+
+    def basis_id(self, basis_id: str, time_s: float) -> str:
+        """Return the basis that frames and status name."""
+        return _OTHER_BASIS if self._plan.active(FaultKind.BASIS, time_s) else basis_id
+
+    def _damaged(
+        self, header: FrameHeader, rows: Array32, time_s: float
+    ) -> tuple[FrameHeader, Array32]:
+        n_slopes = header.n_slopes
+        if self._plan.active(FaultKind.FROZEN, time_s):
+            if self._frozen is None:
+                self._frozen = rows[-1, :n_slopes].copy()
+            rows = np.hstack([np.tile(self._frozen, (header.n, 1)), rows[:, n_slopes:]])
+        else:
+            self._frozen = None
+        fault = self._plan.active(FaultKind.NAN, time_s)
+        if fault is not None:
+            struck = self._rng.random(header.n) < fault.value("SHARE")
+            rows = rows.copy()
+            rows[struck, self._rng.integers(n_slopes)] = np.nan
+        if self._plan.active(FaultKind.SHAPE, time_s):
+            rows = np.delete(rows, n_slopes - 1, axis=1)
+            header = replace(header, n_slopes=n_slopes - 1)
+        return replace(header, basis_id=self.basis_id(header.basis_id, time_s)), rows
+
+    def _garbled(self, message: Sendable, time_s: float) -> Sendable:
+        if not self._struck(FaultKind.GARBAGE, time_s):
+            return message
+        self._n_garbled += 1
+        payload, attachment = message
+        return (payload, _NONSENSE) if self._n_garbled % 2 else (payload[:-3], attachment)
+
+    def _on_the_way(self, message: Sendable, time_s: float) -> list[Sendable]:
+        """Return what leaves in place of a batch, after one that it has overtaken."""
+        late = self._plan.active(FaultKind.LATE, time_s)
+        sent: list[Sendable] = []
+        if self._struck(FaultKind.LOST, time_s):
+            pass
+        elif late is not None:
+            self._held.append(_Held(due_s=time_s + late.value("DELAY"), message=message))
+        else:
+            sent = [message] * (2 if self._struck(FaultKind.DUPLICATED, time_s) else 1)
+        if not self._overtaken and self._struck(FaultKind.REORDERED, time_s):
+            self._overtaken = sent
+            return []
+        sent += self._overtaken
+        self._overtaken = []
+        return sent
+
+    def _struck(self, kind: FaultKind, time_s: float) -> bool:
+        fault = self._plan.active(kind, time_s)
+        return fault is not None and bool(self._rng.random() < fault.value("SHARE"))

@@ -1,21 +1,31 @@
-"""The manual of the simulated RTC: what ``--help`` says besides the options."""
+"""The manual of the simulated RTC: what ``--help`` says besides the options, and how wide."""
 
 from __future__ import annotations
 
-from sim_rtc.options_device import PRESETS
-from sim_rtc.options_rehearsal import EPILOG as REHEARSAL
-from sim_rtc.options_scene import EPILOG as SCENES
+import argparse
+from typing import NoReturn
 
-USAGE = "pyrcal sim [options]    (or: python -m sim_rtc [options])"
+from typing_extensions import override
 
-DESCRIPTION = """\
+from sim_rtc.faults import manual as fault_manual
+from sim_rtc.telescope.detector import FLAO_PRESETS
+
+_USAGE = "pyrcal sim [options]    (or: python -m sim_rtc [options])"
+
+_DESCRIPTION = """\
 Simulated real-time computer of an adaptive telescope with a pyramid sensor. It closes the loop on
 frozen-flow turbulence at the frame rate, publishes telemetry over zenoh, and takes dithers, loop
 commands, gain ramps, measurements and reconstructors, as the service's wire contract says. Its
 mirror is mis-registered on the sensor by an amount that it tells nobody on the wire.
 """
 
-EPILOG = f"""\
+_PRESETS = "\n".join(
+    f"    to R = {preset.faintest:4.1f}: {preset.frame_rate_hz:5.0f} Hz, binning {preset.binning}, "
+    f"{preset.n_controlled} modes"
+    for preset in FLAO_PRESETS
+)
+
+_EPILOG = f"""\
 plants
   linear       one matrix, real time at 1 kHz; an optical gain of its own invention.
   diffractive  the field of the pyramid for every frame: the optical gain is what the residual
@@ -24,7 +34,7 @@ plants
 
 presets
   --preset flao looks at the magnitude:
-{PRESETS}
+{_PRESETS}
   The larger the residual the lower the optical gain: a faint star wants --gain 1 or more.
 
 registration
@@ -41,7 +51,33 @@ mirror
   mirror, gone on smoothly past its edge. Modes are the strokes of the commands matrix on them.
   --position-error moves each function; a dead actuator goes where the surface bends least.
 
-{SCENES}
+scenes
+  onsky: a star through frozen-flow turbulence, the mirror seen once. daytime: a fibre and a
+  retro-reflector; the light meets the mirror twice, so a command's slopes double and --gain is
+  0.2 unless given (the loop gain stays). There is no atmosphere: a turbulence of --seeing, as the
+  sensor sees it, is played on the mirror, and tip, tilt and focus vibrate. The command column is
+  all that is on the mirror: integrator, dither and played turbulence; the dither column is the
+  dither alone. Wavefront errors in the truth file are those at the sensor, after both passes.
+
+atmosphere
+  Screens are extruded row by row from noise that is never used twice: nothing repeats, however
+  long the run. Profiles: single (12 m/s), three-layer, paranal-like (five layers); a linear plant
+  works as hard as the sum of their speeds (12, 41, 67 m/s: .12, .21, .28 ms of processor time
+  a frame). Seeing is that at 500 nm for an infinite outer scale; between two --seeing-at it changes
+  smoothly, then stays.
+
+imperfections
+  ideal: none. usual (the default): light uneven by 10 %, actuators off by 2 % of their pitch,
+  optical gain .6 to .9. realistic: light uneven by 20 %, actuators off by 2 %, optical gain .45 to
+  .75, 6 dead pixels, 0.1 subapertures of radial distortion, 0.2 % of anamorphosis, 10 % more
+  modulation, slope axes turned by 1 deg, 30 nm of non-common path. An option of its own overrides
+  its part of the set. --truth realistic means --imperfections realistic (a truth file of that name
+  is ./realistic).
+
+vibrations
+  tip rises along +x, tilt along +y. Strength is in nm RMS of wavefront at the sensor; DAMPING is
+  that of the resonance noise shakes (default 0.01), 0 a pure sine. By day the default is tip:13:60,
+  tilt:22:40 and focus:47:15, by night none; --vibration none switches them off.
 light
   A star of R = 0 gives 2.1e10 photons per second and square metre in the band (600 to 900 nm); a
   quarter of them are detected. The linear plant adds their noise to its slopes, the diffractive one
@@ -52,7 +88,21 @@ truth file
   second, registration, seeing, wavefront error (RMS and peak, nm) over the pupil and matrix in use;
   and for each reconstructor swap the peaks one second before and after it.
 
-{REHEARSAL}
+{fault_manual()}
+recording
+  --record writes everything that is sent (frames, status, acknowledgements, liveliness, matrices
+  in use) byte for byte to HDF5, from when a service is there. It is flushed twice a second and
+  survives a kill -9; read it with h5py.File(FILE, "r", swmr=True), also while it is written:
+    /messages  time_s, kind (0 frames, 1 status, 2 acknowledgement, 3 liveliness, 4 matrix),
+               start, payload_bytes, attachment_bytes
+    /bytes     all payloads, each followed by its attachment
+    /dropped   messages that were not written
+  --replay plays it, faults included, under the recorded session, sequence and timestamps, at
+  --speed (0: as fast as it goes; above 2 a service gives up windows that it has no time to fit).
+  It begins when the service says what it knows, or after 20 s. It serves the recorded matrix;
+  commands and reconstructors are refused: "unsupported: a replay". A service in mode hold that
+  finds the recorded dither in the status adopts it and gives the answers of that night.
+
 examples
   pyrcal sim --alpha 0.12,-0.08,0.2,1.003 --truth truth.jsonl
       a night of one layer at 1 kHz, the truth written beside it
@@ -76,3 +126,29 @@ examples
 exit status
   0 it ended as asked (time is up, SIGINT, SIGTERM); 2 an option that cannot be.
 """
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage that would push it off the screen."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            prog="sim_rtc",
+            usage=_USAGE,
+            description=_DESCRIPTION,
+            epilog=_EPILOG,
+            formatter_class=_Formatter,
+            allow_abbrev=False,
+        )
+
+    @override
+    def error(self, message: str) -> NoReturn:
+        """End the program with status 2."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    """As wide as the rest of the manual, whatever the terminal."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=34, width=100)

@@ -1,4 +1,4 @@
-"""The command line of the simulated RTC, read like the manual of an instrument."""
+"""The command line of the simulated RTC: every option once, and what they come to together."""
 
 from __future__ import annotations
 
@@ -6,129 +6,483 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import NoReturn
-
-from typing_extensions import override
+from typing import Any
 
 from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration
-from sim_rtc import arguments
-from sim_rtc.manual import DESCRIPTION, EPILOG, USAGE
-from sim_rtc.options_device import (
-    DeviceOptions,
-    add_devices,
-    apply_preset,
-    device_options,
-)
-from sim_rtc.options_rehearsal import RehearsalOptions, add_rehearsal, rehearsal_options
-from sim_rtc.options_scene import (
-    SceneOptions,
-    add_imperfections,
-    add_motion,
-    add_scene,
-    apply_scene,
-    scene_options,
-)
-from sim_rtc.schedule import Drift, Jump
+from sim_rtc import arguments as read
+from sim_rtc import manual
+from sim_rtc.arguments import Reader, count, within
+from sim_rtc.faults import Fault, read_fault
+from sim_rtc.telescope.atmosphere import PROFILES, Layer
+from sim_rtc.telescope.detector import Camera, preset_for
+from sim_rtc.telescope.imperfections import SETS, Imperfections
+from sim_rtc.telescope.influence import InfluenceFile
+from sim_rtc.telescope.mirror import MirrorFaults, MirrorLimits
+from sim_rtc.telescope.registration import Drift, Flexure, Jump, Walk
+from sim_rtc.telescope.scene import Elevation, Scene, SceneKind, Spiders
+from sim_rtc.telescope.sky import DAYTIME_LINES, SeeingSchedule, VibrationLine
 
-_USUAL_SPEED = {"linear": 1.0, "diffractive": 0.0}
-"""The diffractive plant cannot keep up with a real loop: it takes the time it needs."""
+_MICROMETRE = 1e-6
+_MOST_LAYERS = 3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+def _option(
+    usage: str, text: str, reader: Reader | None = None, default: object = None, **more: object
+) -> Any:  # noqa: ANN401 - a field of any type
+    """Return a field that is read from the command line.
+
+    ``usage`` is what ``--help`` shows, flags and what comes after them; ``more`` is argparse's.
+    """
+    if default is not None and "default" not in text:
+        text += f" (default: %(default){'g' if isinstance(default, float) else 's'})"
+    flags = [word for word in usage.split() if word.startswith("-")]
+    metavar = usage.split()[-1] if len(usage.split()) > len(flags) else None
+    told = {"help": text, "metavar": metavar, "type": reader, "default": default, **more}
+    given = {name: value for name, value in told.items() if value is not None}
+    return field(metadata={"flags": flags, "argparse": given})
+
+
+def _many(usage: str, text: str, reader: Reader) -> Any:  # noqa: ANN401 - a field of any type
+    """Return a field of all the values of an option that may be given more than once."""
+    return _option(usage, f"{text}; may be repeated", reader, action="append")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the command line asked for, each value possible by itself."""
+    """What the command line asked for: one field an option, then what several come to."""
 
-    connect: str
-    """zenoh endpoint of the service's router."""
+    instrument: str = _option(
+        "--instrument NAME|FILE", "packaged instrument or instrument file", default="flao-lbt"
+    )
+    plant: str = _option(
+        "--plant", "model of the telescope", default="linear", choices=["linear", "diffractive"]
+    )
+    alpha: Misregistration | None = _option(
+        "--alpha X,Y,ROT_DEG,MAG",
+        "true registration (default: at random, |shift| <= 0.2, 0.3 deg, 0.5 %%)",
+        read.alpha,
+    )
+    jumps: tuple[Jump, ...] = _many(
+        "--jump T:DX,DY,DROT_DEG,DMAG", "sudden change of the registration at T seconds", read.jump
+    )
+    drift: Drift = _option(
+        "--drift DX,DY,DROT_DEG,DMAG", "steady change of the registration, per minute", read.drift
+    )
+    flexure: Flexure = _option(
+        "--flexure X,Y,ROT_DEG,MAG:PERIOD_S",
+        "sinusoid around the registration, by these amplitudes, period 120 s or longer",
+        read.flexure,
+    )
+    walk: Walk = _option(
+        "--walk X,Y,ROT_DEG,MAG", "random walk: standard deviations after a minute", read.walk
+    )
+    pointing: Elevation = _option(
+        "--elevation DEG[,DEG_PER_MIN]",
+        "of the telescope, in the status; what it does to the registration is yours to say with "
+        "--drift, --jump or --flexure (default: 60)",
+        read.elevation,
+    )
+    slews: tuple[tuple[float, float], ...] = _many(
+        "--slew T:DEG", "change of elevation that begins at T seconds, 1 deg/s", read.slew
+    )
+    truths: tuple[Path | str, ...] = _option(
+        "--truth FILE", "write the truth there (never on the wire)", read.truth, action="append"
+    )
+    scene_kind: str = _option(
+        "--scene",
+        "star and atmosphere, or fibre and retro-reflector",
+        default=SceneKind.ONSKY.value,
+        choices=[kind.value for kind in SceneKind],
+    )
+    spiders: Spiders | None = _option(
+        "--spiders N:WIDTH_M",
+        "arms in front of the pupil, evenly spread, the first upwards (default: none)",
+        read.spiders,
+    )
+    profile: str | None = _option(
+        "--profile", "named layers of turbulence (default: single)", choices=list(PROFILES)
+    )
+    later_seeing: tuple[tuple[float, float], ...] = _many(
+        "--seeing-at T:ARCSEC", "seeing at T seconds; it changes smoothly", read.seeing_at
+    )
+    given_vibrations: tuple[VibrationLine | None, ...] = _many(
+        "--vibration SHAPE:HZ:NM[:DAMPING]",
+        "a line on tip, tilt or focus; none: no line",
+        read.vibration,
+    )
+    given_magnitude: float | None = _option(
+        "--mag R",
+        "magnitude of the guide star, or of the fibre (default: 8; by day 7)",
+        within(-5.0, 20.0),
+    )
+    seeing_arcsec: float = _option(
+        "--seeing ARCSEC",
+        "seeing at 500 nm; by day, of what is played",
+        within(0.05, 5.0),
+        default=1.0,
+    )
+    outer_scale_m: float = _option(
+        "--outer-scale M", "outer scale of the turbulence", within(1.0, 1000.0), default=25.0
+    )
+    wind: tuple[Layer, ...] = _many(
+        "--wind SPEED,DIR_DEG[,SHARE]",
+        "a layer: m/s, direction it moves to, share; up to 3, instead of a profile",
+        read.layer,
+    )
+    seed: int | None = _option("--seed N", "of everything random", count(0))
+    imperfection_set: str | None = _option(
+        "--imperfections --truth-model",
+        "how far the telescope is from the drawing (default: usual)",
+        choices=list(SETS),
+    )
+    optical_gain: tuple[float, float] | None = _option(
+        "--optical-gain LOW,HIGH",
+        "of the first and the last mode; linear plant only",
+        read.gain_range,
+    )
+    unevenness: float | None = _option(
+        "--unevenness RATIO", "largest departure of the light from its mean", within(0.0, 0.9)
+    )
+    position_error: float | None = _option(
+        "--position-error PITCHES", "RMS error of actuator positions per axis", within(0.0, 0.3)
+    )
+    distortion_subap: float | None = _option(
+        "--distortion SUBAP", "radial distortion of the pupil image at its edge", within(-2.0, 2.0)
+    )
+    anamorphosis: float | None = _option(
+        "--anamorphosis RATIO", "stretch of the pupil image along x", within(-0.1, 0.1)
+    )
+    modulation_error: float | None = _option(
+        "--modulation-error RATIO",
+        "true modulation over the nominal one, less 1",
+        within(-0.5, 1.0),
+    )
+    slope_rotation_deg: float | None = _option(
+        "--slope-rotation DEG", "turn of the slope axes, +x towards +y", within(-45.0, 45.0)
+    )
+    ncpa_nm: float | None = _option(
+        "--ncpa NM", "static wavefront only the sensor sees, RMS", within(0.0, 300.0)
+    )
+    bad_pixels: int | None = _option(
+        "--bad-pixels N",
+        "dead pixels: dark, and their subapertures read slopes of 0",
+        count(0, 100),
+    )
+    frame_rate_hz: float = _option("--rate HZ", "frame rate", within(10.0, 4000.0), default=1000.0)
+    given_gain: float | None = _option(
+        "--gain G",
+        "integrator gain of every controlled mode (default: 0.4; by day 0.2)",
+        within(0.0, 2.0),
+    )
+    group_gains: tuple[float, float, float] | None = _option(
+        "--gains TIP_TILT,TO_100,REST",
+        "gains by group of modes, instead of --gain",
+        read.group_gains,
+    )
+    gain_ramp_s: float | None = _option(
+        "--gain-ramp S",
+        "at the start raise the gain of tip and tilt, of the modes to 100, and of the rest in "
+        "turn, S seconds a step (default: 1), and keep those of least residual slopes; later "
+        "the service may ask for another",
+        within(0.05, 60.0),
+        nargs="?",
+        const=1.0,
+    )
+    leak: float = _option(
+        "--leak L", "share of the command kept from frame to frame", within(0.0, 1.0), default=0.999
+    )
+    delay_frames: int = _option(
+        "--delay FRAMES", "from an exposure to the command that answers it", count(1, 10), default=2
+    )
+    n_controlled: int = _option(
+        "--n-controlled N", "modes in the loop at the start", count(1), default=400
+    )
+    influence_cube: str | None = _option(
+        "--influence FILE:/DATASET",
+        "influence functions (n_actuators, ny, nx) in HDF5, instead of the plant's own",
+        read.dataset,
+    )
+    influence_pitch_m: float | None = _option(
+        "--influence-pitch M",
+        "distance of their points in the pupil (default: the dataset's attribute pitch_m)",
+        within(1e-5, 10.0),
+    )
+    rise_ms: float = _option(
+        "--rise-ms MS",
+        "time of the mirror from 10 to 90 %% of a step; FLAO's takes 0.7 (default: at once)",
+        within(0.0, 100.0),
+        default=0.0,
+    )
+    actuator_stroke_um: float = _option(
+        "--actuator-stroke UM",
+        "largest OPD of one actuator either way (default: %(default)g um)",
+        within(0.1, 1000.0),
+        default=MirrorLimits().stroke_m / _MICROMETRE,
+    )
+    actuator_bend_um: float = _option(
+        "--actuator-bend UM",
+        "largest OPD between an actuator and its neighbours' mean (default: %(default)g um)",
+        within(0.1, 1000.0),
+        default=MirrorLimits().bend_m / _MICROMETRE,
+    )
+    dead_actuators: tuple[int, ...] = _option(
+        "--dead-actuators N,N...",
+        "actuators that are switched off and follow their neighbours",
+        read.indices,
+    )
+    stuck_actuators: tuple[tuple[int, float], ...] = _many(
+        "--stuck-actuators N:METRES", "an actuator that stays at this OPD", read.stuck_actuator
+    )
+    read_noise_electrons: float = _option(
+        "--read-noise E",
+        "electrons RMS per pixel",
+        within(0.0, 1000.0),
+        default=Camera().read_noise_electrons,
+    )
+    excess_noise: float = _option(
+        "--excess-noise F2",
+        "variance of the photon noise over Poisson's, 2 for an EMCCD",
+        within(1.0, 4.0),
+        default=1.0,
+    )
+    preset: str | None = _option(
+        "--preset",
+        "frame rate, binning and modes that FLAO would choose for this magnitude; overrides "
+        "--rate and --n-controlled; binning needs the diffractive plant",
+        choices=["flao"],
+    )
+    connect: str = _option(
+        "--connect ENDPOINT",
+        "zenoh endpoint of the service (default: %(default)s); may come up later",
+        read.endpoint,
+        default="tcp/127.0.0.1:7447",
+    )
+    seconds: float | None = _option(
+        "--seconds S", "stop after this much loop time", within(0.01, 1e7)
+    )
+    given_speed: float | None = _option(
+        "--speed X",
+        "loop time over wall-clock time, 0: as fast as it goes (default: 1; diffractive: 0)",
+        within(0.0, 100.0),
+    )
+    snapshot: Path | None = _option(
+        "--snapshot FILE",
+        "close the loop for 300 frames without a service, write a contact sheet of pupil "
+        "images, slopes and residual wavefront, and end (needs the extra 'plots')",
+        Path,
+    )
+    quiet: bool = _option("--quiet", "say only what is wrong", action="store_true")
+    faults: tuple[Fault, ...] = _many(
+        "--fault KIND@T[:ARGS]",
+        "something goes wrong at T seconds, by one of the kinds below",
+        read_fault,
+    )
+    record: Path | None = _option(
+        "--record FILE", "write all that is sent to this new HDF5 file", Path
+    )
+    replay: Path | None = _option("--replay FILE", "play a recording instead of a telescope", Path)
+    binning: int = 1
+    """Detector pixels per side of a subaperture, in pixels of the finest one: the preset's."""
 
-    instrument: str
-    """Name of a packaged instrument, or path of an instrument file."""
+    @property
+    def _by_day(self) -> bool:
+        return self.scene_kind == SceneKind.DAYTIME
 
-    alpha: Misregistration | None
-    """True registration at the start; None: drawn at random."""
+    @property
+    def magnitude(self) -> float:
+        """Of the star, or of the fibre."""
+        usual = 7.0 if self._by_day else 8.0
+        return usual if self.given_magnitude is None else self.given_magnitude
 
-    magnitude: float
-    seed: int | None
-    """Of everything random; None: different every time."""
+    @property
+    def gain(self) -> float:
+        """Of every mode; by day, when a command counts twice, half of it makes the same loop."""
+        usual = 0.2 if self._by_day else 0.4
+        return usual if self.given_gain is None else self.given_gain
 
-    sky: SceneOptions
-    """Scene, turbulence, vibrations, imperfections, ways the registration moves."""
+    @property
+    def speed(self) -> float:
+        """Loop time over wall-clock time; a diffractive telescope takes the time it needs."""
+        usual = 1.0 if self.plant == "linear" else 0.0
+        return usual if self.given_speed is None else self.given_speed
 
-    outer_scale_m: float
-    gain: float
-    group_gains: tuple[float, float, float] | None
-    """Of tip and tilt, the modes to 100, the rest; None: ``gain`` for all."""
+    @property
+    def truth(self) -> Path | None:
+        """File of the truth."""
+        files = [given for given in self.truths if isinstance(given, Path)]
+        if len(files) > 1:
+            raise ConfigurationError(f"--truth: found {len(files)} files; expected one")
+        return files[0] if files else None
 
-    gain_ramp_s: float | None
-    """Seconds at each gain of a ramp at the start; None: no ramp."""
+    @property
+    def scene(self) -> Scene:
+        """What is looked at, and through what."""
+        return Scene(kind=SceneKind(self.scene_kind), spiders=self.spiders)
 
-    leak: float
-    delay_frames: int
-    n_controlled: int
-    frame_rate_hz: float
-    plant: str
-    devices: DeviceOptions
-    """Mirror and detector."""
+    @property
+    def elevation(self) -> Elevation:
+        """Of the telescope over the run."""
+        return replace(self.pointing, slews=self.slews)
 
-    truth: Path | None
-    jumps: tuple[Jump, ...]
-    drift: Drift
-    seconds: float | None
-    """Loop time after which to stop; None: never."""
+    @property
+    def seeing(self) -> SeeingSchedule:
+        """The seeing at any time."""
+        return SeeingSchedule(start_arcsec=self.seeing_arcsec, later=self.later_seeing)
 
-    speed: float
-    """Loop time over wall-clock time; 0: as fast as it goes."""
+    @property
+    def layers(self) -> tuple[Layer, ...]:
+        """Of the turbulence."""
+        if self.wind and self.profile is not None:
+            raise ConfigurationError("--profile: found beside --wind; expected one of them")
+        if len(self.wind) > _MOST_LAYERS:
+            raise ConfigurationError(
+                f"--wind: found {len(self.wind)} layers; expected at most {_MOST_LAYERS}"
+            )
+        return self.wind or PROFILES[self.profile or "single"]
 
-    rehearsal: RehearsalOptions
-    """Recording, replay, faults."""
+    @property
+    def vibrations(self) -> tuple[VibrationLine, ...]:
+        """Lines of tip, tilt and focus."""
+        usual = DAYTIME_LINES if self._by_day and not self.given_vibrations else ()
+        lines = tuple(line for line in (*usual, *self.given_vibrations) if line is not None)
+        for line in lines:
+            if line.frequency_hz >= self.frame_rate_hz / 2:
+                raise ConfigurationError(
+                    f"--vibration: found {line.frequency_hz:g} Hz; expected less than half the "
+                    f"frame rate of {self.frame_rate_hz:g} Hz"
+                )
+        return lines
 
-    snapshot: Path | None
-    """Picture to write instead of running the loop for a service."""
+    @property
+    def imperfections(self) -> Imperfections:
+        """A set of them, and those that were given one by one."""
+        named = {given for given in self.truths if isinstance(given, str)}
+        if self.imperfection_set is not None:
+            named.add(self.imperfection_set)
+        if len(named) > 1:
+            sets = " and ".join(sorted(named))
+            raise ConfigurationError(f"--imperfections: found {sets}; expected one set")
+        changes: dict[str, Any] = {
+            one.name: given
+            for one in fields(Imperfections)
+            if (given := getattr(self, one.name, None)) is not None
+        }
+        if self.optical_gain is not None:
+            if self.plant != "linear":
+                raise ConfigurationError(
+                    f"--optical-gain: found --plant {self.plant}, whose own light decides it; "
+                    "expected --plant linear"
+                )
+            changes["lowest_optical_gain"], changes["highest_optical_gain"] = self.optical_gain
+        return replace(SETS[named.pop() if named else "usual"], **changes)
 
-    quiet: bool
+    @property
+    def influence(self) -> InfluenceFile | None:
+        """Measured influence functions; None: those of the plant."""
+        if self.influence_cube is not None:
+            return InfluenceFile(reference=self.influence_cube, pitch_m=self.influence_pitch_m)
+        if self.influence_pitch_m is not None:
+            raise ConfigurationError(
+                "--influence-pitch: found alone; expected --influence beside it"
+            )
+        return None
+
+    @property
+    def mirror_faults(self) -> MirrorFaults:
+        """Actuators that do not obey."""
+        return MirrorFaults(dead=self.dead_actuators, stuck=self.stuck_actuators)
+
+    @property
+    def mirror_limits(self) -> MirrorLimits:
+        """How far and how sharply the mirror may be bent."""
+        return MirrorLimits(
+            stroke_m=self.actuator_stroke_um * _MICROMETRE,
+            bend_m=self.actuator_bend_um * _MICROMETRE,
+        )
+
+    @property
+    def needs_drive(self) -> bool:
+        """Whether a linear plant, too, must follow its mirror's movements one by one."""
+        return self.rise_ms > 0.0 or self.mirror_limits != MirrorLimits()
+
+    @property
+    def camera(self) -> Camera:
+        """The noise of the detector."""
+        return Camera(
+            read_noise_electrons=self.read_noise_electrons, excess_noise=self.excess_noise
+        )
+
+    def complete(self) -> Options:
+        """Return the options with what a preset chooses.
+
+        Raises
+        ------
+        ConfigurationError
+            If they are not possible together: one line that names the option.
+        """
+        if self.replay is not None and (self.record is not None or self.faults):
+            raise ConfigurationError(
+                "--replay: plays a file as it is; found --record or --fault too"
+            )
+        chosen = self
+        if self.preset is not None:
+            preset = preset_for(self.magnitude)
+            chosen = replace(
+                self,
+                frame_rate_hz=preset.frame_rate_hz,
+                n_controlled=preset.n_controlled,
+                binning=preset.binning,
+            )
+        for name, value in vars(Options).items():
+            if isinstance(value, property):
+                getattr(chosen, name)
+        return chosen
+
+
+_CHAPTERS = {
+    "instrument": "instrument and truth",
+    "scene_kind": "scene: star and sky, or fibre",
+    "imperfection_set": "imperfections",
+    "frame_rate_hz": "loop",
+    "influence_cube": "mirror",
+    "read_noise_electrons": "detector",
+    "connect": "run",
+    "faults": "rehearsal: recording, replay, faults",
+}
+"""Chapters of ``--help``, each by its first option."""
+
+_NOT_GIVEN: dict[str, object] = {
+    "drift": Drift(),
+    "flexure": Flexure(),
+    "walk": Walk(),
+    "pointing": Elevation(),
+    "dead_actuators": (),
+}
+"""What stands for an option that was not given, unless None, or nothing where there may be many."""
 
 
 def parse_options(given: Sequence[str] | None = None) -> Options:
     """Return the options; an impossible one ends the program with one line and status 2."""
-    parser = _parser()
-    found = parser.parse_args(_joined(sys.argv[1:] if given is None else given))
+    parser = manual.Parser()
+    options = [one for one in fields(Options) if one.metadata]
+    group: argparse._ActionsContainer = parser
+    for one in options:
+        if one.name in _CHAPTERS:
+            group = parser.add_argument_group(_CHAPTERS[one.name])
+        group.add_argument(*one.metadata["flags"], dest=one.name, **one.metadata["argparse"])
+    found = vars(parser.parse_args(_joined(sys.argv[1:] if given is None else given)))
+    for one in options:
+        if one.metadata["argparse"].get("action") == "append":
+            found[one.name] = tuple(found[one.name] or ())
+        elif found[one.name] is None:
+            found[one.name] = _NOT_GIVEN.get(one.name)
     try:
-        apply_scene(found)
-        apply_preset(found)
-        sky = scene_options(found)
-        devices = device_options(found)
-        rehearsal = rehearsal_options(found)
+        return Options(**found).complete()
     except ConfigurationError as error:
         parser.error(str(error))
-    return Options(
-        connect=found.connect,
-        instrument=found.instrument,
-        alpha=found.alpha,
-        magnitude=found.mag,
-        seed=found.seed,
-        sky=sky,
-        outer_scale_m=found.outer_scale,
-        gain=found.gain,
-        group_gains=found.gains,
-        gain_ramp_s=found.gain_ramp,
-        leak=found.leak,
-        delay_frames=found.delay,
-        n_controlled=found.n_controlled,
-        frame_rate_hz=found.rate,
-        plant=found.plant,
-        devices=devices,
-        truth=sky.truth,
-        jumps=tuple(found.jump or ()),
-        drift=found.drift,
-        seconds=found.seconds,
-        speed=_USUAL_SPEED[found.plant] if found.speed is None else found.speed,
-        rehearsal=rehearsal,
-        snapshot=found.snapshot,
-        quiet=found.quiet,
-    )
 
 
 def _joined(given: Sequence[str]) -> list[str]:
@@ -140,199 +494,6 @@ def _joined(given: Sequence[str]) -> list[str]:
         else:
             joined.append(argument)
     return joined
-
-
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage that would push it off the screen."""
-
-    @override
-    def error(self, message: str) -> NoReturn:
-        """End the program with status 2."""
-        self.exit(2, f"{self.prog}: {message}\n")
-
-
-class _ManualFormatter(argparse.RawDescriptionHelpFormatter):
-    """As wide as the rest of the manual, whatever the terminal."""
-
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=34, width=100)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="sim_rtc",
-        usage=USAGE,
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=_ManualFormatter,
-        allow_abbrev=False,
-    )
-    _add_instrument(parser.add_argument_group("instrument and truth"))
-    _add_sky(parser.add_argument_group("scene: star and sky, or fibre"))
-    add_imperfections(parser.add_argument_group("imperfections"))
-    _add_loop(parser.add_argument_group("loop"))
-    add_devices(parser)
-    _add_run(parser.add_argument_group("run"))
-    add_rehearsal(parser.add_argument_group("rehearsal: recording, replay, faults"))
-    return parser
-
-
-def _add_instrument(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--instrument",
-        default="flao-lbt",
-        metavar="NAME|FILE",
-        help="packaged instrument or instrument file (default: %(default)s)",
-    )
-    group.add_argument(
-        "--plant",
-        choices=["linear", "diffractive"],
-        default="linear",
-        help="model of the telescope (default: %(default)s)",
-    )
-    group.add_argument(
-        "--alpha",
-        type=arguments.alpha,
-        metavar="X,Y,ROT_DEG,MAG",
-        help="true registration (default: at random, |shift| <= 0.2, 0.3 deg, 0.5 %%)",
-    )
-    group.add_argument(
-        "--jump",
-        type=arguments.jump,
-        action="append",
-        metavar="T:DX,DY,DROT_DEG,DMAG",
-        help="sudden change of the registration at T seconds; may be repeated",
-    )
-    group.add_argument(
-        "--drift",
-        type=arguments.drift,
-        default=Drift(),
-        metavar="DX,DY,DROT_DEG,DMAG",
-        help="steady change of the registration, per minute",
-    )
-    add_motion(group)
-    group.add_argument(
-        "--truth",
-        type=arguments.truth,
-        action="append",
-        metavar="FILE",
-        help="write the truth there (never on the wire)",
-    )
-
-
-def _add_sky(group: argparse._ArgumentGroup) -> None:
-    add_scene(group)
-    group.add_argument(
-        "--mag",
-        type=arguments.within(-5.0, 20.0),
-        metavar="R",
-        help="magnitude of the guide star, or of the fibre (default: 8; by day 7)",
-    )
-    group.add_argument(
-        "--seeing",
-        type=arguments.within(0.05, 5.0),
-        default=1.0,
-        metavar="ARCSEC",
-        help="seeing at 500 nm; by day, of what is played (default: %(default)s)",
-    )
-    group.add_argument(
-        "--outer-scale",
-        type=arguments.within(1.0, 1000.0),
-        default=25.0,
-        metavar="M",
-        help="outer scale of the turbulence (default: %(default)s)",
-    )
-    group.add_argument(
-        "--wind",
-        type=arguments.layer,
-        action="append",
-        metavar="SPEED,DIR_DEG[,SHARE]",
-        help="a layer: m/s, direction it moves to, share; up to 3, instead of a profile",
-    )
-    group.add_argument("--seed", type=arguments.count(0), metavar="N", help="of everything random")
-
-
-def _add_loop(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--rate",
-        type=arguments.within(10.0, 4000.0),
-        default=1000.0,
-        metavar="HZ",
-        help="frame rate (default: %(default)s)",
-    )
-    group.add_argument(
-        "--gain",
-        type=arguments.within(0.0, 2.0),
-        metavar="G",
-        help="integrator gain of every controlled mode (default: 0.4; by day 0.2)",
-    )
-    group.add_argument(
-        "--gains",
-        type=arguments.group_gains,
-        metavar="TIP_TILT,TO_100,REST",
-        help="gains by group of modes, instead of --gain",
-    )
-    group.add_argument(
-        "--gain-ramp",
-        type=arguments.within(0.05, 60.0),
-        nargs="?",
-        const=1.0,
-        metavar="S",
-        help="at the start raise the gain of tip and tilt, of the modes to 100, and of the rest in "
-        "turn, S seconds a step (default: 1), and keep those of least residual slopes; later the "
-        "service may ask for another",
-    )
-    group.add_argument(
-        "--leak",
-        type=arguments.within(0.0, 1.0),
-        default=0.999,
-        metavar="L",
-        help="share of the command kept from frame to frame (default: %(default)s)",
-    )
-    group.add_argument(
-        "--delay",
-        type=arguments.count(1, 10),
-        default=2,
-        metavar="FRAMES",
-        help="from an exposure to the command that answers it (default: %(default)s)",
-    )
-    group.add_argument(
-        "--n-controlled",
-        type=arguments.count(1),
-        default=400,
-        metavar="N",
-        help="modes in the loop at the start (default: %(default)s)",
-    )
-
-
-def _add_run(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--connect",
-        type=arguments.endpoint,
-        default="tcp/127.0.0.1:7447",
-        metavar="ENDPOINT",
-        help="zenoh endpoint of the service (default: %(default)s); may come up later",
-    )
-    group.add_argument(
-        "--seconds",
-        type=arguments.within(0.01, 1e7),
-        metavar="S",
-        help="stop after this much loop time",
-    )
-    group.add_argument(
-        "--speed",
-        type=arguments.within(0.0, 100.0),
-        metavar="X",
-        help="loop time over wall-clock time, 0: as fast as it goes (default: 1; diffractive: 0)",
-    )
-    group.add_argument(
-        "--snapshot",
-        type=Path,
-        metavar="FILE",
-        help="close the loop for 300 frames without a service, write a contact sheet of pupil "
-        "images, slopes and residual wavefront, and end (needs the extra 'plots')",
-    )
-    group.add_argument("--quiet", action="store_true", help="say only what is wrong")
 
 
 if __name__ == "__main__":  # whether options make sense, for who would start the simulator later

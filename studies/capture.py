@@ -28,7 +28,7 @@ from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pyramid import Mapper
 from service.model.slopes import Orientation, SlopeOrder
-from sim_rtc.imperfections import SETS
+from sim_rtc.telescope.imperfections import SETS
 from studies.fit_coverage import FIRST_SEED, N_MODES, measured
 
 RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])

@@ -25,8 +25,8 @@ from service.control.reconstructor import Method, Prior, Recipe, reconstruct
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
-from sim_rtc.feed import BATCH_FRAMES
-from sim_rtc.loop import ModalLoop
+from sim_rtc.computer.feed import BATCH_FRAMES
+from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from studies.registered import (
     N_MEASURED,
     PASSES,
@@ -117,7 +117,7 @@ def wavefront_error_nm(matrix: Array32, dome: Dome) -> float:
     gains = np.full(len(matrix), dome.gain, dtype=np.float32)
     power: list[float] = []
     for block in telescope.feed.blocks():
-        terms = block.optics.terms(matrix, gains, 1.0)
+        terms = LoopTerms.of(block.optics, matrix, gains, 1.0)
         for row in range(0, block.n_frames, BATCH_FRAMES):
             commands = block.run(row, loop, terms, None).commands_m
             # every second frame: the residual changes little from one to the next

@@ -28,8 +28,8 @@ from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.telemetry.frames import FrameBlock
 from service.telemetry.health import Actuators, EdgeHealth, edge_watch, observe_edge
 from sim_rtc.assembly import build_telescope
-from sim_rtc.feed import BATCH_FRAMES
-from sim_rtc.loop import ModalLoop
+from sim_rtc.computer.feed import BATCH_FRAMES
+from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.options import parse_options
 
 CASES = (
@@ -130,7 +130,7 @@ def run(case: Case, given: argparse.Namespace, instrument: Instrument) -> Outcom
     ratios: list[float] = []
     slips: list[bool] = []
     for block in telescope.feed.blocks():
-        terms = block.optics.terms(telescope.reconstructor.matrix, gains, case.leak)
+        terms = LoopTerms.of(block.optics, telescope.reconstructor.matrix, gains, case.leak)
         for row in range(0, block.n_frames, BATCH_FRAMES):
             rows = block.run(row, loop, terms, None)
             health = observe_edge(health, _frames(len(errors), rows.slopes, rows.commands_m), watch)

@@ -31,12 +31,11 @@ from service.model.interaction import reference_slopes
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import Basis, ModalBasis, karhunen_loeve_basis
 from service.model.pyramid import Mapper
-from sim_rtc.detector import Camera
-from sim_rtc.diffractive_plant import DiffractivePlant
-from sim_rtc.imperfections import SETS
-from sim_rtc.pixels import PixelDetector
-from sim_rtc.scene import Scene, SceneKind
-from sim_rtc.schedule import random_registration
+from sim_rtc.telescope.detector import Camera, PixelDetector
+from sim_rtc.telescope.diffractive import DiffractivePlant
+from sim_rtc.telescope.imperfections import SETS
+from sim_rtc.telescope.registration import random_registration
+from sim_rtc.telescope.scene import Scene, SceneKind
 
 N_MODES = 400
 STROKE_M = 10e-9
@@ -83,7 +82,7 @@ def measured(
         slopes = []
         for stroke in (STROKE_M, -STROKE_M):
             opd = stroke * optics.opd_per_command[:, mode] + optics.static_opd_m
-            light = optics.sensor.images(opd) / np.float32(optics.at_rest.light)
+            light = optics.sensor.images(opd) / np.float32(optics.light_at_rest)
             slopes.append(reference_slopes(detector.read(light, noise_rng), plant.valid)[0])
         column = (slopes[0] - slopes[1]) / (2.0 * STROKE_M)
         columns.append(optics.errors.applied(column.astype(np.float32)))

@@ -31,7 +31,7 @@ from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Normalisation, SlopeRecipe
 from service.model.windows import frame_windows, slopes_from_frames, slopes_per_unit
-from sim_rtc.diffractive import DiffractivePyramid, centred_pupil
+from sim_rtc.telescope.diffractive import DiffractivePyramid, centred_pupil
 
 Array = NDArray[np.float64]
 

@@ -19,10 +19,10 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.wire import MeasureRequest, Pattern
 from sim_rtc.assembly import build_telescope
-from sim_rtc.computer import RealTimeComputer
-from sim_rtc.measure import Circumstances, product
+from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.measure import Circumstances, product
 from sim_rtc.options import parse_options
-from sim_rtc.plant import Optics
+from sim_rtc.telescope.linear import LinearOptics
 
 N_MODES = 400
 STROKE_M = 20e-9
@@ -118,7 +118,7 @@ def main() -> int:
         computer = telescope.computer(iter(telescope.feed.blocks()))
         computer.prepare()
         optics = telescope.optics.at(0.0)
-        if not isinstance(optics, Optics):
+        if not isinstance(optics, LinearOptics):
             raise TypeError("the study needs the linear plant: only there is a true matrix")
         truth = optics.slopes_per_command.astype(np.float64)
         sys.stdout.write(f"magnitude {given.mag:g}, {given.scene}; RMS of D {truth.std():.3g} /m\n")

@@ -19,8 +19,8 @@ from service.config import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.model.modes import karhunen_loeve_basis
-from sim_rtc.plant import LinearPlant
-from sim_rtc.schedule import random_registration
+from sim_rtc.telescope.linear import LinearPlant
+from sim_rtc.telescope.registration import random_registration
 
 MODES = (509, 527, 545, 563)
 N_STEPS = 3

@@ -36,8 +36,8 @@ from service.tracking.products import NoisyRecord, NoisyState
 from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.computer import RealTimeComputer
-from sim_rtc.feed import Ahead
+from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.feed import Ahead
 from sim_rtc.options import parse_options
 from sim_rtc.truth import WavefrontError
 from studies.campaign.telemetry import blocks_of

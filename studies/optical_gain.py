@@ -20,10 +20,10 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.diffractive_plant import DiffractiveOptics
-from sim_rtc.feed import BATCH_FRAMES
-from sim_rtc.loop import ModalLoop
+from sim_rtc.computer.feed import BATCH_FRAMES
+from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.options import Options, parse_options
+from sim_rtc.telescope.diffractive import DiffractiveOptics
 
 Array32 = NDArray[np.float32]
 
@@ -59,7 +59,9 @@ def closed_loop(telescope: Telescope, gains: Array32, n_frames: int) -> Run:
     loop = ModalLoop(n_modes=len(telescope.settings.gains), delay_frames=2, stroke_m=1e-5)
     turbulence, residual = [], []
     for block in telescope.feed.blocks():
-        terms = block.optics.terms(telescope.reconstructor.matrix, gains, telescope.settings.leak)
+        terms = LoopTerms.of(
+            block.optics, telescope.reconstructor.matrix, gains, telescope.settings.leak
+        )
         for row in range(0, block.n_frames, BATCH_FRAMES):
             commands = block.run(row, loop, terms, None).commands_m
             for k, command in enumerate(commands):

@@ -18,9 +18,9 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.wire import MeasureRequest, Pattern
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.diffractive_plant import DiffractiveOptics
-from sim_rtc.measure import Circumstances, product
+from sim_rtc.computer.measure import Circumstances, product
 from sim_rtc.options import parse_options
+from sim_rtc.telescope.diffractive import DiffractiveOptics
 
 Array = NDArray[Any]
 

@@ -25,10 +25,10 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.atmosphere import fried_parameter_m
-from sim_rtc.feed import BATCH_FRAMES
-from sim_rtc.loop import ModalLoop
+from sim_rtc.computer.feed import BATCH_FRAMES
+from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.options import parse_options
+from sim_rtc.telescope.atmosphere import fried_parameter_m
 
 Array32 = NDArray[np.float32]
 
@@ -89,7 +89,7 @@ def wavefront_errors_nm(
     power: list[list[float]] = [[] for _ in matrices]
     n_frames = 0
     for block in telescope.feed.blocks():
-        terms = [block.optics.terms(matrix, gains, given.leak) for matrix in matrices]
+        terms = [LoopTerms.of(block.optics, matrix, gains, given.leak) for matrix in matrices]
         for row in range(0, block.n_frames, BATCH_FRAMES):
             incoming = None
             for one, (loop, term) in enumerate(zip(loops, terms, strict=True)):

@@ -24,7 +24,7 @@ from service.telemetry.random_dither import Correlated, RandomEstimate
 from service.telemetry.windows import WindowRefused
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.feed import Ahead
+from sim_rtc.computer.feed import Ahead
 from sim_rtc.options import parse_options
 from sim_rtc.truth import WavefrontError
 from studies.campaign.plan import Estimator, Night

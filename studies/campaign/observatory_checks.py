@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from service.control.gate import GateVerdict, pole_radius
 from service.model.misregistration import Misregistration
-from sim_rtc.diffractive_plant import DiffractiveOptics
-from sim_rtc.plant import Optics, TelescopeOptics
-from sim_rtc.telemetry import Snapshot
+from sim_rtc.computer.telemetry import Snapshot
+from sim_rtc.telescope.diffractive import DiffractiveOptics
+from sim_rtc.telescope.linear import LinearOptics
+from sim_rtc.telescope.plant import Optics
 from studies.campaign.observatory_dome import Moment
 
 WATCHED_S = 20.0
@@ -109,9 +110,7 @@ def published(swap: Swap, moments: Sequence[Moment], until_s: float) -> Publicat
     )
 
 
-def true_radius(
-    reconstructor: NDArray[np.float32], optics: TelescopeOptics, rtc: Snapshot
-) -> float:
+def true_radius(reconstructor: NDArray[np.float32], optics: Optics, rtc: Snapshot) -> float:
     """Return the largest pole radius of the loop of these optics, its gains and this matrix."""
     n_modes = len(reconstructor)
     coupling = reconstructor @ _response(optics, n_modes)
@@ -122,9 +121,9 @@ def true_radius(
     return float(radii.max())
 
 
-def _response(optics: TelescopeOptics, n_modes: int) -> NDArray[np.float32]:
+def _response(optics: Optics, n_modes: int) -> NDArray[np.float32]:
     """Return the true interaction matrix ``(n_slopes, n_modes)``: known, or pushed and pulled."""
-    if isinstance(optics, Optics):
+    if isinstance(optics, LinearOptics):
         return optics.slopes_per_command[:, :n_modes]
     if not isinstance(optics, DiffractiveOptics):
         raise TypeError(f"poles: found {type(optics).__name__}; expected a simulated telescope")

@@ -17,13 +17,10 @@ from service.model.misregistration import Misregistration
 from service.telemetry.frames import FrameBlock
 from service.wire import Command, Reply, Status, decode_status, encode_status
 from sim_rtc.assembly import build_telescope
-from sim_rtc.clock import FrameClock
-from sim_rtc.feed import BATCH_FRAMES
-from sim_rtc.messages import status_of
+from sim_rtc.computer.feed import BATCH_FRAMES
+from sim_rtc.computer.telemetry import Batch, FrameClock, Reconstructor, status_of
 from sim_rtc.options import parse_options
-from sim_rtc.plant import TelescopeOptics
-from sim_rtc.reconstructors import Reconstructor
-from sim_rtc.telemetry import Batch
+from sim_rtc.telescope.plant import Optics
 from sim_rtc.truth import WavefrontError
 
 START_NS = 1_800_000_000_000_000_000
@@ -101,7 +98,7 @@ class Dome:
         self._clock = FrameClock(start_ns_utc=START_NS, dt_ns=self._dt_ns)
         self._error = WavefrontError(self.telescope.weights)
         self._block_batches = block_batches
-        self._optics: TelescopeOptics = self.telescope.optics.at(0.0)
+        self._optics: Optics = self.telescope.optics.at(0.0)
 
     @property
     def now_ns(self) -> int:
@@ -114,7 +111,7 @@ class Dome:
         return self.frame / self.rate_hz
 
     @property
-    def optics(self) -> TelescopeOptics:
+    def optics(self) -> Optics:
         """The true optics, as of the last frame."""
         return self._optics
 

@@ -16,7 +16,7 @@ from service.errors import PyrcalError, UnknownIdError, WorkerError
 from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
 from service.worker import Done, OpticsWorker
-from sim_rtc.reconstructors import Outcome, Staging, Verdict
+from sim_rtc.computer.reconstructors import Outcome, Staging, Verdict
 from studies.campaign.observatory_dome import Dome
 
 P = ParamSpec("P")

@@ -27,7 +27,7 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import analytic_basis
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.feed import Ahead
+from sim_rtc.computer.feed import Ahead
 from sim_rtc.options import parse_options
 from studies.campaign.passive_table import table
 from studies.campaign.passive_watch import PassiveNight, Watch

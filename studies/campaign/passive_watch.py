@@ -29,7 +29,7 @@ from service.telemetry.windows import WindowRefused
 from service.wire import DitherAction, DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope
-from sim_rtc.computer import RealTimeComputer
+from sim_rtc.computer.computer import RealTimeComputer
 from studies.campaign.night import loop_of
 from studies.campaign.telemetry import LINE_FRACTIONS, SETTLING_S, blocks_of
 

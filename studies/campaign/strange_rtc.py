@@ -27,7 +27,8 @@ from service.wire import (
     Status,
     layout_of,
 )
-from sim_rtc.reconstructors import Reconstructor, Verdict
+from sim_rtc.computer.reconstructors import Verdict
+from sim_rtc.computer.telemetry import Reconstructor
 from studies.campaign.observatory_dome import Dome
 from studies.campaign.observatory_link import ShortLink
 

@@ -17,8 +17,8 @@ from service.telemetry.random_dither import Correlated, RandomDither, RandomPlan
 from service.telemetry.windows import WindowRefused
 from service.wire import DitherAction, DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
-from sim_rtc.computer import RealTimeComputer
-from sim_rtc.telemetry import Batch
+from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.telemetry import Batch
 from sim_rtc.truth import WavefrontError
 from studies.campaign.plan import Estimator, Night
 from studies.campaign.trouble import strike, told, troubled

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from service.fit.reference import Reference
 from service.model.misregistration import Misregistration
-from sim_rtc.feed import BATCH_FRAMES
-from sim_rtc.readback import Regression
-from sim_rtc.strokes import PushPull, frames_per_shape, modal
+from sim_rtc.computer.feed import BATCH_FRAMES
+from sim_rtc.computer.strokes import PushPull, Regression, frames_per_shape, modal
 from studies.heritier2018 import telescope
 from studies.heritier2018.store import Record, Store, Task
 from studies.heritier2018.telescope import Occasion

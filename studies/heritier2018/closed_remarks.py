@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_rtc.vibration import DAYTIME_LINES
+from sim_rtc.telescope.sky import DAYTIME_LINES
 from studies.heritier2018 import page, paper
 
 Array = NDArray[np.float64]

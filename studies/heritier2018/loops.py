@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 
 from service.model.misregistration import Misregistration
-from sim_rtc.diffractive_plant import DiffractiveOptics
-from sim_rtc.feed import BATCH_FRAMES
-from sim_rtc.loop import ModalLoop
-from sim_rtc.phases import PhaseBlock
+from sim_rtc.computer.feed import BATCH_FRAMES, PhaseBlock
+from sim_rtc.computer.loop import LoopTerms, ModalLoop
+from sim_rtc.telescope.diffractive import DiffractiveOptics
 from studies.heritier2018 import telescope
 from studies.heritier2018.calibration import FRAME_COST_S
 from studies.heritier2018.psf import Camera
@@ -94,7 +93,9 @@ class LoopRun:
         """Return each batch's first residual ``(n, n_points)``, and clipped commands."""
         n_basis = block.optics.opd_per_command.shape[1]
         loop = ModalLoop(n_modes=n_basis, delay_frames=DELAY_FRAMES, stroke_m=STROKE_M)
-        terms = block.optics.terms(matrix, np.full(len(matrix), self.gain, np.float32), LEAK)
+        terms = LoopTerms.of(
+            block.optics, matrix, np.full(len(matrix), self.gain, np.float32), LEAK
+        )
         residual, n_clipped = [], 0
         for row in range(0, self.n_frames_run, BATCH_FRAMES):
             result = block.run(row, loop, terms, None)

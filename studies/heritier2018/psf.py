@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fft2, fftshift, next_fast_len
 
-from sim_rtc.diffractive_plant import DiffractivePlant
+from sim_rtc.telescope.diffractive import DiffractivePlant
 
 Array = NDArray[np.float64]
 

@@ -16,12 +16,11 @@ from service.config import load_instrument
 from service.model.instrument import Instrument, Mirror
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from sim_rtc.detector import Detector
-from sim_rtc.devices import build_plant, build_sky
-from sim_rtc.diffractive_plant import DiffractiveOptics, DiffractivePlant
+from sim_rtc.assembly import build_plant, build_sky
 from sim_rtc.options import Options, parse_options
-from sim_rtc.pixels import PixelDetector
-from sim_rtc.sky import Sky
+from sim_rtc.telescope.detector import Detector, PixelDetector
+from sim_rtc.telescope.diffractive import DiffractiveOptics, DiffractivePlant
+from sim_rtc.telescope.sky import Sky
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -158,7 +157,7 @@ def detector(occasion: Occasion, seen: DiffractiveOptics) -> Detector:
         valid=seen.valid,
         magnitude=options.magnitude,
         frame_rate_hz=options.frame_rate_hz,
-        camera=options.devices.camera,
+        camera=options.camera,
     )
 
 
@@ -166,7 +165,7 @@ def pixels(occasion: Occasion, seen: DiffractiveOptics) -> PixelDetector:
     """Return the detector itself."""
     return PixelDetector(
         electrons_per_light=detector(occasion, seen).electrons_per_frame,
-        camera=occasion.options().devices.camera,
+        camera=occasion.options().camera,
     )
 
 

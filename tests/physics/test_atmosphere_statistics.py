@@ -14,9 +14,8 @@ from scipy.signal import welch
 
 from service.model.instrument import KarhunenLoeve
 from service.model.turbulence import von_karman_covariance
-from sim_rtc.atmosphere import ExtrudedScreen, Layer
-from sim_rtc.flow import FrozenLayer
-from sim_rtc.shapes import FOCUS, TILT, TIP, low_orders
+from sim_rtc.telescope.atmosphere import ExtrudedScreen, FrozenLayer, Layer
+from sim_rtc.telescope.imperfections import FOCUS, TILT, TIP, low_orders
 
 TURBULENCE = KarhunenLoeve(r0_m=0.1, outer_scale_m=10.0)
 PITCH_M = 0.1

@@ -13,7 +13,7 @@ from service.model.interaction import (
 )
 from service.model.modes import karhunen_loeve_basis
 from service.model.pyramid import PyramidOptics
-from sim_rtc.diffractive import DiffractivePyramid, Quadrature, centred_pupil
+from sim_rtc.telescope.diffractive import DiffractivePyramid, Quadrature, centred_pupil
 from tests.physics.fft_pyramid import FftPyramid
 
 MODES = [0, 1, 2, 5, 12, 35, 110, 230, 400, 593]

@@ -19,7 +19,7 @@ from service.tracking.policy import Policy
 from service.tracking.state import Mode, TrackerState
 from service.wire import decode_manifest
 from service.worker import Compute, OpticsWorker
-from sim_rtc.record import Kind, Recording
+from sim_rtc.link.record import Kind, Recording
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
 

@@ -38,7 +38,7 @@ from service.wire import (
     layout_of,
     split,
 )
-from sim_rtc.session import client_config
+from sim_rtc.link.link import client_config
 from tests.system.cable import Cable
 from tests.system.pace import Deadline, patience
 

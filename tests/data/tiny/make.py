@@ -18,7 +18,7 @@ from service.model.interaction import valid_subapertures
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.slopes import Orientation, SlopeOrder, rtc_mask, to_rtc
-from sim_rtc.diffractive_plant import DiffractivePlant
+from sim_rtc.telescope.diffractive import DiffractivePlant
 
 HERE = Path(__file__).parent
 ALPHA = {

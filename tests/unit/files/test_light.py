@@ -14,7 +14,7 @@ from service.fit.options import FitOptions
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.slopes import Orientation
-from sim_rtc.diffractive_plant import DiffractivePlant
+from sim_rtc.telescope.diffractive import DiffractivePlant
 from tests.data.tiny.make import ALPHA, HERE, ORIENTATION, SEED
 from tests.unit.fit.lamps import beam, counts_of, flao, gaussian
 from tests.unit.fit.test_pupil_rotation import SHIFT, TRIPOD, arms, shaded, turned

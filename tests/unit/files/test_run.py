@@ -15,7 +15,7 @@ from service.model.instrument import FrameWindows
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.slopes import Orientation, SlopeRecipe
-from sim_rtc.diffractive_plant import DiffractivePlant
+from sim_rtc.telescope.diffractive import DiffractivePlant
 from tests.data.tiny.make import ALPHA, HERE, STROKE_M
 
 N_MODES = 20

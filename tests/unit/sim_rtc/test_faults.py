@@ -7,10 +7,16 @@ import pytest
 
 from service.errors import WireError
 from service.wire import FrameHeader, Loop, decode_frames
-from sim_rtc.clock import FrameClock, Pace
-from sim_rtc.faults import FORMS, FaultKind, FaultPlan, manual, read_fault
-from sim_rtc.sabotage import Sabotage
-from sim_rtc.wire_faults import WireFaults
+from sim_rtc.computer.telemetry import FrameClock, Pace
+from sim_rtc.faults import (
+    FORMS,
+    ComputerFaults,
+    FaultKind,
+    FaultPlan,
+    WireFaults,
+    manual,
+    read_fault,
+)
 
 N_SLOPES, N_MODES, N = 6, 3, 10
 
@@ -186,7 +192,7 @@ def sabotaged(*texts, until_s=3.0):
         yield
 
     clock = FrameClock(start_ns_utc=0, dt_ns=1_000_000)
-    sabotage = Sabotage(
+    sabotage = ComputerFaults(
         FaultPlan(tuple(read_fault(text) for text in texts)),
         victim,
         clock=clock,

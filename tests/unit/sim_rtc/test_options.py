@@ -8,11 +8,11 @@ from sim_rtc.options import parse_options
 
 def test_the_defaults_are_one_arcsecond_400_modes_and_a_secret_registration():
     options = parse_options([])
-    assert (options.sky.seeing.start_arcsec, options.magnitude, options.gain) == (1.0, 8.0, 0.4)
+    assert (options.seeing.start_arcsec, options.magnitude, options.gain) == (1.0, 8.0, 0.4)
     assert (options.delay_frames, options.n_controlled, options.frame_rate_hz) == (2, 400, 1000.0)
     assert options.alpha is None
     assert options.connect == "tcp/127.0.0.1:7447"
-    (layer,) = options.sky.layers
+    (layer,) = options.layers
     assert (layer.speed_m_s, layer.direction_deg) == (12.0, 35.0)
 
 
@@ -36,7 +36,7 @@ def test_layers_jumps_and_drift_are_read():
             "-0.1,0,0,0",
         ]
     )
-    assert [(la.speed_m_s, la.direction_deg, la.fraction) for la in options.sky.layers] == [
+    assert [(la.speed_m_s, la.direction_deg, la.fraction) for la in options.layers] == [
         (8.0, 0.0, 2.0),
         (15.0, -90.0, 1.0),
     ]

@@ -1,15 +1,12 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
-from sim_rtc.devices import binned_basis, build_drive, build_plant
-from sim_rtc.diffractive_plant import DiffractivePlant
-from sim_rtc.drive import MirrorLimits
-from sim_rtc.mirror import MirrorFaults
+from sim_rtc.assembly import binned_basis, build_drive, build_plant
 from sim_rtc.options import parse_options
-from sim_rtc.pixels import binned
+from sim_rtc.telescope.detector import binned
+from sim_rtc.telescope.diffractive import DiffractivePlant
+from sim_rtc.telescope.mirror import MirrorFaults
 
 
 def refusal(capsys, *given):
@@ -21,20 +18,20 @@ def refusal(capsys, *given):
 
 
 def test_by_default_mirror_and_detector_are_as_before():
-    devices = parse_options([]).devices
+    devices = parse_options([])
     assert not devices.needs_drive
-    assert devices.faults == MirrorFaults()
+    assert devices.mirror_faults == MirrorFaults()
     assert (devices.camera.read_noise_electrons, devices.camera.excess_noise) == (4.0, 1.0)
 
 
 def test_faults_limits_and_noise_are_read_in_the_units_they_are_given_in():
     mirror = "--rise-ms 0.7 --actuator-stroke 20 --actuator-bend 2"
     faults = "--dead-actuators 12,40 --stuck-actuators 7:-1e-6 --excess-noise 2"
-    devices = parse_options(f"{mirror} {faults}".split()).devices
-    assert devices.rise_s == pytest.approx(0.7e-3)
-    assert devices.limits.stroke_m == pytest.approx(20e-6)
-    assert devices.limits.bend_m == pytest.approx(2e-6)
-    assert devices.faults == MirrorFaults(dead=(12, 40), stuck=((7, -1e-6),))
+    devices = parse_options(f"{mirror} {faults}".split())
+    assert devices.rise_ms == pytest.approx(0.7)
+    assert devices.mirror_limits.stroke_m == pytest.approx(20e-6)
+    assert devices.mirror_limits.bend_m == pytest.approx(2e-6)
+    assert devices.mirror_faults == MirrorFaults(dead=(12, 40), stuck=((7, -1e-6),))
     assert devices.camera.excess_noise == 2.0
     assert devices.needs_drive
 
@@ -48,7 +45,7 @@ def test_the_diffractive_plant_takes_its_time_unless_told_otherwise():
 def test_a_preset_follows_the_magnitude():
     options = parse_options(["--preset", "flao", "--mag", "12", "--plant", "diffractive"])
     assert (options.frame_rate_hz, options.n_controlled) == (800.0, 153)
-    assert options.devices.binning == 2
+    assert options.binning == 2
 
 
 @pytest.mark.parametrize(
@@ -102,5 +99,4 @@ def test_binning_leaves_the_modes_as_they_are(small_instrument, small_basis):
 
 
 def test_limits_alone_put_a_linear_mirror_on_a_drive():
-    devices = parse_options([]).devices
-    assert replace(devices, limits=MirrorLimits(bend_m=1e-6)).needs_drive
+    assert parse_options(["--actuator-bend", "1"]).needs_drive

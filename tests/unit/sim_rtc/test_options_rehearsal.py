@@ -7,13 +7,13 @@ from sim_rtc.options import parse_options
 def test_faults_are_read_in_any_number_and_a_recording_beside_them():
     options = parse_options(
         ["--fault", "lost@3:0.5", "--fault", "clock@4:-0.5", "--record", "night.h5"]
-    ).rehearsal
+    )
     assert [(f.kind, f.values[0]) for f in options.faults] == [
         (FaultKind.LOST, 0.5),
         (FaultKind.CLOCK, -0.5),
     ]
     assert options.record.name == "night.h5"
-    assert parse_options([]).rehearsal.faults == ()
+    assert parse_options([]).faults == ()
 
 
 @pytest.mark.parametrize(

@@ -3,30 +3,30 @@ from pathlib import Path
 
 import pytest
 
-from sim_rtc.imperfections import SETS, Imperfections
 from sim_rtc.options import parse_options
-from sim_rtc.profiles import PROFILES
-from sim_rtc.scene import SceneKind, Spiders
-from sim_rtc.vibration import DAYTIME_LINES, Shape, VibrationLine
+from sim_rtc.telescope.atmosphere import PROFILES
+from sim_rtc.telescope.imperfections import SETS, Imperfections
+from sim_rtc.telescope.scene import SceneKind, Spiders
+from sim_rtc.telescope.sky import DAYTIME_LINES, Shape, VibrationLine
 
 
 def sky(*words):
-    return parse_options(list(words)).sky
+    return parse_options(list(words))
 
 
 def test_the_default_is_a_night_with_the_usual_imperfections():
     options = parse_options([])
-    assert options.sky.scene.kind is SceneKind.ONSKY
-    assert options.sky.scene.passes == 1
-    assert options.sky.imperfections == Imperfections()
-    assert options.sky.vibrations == ()
-    assert not options.sky.seeing.changes
+    assert options.scene.kind is SceneKind.ONSKY
+    assert options.scene.passes == 1
+    assert options.imperfections == Imperfections()
+    assert options.vibrations == ()
+    assert not options.seeing.changes
 
 
 def test_by_day_the_fibre_is_brighter_the_gain_half_and_three_shapes_vibrate():
     options = parse_options(["--scene", "daytime"])
-    assert (options.magnitude, options.gain, options.sky.scene.passes) == (7.0, 0.2, 2)
-    assert options.sky.vibrations == DAYTIME_LINES
+    assert (options.magnitude, options.gain, options.scene.passes) == (7.0, 0.2, 2)
+    assert options.vibrations == DAYTIME_LINES
     assert {line.shape for line in DAYTIME_LINES} == set(Shape)
     given = parse_options(["--scene", "daytime", "--mag", "9", "--gain", "0.3"])
     assert (given.magnitude, given.gain) == (9.0, 0.3)

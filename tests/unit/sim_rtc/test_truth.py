@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from service.model.misregistration import Misregistration
-from sim_rtc.clock import FrameClock
+from sim_rtc.computer.telemetry import Batch, FrameClock
 from sim_rtc.options import parse_options
-from sim_rtc.plant import Optics
-from sim_rtc.telemetry import Batch
+from sim_rtc.telescope.linear import LinearOptics
 from sim_rtc.truth import TruthRecorder, WavefrontError
 
 N_POINTS = 50
@@ -15,9 +14,9 @@ WEIGHTS = np.full(N_POINTS, 1 / N_POINTS)
 CLOCK = FrameClock(start_ns_utc=1_000, dt_ns=1_000_000)
 
 
-OPTICS = Optics(
+OPTICS = LinearOptics(
     alpha=Misregistration(shift_x_subap=0.1),
-    responses=(),
+    stuck_opd_m=np.zeros(N_POINTS, dtype=np.float32),
     slopes_per_command=np.zeros((4, 2), dtype=np.float32),
     opd_per_command=np.random.default_rng(1).standard_normal((N_POINTS, 2)).astype(np.float32),
     images=np.ones((2, 1, 2, 1)),

@@ -1,0 +1,200 @@
+"""What is done with a loop besides closing it: dithers, measurements of its matrix, gain ramps.
+
+At most one of each at a time. What may be on the mirror together is decided here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, LoopRequest
+from sim_rtc.computer.gains import Tuning
+from sim_rtc.computer.measure import Measured, Measurement, Measurements
+from sim_rtc.computer.telemetry import Batch, DitherLimits, LoopSettings
+
+Array32 = NDArray[np.float32]
+
+
+class Activities:
+    """What is under way; not for two threads at once."""
+
+    def __init__(self, *, n_modes: int, n_slopes: int, frame_rate_hz: float) -> None:
+        self._n_modes, self._n_slopes = n_modes, n_slopes
+        self._frame_rate_hz = frame_rate_hz
+        self._dither: Dither | None = None
+        self._measurements = Measurements()
+        self._tuning: Tuning | None = None
+        self.late_dither_frames = 0
+        """After the announced frame, that dithers to come really begin."""
+
+    @property
+    def dither(self) -> DitherStatus | None:
+        """The dither that is on, as a status tells it."""
+        if self._dither is None:
+            return None
+        return DitherStatus(request=self._dither.request, start_seq=self._dither.start_seq)
+
+    @property
+    def telemetry_dithers(self) -> bool:
+        """Whether what is added to commands is told as a dither; strokes in open loop are not."""
+        current = self._measurements.current
+        return current is None or not current.needs_open_loop
+
+    def in_the_loops_way(self) -> str:
+        """Return what needs the loop as it is, in the wire's words; empty: nothing."""
+        if self._tuning is not None:
+            return f"busy: gain ramp {self._tuning.name} is under way; open the loop to end it"
+        return self._measurements.busy()
+
+    def forbids(self, request: LoopRequest) -> str:
+        """Return why the loop is not to be changed so now; a ramp lets it be opened."""
+        if request.loop is Loop.OPEN:
+            return self._measurements.busy()
+        return self.in_the_loops_way()
+
+    def on_the_mirror(self) -> str:
+        """Return what occupies the mirror, in the wire's words; empty: nothing."""
+        if self._dither is not None:
+            return (
+                f"busy: dither {self._dither.request.id} is on until frame "
+                f"{self._dither.stop_seq}; stop it first"
+            )
+        return self._measurements.busy()
+
+    def begin_dither(self, request: DitherRequest, start_seq: int) -> None:
+        """Let a dither begin at this frame."""
+        self._dither = Dither(
+            request,
+            start_seq=start_seq,
+            n_modes=self._n_modes,
+            frame_rate_hz=self._frame_rate_hz,
+            late_frames=self.late_dither_frames,
+        )
+
+    def end_dither(self) -> None:
+        """Let the dither, if any, end now."""
+        self._dither = None
+
+    def begin_measurement(self, measurement: Measurement, *, closes_again: bool) -> None:
+        """Let a measurement begin at its frame; the loop may have to be closed after it."""
+        self._measurements.current = measurement
+        self._measurements.closes_again = closes_again
+
+    def begin_ramp(self, tuning: Tuning, settings: LoopSettings) -> LoopSettings:
+        """Let a gain ramp begin; return the settings that it asks for."""
+        self._tuning = tuning
+        return replace(settings, gains=tuning.gains)
+
+    def end_ramp(self, settings: LoopSettings, reason: str) -> LoopSettings:
+        """Give up the ramp, if any; return settings with what it has chosen so far."""
+        tuning, self._tuning = self._tuning, None
+        if tuning is None:
+            return settings
+        tuning.give_up(reason)
+        return replace(settings, gains=tuning.settled)
+
+    def end_all(self, settings: LoopSettings, session: str) -> LoopSettings:
+        """End everything, for the loop starts over; return the settings that are left."""
+        self._measurements.end(
+            session, self._n_slopes, "the loop started over during the measurement"
+        )
+        self._dither = None
+        return self.end_ramp(settings, "the loop started over")
+
+    def commands(self, seq0: int, n_frames: int) -> Array32 | None:
+        """Return what is added to the commands of the batch ``(n_frames, n_modes)``, metres."""
+        dither, measuring = self._dither, self._measurements.current
+        commands = None
+        if dither is not None:
+            commands = dither.commands(seq0, n_frames)
+            if seq0 + n_frames >= dither.stop_seq:
+                self._dither = None
+        return commands if measuring is None else measuring.commands(seq0, n_frames)
+
+    def look(self, batch: Batch, matrix: Array32, settings: LoopSettings) -> LoopSettings:
+        """Read a batch back; return the settings of the next one.
+
+        ``matrix`` is what multiplied its slopes.
+        """
+        ended = self._measurements.take(batch.session, batch.seq0, batch.slopes, batch.commands_m)
+        if ended and self._measurements.closes_again:
+            settings = replace(settings, closed=True)
+        tuning = self._tuning
+        if tuning is not None and batch.closed and tuning.look(batch, matrix):
+            settings = replace(settings, gains=tuning.gains)
+            if tuning.done:
+                self._tuning = None
+        return settings
+
+    def take_measured(self) -> list[Measured]:
+        """Return the measurements that have ended since the last call."""
+        return self._measurements.take_ended()
+
+
+class Dither:
+    """One accepted dither, from its first frame to its last."""
+
+    def __init__(
+        self,
+        request: DitherRequest,
+        *,
+        start_seq: int,
+        n_modes: int,
+        frame_rate_hz: float,
+        late_frames: int = 0,
+    ) -> None:
+        """Take what was asked for; ``late_frames`` after ``start_seq`` it really begins."""
+        self.request = request
+        self._late_frames = late_frames
+        self.start_seq = start_seq
+        self._n_modes = n_modes
+        self._frame_rate_hz = frame_rate_hz
+        self.stop_seq = start_seq + max(1, round((request.duration_s or 0.0) * frame_rate_hz))
+        """First frame without it."""
+        self._modes = np.array(request.modes, dtype=np.intp)
+        self._amplitude_m = np.array(request.amplitude_m)
+        self._rng = np.random.default_rng(request.seed or 0)
+
+    def commands(self, seq0: int, n_frames: int) -> Array32 | None:
+        """Return the dither of these frames ``(n_frames, n_modes)``, metres; None: it is silent.
+
+        Frames must be asked for in order: a binary sequence is drawn as it is played.
+        """
+        seq = np.arange(seq0, seq0 + n_frames) - self._late_frames
+        playing = (seq >= self.start_seq) & (seq < self.stop_seq)
+        if not playing.any():
+            return None
+        out = np.zeros((n_frames, self._n_modes), dtype=np.float32)
+        out[np.ix_(playing, self._modes)] = self._waveform(seq[playing] - self.start_seq)
+        return out
+
+    def _waveform(self, frame: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return ``(n_playing, n_dithered)`` metres, ``frame`` counted from the first one."""
+        if self.request.kind is DitherKind.BINARY:
+            signs = self._rng.integers(0, 2, (len(frame), len(self._modes))) * 2 - 1
+            return np.asarray(signs * self._amplitude_m)
+        frequency = np.array(self.request.frequency_hz)
+        phase = 2 * np.pi * frequency * (frame[:, None] / self._frame_rate_hz)
+        return np.asarray(self._amplitude_m * np.sqrt(2.0) * np.sin(phase))
+
+
+def refusal(
+    request: DitherRequest, limits: DitherLimits, *, n_modes: int, frame_rate_hz: float
+) -> str:
+    """Return why a dither cannot be played, in the wire's words; empty: it can."""
+    modes, amplitude_m = request.modes or (), request.amplitude_m or ()
+    if max(modes, default=0) >= n_modes:
+        return f"range: mode {max(modes)}, expected 0 to {n_modes - 1}"
+    if len(modes) > limits.most_modes:
+        return f"range: {len(modes)} modes, expected at most {limits.most_modes}"
+    if max(amplitude_m, default=0.0) > limits.largest_m:
+        return f"range: amplitude_m {max(amplitude_m):.3g}, expected at most {limits.largest_m:.3g}"
+    highest = max(request.frequency_hz or (), default=0.0)
+    if highest >= frame_rate_hz / 2:
+        return f"range: frequency_hz {highest:g}, expected below {frame_rate_hz / 2:g}"
+    if (request.duration_s or 0.0) > limits.longest_s:
+        return f"range: duration_s {request.duration_s:g}, expected at most {limits.longest_s:g}"
+    return ""

@@ -1,0 +1,392 @@
+"""The real-time computer itself: one batch of frames after the other, and what may change between.
+
+Everything that may change (matrix, gains, dither, loop state) changes between two batches, under
+one lock, so a batch has one reconstructor and one session, and no frame is ever skipped.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.wire import (
+    Command,
+    DitherAction,
+    DitherRequest,
+    Loop,
+    LoopRequest,
+    MeasureRequest,
+    RampRequest,
+    Reply,
+)
+from sim_rtc.computer.activities import Activities, refusal
+from sim_rtc.computer.feed import BATCH_FRAMES, Block
+from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, Plan, Tuning, ramp_refusal
+from sim_rtc.computer.loop import LoopTerms, ModalLoop
+from sim_rtc.computer.measure import Measured, MeasurementRules
+from sim_rtc.computer.reconstructors import Terms
+from sim_rtc.computer.telemetry import (
+    Batch,
+    DitherLimits,
+    Identity,
+    LoopSettings,
+    Reconstructor,
+    Snapshot,
+    new_session,
+)
+from sim_rtc.telescope.mirror import MirrorDrive
+from sim_rtc.telescope.plant import Optics
+
+Array32 = NDArray[np.float32]
+
+_LEAD_BATCHES = 1
+"""Whole batches between a command's acceptance and the first frame that contains it: its answer
+is there before them."""
+
+_SETTLING_FRAMES = 20
+"""Between the opening of the loop and the first stroke: the mirror comes to rest."""
+
+_START_S = 2.0
+"""Of closed loop before a ramp at the start begins."""
+
+
+class RealTimeComputer:
+    """The loop over a feed of open-loop blocks.
+
+    ``next_batch`` is for one thread, everything else for any.
+    """
+
+    def __init__(
+        self,
+        blocks: Iterator[Block],
+        *,
+        identity: Identity,
+        settings: LoopSettings,
+        reconstructor: Reconstructor,
+        optics: Optics,
+        stroke_m: float,
+        limits: DitherLimits,
+        drive: MirrorDrive | None = None,
+        mode_to_actuator: NDArray[np.float64] | None = None,
+    ) -> None:
+        self._blocks = blocks
+        self.identity = identity
+        self._settings = settings
+        self._limits = limits
+        self._n_slopes, self._n_modes = optics.n_slopes, optics.opd_per_command.shape[1]
+        self._loop = ModalLoop(
+            n_modes=self._n_modes,
+            delay_frames=settings.delay_frames,
+            stroke_m=stroke_m,
+            drive=drive,
+        )
+        self._lock = threading.Lock()
+        self._session = new_session()
+        self._seq = 0
+        self._first = self._active = reconstructor
+        self._stroke_m = stroke_m
+        self._staged: deque[Reconstructor] = deque()
+        self._swaps: deque[tuple[str, int]] = deque(maxlen=16)
+        self._activities = Activities(
+            n_modes=self._n_modes,
+            n_slopes=self._n_slopes,
+            frame_rate_hz=settings.frame_rate_hz,
+        )
+        self._rules = MeasurementRules(
+            n_modes=self._n_modes,
+            n_slopes=self._n_slopes,
+            frame_rate_hz=settings.frame_rate_hz,
+            mode_to_actuator=mode_to_actuator,
+        )
+        self._terms: LoopTerms | None = None
+        self._block: Block | None = None
+        self._row = 0
+        self._batch_frames = BATCH_FRAMES
+        self._optics = optics
+
+    def prepare(self) -> None:
+        """Wait for the first frames of the feed, so that the first batch does not."""
+        self._block, self._row = next(self._blocks), 0
+
+    def next_batch(self) -> Batch:
+        """Process the next frames, whatever the clock says."""
+        block, row = self._next_rows()
+        n_frames = self._batch_frames = block.batch_frames
+        with self._lock:
+            self._swap()
+            terms = self._current_terms(block.optics)
+            activities = self._activities
+            result = block.run(row, self._loop, terms, activities.commands(self._seq, n_frames))
+            batch = Batch(
+                session=self._session,
+                seq0=self._seq,
+                slopes=result.slopes,
+                commands_m=result.commands_m,
+                dither_m=result.dither_m if activities.telemetry_dithers else None,
+                cm_id=self._active.manifest.id,
+                n_clipped=result.n_clipped,
+                closed=self._settings.closed,
+                n_controlled=len(terms.gains),
+                optics=block.optics,
+                phase_m=block.phase_at(row),
+            )
+            self._set(activities.look(batch, self._active.matrix, self._settings))
+            self._seq += n_frames
+            return batch
+
+    def stage(self, reconstructor: Reconstructor) -> None:
+        """Take a checked matrix; it is swapped in before the next batch."""
+        with self._lock:
+            self._staged.append(reconstructor)
+
+    def restart(self) -> None:
+        """Begin a session from frame 0 with the matrix of the start, as a new process would."""
+        with self._lock:
+            self._start_over()
+            self._seq, self._active, self._terms = 0, self._first, None
+            n_controlled = len(self._first.matrix)
+            self._set(replace(self._settings, closed=True, n_controlled_next=n_controlled))
+            self._swaps.clear()
+
+    def limit_stroke(self, stroke_m: float | None) -> None:
+        """Clip commands at this, metres RMS of a mode; None: as at the start."""
+        with self._lock:
+            self._loop.limit(self._stroke_m if stroke_m is None else stroke_m)
+
+    def delay_dithers(self, n_frames: int) -> None:
+        """Let dithers to come begin so many frames after the announced one."""
+        with self._lock:
+            self._activities.late_dither_frames = n_frames
+
+    def take_swaps(self) -> list[tuple[str, int]]:
+        """Return ids and first frames of the matrices swapped in since the last call."""
+        with self._lock:
+            swaps = list(self._swaps)
+            self._swaps.clear()
+        return swaps
+
+    def take_measured(self) -> list[Measured]:
+        """Return the measurements that have ended since the last call."""
+        with self._lock:
+            return self._activities.take_measured()
+
+    def terms(self) -> Terms:
+        """Return what a new reconstructor must fit at present."""
+        with self._lock:
+            rows = {self._settings.n_controlled_next: None, len(self._active.matrix): None}
+        return Terms(
+            n_slopes=self._n_slopes,
+            n_controlled=tuple(rows),
+            basis_id=self.identity.basis_id,
+            config_id=self.identity.config_id,
+            system=self.identity.system,
+        )
+
+    @property
+    def largest_matrix_bytes(self) -> int:
+        """Bytes of a matrix for all modes."""
+        return int(4 * self._n_modes * self._n_slopes)
+
+    def snapshot(self) -> Snapshot:
+        """Return what a status message tells."""
+        with self._lock:
+            return Snapshot(
+                session=self._session,
+                seq=max(self._seq - 1, 0),
+                settings=self._settings,
+                loop=self._loop_state(),
+                gains=self._effective_gains(),
+                reconstructor=self._active,
+                dither=self._activities.dither,
+                limits=self._limits,
+                images=self._optics.images,
+            )
+
+    def execute(self, command: Command) -> Reply:
+        """Carry out a command, or say why not."""
+        match command:
+            case DitherRequest(action=DitherAction.STOP):
+                return self._stop_dither(command)
+            case DitherRequest():
+                return self._start_dither(command)
+            case LoopRequest():
+                return self._change_loop(command)
+            case MeasureRequest():
+                return self._start_measurement(command)
+            case RampRequest():
+                return self._start_ramp(command)
+
+    def ramp_up(self, step_s: float) -> None:
+        """Try gains around those of the start, once the loop has been closed for a moment."""
+        with self._lock:
+            settings = self._settings
+            plan = Plan.at_start(
+                settings.gains,
+                n_controlled=len(self._active.matrix),
+                frame_rate_hz=settings.frame_rate_hz,
+                step_s=step_s,
+            )
+            tuning = Tuning(
+                GainRamp(settings.gains, plan),
+                name="start",
+                wait_frames=round(_START_S * settings.frame_rate_hz),
+            )
+            self._set(self._activities.begin_ramp(tuning, settings))
+
+    def _next_rows(self) -> tuple[Block, int]:
+        if self._block is None or self._row >= self._block.n_frames:
+            self._block, self._row = next(self._blocks), 0
+        row = self._row
+        self._row += self._block.batch_frames
+        return self._block, row
+
+    def _swap(self) -> None:
+        if not self._staged:
+            return
+        fewer = len(self._staged[0].matrix) < len(self._active.matrix)
+        self._active = self._staged.popleft()
+        self._terms = None
+        if fewer:
+            self._loop.release(len(self._active.matrix))
+            self._set(self._activities.end_ramp(self._settings, "fewer modes are controlled"))
+        self._swaps.append((self._active.manifest.id, self._seq))
+
+    def _current_terms(self, optics: Optics) -> LoopTerms:
+        matrix = self._active.matrix
+        if self._terms is None or self._optics is not optics:
+            self._terms = LoopTerms.of(optics, matrix, self._gains(), self._settings.leak)
+            self._optics = optics
+        return self._terms
+
+    def _set(self, settings: LoopSettings) -> None:
+        """Put settings in force from the next batch on."""
+        if settings == self._settings:
+            return
+        self._settings = settings
+        if self._terms is not None:
+            self._terms = replace(self._terms, gains=self._gains(), leak=settings.leak)
+
+    def _gains(self) -> Array32:
+        """Return the gains of the modes that the matrix in use controls."""
+        controlled = self._effective_gains()[: len(self._active.matrix)]
+        return np.array(controlled, dtype=np.float32)
+
+    def _effective_gains(self) -> tuple[float, ...]:
+        n_controlled = len(self._active.matrix) if self._settings.closed else 0
+        unused = (0.0,) * int(self._n_modes - n_controlled)
+        return self._settings.gains[:n_controlled] + unused
+
+    def _loop_state(self) -> Loop:
+        if not self._settings.closed:
+            return Loop.OPEN
+        controlled = self._settings.gains[: len(self._active.matrix)]
+        return Loop.CLOSED if all(controlled) else Loop.PARTIAL
+
+    def _start_dither(self, request: DitherRequest) -> Reply:
+        rate_hz = self._settings.frame_rate_hz
+        reason = refusal(request, self._limits, n_modes=self._n_modes, frame_rate_hz=rate_hz)
+        with self._lock:
+            reason = reason or self._activities.on_the_mirror()
+            if reason:
+                return refused(request.id, reason)
+            start_seq = self._seq + _LEAD_BATCHES * self._batch_frames
+            self._activities.begin_dither(request, start_seq)
+        return accepted(request.id, start_seq)
+
+    def _stop_dither(self, request: DitherRequest) -> Reply:
+        with self._lock:
+            self._activities.end_dither()
+            return accepted(request.id, self._seq)
+
+    def _start_measurement(self, request: MeasureRequest) -> Reply:
+        in_use = self._active.matrix
+        reason = self._rules.refusal(request, len(in_use))
+        if reason:
+            return refused(request.id, reason)
+        measurement = self._rules.measurement(request, in_use)
+        with self._lock:
+            activities, was_closed = self._activities, self._settings.closed
+            reason = activities.on_the_mirror() or activities.in_the_loops_way()
+            if not reason and not measurement.needs_open_loop and not was_closed:
+                reason = f"unsupported: {request.pattern} while the loop is open; close it first"
+            if reason:
+                return refused(request.id, reason)
+            if measurement.needs_open_loop and was_closed:
+                self._set(replace(self._settings, closed=False))
+                self._start_over()
+            start_seq = self._seq + _LEAD_BATCHES * self._batch_frames + _SETTLING_FRAMES
+            measurement.start_seq = start_seq
+            activities.begin_measurement(measurement, closes_again=was_closed)
+        return accepted(request.id, start_seq)
+
+    def _start_ramp(self, request: RampRequest) -> Reply:
+        with self._lock:
+            settings = self._settings
+            reason = self._activities.in_the_loops_way() or ramp_refusal(
+                request, settings, len(self._active.matrix)
+            )
+            if reason:
+                return refused(request.id, reason)
+            plan = Plan.asked(request, frame_rate_hz=settings.frame_rate_hz)
+            tuning = Tuning(GainRamp(settings.gains, plan), name=request.id)
+            self._set(self._activities.begin_ramp(tuning, settings))
+            return accepted(request.id, self._seq)
+
+    def _change_loop(self, request: LoopRequest) -> Reply:
+        reason = loop_refusal(request, self._n_modes)
+        with self._lock:
+            reason = reason or self._activities.forbids(request)
+            if reason:
+                return refused(request.id, reason)
+            was_closed = self._settings.closed
+            if was_closed and request.loop is Loop.OPEN:
+                self._start_over()
+            self._set(changed(self._settings, request))
+            return accepted(request.id, self._seq)
+
+    def _start_over(self) -> None:
+        """Zero the integrator, which by the wire's rules begins a new session."""
+        self._set(self._activities.end_all(self._settings, self._session))
+        self._loop.reset()
+        self._session = new_session()
+        self._staged.clear()
+
+
+def accepted(request_id: str, start_seq: int) -> Reply:
+    """Return the reply to an order that is carried out from this frame on."""
+    return Reply(id=request_id, accepted=True, reason="", start_seq=start_seq)
+
+
+def refused(request_id: str, reason: str) -> Reply:
+    """Return the reply to an order that is not carried out."""
+    return Reply(id=request_id, accepted=False, reason=reason, start_seq=None)
+
+
+def loop_refusal(request: LoopRequest, n_modes: int) -> str:
+    """Return why the loop cannot be changed so, in the wire's words; empty: it can."""
+    gains = request.gains
+    if gains is not None and len(gains) != n_modes:
+        return f"range: {len(gains)} gains, expected {n_modes}"
+    if gains is not None and max(gains) > LARGEST_GAIN:
+        return f"range: gain {max(gains):g}, expected at most {LARGEST_GAIN:g}"
+    if request.n_controlled is not None and not 1 <= request.n_controlled <= n_modes:
+        return f"range: n_controlled {request.n_controlled}, expected 1 to {n_modes}"
+    if request.loop is Loop.PARTIAL:
+        return "unsupported: loop 'partial', ask for 'closed' with some gains 0"
+    return ""
+
+
+def changed(settings: LoopSettings, request: LoopRequest) -> LoopSettings:
+    """Return the settings after a request that :func:`loop_refusal` has nothing against."""
+    return replace(
+        settings,
+        closed=settings.closed if request.loop is None else request.loop is not Loop.OPEN,
+        gains=settings.gains if request.gains is None else request.gains,
+        leak=settings.leak if request.leak is None else request.leak,
+        n_controlled_next=request.n_controlled or settings.n_controlled_next,
+    )

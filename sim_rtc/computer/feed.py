@@ -1,0 +1,337 @@
+"""What the sensor would see without the mirror, block by block and ahead of the loop.
+
+Of a linear telescope it is slopes, half a second at a time: frames are interpolated between the
+steps of the screens. Of a diffractive one it is the phase of every frame; slopes follow one frame
+at a time, when the loop knows what the mirror is doing. A thread of its own makes them, so that
+nothing holds a frame up.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from sim_rtc.computer.loop import LoopBlock, LoopTerms, ModalLoop
+from sim_rtc.telescope.detector import Detector, PixelDetector
+from sim_rtc.telescope.diffractive import DiffractiveOptics
+from sim_rtc.telescope.linear import LinearOptics
+from sim_rtc.telescope.plant import Optics
+from sim_rtc.telescope.registration import MovingOptics
+from sim_rtc.telescope.sky import Sky
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+BATCH_FRAMES = 10
+"""Frames the loop processes together unless told otherwise: one message on the wire."""
+
+_MESSAGE_S = 0.05
+"""Of telemetry in a message where frames come fast: the longer, the less a frame costs."""
+
+_MOST_MESSAGE_FRAMES = 50
+"""More are refused by the wire."""
+
+_BLOCK_FRAMES = 500
+_PHASE_BLOCK_FRAMES = 200
+_MODES_FRAMES = 250
+"""Frames reconstructed at a time: for ten, the library's copy of the matrix costs four times the
+product."""
+
+_AHEAD_BLOCKS = 2
+_POLL_S = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Block(ABC):
+    """Consecutive frames through one set of optics, the mirror still to be added."""
+
+    first_frame: int
+    """Number of row 0 since the start of the run."""
+
+    optics: Optics
+    """Valid for all of it."""
+
+    phases_m: Array32
+    """OPD ``(..., n_points)`` that comes in, what is stuck on the mirror included."""
+
+    played_m: Array32 | None = None
+    """``(n_frames, n_modes)`` turbulence played on the mirror; None: none is."""
+
+    batch_frames: int = BATCH_FRAMES
+
+    @property
+    @abstractmethod
+    def n_frames(self) -> int:
+        """Frames of the block, a multiple of the batch."""
+
+    @abstractmethod
+    def phase_at(self, row: int) -> Array32:
+        """Return the OPD ``(n_points,)`` of a batch's first frame, commands left out."""
+
+    @abstractmethod
+    def run(
+        self, row: int, loop: ModalLoop, terms: LoopTerms, dither_m: Array32 | None
+    ) -> LoopBlock:
+        """Run the batch that begins at ``row`` through the loop."""
+
+    def _played(self, row: int) -> Array32 | None:
+        """Return the rows of the batch that begins at ``row``."""
+        return None if self.played_m is None else self.played_m[row : row + self.batch_frames]
+
+
+class OpenModes:
+    """What the reconstructor makes of a block's slopes, computed for many frames at a time."""
+
+    def __init__(self) -> None:
+        self._reconstructor: Array32 | None = None
+        self._first = 0
+        self._modes = np.empty((0, 0), dtype=np.float32)
+
+    def rows(self, slopes: Array32, row: int, n_frames: int, reconstructor: Array32) -> Array32:
+        """Return ``(n_frames, n_controlled)`` of the block's ``slopes`` from ``row`` on."""
+        known = self._first <= row and row + n_frames <= self._first + len(self._modes)
+        if not known or self._reconstructor is not reconstructor:
+            self._reconstructor, self._first = reconstructor, row
+            self._modes = slopes[row : row + max(n_frames, _MODES_FRAMES)] @ reconstructor.T
+        return self._modes[row - self._first : row - self._first + n_frames]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OpenLoopBlock(Block):
+    """Slopes of a linear telescope; ``phases_m`` has a row for each batch, of its first frame."""
+
+    slopes: Array32
+    """``(n_frames, n_slopes)`` what comes in, and noise."""
+
+    open_modes: OpenModes = field(default_factory=OpenModes)
+
+    @property
+    @override
+    def n_frames(self) -> int:
+        return len(self.slopes)
+
+    @override
+    def phase_at(self, row: int) -> Array32:
+        return np.asarray(self.phases_m[row // self.batch_frames])
+
+    @override
+    def run(
+        self, row: int, loop: ModalLoop, terms: LoopTerms, dither_m: Array32 | None
+    ) -> LoopBlock:
+        slopes = self.slopes[row : row + self.batch_frames]
+        modes = self.open_modes.rows(self.slopes, row, len(slopes), terms.reconstructor)
+        return loop.run(slopes, terms, dither_m, self._played(row), modes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PhaseBlock(Block):
+    """Phases of a diffractive telescope; ``phases_m`` has a row for each frame."""
+
+    optics: DiffractiveOptics
+    detector: PixelDetector
+    rng: np.random.Generator
+    """Of the photons; used by the loop's thread alone."""
+
+    @property
+    @override
+    def n_frames(self) -> int:
+        return len(self.phases_m)
+
+    @override
+    def phase_at(self, row: int) -> Array32:
+        return np.asarray(self.phases_m[row])
+
+    @override
+    def run(
+        self, row: int, loop: ModalLoop, terms: LoopTerms, dither_m: Array32 | None
+    ) -> LoopBlock:
+        def sense(k: int, command_m: Array32) -> Array32:
+            opd_m = self.optics.mirror_opd_m(command_m)
+            opd_m += self.phases_m[row + k]
+            return self.optics.slopes(opd_m, self.detector, self.rng)
+
+        return loop.run_frames(self.batch_frames, sense, terms, dither_m, self._played(row))
+
+
+class Source(TypedDict):
+    """What a feed is made of."""
+
+    sky: Sky
+    optics: MovingOptics
+    frame_rate_hz: float
+    jump_times_s: tuple[float, ...]
+    rng: np.random.Generator
+    """Of the detector's noise."""
+
+
+class Feed(ABC):
+    """Blocks, one after the other for ever."""
+
+    def __init__(self, batch_frames: int, block_frames: int, source: Source) -> None:
+        self.batch_frames = batch_frames
+        """Frames of a batch."""
+        self._block_frames = block_frames // batch_frames * batch_frames
+        self._sky, self._optics, self._rng = source["sky"], source["optics"], source["rng"]
+        self._frame_rate_hz = source["frame_rate_hz"]
+        self._jump_frames = [
+            batch_boundary(time_s, self._frame_rate_hz, batch_frames)
+            for time_s in source["jump_times_s"]
+        ]
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the blocks; one ends where a jump falls."""
+        frame = 0
+        while True:
+            jumps = [jump - frame for jump in self._jump_frames if jump > frame]
+            n_frames = min([self._block_frames, *jumps])
+            time_s = (frame + np.arange(n_frames)) / self._frame_rate_hz
+            yield self._block(frame, time_s, self._optics.at(float(time_s[0])))
+            frame += n_frames
+
+    @abstractmethod
+    def _block(self, first_frame: int, time_s: Array, optics: Optics) -> Block:
+        """Return the block of these times."""
+
+
+class OpenLoopFeed(Feed):
+    """Blocks of open-loop slopes."""
+
+    def __init__(
+        self,
+        *,
+        sensor_opd_m: Array32,
+        detector: Detector,
+        batch_frames: int = BATCH_FRAMES,
+        **source: Unpack[Source],
+    ) -> None:
+        """Take the static OPD ``(n_points,)`` that only the sensor sees."""
+        super().__init__(batch_frames, _BLOCK_FRAMES, source)
+        self._sources = np.column_stack([self._sky.vibrations.phase_per_line, sensor_opd_m])
+        self._source_slopes = np.empty((0, 0), dtype=np.float32)
+        """``(n_lines + 1, n_slopes)`` of the vibrations, and what is static."""
+        self._detector = detector
+        self._seen: LinearOptics | None = None
+
+    @override
+    def _block(self, first_frame: int, time_s: Array, optics: Optics) -> OpenLoopBlock:
+        if not isinstance(optics, LinearOptics):
+            raise TypeError(f"feed: found {type(optics).__name__}; expected LinearOptics")
+        self._look(optics)
+        slopes = self._detector.noise(len(time_s), self._rng)
+        vibrations = self._sky.vibrations
+        strength = vibrations.frames(len(time_s))
+        if strength.any():
+            slopes += strength @ self._source_slopes[:-1]
+        if self._source_slopes[-1].any():
+            slopes += self._source_slopes[-1]
+        phases = strength[:: self.batch_frames] @ vibrations.phase_per_line.T
+        turbulence, played = self._sky.turbulence.at(time_s), self._sky.played
+        if played is None:
+            for share, response in optics.responses:
+                part = turbulence.through(response)
+                part *= np.float32(share)
+                slopes += part
+            phases += turbulence.phases_m(self.batch_frames)
+        phases += optics.stuck_opd_m
+        return OpenLoopBlock(
+            first_frame=first_frame,
+            optics=optics,
+            slopes=slopes,
+            phases_m=phases,
+            played_m=None if played is None else turbulence.through(played.response),
+            batch_frames=self.batch_frames,
+        )
+
+    def _look(self, optics: LinearOptics) -> None:
+        """See vibrations and static wavefronts through these optics."""
+        if optics is not self._seen:
+            self._seen, self._source_slopes = optics, optics.slopes_of(self._sources).T
+            if optics.stuck_opd_m.any():
+                self._source_slopes[-1] += optics.slopes_of(optics.stuck_opd_m)
+
+
+class PhaseFeed(Feed):
+    """Blocks of phases: each frame takes milliseconds, so a message has few of them."""
+
+    def __init__(self, *, detector: PixelDetector, **source: Unpack[Source]) -> None:
+        super().__init__(BATCH_FRAMES, _PHASE_BLOCK_FRAMES, source)
+        self._detector = detector
+
+    @override
+    def _block(self, first_frame: int, time_s: Array, optics: Optics) -> PhaseBlock:
+        if not isinstance(optics, DiffractiveOptics):
+            raise TypeError(f"feed: found {type(optics).__name__}; expected DiffractiveOptics")
+        phases, played = self._sky.seen(time_s)
+        phases += optics.stuck_opd_m
+        return PhaseBlock(
+            first_frame=first_frame,
+            optics=optics,
+            phases_m=phases,
+            played_m=played,
+            detector=self._detector,
+            rng=self._rng,
+        )
+
+
+class Ahead:
+    """Blocks computed ahead in a thread of their own; two at most, then the thread waits."""
+
+    def __init__(self, blocks: Iterator[Block]) -> None:
+        self._blocks = blocks
+        self._queue: queue.Queue[Block | BaseException] = queue.Queue(_AHEAD_BLOCKS)
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="open-loop", daemon=True)
+
+    def __enter__(self) -> Ahead:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def __iter__(self) -> Iterator[Block]:
+        """Yield the blocks until the ``with`` block ends; re-raise what stopped the thread."""
+        while not self._stopped.is_set():
+            try:
+                item = self._queue.get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+
+    def _work(self) -> None:
+        try:
+            for block in self._blocks:
+                if not self._put(block):
+                    return
+        except Exception as error:  # noqa: BLE001 - handed to the loop, which re-raises it
+            self._put(error)
+
+    def _put(self, item: Block | BaseException) -> bool:
+        while not self._stopped.is_set():
+            try:
+                self._queue.put(item, timeout=_POLL_S)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+
+def message_frames(frame_rate_hz: float) -> int:
+    """Return how many frames a message of a loop in real time should have."""
+    return min(max(round(_MESSAGE_S * frame_rate_hz), BATCH_FRAMES), _MOST_MESSAGE_FRAMES)
+
+
+def batch_boundary(time_s: float, frame_rate_hz: float, batch_frames: int = BATCH_FRAMES) -> int:
+    """Return the first frame of the first batch that begins at this time or later."""
+    return int(np.ceil(time_s * frame_rate_hz / batch_frames)) * batch_frames

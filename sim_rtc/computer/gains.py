@@ -1,0 +1,275 @@
+"""The gain ramp: one group of modes after the other, the gain of least residual slopes is kept.
+
+The groups are the paper's three unless others are asked for: tip and tilt, the modes up to 100,
+the rest. A group tries its gains in turn while the others stay; once the residual has clearly
+grown it tries no higher one, which is well before the loop is lost. The residual slopes are judged
+as the group sees them, through its own rows of the reconstructor: in the RMS of all slopes the
+noise of 1400 of them hides tip and tilt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Self
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from service.wire import RampRequest
+from sim_rtc.computer.telemetry import Batch, LoopSettings
+
+Array32 = NDArray[np.float32]
+_log = structlog.get_logger("sim_rtc")
+
+LARGEST_GAIN = 2.0
+
+GROUP_ENDS = (2, 100)
+"""First mode after each group but the last."""
+
+FACTORS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5)
+"""Gains tried at the start, over the gain the loop starts with."""
+
+_CLEARLY_WORSE = 1.5
+"""Residual over the best so far from which on a group tries no higher gain.
+
+A second of turbulence makes that of tip and tilt differ by a fifth and more by itself.
+"""
+
+_SETTLING_S = 0.2
+"""Between a new gain and the first slopes that are judged."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """One gain tried."""
+
+    group: int
+    gain: float
+    residual_m: float
+    """RMS of the slopes, reconstructed into the modes of the group, metres OPD."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What a ramp tries."""
+
+    groups: tuple[slice, ...]
+    """Modes that get one gain; those that the loop does not control are not judged."""
+
+    gains: tuple[tuple[float, ...], ...]
+    """Gains of each group, in the order in which they are tried."""
+
+    settling_frames: int
+    """Ignored after each change."""
+
+    judged_frames: int
+    """Judged after them."""
+
+    @classmethod
+    def at_start(
+        cls, gains: tuple[float, ...], *, n_controlled: int, frame_rate_hz: float, step_s: float
+    ) -> Self:
+        """Return the ramp of a loop that begins with these gains, one per mode of the basis.
+
+        Within a group the first one counts; modes beyond the loop get the last group's gain.
+        """
+        *first, last = groups_of(n_controlled)
+        groups = (*first, slice(last.start, len(gains)))
+        return cls(
+            groups=groups,
+            gains=tuple(
+                tuple(min(gains[group.start] * factor, LARGEST_GAIN) for factor in FACTORS)
+                for group in groups
+            ),
+            settling_frames=round(_SETTLING_S * frame_rate_hz),
+            judged_frames=max(1, round(step_s * frame_rate_hz)),
+        )
+
+    @classmethod
+    def asked(cls, request: RampRequest, *, frame_rate_hz: float) -> Self:
+        """Return the ramp of a request: what settles is part of its frames, at most half."""
+        settling = min(round(_SETTLING_S * frame_rate_hz), request.frames_per_gain // 2)
+        return cls(
+            groups=tuple(slice(first, last + 1) for first, last in request.groups),
+            gains=(request.gains,) * len(request.groups),
+            settling_frames=settling,
+            judged_frames=request.frames_per_gain - settling,
+        )
+
+
+def groups_of(n_controlled: int) -> tuple[slice, ...]:
+    """Return the modes of each group; one that the loop does not reach is left out."""
+    edges = (0, *(end for end in GROUP_ENDS if end < n_controlled), n_controlled)
+    return tuple(slice(a, b) for a, b in pairwise(edges))
+
+
+def by_group(gains: tuple[float, ...], n_modes: int) -> tuple[float, ...]:
+    """Return one gain per mode from one per group; groups the basis does not reach are ignored."""
+    spread = np.empty(n_modes)
+    for group, gain in zip(groups_of(n_modes), gains, strict=False):
+        spread[group] = gain
+    return tuple(spread.tolist())
+
+
+class GainRamp:
+    """The ramp itself: told the residual, it says which gains are to be tried next."""
+
+    def __init__(self, gains: tuple[float, ...], plan: Plan) -> None:
+        """Take the gains as they are, one per mode of the basis."""
+        self._settled = np.array(gains)
+        self._plan = plan
+        self._group = 0
+        self.steps: tuple[Step, ...] = ()
+        """Every gain tried so far, in order."""
+        self._begin_group()
+
+    @property
+    def done(self) -> bool:
+        """Whether every group has its gain."""
+        return self._group == len(self._plan.groups)
+
+    @property
+    def modes(self) -> slice:
+        """The modes whose residual is judged now."""
+        return self._plan.groups[min(self._group, len(self._plan.groups) - 1)]
+
+    @property
+    def settled(self) -> tuple[float, ...]:
+        """One per mode: what has been chosen so far, and else what was there before."""
+        return tuple(self._settled.tolist())
+
+    @property
+    def gains(self) -> tuple[float, ...]:
+        """One per mode: what is to be in force now, and once done what was chosen."""
+        gains = self._settled.copy()
+        if not self.done:
+            gains[self.modes] = self._waiting[0]
+        return tuple(gains.tolist())
+
+    @property
+    def gains_by_group(self) -> tuple[float, ...]:
+        """The same, one per group."""
+        gains = self.gains
+        return tuple(gains[group.start] for group in self._plan.groups)
+
+    def take(self, residual_m: Array32) -> bool:
+        """Take the residual of the group's modes ``(n_frames, n_group)`` in the next frames.
+
+        Returns
+        -------
+        Whether other gains are to be tried from now on.
+        """
+        self._frames += len(residual_m)
+        settling = self._plan.settling_frames
+        if self.done or self._frames <= settling:
+            return False
+        finite = residual_m[np.isfinite(residual_m).all(axis=1)].astype(np.float64)
+        self._power += float((finite**2).sum())
+        self._judged += finite.size
+        if self._frames < settling + self._plan.judged_frames:
+            return False
+        self._judge()
+        return True
+
+    def again(self) -> None:
+        """Forget what the present group has shown: the loop is no longer the same."""
+        if not self.done:
+            self.steps = tuple(step for step in self.steps if step.group != self._group)
+            self._begin_group()
+
+    def _judge(self) -> None:
+        residual_m = float(np.sqrt(self._power / self._judged)) if self._judged else np.inf
+        gain, *waiting = self._waiting
+        self.steps = (*self.steps, Step(group=self._group, gain=gain, residual_m=residual_m))
+        tried = [step for step in self.steps if step.group == self._group]
+        best = min(tried, key=lambda step: step.residual_m)
+        if residual_m > _CLEARLY_WORSE * best.residual_m:
+            waiting = [other for other in waiting if other < gain]
+        if waiting:
+            self._begin_step(tuple(waiting))
+            return
+        self._settled[self.modes] = best.gain
+        self._group += 1
+        self._begin_group()
+
+    def _begin_group(self) -> None:
+        self._begin_step(() if self.done else self._plan.gains[self._group])
+
+    def _begin_step(self, waiting: tuple[float, ...]) -> None:
+        self._waiting, self._frames, self._power, self._judged = waiting, 0, 0.0, 0
+
+
+class Tuning:
+    """Shows a ramp the batches of a closed loop, and tells the log what it makes of them."""
+
+    def __init__(self, ramp: GainRamp, *, name: str, wait_frames: int = 0) -> None:
+        """Take a ramp, and the frames of closed loop after which it begins."""
+        self.name = name
+        self._ramp = ramp
+        self._wait_frames = wait_frames
+        self._loop: tuple[str, bool] | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether there is nothing left to try."""
+        return self._ramp.done
+
+    @property
+    def gains(self) -> tuple[float, ...]:
+        """One per mode of the basis: what is to be in force now."""
+        return self._ramp.settled if self._wait_frames > 0 else self._ramp.gains
+
+    @property
+    def settled(self) -> tuple[float, ...]:
+        """One per mode of the basis: what is to be in force if the ramp ends here."""
+        return self._ramp.settled
+
+    def look(self, batch: Batch, matrix: NDArray[Any]) -> bool:
+        """Take a batch and the matrix that multiplied its slopes; return whether gains change.
+
+        Another matrix, or a dither that begins or ends, makes another loop: what the group under
+        way has shown by then counts no more.
+        """
+        loop = (batch.cm_id, batch.dither_m is None)
+        known, self._loop = self._loop in {None, loop}, loop
+        if self._wait_frames > 0:
+            self._wait_frames -= len(batch.slopes)
+            return self._wait_frames <= 0
+        if not known:
+            self._ramp.again()
+            return True
+        if not self._ramp.take(batch.slopes @ matrix[self._ramp.modes].T):
+            return False
+        self._tell()
+        return True
+
+    def give_up(self, reason: str) -> None:
+        """Tell the log why it ends before its time."""
+        _log.warning("gains.given-up", ramp=self.name, reason=reason)
+
+    def _tell(self) -> None:
+        step = self._ramp.steps[-1]
+        _log.info(
+            "gains.step",
+            ramp=self.name,
+            group=step.group,
+            gain=round(step.gain, 3),
+            residual_nm=round(1e9 * step.residual_m, 2),
+        )
+        if self.done:
+            chosen = [round(gain, 3) for gain in self._ramp.gains_by_group]
+            _log.info("gains.chosen", ramp=self.name, by_group=chosen)
+
+
+def ramp_refusal(request: RampRequest, settings: LoopSettings, n_controlled: int) -> str:
+    """Return why gains cannot be tried so, in the wire's words; empty: they can."""
+    if not settings.closed:
+        return "unsupported: a gain ramp while the loop is open; close it first"
+    last = max(last for _, last in request.groups)
+    if last >= n_controlled:
+        return f"range: mode {last} in groups, expected 0 to {n_controlled - 1}"
+    if max(request.gains) > LARGEST_GAIN:
+        return f"range: gain {max(request.gains):g}, expected at most {LARGEST_GAIN:g}"
+    return ""

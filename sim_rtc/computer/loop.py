@@ -1,0 +1,242 @@
+"""The modal integrator, in blocks of frames.
+
+``c[k+d] = leak c[k+d-1] - gain R s[k]``, the dither added to what is applied and never fed back.
+A linear plant gives ``R s = R s_open + (R D) c``: the first term is one product for many frames,
+the second a small one for each ``d`` of them, whose commands are decided already, and the slopes
+themselves follow at the end. Any other plant is asked for its slopes frame by frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_rtc.telescope.linear import LinearOptics
+from sim_rtc.telescope.mirror import MirrorDrive
+from sim_rtc.telescope.plant import Optics
+
+Array32 = NDArray[np.float32]
+
+Sense = Callable[[int, Array32], Array32]
+"""Slopes ``(n_slopes,)`` of frame k of the block, with this command on the mirror."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopTerms:
+    """What the integrator needs, constant during a block."""
+
+    reconstructor: Array32
+    """R ``(n_controlled, n_slopes)``, metres per slope."""
+
+    gains: Array32
+    """``(n_controlled,)``; all 0 leaves the integrator to its leak."""
+
+    leak: float
+    """Per frame; 1 forgets nothing."""
+
+    slopes_per_command: Array32 | None = None
+    """D ``(n_slopes, n_modes)`` of a linear plant, slope per metre; None: it is not linear."""
+
+    modal_response: Array32 | None = None
+    """R D ``(n_controlled, n_modes)``, in columns: for two frames at a time a copy of it would cost
+    four times the product."""
+
+    @classmethod
+    def of(cls, optics: Optics, reconstructor: Array32, gains: Array32, leak: float) -> LoopTerms:
+        """Return the terms of a loop around these optics."""
+        if not isinstance(optics, LinearOptics):
+            return cls(reconstructor=reconstructor, gains=gains, leak=leak)
+        response = optics.slopes_per_command
+        return cls(
+            # in columns, as the product with rows of slopes reads it
+            reconstructor=np.asfortranarray(reconstructor),
+            gains=gains,
+            leak=leak,
+            slopes_per_command=response,
+            modal_response=np.asfortranarray(reconstructor @ response),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopBlock:
+    """What a block of frames came to."""
+
+    slopes: Array32
+    """``(n_frames, n_slopes)``."""
+
+    commands_m: Array32
+    """``(n_frames, n_modes)`` on the mirror during each exposure, dither included, clipped."""
+
+    dither_m: Array32 | None
+    """``(n_frames, n_modes)`` its dither part: what was asked for, as the mirror follows it."""
+
+    n_clipped: int
+    """Commands that met a limit of the mirror."""
+
+
+class ModalLoop:
+    """The integrator's memory: the commands already decided for the frames to come."""
+
+    def __init__(
+        self,
+        *,
+        n_modes: int,
+        delay_frames: int,
+        stroke_m: float,
+        drive: MirrorDrive | None = None,
+    ) -> None:
+        """Take a drive for a mirror with limits or a lag; without one it obeys at once."""
+        self._stroke_m = np.float32(stroke_m)
+        self._drive = drive
+        self._decided = np.zeros((delay_frames, n_modes), dtype=np.float32)
+
+    def limit(self, stroke_m: float) -> None:
+        """Clip commands at this from now on, metres RMS of a mode."""
+        self._stroke_m = np.float32(stroke_m)
+
+    def reset(self) -> None:
+        """Forget everything: the integrator starts from zero."""
+        self._decided[:] = 0.0
+
+    def release(self, n_controlled: int) -> None:
+        """Zero the modes from ``n_controlled`` on: nothing would correct them any more."""
+        self._decided[:, n_controlled:] = 0.0
+
+    def run(
+        self,
+        open_slopes: Array32,
+        terms: LoopTerms,
+        dither_m: Array32 | None,
+        played_m: Array32 | None = None,
+        open_modes: Array32 | None = None,
+    ) -> LoopBlock:
+        """Run the frames whose slopes, mirror apart, are ``open_slopes`` ``(n_frames, n_slopes)``.
+
+        ``dither_m`` and ``played_m`` are ``(n_frames, n_modes)``, added to the integrator's
+        command: the dither is told on the wire, what is played is not.
+        A command beyond the stroke limit is clipped, in the integrator too: a loop that diverges
+        stays finite and recovers.
+        ``open_modes`` are ``open_slopes @ R.T`` where they are known already.
+        """
+        matrix, modal_response = terms.slopes_per_command, terms.modal_response
+        if matrix is None or modal_response is None:
+            raise TypeError("loop: found no matrix of the plant; only a linear one has open slopes")
+        if open_modes is None:
+            open_modes = open_slopes @ terms.reconstructor.T
+        added = _Added.of(dither_m, played_m, (len(open_slopes), len(self._decided[0])))
+        moved = self._moved(added, len(terms.gains))
+        response = modal_response[:, :moved]
+
+        def estimate(first: int, commands: Array32) -> Array32:
+            modes = commands[:, :moved] @ response.T
+            modes += open_modes[first : first + len(modes)]
+            return modes
+
+        n_clipped = self._integrate(estimate, terms, added)
+        slopes = added.applied[:, :moved] @ matrix[:, :moved].T
+        slopes += open_slopes
+        return LoopBlock(
+            slopes=slopes, commands_m=added.applied, dither_m=added.dither, n_clipped=n_clipped
+        )
+
+    def _moved(self, added: _Added, n_controlled: int) -> int:
+        """Return how many of the first modes may move: nothing corrects those beyond the loop."""
+        if self._drive is not None:
+            return int(added.applied.shape[1])
+        beyond = added.applied.any(axis=0) | self._decided.any(axis=0)
+        return max(n_controlled, int(np.flatnonzero(beyond)[-1]) + 1 if beyond.any() else 0)
+
+    def run_frames(
+        self,
+        n_frames: int,
+        sense: Sense,
+        terms: LoopTerms,
+        dither_m: Array32 | None,
+        played_m: Array32 | None = None,
+    ) -> LoopBlock:
+        """Run frames one by one, each with the slopes that ``sense`` says it makes."""
+        slopes = np.empty((n_frames, terms.reconstructor.shape[1]), dtype=np.float32)
+
+        def estimate(first: int, commands: Array32) -> Array32:
+            for k, command in enumerate(commands, first):
+                slopes[k] = sense(k, command)
+            return np.asarray(slopes[first : first + len(commands)] @ terms.reconstructor.T)
+
+        added = _Added.of(dither_m, played_m, (n_frames, len(self._decided[0])))
+        n_clipped = self._integrate(estimate, terms, added)
+        return LoopBlock(
+            slopes=slopes, commands_m=added.applied, dither_m=added.dither, n_clipped=n_clipped
+        )
+
+    def _integrate(
+        self,
+        estimate: Callable[[int, Array32], Array32],
+        terms: LoopTerms,
+        added: _Added,
+    ) -> int:
+        """Complete the commands of ``added`` frame by frame; return how many were clipped.
+
+        ``estimate`` gives the modes ``(n, n_controlled)`` that frames k, k + 1, ... show under n
+        commands; a frame in which one of them is not finite corrects nothing.
+        """
+        applied = added.applied
+        n_frames, delay = len(applied), len(self._decided)
+        integrator = np.empty((n_frames + delay, applied.shape[1]), dtype=np.float32)
+        integrator[:delay] = self._decided
+        # Arrays of no dimension: a scalar is converted again in every frame.
+        leak, stroke = np.array(terms.leak, dtype=np.float32), np.array(self._stroke_m)
+        least = -stroke
+        n_controlled = len(terms.gains)
+        n_limited = 0
+        for first in range(0, n_frames, delay):
+            commands = applied[first : first + delay]
+            commands += integrator[first : first + len(commands)]
+            np.minimum(commands, stroke, out=commands)
+            np.maximum(commands, least, out=commands)
+            if self._drive is not None:
+                n_limited += self._follow(self._drive, first, added)
+            corrections = estimate(first, commands)
+            corrections *= terms.gains
+            # a slope that is no number would stay in the integrator for ever, at a gain of 0, too
+            if not math.isfinite(np.add.reduce(corrections, axis=None)):
+                corrections[~np.isfinite(corrections).all(axis=1)] = 0.0
+            for k, correction in enumerate(corrections, first + delay):
+                decided = integrator[k]
+                np.multiply(integrator[k - 1], leak, out=decided)
+                decided[:n_controlled] -= correction
+                np.minimum(decided, stroke, out=decided)
+                np.maximum(decided, least, out=decided)
+        self._decided = integrator[n_frames:].copy()
+        return n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
+
+    def _follow(self, drive: MirrorDrive, first: int, added: _Added) -> int:
+        """Let the drive make what it can of the next commands; count its limits."""
+        return sum(
+            drive.follow(added.applied[k], None if added.dither is None else added.dither[k])
+            for k in range(first, min(first + len(self._decided), len(added.applied)))
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Added:
+    """What is added to the integrator's commands; both arrays become the mirror's in place."""
+
+    applied: Array32
+    """``(n_frames, n_modes)`` dither and played commands together."""
+
+    dither: Array32 | None
+    """``(n_frames, n_modes)``."""
+
+    @classmethod
+    def of(
+        cls, dither_m: Array32 | None, played_m: Array32 | None, shape: tuple[int, int]
+    ) -> _Added:
+        applied = np.zeros(shape, dtype=np.float32)
+        for part in (dither_m, played_m):
+            if part is not None:
+                applied += part
+        return cls(applied=applied, dither=None if dither_m is None else dither_m.copy())

@@ -1,0 +1,272 @@
+"""Reconstructors: the first one, and the two-phase way of others into the loop.
+
+Collect, check, stage, swap, acknowledge.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import svd
+
+from service.errors import WireError
+from service.model.instrument import BasisKind, Instrument
+from service.model.interaction import InteractionModel
+from service.model.modes import ModalBasis
+from service.wire import CHUNK_LIMIT, AckState, ChunkAssembler, Manifest, layout_of
+from sim_rtc.computer.telemetry import Identity, Reconstructor
+
+Array32 = NDArray[np.float32]
+
+_WAIT_S = 2.0
+"""How long missing chunks are waited for, before and again after they have been asked for."""
+
+_MOST_COLLECTED = 4
+"""Matrices collected at a time; beyond it the oldest is forgotten."""
+
+_MOST_REMEMBERED = 1000
+_SMALLEST_SINGULAR_RATIO = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Terms:
+    """What a reconstructor must fit."""
+
+    n_slopes: int
+    n_controlled: tuple[int, ...]
+    """Numbers of rows the loop takes: the present one, and the one a command has asked for."""
+
+    basis_id: str
+    config_id: str
+    system: str
+
+    def refusal(self, manifest: Manifest) -> str:
+        """Return why the manifest does not fit; empty: it does."""
+        rows, columns = manifest.layout.shape
+        if columns != self.n_slopes or rows not in self.n_controlled:
+            expected = " or ".join(str([n, self.n_slopes]) for n in self.n_controlled)
+            return f"range: shape {[rows, columns]}, expected {expected}"
+        pairs = {
+            "basis_id": (manifest.basis_id, self.basis_id),
+            "config_id": (manifest.config_id, self.config_id),
+            "system": (manifest.system, self.system),
+        }
+        for name, (found, expected) in pairs.items():
+            if found != expected:
+                return f"id: {name} {found!r}, expected {expected!r}"
+        return ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What the RTC says of one reconstructor; becomes an acknowledgement."""
+
+    id: str
+    sha256: str
+    state: AckState
+    reason: str = ""
+    frame_seq: int | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class _Collection:
+    """Parts of one matrix, and its manifest once it has come."""
+
+    parts: ChunkAssembler
+    manifest: Manifest | None = None
+    deadline_s: float = float("inf")
+    asked: bool = False
+
+
+@dataclass(slots=True, kw_only=True)
+class Outcome:
+    """What is to be done after something has arrived or time has passed."""
+
+    verdicts: list[Verdict] = field(default_factory=list)
+    """To be acknowledged, in order."""
+
+    staged: list[Reconstructor] = field(default_factory=list)
+    """To be handed to the loop."""
+
+    missing: list[tuple[str, tuple[int, ...]]] = field(default_factory=list)
+    """Ids and chunk numbers to be asked for."""
+
+
+class Staging:
+    """Reconstructors on their way in. Time is given, nothing is sent: the link does both."""
+
+    def __init__(self, terms: Callable[[], Terms], *, limit_bytes: int) -> None:
+        self._terms = terms
+        self._limit_bytes = limit_bytes
+        self._collected: OrderedDict[str, _Collection] = OrderedDict()
+        self._verdicts: OrderedDict[str, Verdict] = OrderedDict()
+
+    def chunk(self, matrix_id: str, index: int, data: bytes) -> Outcome:
+        """Take one part; one that cannot be right is dropped and asked for again in time."""
+        if matrix_id in self._verdicts:
+            return Outcome()
+        with suppress(WireError):
+            self._collection(matrix_id).parts.add(index, data)
+        return self._complete(matrix_id)
+
+    def commit(self, manifest: Manifest, now_s: float) -> Outcome:
+        """Take a manifest: the order to stage and swap."""
+        known = self._verdicts.get(manifest.id)
+        if known is not None:
+            return self._repeated(manifest, known)
+        collection = self._collection(manifest.id)
+        if collection.manifest is not None:
+            return Outcome()
+        collection.manifest = manifest
+        refusal = self._terms().refusal(manifest)
+        if refusal:
+            return self._reject(manifest.id, refusal)
+        collection.deadline_s = now_s + _WAIT_S
+        # Parts that do not fit the manifest are dropped by it, and so will be asked for.
+        with suppress(WireError):
+            collection.parts.announce(manifest.layout)
+        return self._complete(manifest.id)
+
+    def poll(self, now_s: float) -> Outcome:
+        """Ask for what is missing when the wait is over, and give up after a second wait."""
+        outcome = Outcome()
+        for matrix_id, collection in list(self._collected.items()):
+            if now_s < collection.deadline_s:
+                continue
+            missing = collection.parts.missing()
+            if collection.asked:
+                reason = f"missing: chunks {list(missing[:8])}, {len(missing)} in all"
+                outcome.verdicts += self._reject(matrix_id, reason).verdicts
+            else:
+                collection.asked, collection.deadline_s = True, now_s + _WAIT_S
+                outcome.missing.append((matrix_id, missing))
+        return outcome
+
+    def applied(self, matrix_id: str, frame_seq: int) -> Verdict | None:
+        """Note that the loop has swapped; return what to acknowledge, None if it was voided."""
+        staged = self._verdicts.get(matrix_id)
+        if staged is None:
+            return None
+        return self._remember(replace(staged, state=AckState.APPLIED, frame_seq=frame_seq))
+
+    def void(self) -> None:
+        """Forget what has not been applied: a new session begins."""
+        self._collected.clear()
+        for matrix_id, verdict in list(self._verdicts.items()):
+            if verdict.state is AckState.STAGED:
+                del self._verdicts[matrix_id]
+
+    def _collection(self, matrix_id: str) -> _Collection:
+        if matrix_id not in self._collected:
+            parts = ChunkAssembler(self._limit_bytes)
+            self._collected[matrix_id] = _Collection(parts=parts)
+            if len(self._collected) > _MOST_COLLECTED:
+                self._collected.popitem(last=False)
+        return self._collected[matrix_id]
+
+    def _complete(self, matrix_id: str) -> Outcome:
+        collection = self._collected[matrix_id]
+        if collection.manifest is None or not collection.parts.complete:
+            return Outcome()
+        try:
+            matrix = collection.parts.matrix()
+        except WireError as error:
+            return self._reject(matrix_id, str(error))
+        manifest = collection.manifest
+        del self._collected[matrix_id]
+        staged = Verdict(id=matrix_id, sha256=manifest.layout.sha256, state=AckState.STAGED)
+        return Outcome(
+            verdicts=[self._remember(staged)],
+            staged=[Reconstructor(manifest=manifest, matrix=matrix)],
+        )
+
+    def _reject(self, matrix_id: str, reason: str) -> Outcome:
+        manifest = self._collected.pop(matrix_id).manifest
+        if manifest is None:
+            return Outcome()
+        verdict = Verdict(
+            id=matrix_id, sha256=manifest.layout.sha256, state=AckState.REJECTED, reason=reason
+        )
+        return Outcome(verdicts=[self._remember(verdict)])
+
+    def _repeated(self, manifest: Manifest, known: Verdict) -> Outcome:
+        """Repeat the verdict on the same matrix; an id that is used again is refused."""
+        if manifest.layout.sha256 == known.sha256:
+            return Outcome(verdicts=[known])
+        reason = f"id: {manifest.id} was used with sha256 {known.sha256}, expected a new id"
+        return Outcome(
+            verdicts=[
+                Verdict(
+                    id=manifest.id,
+                    sha256=manifest.layout.sha256,
+                    state=AckState.REJECTED,
+                    reason=reason,
+                )
+            ]
+        )
+
+    def _remember(self, verdict: Verdict) -> Verdict:
+        self._verdicts[verdict.id] = verdict
+        self._verdicts.move_to_end(verdict.id)
+        if len(self._verdicts) > _MOST_REMEMBERED:
+            self._verdicts.popitem(last=False)
+        return verdict
+
+
+def truncated_inverse(interaction: Array32) -> Array32:
+    """Return the pseudo-inverse of D ``(n_slopes, n_modes)`` without its weakest directions."""
+    u, values, vh = svd(interaction.astype(np.float64), full_matrices=False)
+    kept = values > _SMALLEST_SINGULAR_RATIO * values[0]
+    inverse = (vh[kept].T / values[kept]) @ u[:, kept].T
+    return np.ascontiguousarray(inverse, dtype=np.float32)
+
+
+def initial_reconstructor(
+    instrument: Instrument, basis: ModalBasis, identity: Identity, n_controlled: int
+) -> Reconstructor:
+    """Return what an observatory has before any flexure: the nominal model's inverse."""
+    aligned = instrument.start
+    interaction = InteractionModel(instrument, basis).interaction_matrix(aligned)
+    matrix = truncated_inverse(interaction[:, :n_controlled])
+    layout = layout_of(matrix, CHUNK_LIMIT)
+    manifest = Manifest(
+        id=f"initial-{n_controlled}-{layout.sha256[:8]}",
+        layout=layout,
+        alpha=aligned.to_boundary(),
+        sigma=None,
+        im_id=None,
+        parent=None,
+        basis_id=identity.basis_id,
+        config_id=identity.config_id,
+        system=identity.system,
+        created_ns=time.time_ns(),
+    )
+    return Reconstructor(manifest=manifest, matrix=matrix)
+
+
+def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:
+    """Return the names of basis and sensor configuration: they change when either does."""
+    mirror, wfs = instrument.analytic_mirror, instrument.wfs
+    basis = hashlib.sha256(np.round(mirror.positions_m, 6).tobytes())
+    basis.update(repr((mirror.influence, mirror.coupling, instrument.modes)).encode())
+    kind = "kl"
+    if mirror.mode_to_actuator is not None or mirror.basis is not BasisKind.KARHUNEN_LOEVE:
+        kind = "own"
+        strokes = mirror.mode_to_actuator
+        basis.update(b"zonal" if strokes is None else np.round(strokes, 9).tobytes())
+    sensor = hashlib.sha256(np.packbits(valid).tobytes())
+    sensor.update(
+        repr((wfs.wavelength_m, wfs.modulation_lambda_over_d, wfs.pupil_separation_subap)).encode()
+    )
+    return Identity(
+        system=instrument.name,
+        basis_id=f"{kind}-{instrument.modes.n_modes}-{basis.hexdigest()[:8]}",
+        config_id=f"pyramid-{wfs.n_subapertures}-{sensor.hexdigest()[:8]}",
+    )

@@ -1,0 +1,248 @@
+"""Reconstructors from the wire into the loop, and the acknowledgements back."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+import structlog
+import zenoh
+
+from service.errors import WireError
+from service.wire import (
+    CHUNK_LIMIT,
+    Acknowledgement,
+    AckState,
+    Encodings,
+    Keys,
+    Manifest,
+    Role,
+    decode_manifest,
+    encode_acknowledgement,
+)
+from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.reconstructors import Outcome, Staging, Verdict
+from sim_rtc.computer.telemetry import Reconstructor
+from sim_rtc.faults import Fault, FaultKind, FaultPlan
+from sim_rtc.link.record import Kind, Recorder
+
+_log = structlog.get_logger("sim_rtc")
+
+_POLL_S: Final = 0.05
+_QUERY_TIMEOUT_S: Final = 2.0
+_MOST_EVENTS: Final = 256
+"""Events that wait for the thread; a burst beyond it is dropped, its chunks are asked for again."""
+
+
+Event = Callable[[], None]
+
+
+class Intake:
+    """Looks after reconstructors in a thread of its own while its ``with`` block lasts."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        computer: RealTimeComputer,
+        *,
+        plan: FaultPlan | None = None,
+        recorder: Recorder | None = None,
+    ) -> None:
+        self._session = session
+        self._keys = keys
+        self._computer = computer
+        self._staging = Staging(computer.terms, limit_bytes=computer.largest_matrix_bytes)
+        self._events: queue.Queue[Event] = queue.Queue(_MOST_EVENTS)
+        self._stopped = threading.Event()
+        self._rtc_session = computer.snapshot().session
+        self._asked_current = False
+        self._plan = plan or FaultPlan()
+        self._recorder = recorder
+        self._refused: dict[Fault, int] = {}
+        self._late: list[tuple[float, Reconstructor]] = []
+        self._thread = threading.Thread(target=self._run, name="reconstructors", daemon=True)
+
+    def __enter__(self) -> Intake:
+        self._thread.start()
+        self._declared = (
+            self._session.declare_subscriber(self._keys.all_chunks, self._on_chunk),
+            self._session.declare_subscriber(self._keys.all_commits, self._on_commit),
+            self._session.liveliness().declare_subscriber(
+                self._keys.alive(Role.SERVICE), self._on_service, history=True
+            ),
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def _on_chunk(self, sample: zenoh.Sample) -> None:
+        if len(sample.payload) > CHUNK_LIMIT:
+            return
+        key, data = str(sample.key_expr), sample.payload.to_bytes()
+        self._enqueue(lambda: self._chunk(key, data))
+
+    def _on_commit(self, sample: zenoh.Sample) -> None:
+        key, data = str(sample.key_expr), sample.payload.to_bytes()
+        self._enqueue(lambda: self._commit(key, data))
+
+    def _on_service(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._enqueue(self._ask_current)
+
+    def _enqueue(self, event: Event) -> None:
+        try:
+            self._events.put_nowait(event)
+        except queue.Full:
+            _log.warning("reconstructor.overflow", waiting=_MOST_EVENTS)
+
+    def _run(self) -> None:
+        while not self._stopped.is_set():
+            try:
+                event = self._events.get(timeout=_POLL_S)
+            except queue.Empty:
+                event = None
+            self._follow_session()
+            if event is not None:
+                event()
+            self._carry_out(self._staging.poll(time.monotonic()))
+            self._swap_late()
+            for matrix_id, seq in self._computer.take_swaps():
+                verdict = self._staging.applied(matrix_id, seq)
+                if verdict is not None:
+                    self._acknowledge(verdict)
+
+    def _follow_session(self) -> None:
+        """Void what was on its way when the computer has started a new session."""
+        current = self._computer.snapshot().session
+        if current != self._rtc_session:
+            self._rtc_session = current
+            self._staging.void()
+            self._late.clear()
+
+    def _chunk(self, key: str, data: bytes) -> None:
+        try:
+            matrix_id, index = self._keys.matrix_id_of(key), self._keys.chunk_index_of(key)
+        except WireError as error:
+            _log.warning("reconstructor.refused", reason=str(error))
+            return
+        if index is not None:
+            self._carry_out(self._staging.chunk(matrix_id, index, data))
+
+    def _commit(self, key: str, data: bytes) -> None:
+        try:
+            manifest = decode_manifest(data)
+            if manifest.id != self._keys.matrix_id_of(key):
+                raise WireError(f"id: {manifest.id} in the manifest at {key}")
+        except WireError as error:
+            # Without a readable manifest there is no id and checksum to acknowledge.
+            _log.warning("reconstructor.refused", reason=str(error))
+            return
+        if self._plan.active(FaultKind.DEAF):
+            return
+        if self._refuses():
+            reason = "range: refused as a fault asked for"
+            sha256 = manifest.layout.sha256
+            self._acknowledge(
+                Verdict(id=manifest.id, sha256=sha256, state=AckState.REJECTED, reason=reason)
+            )
+            return
+        self._carry_out(self._staging.commit(manifest, time.monotonic()))
+
+    def _refuses(self) -> bool:
+        """Return whether a fault asks for one more refusal."""
+        fault = self._plan.active(FaultKind.REFUSE)
+        if fault is None or self._refused.get(fault, 0) >= fault.value("COUNT"):
+            return False
+        self._refused[fault] = self._refused.get(fault, 0) + 1
+        return True
+
+    def _ask_current(self) -> None:
+        """Ask what the service wants in use, once, and take it if it fits."""
+        if self._asked_current:
+            return
+        self._asked_current = True
+        data = self._get(self._keys.current)
+        if data is None:
+            return
+        try:
+            manifest = decode_manifest(data)
+        except WireError as error:
+            _log.warning("reconstructor.refused", reason=str(error))
+            return
+        refusal = self._computer.terms().refusal(manifest)
+        if refusal:
+            _log.info("reconstructor.not-taken", id=manifest.id, reason=refusal)
+            return
+        if self._is_in_use(manifest):
+            return
+        self._carry_out(self._staging.commit(manifest, time.monotonic()))
+        self._fetch(manifest.id, tuple(range(manifest.layout.n_chunks)))
+
+    def _is_in_use(self, manifest: Manifest) -> bool:
+        active = self._computer.snapshot().reconstructor.manifest
+        return (active.id, active.layout.sha256) == (manifest.id, manifest.layout.sha256)
+
+    def _fetch(self, matrix_id: str, chunks: tuple[int, ...]) -> None:
+        for index in chunks:
+            data = self._get(f"{self._keys.matrix(matrix_id)}?chunk={index}")
+            if data is not None:
+                self._carry_out(self._staging.chunk(matrix_id, index, data))
+
+    def _get(self, selector: str) -> bytes | None:
+        """Return the first ordinary reply to a query, None when there is none in time."""
+        for reply in self._session.get(selector, timeout=_QUERY_TIMEOUT_S):
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+            text = "" if reply.err is None else reply.err.payload.to_string()
+            _log.info("query.refused", selector=selector, reason=text)
+        return None
+
+    def _carry_out(self, outcome: Outcome) -> None:
+        for verdict in outcome.verdicts:
+            self._acknowledge(verdict)
+        for reconstructor in outcome.staged:
+            late = self._plan.active(FaultKind.LATE_SWAP)
+            if late is None:
+                self._computer.stage(reconstructor)
+            else:
+                self._late.append((self._plan.now_s + late.value("DELAY"), reconstructor))
+        for matrix_id, chunks in outcome.missing:
+            self._fetch(matrix_id, chunks)
+
+    def _swap_late(self) -> None:
+        while self._late and self._late[0][0] <= self._plan.now_s:
+            self._computer.stage(self._late.pop(0)[1])
+
+    def _acknowledge(self, verdict: Verdict) -> None:
+        _log.info(
+            "reconstructor." + verdict.state,
+            id=verdict.id,
+            reason=verdict.reason,
+            frame_seq=verdict.frame_seq,
+        )
+        message = Acknowledgement(
+            session=self._rtc_session,
+            id=verdict.id,
+            sha256=verdict.sha256,
+            state=verdict.state,
+            reason=verdict.reason,
+            frame_seq=verdict.frame_seq,
+        )
+        if self._plan.active(FaultKind.MUTE):
+            return
+        data = encode_acknowledgement(message)
+        if self._recorder is not None:
+            self._recorder.put(Kind.ACKNOWLEDGEMENT, data)
+        self._session.put(
+            self._keys.acknowledgement,
+            data,
+            encoding=Encodings.ACKNOWLEDGEMENT,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA_HIGH,
+        )

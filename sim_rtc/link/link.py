@@ -1,0 +1,351 @@
+"""The RTC's side of the wire: telemetry and status out, commands and reconstructors in.
+
+One thread publishes, another looks after reconstructors; the loop only drops batches into a
+bounded queue. The service may come before, after or in the middle.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import structlog
+import zenoh
+import zenoh.ext
+
+from service.wire import Encodings, Keys, Role, encode_manifest, encode_status, split
+from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of, status_of
+from sim_rtc.faults import FaultPlan, WireFaults
+from sim_rtc.link.intake import Intake
+from sim_rtc.link.record import Kind, Recorder
+from sim_rtc.link.replies import MeasuredPublisher, Replies
+from sim_rtc.telescope.detector import Detector
+from sim_rtc.telescope.scene import Elevation
+
+_log = structlog.get_logger("sim_rtc")
+
+_STATUS_PERIOD_S = 0.2
+_BACKLOG_S = 1.0
+"""Of telemetry that waits for the publishing thread; beyond it the oldest is dropped, counted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rehearsal:
+    """What is done to the link on request."""
+
+    plan: FaultPlan
+    """Faults."""
+
+    recorder: Recorder | None = None
+    """Where everything that is sent is written, too."""
+
+    seed: int | None = None
+    """Of the faults' randomness."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Outgoing:
+    """A batch that waits to be published."""
+
+    batch: Batch
+    t0_ns: int
+    time_s: float
+    """Loop time."""
+
+
+class Link:
+    """Connects a computer to the service for as long as the ``with`` block lasts."""
+
+    def __init__(
+        self,
+        computer: RealTimeComputer,
+        *,
+        endpoint: str,
+        clock: FrameClock,
+        detector: Detector,
+        magnitude: float,
+        batch_frames: int,
+        elevation: Elevation | None = None,
+        rehearsal: Rehearsal | None = None,
+    ) -> None:
+        rehearsal = rehearsal or Rehearsal(plan=FaultPlan())
+        self._plan = rehearsal.plan
+        self._recorder = rehearsal.recorder
+        self._faults = WireFaults(self._plan, np.random.default_rng(rehearsal.seed))
+        self._absent = threading.Event()
+        self._recorded_cm_id: str | None = None
+        self._computer = computer
+        self._endpoint = endpoint
+        self._clock = clock
+        self._detector = detector
+        self._magnitude = magnitude
+        self._batch_frames = batch_frames
+        self._elevation = elevation or Elevation()
+        self._keys = Keys(computer.identity.system)
+        self._backlog: deque[_Outgoing] = deque()
+        self._ready = threading.Condition()
+        self._stopped = threading.Event()
+        self._dropped = 0
+        self._thread = threading.Thread(target=self._run, name="link", daemon=True)
+
+    def __enter__(self) -> Link:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        with self._ready:
+            self._ready.notify()
+        self._thread.join()
+
+    @property
+    def n_dropped_frames(self) -> int:
+        """Frames that were never published: the thread was behind, or there was no service yet."""
+        return self._dropped
+
+    def offer(self, batch: Batch) -> None:
+        """Queue a batch for publication; never waits."""
+        with self._ready:
+            if len(self._backlog) * len(batch.slopes) * self._clock.dt_ns >= _BACKLOG_S * 1e9:
+                self._dropped += len(self._backlog.popleft().batch.slopes)
+            self._backlog.append(
+                _Outgoing(
+                    batch=batch,
+                    t0_ns=self._clock.end_of_exposure_ns(batch.seq0),
+                    time_s=self._plan.now_s,
+                )
+            )
+            self._ready.notify()
+
+    @contextmanager
+    def absence(self) -> Iterator[None]:
+        """Withdraw the liveliness token and send no status while the ``with`` block lasts."""
+        self._absent.set()
+        try:
+            yield
+        finally:
+            self._absent.clear()
+
+    def _run(self) -> None:
+        replies = Replies(self._keys, self._computer)
+        while (session := self._open()) is not None:
+            self._speak(session, replies)
+
+    def _speak(self, session: zenoh.Session, replies: Replies) -> None:
+        """Do an RTC's part in a session until it is cut off or the link ends."""
+        with session:
+            replies.declare(session)
+            with self._ready:
+                # What has waited for a service is old: it would only arrive as a burst.
+                self._backlog.clear()
+            with (
+                Intake(
+                    session,
+                    self._keys,
+                    self._computer,
+                    plan=self._plan,
+                    recorder=self._recorder,
+                ),
+                MeasuredPublisher(session, self._keys, self._computer),
+                Token(session, self._keys, self._recorder) as token,
+            ):
+                _log.info("link.open", endpoint=self._endpoint, system=self._keys.system)
+                self._publish(session, token)
+
+    def _open(self) -> zenoh.Session | None:
+        """Open the session, waiting for the service's router for as long as it takes."""
+        waiting = False
+        while not self._stopped.is_set():
+            try:
+                return zenoh.open(client_config(self._endpoint))
+            except zenoh.ZError:
+                if not waiting:
+                    _log.warning("link.waiting", endpoint=self._endpoint)
+                waiting = True
+                self._stopped.wait(RETRY_S)
+        return None
+
+    def _publish(self, session: zenoh.Session, token: Token) -> None:
+        rate_hz = 1e9 / self._clock.dt_ns
+        frames = frames_publisher(session, self._keys, rate_hz / self._batch_frames)
+        status = status_publisher(session, self._keys)
+        next_status_s = 0.0
+        lifeline = Lifeline(time.monotonic())
+        while not self._stopped.is_set():
+            outgoing = self._next()
+            if outgoing is not None:
+                self._note_matrix(outgoing.batch.cm_id)
+                header, rows = frames_of(
+                    outgoing.batch, self._computer.identity, outgoing.t0_ns, self._clock.dt_ns
+                )
+                for payload, attachment in self._faults.messages(header, rows, outgoing.time_s):
+                    frames.put(payload, attachment=attachment)
+                    self._record(Kind.FRAMES, payload, attachment)
+            token.show(visible=not self._absent.is_set())
+            now_s = time.monotonic()
+            if now_s >= next_status_s and not self._absent.is_set():
+                data = self._status()
+                status.put(data)
+                self._record(Kind.STATUS, data)
+                next_status_s = now_s + _STATUS_PERIOD_S
+                if lifeline.cut(session, now_s):
+                    _log.warning("link.cut-off", text=lifeline.text)
+                    return
+
+    def _note_matrix(self, cm_id: str) -> None:
+        """Record a matrix when the first frames that it multiplies are sent."""
+        if self._recorder is None or cm_id == self._recorded_cm_id:
+            return
+        self._recorded_cm_id = cm_id
+        active = self._computer.snapshot().reconstructor
+        matrix = b"".join(split(active.matrix, active.manifest.layout.chunk_bytes))
+        self._record(Kind.MATRIX, matrix, encode_manifest(active.manifest))
+
+    def _record(self, kind: Kind, payload: bytes, attachment: bytes = b"") -> None:
+        if self._recorder is not None:
+            self._recorder.put(kind, payload, attachment)
+
+    def _next(self) -> _Outgoing | None:
+        with self._ready:
+            if not self._backlog:
+                self._ready.wait(_STATUS_PERIOD_S / 2)
+            return self._backlog.popleft() if self._backlog else None
+
+    def _status(self) -> bytes:
+        time_s = self._plan.now_s
+        return encode_status(
+            status_of(
+                self._computer.snapshot(),
+                identity=self._computer.identity,
+                clock=self._clock,
+                detector=self._detector,
+                magnitude=self._magnitude,
+                basis_id=self._faults.basis_id(self._computer.identity.basis_id, time_s),
+                pointing=self._elevation.at(time_s),
+            )
+        )
+
+
+RETRY_S = 0.2
+"""Between two attempts to find the service's router."""
+
+_CUT_OFF_S = 5.0
+"""Without a router, until a session is given up: zenoh itself reconnects within 1.6 s."""
+
+_OPEN_TIMEOUT_MS = 1000
+_LEASE_MS = 2000
+_WAIT_BEFORE_DROP_US = 20_000
+_QUEUED_MESSAGES = 16
+_RETRY = {
+    "period_init_ms": round(1000 * RETRY_S),
+    "period_increase_factor": 1.5,
+    "period_max_ms": 1000,
+}
+_CACHE_S = 5.0
+_HEARTBEAT_S = 0.2
+
+
+def client_config(endpoint: str) -> zenoh.Config:
+    """Return the settings of a zenoh client of the service's router, as the wire page asks."""
+    settings: dict[str, object] = {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": _OPEN_TIMEOUT_MS,
+        "connect/retry": _RETRY,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/tx/lease": _LEASE_MS,
+        "transport/link/tx/queue/size/data": _QUEUED_MESSAGES,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _WAIT_BEFORE_DROP_US,
+        "transport/shared_memory/enabled": False,
+        "timestamping/enabled": True,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def frames_publisher(
+    session: zenoh.Session, keys: Keys, batches_per_s: float
+) -> zenoh.ext.AdvancedPublisher:
+    """Return the publisher of telemetry: what the service missed it can ask for again."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        keys.frames,
+        encoding=Encodings.FRAMES,
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=zenoh.Priority.DATA,
+        cache=zenoh.ext.CacheConfig(math.ceil(_CACHE_S * batches_per_s)),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(
+            heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
+        ),
+        publisher_detection=True,
+    )
+
+
+def status_publisher(session: zenoh.Session, keys: Keys) -> zenoh.Publisher:
+    """Return the publisher of status messages."""
+    return session.declare_publisher(
+        keys.status,
+        encoding=Encodings.STATUS,
+        congestion_control=zenoh.CongestionControl.DROP,
+    )
+
+
+class Lifeline:
+    """Whether a session still has a router.
+
+    When both ends have stood still for longer than the lease, zenoh's client may connect twice at
+    once. One of the connections stays open and unused, and the router takes no second one of the
+    same session (``MAX_LINKS``): its token is there, and nothing that it publishes arrives, for
+    ever. Only a new session, under a new name, ends that.
+    """
+
+    text = f"no router for {_CUT_OFF_S:.0f} s: the session is closed and opened anew"
+
+    def __init__(self, now_s: float) -> None:
+        self._seen_s = now_s
+
+    def cut(self, session: zenoh.Session, now_s: float) -> bool:
+        """Return whether the session has been without a router for so long that it is given up."""
+        if session.info.routers_zid():
+            self._seen_s = now_s
+        return now_s - self._seen_s > _CUT_OFF_S
+
+
+class Token:
+    """The RTC's liveliness token, which may go and come back while the ``with`` block lasts."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, recorder: Recorder | None) -> None:
+        self._session = session
+        self._key = keys.alive(Role.RTC)
+        self._recorder = recorder
+        self._token: zenoh.LivelinessToken | None = None
+
+    def __enter__(self) -> Token:
+        self.show(visible=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.show(visible=False)
+
+    def show(self, *, visible: bool) -> None:
+        """Declare or withdraw the token, unless that is how it is."""
+        if visible is (self._token is not None):
+            return
+        if self._recorder is not None:
+            self._recorder.put(Kind.LIVELINESS, bytes([visible]))
+        if self._token is None:
+            self._token = self._session.liveliness().declare_token(self._key)
+        else:
+            self._token.undeclare()  # type: ignore[no-untyped-call]
+            self._token = None

@@ -1,0 +1,247 @@
+"""A night on file: what the RTC sent, byte for byte, in HDF5 that survives a ``kill -9``.
+
+Layout (version 1). Everything grows by appending; nothing is ever rewritten::
+
+    /            attributes: format "pyrcal-telemetry", version, system, created_ns
+    /bytes       uint8   payloads and attachments of all messages, one after another
+    /messages    one row a message, in the order of sending:
+                   time_s            seconds since the recording began, by the sender's clock
+                   kind              0 frames, 1 status, 2 acknowledgement, 3 liveliness, 4 matrix
+                   start             of its payload in /bytes
+                   payload_bytes
+                   attachment_bytes  of the attachment, right behind the payload
+    /dropped     int64 [1]  messages that were not written: the disk was too slow, or full
+
+Frames, status and acknowledgements are as the wire contract has them; liveliness is one byte,
+1 when the RTC's token came and 0 when it went; a matrix is a reconstructor from the moment it is
+in use, its payload the float32 matrix, its attachment the manifest. The file is written in HDF5's
+single-writer mode and flushed twice a second: read it with ``h5py.File(path, "r", swmr=True)``,
+also while it is being written.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, Final, Self
+
+import h5py
+import numpy as np
+import structlog
+
+from service.errors import ConfigurationError
+
+_log = structlog.get_logger("sim_rtc")
+
+FORMAT: Final = "pyrcal-telemetry"
+VERSION: Final = 1
+FLUSH_S: Final = 0.5
+"""Most that a killed process loses, beside the time the disk needs."""
+
+BACKLOG_BYTES: Final = 64_000_000
+"""What may wait for the disk; beyond it messages are dropped and counted."""
+
+_BYTES_CHUNK = 1 << 20
+_ROWS_CHUNK = 4096
+_SLAB_ROWS = 256
+
+_ROW: Final = np.dtype(
+    [
+        ("time_s", "<f8"),
+        ("kind", "u1"),
+        ("start", "<u8"),
+        ("payload_bytes", "<u4"),
+        ("attachment_bytes", "<u4"),
+    ]
+)
+
+
+class Kind(IntEnum):
+    """What a recorded message is."""
+
+    FRAMES = 0
+    STATUS = 1
+    ACKNOWLEDGEMENT = 2
+    LIVELINESS = 3
+    MATRIX = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Message:
+    """One message as it was sent."""
+
+    time_s: float
+    """Seconds since the recording began."""
+
+    kind: Kind
+    payload: bytes
+    attachment: bytes = b""
+
+
+class Recorder:
+    """Writes messages in a thread of its own during its ``with`` block; ``put`` never waits."""
+
+    def __init__(self, path: Path, *, system: str, backlog_bytes: int = BACKLOG_BYTES) -> None:
+        self._path = path
+        self._system = system
+        self._backlog_bytes = backlog_bytes
+        self._waiting: deque[Message] = deque()
+        self._waiting_bytes = 0
+        self._lock = threading.Lock()
+        self._stopped = threading.Event()
+        self._broken = False
+        self._start_s = time.monotonic()
+        self.n_dropped = 0
+        """Messages that were not written."""
+
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Create the file.
+
+        Raises
+        ------
+        ConfigurationError
+            If it exists already, or cannot be created.
+        """
+        try:
+            self._file = h5py.File(self._path, "x", libver="latest")
+        except OSError as error:
+            reason = "it exists already" if self._path.exists() else str(error)
+            raise ConfigurationError(f"--record: cannot create {self._path}: {reason}") from error
+        self._file.attrs.update(
+            format=FORMAT, version=VERSION, system=self._system, created_ns=time.time_ns()
+        )
+        self._bytes = _growing(self._file, "bytes", np.dtype("u1"), _BYTES_CHUNK)
+        self._rows = _growing(self._file, "messages", _ROW, _ROWS_CHUNK)
+        self._dropped = self._file.create_dataset("dropped", data=np.zeros(1, np.int64))
+        self._file.swmr_mode = True
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Write what waits and close the file."""
+        self._stopped.set()
+        self._thread.join()
+        self._file.close()
+        _log.info("record.end", file=str(self._path), dropped=self.n_dropped)
+
+    def put(self, kind: Kind, payload: bytes, attachment: bytes = b"") -> None:
+        """Hand over a message that has just been sent, from any thread."""
+        time_s = time.monotonic() - self._start_s
+        message = Message(time_s=time_s, kind=kind, payload=payload, attachment=attachment)
+        size = len(payload) + len(attachment)
+        with self._lock:
+            if self._broken or self._waiting_bytes + size > self._backlog_bytes:
+                self.n_dropped += 1
+                return
+            self._waiting.append(message)
+            self._waiting_bytes += size
+
+    def _run(self) -> None:
+        try:
+            while not self._stopped.wait(FLUSH_S):
+                self._write()
+            self._write()
+        except OSError as error:
+            _log.error("record.failed", file=str(self._path), reason=str(error))
+            with self._lock:
+                self.n_dropped += len(self._waiting)
+                self._waiting.clear()
+                self._broken = True
+
+    def _write(self) -> None:
+        """Append what waits: bytes before the rows that point to them, and both to the disk."""
+        with self._lock:
+            messages, self._waiting = list(self._waiting), deque()
+            n_dropped = self.n_dropped
+        if n_dropped != self._dropped[0]:
+            self._dropped[0] = n_dropped
+            self._dropped.flush()
+        if not messages:
+            return
+        data = np.frombuffer(b"".join(m.payload + m.attachment for m in messages), dtype="u1")
+        sizes = np.array([(len(m.payload), len(m.attachment)) for m in messages])
+        rows = np.empty(len(messages), dtype=_ROW)
+        rows["time_s"] = [m.time_s for m in messages]
+        rows["kind"] = [m.kind for m in messages]
+        rows["payload_bytes"], rows["attachment_bytes"] = sizes.T
+        ends = np.cumsum(sizes.sum(axis=1))
+        rows["start"] = len(self._bytes) + ends - sizes.sum(axis=1)
+        for dataset, new in ((self._bytes, data), (self._rows, rows)):
+            before = len(dataset)
+            dataset.resize(before + len(new), axis=0)
+            dataset[before:] = new
+            dataset.flush()
+        with self._lock:
+            self._waiting_bytes -= len(data)
+
+
+class Recording:
+    """A recorded file, read from its beginning; a context manager."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> Self:
+        """Open the file.
+
+        Raises
+        ------
+        ConfigurationError
+            If it cannot be read or is no recording of a version this code knows.
+        """
+        try:
+            self._file = h5py.File(self._path, "r", swmr=True)
+        except OSError as error:
+            raise ConfigurationError(f"--replay: cannot read {self._path}: {error}") from error
+        found = (self._file.attrs.get("format"), int(self._file.attrs.get("version", 0)))
+        if found != (FORMAT, VERSION):
+            self._file.close()
+            raise ConfigurationError(
+                f"--replay: {self._path} is {found}, expected {(FORMAT, VERSION)}"
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    @property
+    def system(self) -> str:
+        """The ``{system}`` of the keys it was sent on."""
+        return str(self._file.attrs["system"])
+
+    @property
+    def n_dropped(self) -> int:
+        """Messages that are not in it although they were sent."""
+        return int(self._file["dropped"][0])
+
+    def messages(self) -> Iterator[Message]:
+        """Yield the messages in the order of sending; what a killed writer left half is not one."""
+        rows, data = self._file["messages"], self._file["bytes"]
+        for first in range(0, len(rows), _SLAB_ROWS):
+            slab = rows[first : first + _SLAB_ROWS]
+            start = int(slab["start"][0])
+            lengths = slab["payload_bytes"].astype(np.int64) + slab["attachment_bytes"]
+            chunk = data[start : int(slab["start"][-1]) + int(lengths[-1])].tobytes()
+            for row, length in zip(slab, lengths, strict=True):
+                at = int(row["start"]) - start
+                if at + int(length) > len(chunk):
+                    return
+                middle = at + int(row["payload_bytes"])
+                yield Message(
+                    time_s=float(row["time_s"]),
+                    kind=Kind(int(row["kind"])),
+                    payload=chunk[at:middle],
+                    attachment=chunk[middle : at + int(length)],
+                )
+
+
+def _growing(file: Any, name: str, kind: np.dtype[Any], chunk: int) -> Any:  # noqa: ANN401 - h5py
+    """Return a new dataset without rows that may grow for ever."""
+    return file.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(chunk,), dtype=kind)

@@ -1,0 +1,189 @@
+"""A recorded night played again, as the RTC it was.
+
+Session, sequence numbers and timestamps are the recorded ones: what depends on them (where a window
+begins, when it ends) comes out as it did that night, and so do the estimates. Nothing that the
+service asks for is carried out.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Final
+
+import structlog
+import zenoh
+import zenoh.ext
+
+from service.errors import WireError
+from service.wire import (
+    Acknowledgement,
+    AckState,
+    CommandKind,
+    Encodings,
+    Keys,
+    Reply,
+    Status,
+    command_id,
+    decode_manifest,
+    decode_status,
+    encode_acknowledgement,
+    encode_reply,
+)
+from sim_rtc.link.link import Token, client_config, frames_publisher, status_publisher
+from sim_rtc.link.record import Kind, Message, Recording
+
+_log = structlog.get_logger("sim_rtc")
+
+REFUSAL: Final = "unsupported: a replay"
+SERVICE_WITHIN_S: Final = 20.0
+"""How long a service is waited for that says what it knows: before, it could fit nothing."""
+
+_RETRY_S = 0.2
+_BATCHES_PER_S = 100.0
+_LINGER_S = 0.5
+"""For the last messages to leave."""
+
+
+class Replay:
+    """Plays a recording once."""
+
+    def __init__(self, recording: Recording, *, endpoint: str, speed: float) -> None:
+        """Take the recording; ``speed`` is recorded time over wall-clock time, 0: no waiting."""
+        self._recording = recording
+        self._endpoint = endpoint
+        self._speed = speed
+        self._keys = Keys(recording.system)
+        self._matrix: Message | None = None
+        self._status: Status | None = None
+        self._service = threading.Event()
+        self._refused: deque[tuple[str, str]] = deque(maxlen=64)
+
+    def run(self, stopped: threading.Event) -> None:
+        """Play until the end or until ``stopped``."""
+        session = self._open(stopped)
+        if session is None:
+            return
+        with session:
+            for kind in CommandKind:
+                session.declare_queryable(self._keys.command(kind), self._refusing(kind))
+            session.declare_queryable(self._keys.applied, self._answer_applied)
+            session.declare_subscriber(self._keys.all_commits, self._on_commit)
+            zenoh.ext.declare_advanced_subscriber(
+                session,
+                self._keys.state,
+                lambda _: self._service.set(),
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+            )
+            self._await_service(stopped)
+            _log.info("replay.start", system=self._keys.system, speed=self._speed)
+            n_messages = self._play(session, stopped)
+            stopped.wait(_LINGER_S)
+            _log.info("replay.end", messages=n_messages)
+
+    def _open(self, stopped: threading.Event) -> zenoh.Session | None:
+        while not stopped.is_set():
+            try:
+                return zenoh.open(client_config(self._endpoint))
+            except zenoh.ZError:
+                stopped.wait(_RETRY_S)
+        return None
+
+    def _await_service(self, stopped: threading.Event) -> None:
+        deadline_s = time.monotonic() + SERVICE_WITHIN_S
+        while not self._service.wait(_RETRY_S) and time.monotonic() < deadline_s:
+            if stopped.is_set():
+                return
+
+    def _play(self, session: zenoh.Session, stopped: threading.Event) -> int:
+        frames = frames_publisher(session, self._keys, _BATCHES_PER_S)
+        status = status_publisher(session, self._keys)
+        n_messages = 0
+        with Token(session, self._keys, None) as token:
+            for message in self._timed(stopped):
+                n_messages += 1
+                self._acknowledge_refusals(session)
+                match message.kind:
+                    case Kind.FRAMES:
+                        frames.put(message.payload, attachment=message.attachment)
+                    case Kind.STATUS:
+                        self._status = decode_status(message.payload)
+                        status.put(message.payload)
+                    case Kind.ACKNOWLEDGEMENT:
+                        self._acknowledge(session, message.payload)
+                    case Kind.LIVELINESS:
+                        token.show(visible=message.payload != b"\x00")
+                    case Kind.MATRIX:
+                        self._matrix = message
+        return n_messages
+
+    def _timed(self, stopped: threading.Event) -> Iterator[Message]:
+        """Yield the messages, each when it is due."""
+        start_s, first_s = time.monotonic(), None
+        for message in self._recording.messages():
+            first_s = message.time_s if first_s is None else first_s
+            if self._speed > 0.0:
+                due_s = start_s + (message.time_s - first_s) / self._speed
+                stopped.wait(max(0.0, due_s - time.monotonic()))
+            if stopped.is_set():
+                return
+            yield message
+
+    def _refusing(self, kind: CommandKind) -> Callable[[zenoh.Query], None]:
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                data = b"" if query.payload is None else query.payload.to_bytes()
+                reply = Reply(id=command_id(data), accepted=False, reason=REFUSAL, start_seq=None)
+                query.reply(self._keys.command(kind), encode_reply(reply), encoding=Encodings.REPLY)
+
+        return answer
+
+    def _answer_applied(self, query: zenoh.Query) -> None:
+        with query:
+            matrix, wanted = self._matrix, query.parameters.get("chunk")
+            if matrix is None:
+                query.reply_err("missing: no matrix has been played yet")
+                return
+            if wanted is None:
+                query.reply(self._keys.applied, matrix.attachment, encoding=Encodings.COMMIT)
+                return
+            layout = decode_manifest(matrix.attachment).layout
+            if not wanted.isdecimal() or int(wanted) >= layout.n_chunks:
+                query.reply_err(f"range: chunk {wanted}, expected 0 to {layout.n_chunks - 1}")
+                return
+            start = int(wanted) * layout.chunk_bytes
+            part = matrix.payload[start : start + layout.chunk_bytes]
+            query.reply(self._keys.applied, part, encoding=Encodings.BYTES)
+
+    def _on_commit(self, sample: zenoh.Sample) -> None:
+        try:
+            manifest = decode_manifest(sample.payload.to_bytes())
+        except WireError as error:
+            _log.warning("reconstructor.refused", reason=str(error))
+            return
+        self._refused.append((manifest.id, manifest.layout.sha256))
+
+    def _acknowledge_refusals(self, session: zenoh.Session) -> None:
+        """Reject what the service has sent, in the name of the session that is being played."""
+        while self._refused and self._status is not None:
+            matrix_id, sha256 = self._refused.popleft()
+            refused = Acknowledgement(
+                session=self._status.session,
+                id=matrix_id,
+                sha256=sha256,
+                state=AckState.REJECTED,
+                reason=REFUSAL,
+                frame_seq=None,
+            )
+            self._acknowledge(session, encode_acknowledgement(refused))
+
+    def _acknowledge(self, session: zenoh.Session, data: bytes) -> None:
+        session.put(
+            self._keys.acknowledgement,
+            data,
+            encoding=Encodings.ACKNOWLEDGEMENT,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA_HIGH,
+        )

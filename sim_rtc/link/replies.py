@@ -1,0 +1,190 @@
+"""What the RTC answers when it is asked, and the matrices that it was asked to measure.
+
+A command is carried out once, however often it is sent.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import structlog
+import zenoh
+
+from service.errors import WireError
+from service.wire import (
+    Command,
+    CommandKind,
+    Encodings,
+    Keys,
+    Reply,
+    command_id,
+    decode_command,
+    encode_manifest,
+    encode_measured_manifest,
+    encode_reply,
+    split,
+)
+from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.measure import Circumstances, Measured, product
+
+_log = structlog.get_logger("sim_rtc")
+
+
+class Replies:
+    """The RTC's queryables; they answer on the network's threads."""
+
+    def __init__(self, keys: Keys, computer: RealTimeComputer) -> None:
+        self._keys = keys
+        self._computer = computer
+        self._desk = ReplyCache(computer.execute)
+
+    def declare(self, session: zenoh.Session) -> None:
+        """Let the session answer from now on."""
+        for kind in CommandKind:
+            session.declare_queryable(self._keys.command(kind), self._answering(kind))
+        session.declare_queryable(self._keys.applied, self._answer_applied)
+
+    def _answering(self, kind: CommandKind) -> Callable[[zenoh.Query], None]:
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                data = b"" if query.payload is None else query.payload.to_bytes()
+                try:
+                    reply = self._desk.handle(decode_command(kind, data), time.monotonic())
+                except WireError as error:
+                    reply = Reply(
+                        id=command_id(data), accepted=False, reason=str(error), start_seq=None
+                    )
+                _log.info(
+                    "command",
+                    kind=str(kind),
+                    id=reply.id,
+                    accepted=reply.accepted,
+                    reason=reply.reason,
+                )
+                query.reply(
+                    self._keys.command(kind),
+                    encode_reply(reply),
+                    encoding=Encodings.REPLY,
+                )
+
+        return answer
+
+    def _answer_applied(self, query: zenoh.Query) -> None:
+        with query:
+            active = self._computer.snapshot().reconstructor
+            wanted = query.parameters.get("chunk")
+            if wanted is None:
+                query.reply(
+                    self._keys.applied, encode_manifest(active.manifest), encoding=Encodings.COMMIT
+                )
+                return
+            chunks = split(active.matrix, active.manifest.layout.chunk_bytes)
+            if not wanted.isdecimal() or int(wanted) >= len(chunks):
+                query.reply_err(f"range: chunk {wanted}, expected 0 to {len(chunks) - 1}")
+                return
+            query.reply(self._keys.applied, chunks[int(wanted)], encoding=Encodings.BYTES)
+
+
+_REMEMBERED_S = 600.0
+
+
+class _Answered(NamedTuple):
+    time_s: float
+    command: Command
+    reply: Reply
+
+
+class ReplyCache:
+    """Gives the same id the same reply for ten minutes."""
+
+    def __init__(self, execute: Callable[[Command], Reply]) -> None:
+        self._execute = execute
+        self._lock = threading.Lock()
+        self._answered: dict[str, _Answered] = {}
+
+    def handle(self, command: Command, now_s: float) -> Reply:
+        """Return the reply; ``now_s`` is any clock that never goes back."""
+        with self._lock:
+            self._answered = {
+                key: answered
+                for key, answered in self._answered.items()
+                if now_s - answered.time_s <= _REMEMBERED_S
+            }
+            known = self._answered.get(command.id)
+            if known is None:
+                reply = self._execute(command)
+                self._answered[command.id] = _Answered(now_s, command, reply)
+                return reply
+            if known.command == command:
+                return known.reply
+        reason = f"id: {command.id} was used for another command, expected a new id"
+        return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
+
+
+_POLL_S: Final = 0.05
+
+
+class MeasuredPublisher:
+    """Solves and sends what was measured, in a thread of its own while its ``with`` block lasts.
+
+    Solving takes up to half a second and sending waits for the network: telemetry must not wait
+    with it.
+    """
+
+    def __init__(self, session: zenoh.Session, keys: Keys, computer: RealTimeComputer) -> None:
+        self._session = session
+        self._keys = keys
+        self._computer = computer
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="measured", daemon=True)
+
+    def __enter__(self) -> MeasuredPublisher:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopped.wait(_POLL_S):
+            for measured in self._computer.take_measured():
+                self._send(measured)
+
+    def _send(self, measured: Measured) -> None:
+        """Send a matrix in parts, then its manifest, or why there is none."""
+        identity = self._computer.identity
+        circumstances = Circumstances(
+            system=identity.system,
+            basis_id=identity.basis_id,
+            config_id=identity.config_id,
+            double_pass=identity.double_pass,
+            created_ns=time.time_ns(),
+        )
+        manifest, matrix = product(measured, circumstances)
+        parts = [] if matrix is None else split(matrix, manifest.layout.chunk_bytes)
+        for index, part in enumerate(parts):
+            self._session.put(
+                self._keys.measured_chunk(manifest.id, index),
+                part,
+                encoding=Encodings.BYTES,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+        self._session.put(
+            self._keys.measured_commit(manifest.id),
+            encode_measured_manifest(manifest),
+            encoding=Encodings.MEASURED_COMMIT,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA_HIGH,
+        )
+        _log.info(
+            "matrix.measured",
+            id=manifest.id,
+            pattern=str(manifest.pattern),
+            shape=manifest.layout.shape,
+            reason=manifest.reason or "",
+        )

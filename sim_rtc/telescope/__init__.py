@@ -1,0 +1,1 @@
+"""The telescope: sky, pupil, mirror, sensor, and all that is not as it was drawn."""

@@ -1,0 +1,230 @@
+"""The detector: how many photons a star gives, and what they do to pixels and slopes.
+
+Also how a bright-star sensor is set up for a faint star: slower, and with its pixels binned, which
+makes larger subapertures of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from service.errors import ConfigurationError
+from service.model.instrument import Instrument
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+AnyArray = NDArray[Any]
+
+_FRAMES_TOGETHER = 50
+"""Frames of noise drawn at a time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Camera:
+    """Band, throughput and read noise of the sensor's detector."""
+
+    zero_point_photons: float = 2.1e10
+    """Photons per second and square metre above the atmosphere from a star of R = 0.
+
+    7.0e6 photons per second, square metre and nanometre in Johnson R (Bessell 1979), over the
+    300 nm of the sensor's band, 600 to 900 nm.
+    """
+
+    throughput: float = 0.25
+    """Atmosphere, telescope, sensor optics and quantum efficiency together, 0..1."""
+
+    read_noise_electrons: float = 4.0
+    """RMS per pixel and read; a subaperture is one pixel in each of the four images."""
+
+    excess_noise: float = 1.0
+    """Variance of the photon noise over Poisson's: 2 for an electron-multiplying CCD."""
+
+    def electrons_per_frame(
+        self, instrument: Instrument, *, magnitude: float, frame_rate_hz: float
+    ) -> float:
+        """Return the electrons of a star in all four images together."""
+        area_m2 = np.pi / 4 * instrument.diameter_m**2 * (1 - instrument.obscuration_ratio**2)
+        flux = self.zero_point_photons * 10 ** (-0.4 * magnitude) * area_m2
+        return float(flux * self.throughput / frame_rate_hz)
+
+
+class Detector:
+    """Photon and read noise of the slopes, as Gaussian noise per subaperture from its own flux."""
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        *,
+        images: Array,
+        valid: NDArray[np.bool_],
+        magnitude: float,
+        frame_rate_hz: float,
+        camera: Camera | None = None,
+        silent: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Take the share of the light that each pixel detects, ``images`` ``(2, n, 2, n)``.
+
+        ``silent`` ``(n_valid,)`` are subapertures that read 0, noise included.
+        """
+        camera = camera or Camera()
+        self.electrons_per_frame: float = camera.electrons_per_frame(
+            instrument, magnitude=magnitude, frame_rate_hz=frame_rate_hz
+        )
+        """Detected in all four images together while no pixel is dead."""
+        own = images.sum(axis=(0, 2))[valid] * self.electrons_per_frame
+        variance = camera.excess_noise * own + 4 * camera.read_noise_electrons**2
+        variance /= own.mean() ** 2
+        self.sigma: Array32 = np.sqrt(np.tile(variance, 2)).astype(np.float32)
+        """``(n_slopes,)`` 1 σ of a slope in one frame."""
+        if silent is not None:
+            self.sigma[np.tile(silent, 2)] = 0.0
+        # Drawn from by number, in a third of the time of a normal deviate; they end at 4.3 sigma.
+        self._normal = _normal_values(2**16)
+
+    def counts(self, images: Array) -> Array32:
+        """Return ``(4, n, n)`` electrons per frame of these images ``(2, n, 2, n)``.
+
+        In row-major order of the images' place on the detector.
+        """
+        n = images.shape[1]
+        electrons = images * self.electrons_per_frame
+        return electrons.transpose(0, 2, 1, 3).reshape(4, n, n).astype(np.float32)
+
+    def noise(self, n_frames: int, rng: np.random.Generator) -> Array32:
+        """Return slope noise ``(n_frames, n_slopes)``.
+
+        The x and y slopes of a subaperture use the same four pixels with signs that make their
+        noise uncorrelated.
+        """
+        noise = np.empty((n_frames, len(self.sigma)), dtype=np.float32)
+        for start in range(0, n_frames, _FRAMES_TOGETHER):
+            some = noise[start : start + _FRAMES_TOGETHER]
+            drawn = rng.integers(0, len(self._normal), some.shape, dtype=np.uint16)
+            np.take(self._normal, drawn, out=some, mode="clip")
+            some *= self.sigma
+        return noise
+
+
+def _normal_values(n: int) -> Array32:
+    """Return n equally probable values of a normal distribution, of variance 1."""
+    values = ndtri((np.arange(n) + 0.5) / n)
+    return np.asarray(values / values.std(), dtype=np.float32)
+
+
+_MANY = 30.0
+"""Electrons from which a Poisson number is drawn as a normal one: skewness below 0.18."""
+
+
+class PixelDetector:
+    """Turns the light on the pixels into what is read from them."""
+
+    def __init__(self, *, electrons_per_light: float, camera: Camera | None = None) -> None:
+        """Take the electrons that a frame collects from a unit of light."""
+        self._camera = camera or Camera()
+        self._electrons_per_light = np.float32(electrons_per_light)
+
+    def read(self, light: AnyArray, rng: np.random.Generator) -> Array32:
+        """Return electrons, shaped like ``light``, with photon, excess and read noise in them."""
+        expected = (light * self._electrons_per_light).astype(np.float32, copy=False)
+        excess = np.float32(self._camera.excess_noise)
+        variance = excess * expected
+        few = expected < _MANY
+        faint = bool(few.any())
+        if faint:
+            variance[few] = 0.0
+        variance += np.float32(self._camera.read_noise_electrons**2)
+        read = rng.standard_normal(expected.shape, dtype=np.float32)
+        read *= np.sqrt(variance)
+        if faint:
+            read[few] += _arrivals(expected[few], float(excess), rng)
+            read[~few] += expected[~few]
+            return read
+        read += expected
+        return read
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preset:
+    """How the sensor is run for stars down to a magnitude."""
+
+    faintest: float
+    """R magnitude of the faintest star it is for."""
+
+    frame_rate_hz: float
+    binning: int
+    """Detector pixels per side of a subaperture, in pixels of the finest one."""
+
+    n_controlled: int
+    """Modes the loop corrects with."""
+
+
+FLAO_PRESETS = (
+    Preset(faintest=10.0, frame_rate_hz=1000.0, binning=1, n_controlled=400),
+    Preset(faintest=11.0, frame_rate_hz=800.0, binning=1, n_controlled=400),
+    Preset(faintest=13.0, frame_rate_hz=800.0, binning=2, n_controlled=153),
+    Preset(faintest=14.5, frame_rate_hz=500.0, binning=3, n_controlled=66),
+    Preset(faintest=16.5, frame_rate_hz=200.0, binning=5, n_controlled=36),
+)
+"""After FLAO's practice: 30, 15, 10 and few subapertures across as the star gets fainter."""
+
+
+def preset_for(magnitude: float) -> Preset:
+    """Return the way FLAO would look at a star of this magnitude.
+
+    Raises
+    ------
+    ConfigurationError
+        If the star is fainter than any that the sensor can use.
+    """
+    for preset in FLAO_PRESETS:
+        if magnitude <= preset.faintest:
+            return preset
+    raise ConfigurationError(
+        f"--preset flao: found magnitude {magnitude:g}; "
+        f"expected a star of {FLAO_PRESETS[-1].faintest:g} or brighter"
+    )
+
+
+def binned(instrument: Instrument, binning: int) -> Instrument:
+    """Return the instrument with this many detector pixels to a side of a subaperture.
+
+    Raises
+    ------
+    ConfigurationError
+        If the subapertures do not divide by it, or the mask of valid ones is given.
+    """
+    if binning == 1:
+        return instrument
+    wfs = instrument.wfs
+    if binning < 1 or wfs.n_subapertures % binning or wfs.valid_subapertures is not None:
+        raise ConfigurationError(
+            f"binning: found {binning}; {wfs.n_subapertures} subapertures must divide by it, and "
+            "their mask must be found by flux"
+        )
+    return replace(
+        instrument,
+        wfs=replace(
+            wfs,
+            n_subapertures=wfs.n_subapertures // binning,
+            pupil_separation_subap=wfs.pupil_separation_subap / binning,
+            pupil_diameter_subap=wfs.pupil_diameter / binning,
+        ),
+    )
+
+
+def _arrivals(expected: Array32, excess: float, rng: np.random.Generator) -> Array32:
+    """Return Poisson numbers, multiplied by a gain register that adds noise if ``excess`` > 1.
+
+    A sum of n exponential gains has a gamma distribution; its shape is chosen so that the
+    variance of the result is ``excess`` times that of the photons.
+    """
+    photons = rng.poisson(np.maximum(expected, 0.0))
+    if excess == 1.0:
+        return photons.astype(np.float32)
+    spread = excess - 1.0
+    return np.asarray(rng.standard_gamma(photons / spread) * spread, dtype=np.float32)

@@ -1,0 +1,190 @@
+"""How far the telescope is from the drawing, and what that does to light and slopes.
+
+One record for every plant. A calibration must survive all of it, so each is an option with a
+default, and ``realistic`` is a mix of them all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.instrument import Pyramid
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+_NCPA_ORDER = 4
+_NCPA_FIRST_SHAPE = 3
+"""Piston and the tilts are left out: an offset of the image is nobody's aberration."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Imperfections:
+    """How far the plant is from the drawing."""
+
+    unevenness: float = 0.10
+    """Largest departure of the illumination from its mean, ratio of the flux."""
+
+    position_error: float = 0.02
+    """RMS error of an actuator's position per axis, in actuator pitches."""
+
+    lowest_optical_gain: float = 0.6
+    """Optical gain of the first mode, 0..1; the linear plant's only: physics gives the other's."""
+
+    highest_optical_gain: float = 0.9
+    """Optical gain of the last mode, 0..1."""
+
+    bad_pixels: int = 0
+    """Dead detector pixels: no light is read there, and the RTC, which knows them, reads slopes of
+    0 in their subapertures."""
+
+    distortion_subap: float = 0.0
+    """Third-order radial distortion of the pupil image at its edge, in subapertures."""
+
+    anamorphosis: float = 0.0
+    """Stretch of the pupil image along x over the mean of both axes, ratio less 1."""
+
+    modulation_error: float = 0.0
+    """True modulation radius over the nominal one, less 1."""
+
+    slope_rotation_deg: float = 0.0
+    """Turn of the slope axes (the pyramid's edges) from +x towards +y."""
+
+    ncpa_nm: float = 0.0
+    """Static wavefront that only the sensor sees, nm RMS."""
+
+
+SETS = {
+    "ideal": Imperfections(
+        unevenness=0.0, position_error=0.0, lowest_optical_gain=1.0, highest_optical_gain=1.0
+    ),
+    "usual": Imperfections(),
+    "realistic": Imperfections(
+        unevenness=0.20,
+        position_error=0.02,
+        lowest_optical_gain=0.45,
+        highest_optical_gain=0.75,
+        bad_pixels=6,
+        distortion_subap=0.10,
+        anamorphosis=0.002,
+        modulation_error=0.10,
+        slope_rotation_deg=1.0,
+        ncpa_nm=30.0,
+    ),
+}
+"""Mixes that have a name."""
+
+
+class SlopeErrors:
+    """What becomes of light and slopes: dark pixels, silent subapertures, turned axes.
+
+    The flux that dead pixels lack is missing in the mean that normalises every other slope, too.
+    """
+
+    def __init__(
+        self, valid: NDArray[np.bool_], imperfections: Imperfections, rng: np.random.Generator
+    ) -> None:
+        n_valid = int(valid.sum())
+        angle = np.deg2rad(imperfections.slope_rotation_deg)
+        self._cosine, self._sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+        n_bad = min(imperfections.bad_pixels, 4 * n_valid)
+        # Four images: a pixel's subaperture is its number modulo their common mask.
+        pixels = rng.choice(4 * n_valid, size=n_bad, replace=False)
+        self.silent: NDArray[np.bool_] = np.zeros(n_valid, dtype=np.bool_)
+        """``(n_valid,)`` subapertures whose slopes read 0."""
+        self.silent[pixels % n_valid] = True
+        self.dark: NDArray[np.bool_] = np.zeros((2, len(valid), 2, len(valid)), dtype=np.bool_)
+        """``(2, n, 2, n)`` dead pixels: side, row along y, side, column along x."""
+        side_y, side_x = np.divmod(pixels // n_valid, 2)
+        row, column = np.argwhere(valid)[pixels % n_valid].T
+        self.dark[side_y, row, side_x, column] = True
+
+    @property
+    def absent(self) -> bool:
+        """Whether the slopes are left as they are."""
+        return bool(self._sine == 0.0 and not self.silent.any())
+
+    def read(self, light: NDArray[Any]) -> NDArray[Any]:
+        """Return what reaches the detector's electronics of ``light`` ``(2, n, 2, n)``."""
+        return np.where(self.dark, 0, light) if self.silent.any() else light
+
+    def applied(self, slopes: Array32) -> Array32:
+        """Return what is read instead of ``slopes``, whose first axis is ``n_slopes``."""
+        if self.absent:
+            return slopes
+        along_x, along_y = np.split(slopes, 2)
+        read = np.concatenate(
+            [
+                self._cosine * along_x - self._sine * along_y,
+                self._sine * along_x + self._cosine * along_y,
+            ]
+        )
+        read[np.tile(self.silent, 2)] = 0.0
+        return np.asarray(read)
+
+
+def distorted(points: Array, weights: Array, imperfections: Imperfections) -> Array:
+    """Return where in the pupil the light at these points of its image comes from.
+
+    ``points`` is ``(n_points, 2)``. What a shift, a turn or a change of size could describe is
+    taken out, weighted by area: that part would be a registration, and the true α another one.
+    The outline keeps its place.
+    """
+    if imperfections.distortion_subap == 0.0 and imperfections.anamorphosis == 0.0:
+        return points
+    radius = np.hypot(*points.T)
+    cubic = imperfections.distortion_subap * (radius / radius.max()) ** 2 / radius.max()
+    moved = points * cubic[:, None] + points * [
+        imperfections.anamorphosis,
+        -imperfections.anamorphosis,
+    ]
+    place, error = points @ [1.0, 1.0j], moved @ [1.0, 1.0j]
+    root = np.sqrt(weights)
+    similarity = np.column_stack([np.ones_like(place), place])
+    fit, *_ = np.linalg.lstsq(similarity * root[:, None], error * root, rcond=None)
+    error -= similarity @ fit
+    return np.asarray(points + np.column_stack([error.real, error.imag]))
+
+
+def true_sensor(wfs: Pyramid, imperfections: Imperfections) -> Pyramid:
+    """Return the sensor with the modulation it really has."""
+    radius = wfs.modulation_lambda_over_d * (1.0 + imperfections.modulation_error)
+    return replace(wfs, modulation_lambda_over_d=radius)
+
+
+def non_common_path(
+    points: Array, weights: Array, imperfections: Imperfections, rng: np.random.Generator
+) -> Array32:
+    """Return the static wavefront of the sensor's own optics, ``(n_points,)`` metres.
+
+    Focus to fourth order, random, weaker as the order rises.
+    """
+    shapes = low_orders(points, weights, _NCPA_ORDER)
+    strength = rng.standard_normal(shapes.shape[1]) / np.arange(1, shapes.shape[1] + 1)
+    strength[:_NCPA_FIRST_SHAPE] = 0.0
+    strength *= imperfections.ncpa_nm * 1e-9 / np.linalg.norm(strength)
+    return np.asarray(shapes @ strength, dtype=np.float32)
+
+
+TIP, TILT, FOCUS = 1, 2, 3
+"""Columns of ``low_orders``: rising along +x, rising along +y, concave."""
+
+
+def low_orders(points: Array, weights: Array, order: int) -> Array:
+    """Return polynomials up to ``order`` at the points, ``(n_points, n_shapes)``.
+
+    Piston first, then the tilt along x, the tilt along y, focus and the rest, made orthonormal
+    over the area ``weights`` in that order: what Zernike's are on a full disc, on any outline.
+    """
+    x, y = points.T / np.abs(points).max()
+    columns = [np.ones_like(x), x, y]
+    for degree in range(2, order + 1):
+        monomials = [x ** (degree - k) * y**k for k in range(degree + 1)]
+        columns += [x**2 + y**2, *monomials[:2]] if degree == 2 else monomials
+    root = np.sqrt(weights)[:, None]
+    factor, triangle = np.linalg.qr(np.column_stack(columns) * root)
+    return np.asarray(factor * np.sign(np.diag(triangle)) / root)

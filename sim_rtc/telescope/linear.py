@@ -1,0 +1,141 @@
+"""A telescope that is linear: the slopes are ``K_eff turbulence + D G command``.
+
+It differs from the service's model by its grid (q = 4), its quadrature and modulation points, by
+everything in ``Imperfections``, and by an optical gain for every mode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from typing_extensions import override
+
+from service.model.instrument import Instrument, Mirror
+from service.model.interaction import normalised_jacobian
+from service.model.misregistration import Misregistration
+from service.model.modes import ModalBasis
+from service.model.pupil import instrument_pupil
+from service.model.pyramid import PyramidOptics
+from sim_rtc.telescope.atmosphere import PhaseResponse
+from sim_rtc.telescope.imperfections import Imperfections
+from sim_rtc.telescope.mirror import DrawnSurface
+from sim_rtc.telescope.plant import Departures, Optics, Plant, between, registration_between
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+_SAMPLING = 4
+_NODES = 4
+_FEWEST_MODULATION_POINTS = 32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LinearOptics(Optics):
+    """The optics of a linear plant, the optical gain included."""
+
+    slopes_per_command: Array32
+    """``(n_slopes, n_modes)`` slope per metre of command."""
+
+    @property
+    @override
+    def n_slopes(self) -> int:
+        return len(self.slopes_per_command)
+
+    @property
+    def slopes_per_phase(self) -> Array32:
+        """``(n_slopes, n_points)`` slope per metre of turbulence OPD."""
+        parts = [np.float32(share) * one.matrix for share, one in self.responses]
+        return np.asarray(sum(parts[1:], parts[0]))
+
+    def slopes_of(self, opd_m: Array32) -> Array32:
+        """Return the slopes ``(n_slopes, ...)`` of wavefronts ``(n_points, ...)``, mirror apart."""
+        parts = [np.float32(share) * (one.matrix @ opd_m) for share, one in self.responses]
+        return np.asarray(sum(parts[1:], parts[0]))
+
+    @override
+    def towards(self, other: LinearOptics, share: float) -> LinearOptics:
+        return LinearOptics(
+            alpha=registration_between(self, other, share),
+            responses=tuple(
+                (weight * part, response)
+                for part, optics in ((1.0 - share, self), (share, other))
+                for weight, response in optics.responses
+                if part > 0.0
+            ),
+            slopes_per_command=between(self.slopes_per_command, other.slopes_per_command, share),
+            opd_per_command=between(self.opd_per_command, other.opd_per_command, share),
+            images=(1.0 - share) * self.images + share * other.images,
+            stuck_opd_m=between(self.stuck_opd_m, other.stuck_opd_m, share),
+        )
+
+
+class LinearPlant(Plant):
+    """A pyramid and a thin-plate mirror, each slightly unlike the service's model of them."""
+
+    def __init__(
+        self, instrument: Instrument, basis: ModalBasis, **made: Unpack[Departures]
+    ) -> None:
+        super().__init__(instrument, basis, instrument_pupil(instrument, _SAMPLING), made)
+        self._pyramid = PyramidOptics(
+            wfs=self._wfs,
+            pupil=self._pupil,
+            n_nodes=_NODES,
+            n_modulation=_modulation_points(self._wfs.modulation_lambda_over_d),
+        )
+        imperfections = made.get("imperfections") or Imperfections()
+        self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)
+
+    @override
+    def optics(self, alpha: Misregistration) -> LinearOptics:
+        """Return the optics at ``alpha``: K at the shifted images, modes turned and scaled.
+
+        The optical gain acts on the part of the turbulence the mirror can reproduce exactly as it
+        acts on the mirror: ``K_eff = K + D (G - 1) P`` with P the projection of phase on modes.
+        Of dead pixels the lost flux counts; what the phase would have changed in it, some 1e-4 of
+        the flux's gradient, does not.
+        """
+        response = self._pyramid.response(self.valid, self._image_shift(alpha))
+        light = float(response.images.sum())
+        response = replace(response, images=self.slope_errors.read(response.images))
+        jacobian = normalised_jacobian(response, self.valid)
+        jacobian *= np.float32(2 * np.pi / self._instrument.wfs.wavelength_m)
+        jacobian = self.slope_errors.applied(jacobian)
+        shapes, stuck_opd_m = self._render(alpha)
+        modes = np.ascontiguousarray(shapes)
+        matrix = jacobian @ modes
+        jacobian += (matrix * (self._gain - 1.0)) @ self._projection(modes)
+        return LinearOptics(
+            alpha=alpha,
+            responses=((1.0, PhaseResponse(jacobian)),),
+            slopes_per_command=np.asfortranarray(matrix * (self._gain * self._passes)),
+            opd_per_command=modes * self._passes,
+            images=response.images / light,
+            stuck_opd_m=stuck_opd_m * self._passes,
+        )
+
+    @override
+    def _own_surface(self, mirror: Mirror, strokes: Array) -> tuple[DrawnSurface, Array]:
+        return DrawnSurface(mirror=mirror, subaperture_m=self._instrument.subaperture_m), strokes
+
+    def _projection(self, modes: Array32) -> Array32:
+        """Return ``(n_modes, n_points)``: least-squares modal content of a phase, by area."""
+        weighted = modes * self.weights[:, None].astype(np.float32)
+        gram = (modes.T @ weighted).astype(np.float64)
+        return np.asarray(cho_solve(cho_factor(gram), weighted.T.astype(np.float64)), np.float32)
+
+
+def _modulation_points(radius_lambda_over_d: float) -> int:
+    """Return an even number of points that is enough for the radius."""
+    enough = 2 * int(np.ceil(3 * radius_lambda_over_d)) + 10
+    return max(_FEWEST_MODULATION_POINTS, enough)
+
+
+def optical_gain(n_modes: int, imperfections: Imperfections) -> Array32:
+    """Return the plant's optical gain per mode: a smooth rise from low to high order."""
+    progress = np.sqrt(np.arange(n_modes) / max(n_modes - 1, 1))
+    low, high = imperfections.lowest_optical_gain, imperfections.highest_optical_gain
+    return (low + (high - low) * progress).astype(np.float32)

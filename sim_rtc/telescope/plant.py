@@ -1,0 +1,177 @@
+"""What every simulated telescope is made of: a pupil, a mirror, and errors of both and the sensor.
+
+It differs from the service's model of it by its grid and by everything in ``Imperfections``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Required, Self, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.instrument import Instrument, Mirror, Stop
+from service.model.interaction import rotation, valid_subapertures
+from service.model.misregistration import Misregistration
+from service.model.modes import ModalBasis
+from service.model.pupil import PupilGrid
+from sim_rtc.telescope.atmosphere import PhaseResponse
+from sim_rtc.telescope.imperfections import (
+    Imperfections,
+    SlopeErrors,
+    distorted,
+    non_common_path,
+    true_sensor,
+)
+from sim_rtc.telescope.influence import InfluenceCube
+from sim_rtc.telescope.mirror import MirrorFaults, PlantSurface, disobedient, misplaced
+from sim_rtc.telescope.scene import Scene
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+_RENDER_ROWS = 512
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Optics(ABC):
+    """What the telescope does to a wavefront at one registration."""
+
+    alpha: Misregistration
+    """Where the mirror truly lies on the sensor."""
+
+    opd_per_command: Array32
+    """``(n_points, n_modes)`` OPD at the plant's pupil points per metre of command, as seen."""
+
+    stuck_opd_m: Array32
+    """``(n_points,)`` what stuck actuators add."""
+
+    images: Array
+    """``(2, n, 2, n)`` share of the light that every pixel detects, 0 where it is dead.
+
+    Side, row along y, side, column along x.
+    """
+
+    responses: tuple[tuple[float, PhaseResponse], ...] = ()
+    """Slopes per metre of turbulence OPD: shares of exact responses, their sum 1; none where the
+    slopes are not linear in the phase."""
+
+    @property
+    @abstractmethod
+    def n_slopes(self) -> int:
+        """Slopes of a frame."""
+
+    @abstractmethod
+    def towards(self, other: Self, share: float) -> Self:
+        """Return the optics part of the way to ``other``, for small steps of a drift."""
+
+
+class Departures(TypedDict, total=False):
+    """How a telescope departs from the drawing; only the random numbers must be given."""
+
+    rng: Required[np.random.Generator]
+    imperfections: Imperfections
+    scene: Scene
+    faults: MirrorFaults
+    influence: InfluenceCube | None
+    """Influence functions to use instead of the plant's own."""
+
+
+class Plant(ABC):
+    """A telescope, at any registration."""
+
+    def __init__(
+        self, instrument: Instrument, basis: ModalBasis, pupil: PupilGrid, made: Departures
+    ) -> None:
+        """Take the pupil as it is drawn."""
+        imperfections = made.get("imperfections") or Imperfections()
+        scene = made.get("scene") or Scene()
+        uneven_rng, position_rng, pixel_rng, path_rng = made["rng"].spawn(4)
+        self._instrument = instrument
+        self._passes = np.float32(scene.passes)
+        width_m = instrument.subaperture_m
+        pupil = scene.light(pupil, width_m)
+        self._wfs = true_sensor(instrument.wfs, imperfections)
+        self._pupil = uneven(pupil, imperfections.unevenness, uneven_rng)
+        drawn, influence = instrument.analytic_mirror, made.get("influence")
+        mirror = misplaced(drawn, imperfections.position_error, position_rng)
+        strokes = basis.mode_to_actuator
+        if influence is None:
+            self._surface, strokes = self._own_surface(mirror, strokes)
+        else:
+            self._surface = influence.surface(drawn.positions_m, mirror.positions_m, width_m)
+        faults = made.get("faults") or MirrorFaults()
+        self._weights = np.column_stack(disobedient(self._surface, strokes, faults))
+        self._points = distorted(pupil.points, pupil.weights, imperfections)
+        self.points_m: Array = self._points * width_m
+        """``(n_points, 2)`` where the phase is sampled in the pupil, metres."""
+        self.pitch_m: float = width_m / pupil.sampling
+        """Distance between neighbouring points, metres."""
+        self.weights: Array = pupil.weights
+        """``(n_points,)`` share of the pupil's area at each point; sums to 1."""
+        self.valid: NDArray[np.bool_] = valid_subapertures(instrument)
+        """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
+        self.slope_errors = SlopeErrors(self.valid, imperfections, pixel_rng)
+        """What the sensor makes of correct light and slopes."""
+        self.sensor_opd_m: Array32 = non_common_path(
+            self._points, self.weights, imperfections, path_rng
+        )
+        """``(n_points,)`` static OPD that the sensor sees and the science does not."""
+
+    @abstractmethod
+    def optics(self, alpha: Misregistration) -> Optics:
+        """Return the optics at ``alpha``; takes seconds."""
+
+    @abstractmethod
+    def _own_surface(self, mirror: Mirror, strokes: Array) -> tuple[PlantSurface, Array]:
+        """Return the surface of a mirror without measured influence functions, and its strokes."""
+
+    def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
+        """Return by how much the pupil images move on the sensor, subapertures."""
+        if self._instrument.stop is Stop.TELESCOPE:
+            return (0.0, 0.0)
+        return (alpha.shift_x_subap, alpha.shift_y_subap)
+
+    def _render(self, alpha: Misregistration) -> tuple[Array32, Array32]:
+        """Return the modes ``(n_points, n_modes)`` and what is stuck ``(n_points,)``, seen once."""
+        points = self._points
+        if self._instrument.stop is Stop.TELESCOPE:
+            points = points - alpha.vector[:2]
+        on_mirror = points @ rotation(alpha.rotation_rad) / alpha.magnification
+        blocks = [
+            self._surface.basis(on_mirror[start : start + _RENDER_ROWS]) @ self._weights
+            for start in range(0, len(on_mirror), _RENDER_ROWS)
+        ]
+        shapes = np.concatenate([block.astype(np.float32) for block in blocks])
+        return shapes[:, :-1], np.ascontiguousarray(shapes[:, -1])
+
+
+def between(first: Array32, last: Array32, share: float) -> Array32:
+    """Return the array part of the way from ``first`` to ``last``."""
+    mixed = last - first
+    mixed *= np.float32(share)
+    mixed += first
+    return mixed
+
+
+def registration_between(first: Optics, last: Optics, share: float) -> Misregistration:
+    """Return the registration part of the way from one to the other."""
+    return Misregistration.from_vector(
+        (1.0 - share) * first.alpha.vector + share * last.alpha.vector
+    )
+
+
+def uneven(pupil: PupilGrid, unevenness: float, rng: np.random.Generator) -> PupilGrid:
+    """Return the pupil lit by a random smooth map: polynomials up to third order, mean kept."""
+    u = pupil.coordinates / np.abs(pupil.coordinates).max()
+    x, y = u[None, :], u[:, None]
+    powers = [(i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3]
+    departure = np.zeros_like(pupil.amplitude)
+    for (i, j), weight in zip(powers, rng.standard_normal(len(powers)), strict=True):
+        departure += weight * x**i * y**j
+    departure -= departure[pupil.lit] @ pupil.weights
+    departure *= unevenness / np.abs(departure[pupil.lit]).max()
+    flux = np.maximum(1.0 + np.where(pupil.lit, departure, 0.0), 0.0)
+    return replace(pupil, amplitude=pupil.amplitude * np.sqrt(flux))

@@ -1,0 +1,197 @@
+from itertools import count
+
+import numpy as np
+import pytest
+
+from service.model.misregistration import Misregistration
+from service.wire import (
+    DitherAction,
+    DitherKind,
+    DitherRequest,
+    Loop,
+    LoopRequest,
+    Manifest,
+    layout_of,
+)
+from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.feed import OpenLoopBlock
+from sim_rtc.computer.telemetry import DitherLimits, Identity, LoopSettings, Reconstructor
+from sim_rtc.link.replies import ReplyCache
+from sim_rtc.telescope.linear import LinearOptics
+
+N_MODES, N_SLOPES = 4, 8
+# Orthogonal modes: what is not controlled does not alias into what is.
+RESPONSE = np.linalg.qr(np.random.default_rng(1).standard_normal((N_SLOPES, N_MODES)))[0].astype(
+    np.float32
+)
+OPTICS = LinearOptics(
+    alpha=Misregistration(),
+    stuck_opd_m=np.zeros(5, dtype=np.float32),
+    slopes_per_command=RESPONSE,
+    opd_per_command=np.zeros((5, N_MODES), dtype=np.float32),
+    images=np.ones((2, 1, 2, 1)) / 4,
+)
+IDENTITY = Identity(system="small", basis_id="basis", config_id="sensor")
+
+
+def reconstructor(name, n_controlled):
+    matrix = np.linalg.pinv(RESPONSE[:, :n_controlled]).astype(np.float32)
+    manifest = Manifest(
+        id=name,
+        layout=layout_of(matrix, 1000),
+        alpha=None,
+        sigma=None,
+        im_id=None,
+        parent=None,
+        basis_id="basis",
+        config_id="sensor",
+        system="small",
+        created_ns=1,
+    )
+    return Reconstructor(manifest=manifest, matrix=matrix)
+
+
+def blocks():
+    """Blocks of three batches with a constant wavefront of 100 nm in every mode."""
+    slopes = np.tile(RESPONSE.sum(axis=1) * np.float32(1e-7), (30, 1))
+    for first in count(0, 30):
+        yield OpenLoopBlock(
+            first_frame=first, optics=OPTICS, slopes=slopes, phases_m=np.zeros((3, 5), np.float32)
+        )
+
+
+@pytest.fixture
+def computer():
+    return RealTimeComputer(
+        blocks(),
+        identity=IDENTITY,
+        settings=LoopSettings(
+            frame_rate_hz=1000.0,
+            delay_frames=2,
+            gains=(0.4,) * N_MODES,
+            leak=1.0,
+            n_controlled_next=3,
+        ),
+        reconstructor=reconstructor("first", 3),
+        optics=OPTICS,
+        stroke_m=1e-5,
+        limits=DitherLimits(),
+    )
+
+
+def run(computer, n_batches):
+    return [computer.next_batch() for _ in range(n_batches)]
+
+
+def loop_request(name, **changes):
+    return LoopRequest(id=name, **changes)
+
+
+def dither_request(name):
+    return DitherRequest(
+        id=name,
+        action=DitherAction.START,
+        kind=DitherKind.SINE,
+        modes=(3,),
+        amplitude_m=(1e-9,),
+        frequency_hz=(100.0,),
+        duration_s=1.0,
+    )
+
+
+def test_the_loop_takes_out_what_it_controls(computer):
+    last = run(computer, 10)[-1]
+    np.testing.assert_allclose(last.commands_m[-1], [-1e-7, -1e-7, -1e-7, 0.0], rtol=1e-3)
+
+
+def test_matrices_are_swapped_one_per_batch_and_told(computer):
+    run(computer, 2)
+    computer.stage(reconstructor("second", 3))
+    computer.stage(reconstructor("third", 3))
+    batches = run(computer, 3)
+    assert [(b.seq0, b.cm_id) for b in batches] == [(20, "second"), (30, "third"), (40, "third")]
+    assert computer.take_swaps() == [("second", 20), ("third", 30)]
+    assert computer.take_swaps() == []
+
+
+def test_the_number_of_modes_waits_for_a_matrix_of_that_shape(computer):
+    computer.execute(loop_request("a", n_controlled=4))
+    assert computer.terms().n_controlled == (4, 3)
+    computer.stage(reconstructor("still-three", 3))
+    run(computer, 1)
+    assert computer.terms().n_controlled == (4, 3)
+    computer.stage(reconstructor("four", 4))
+    last = run(computer, 10)[-1]
+    assert last.commands_m[-1, 3] == pytest.approx(-1e-7, rel=1e-3)
+    assert computer.terms().n_controlled == (4,)
+    assert computer.snapshot().gains == (0.4,) * 4
+
+
+def test_modes_that_are_given_up_go_to_zero(computer):
+    computer.stage(reconstructor("four", 4))
+    run(computer, 10)
+    computer.stage(reconstructor("three", 3))
+    (batch,) = run(computer, 1)
+    np.testing.assert_array_equal(batch.commands_m[:, 3], 0.0)
+    assert abs(batch.commands_m[0, 2]) > 5e-8
+
+
+def test_opening_begins_a_session_with_an_empty_integrator_and_nothing_pending(computer):
+    (before,) = run(computer, 1)
+    computer.execute(dither_request("d"))
+    computer.stage(reconstructor("second", 3))
+    assert computer.execute(loop_request("o", loop=Loop.OPEN)).accepted
+    after = run(computer, 3)
+    assert {b.session for b in after} == {computer.snapshot().session}
+    assert after[0].session != before.session
+    assert after[0].seq0 == before.seq0 + 10
+    assert not any(b.commands_m.any() for b in after)
+    assert {b.cm_id for b in after} == {"first"}
+    assert computer.snapshot().loop is Loop.OPEN
+    assert set(computer.snapshot().gains) == {0.0}
+
+
+def test_a_controlled_mode_without_gain_makes_the_loop_partial(computer):
+    computer.execute(loop_request("g", gains=(0.4, 0.0, 0.4, 0.4), leak=0.99))
+    snapshot = computer.snapshot()
+    assert snapshot.loop is Loop.PARTIAL
+    assert snapshot.gains == (0.4, 0.0, 0.4, 0.0)
+    assert snapshot.settings.leak == 0.99
+    last = run(computer, 30)[-1]
+    assert last.commands_m[-1, 1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"gains": (0.4,) * 3}, "range: 3 gains, expected 4"),
+        ({"gains": (2.5,) * 4}, "range: gain 2.5, expected at most 2"),
+        ({"n_controlled": 5}, "range: n_controlled 5, expected 1 to 4"),
+        ({"loop": Loop.PARTIAL}, "unsupported: loop 'partial'"),
+    ],
+)
+def test_impossible_loop_commands_change_nothing(computer, changes, reason):
+    before = computer.snapshot().settings
+    reply = computer.execute(loop_request("x", leak=0.5, **changes))
+    assert not reply.accepted
+    assert reply.reason.startswith(reason)
+    assert computer.snapshot().settings == before
+
+
+def test_a_dither_starts_at_the_announced_frame_and_ends_by_itself(computer):
+    run(computer, 1)
+    reply = computer.execute(dither_request("d"))
+    batches = run(computer, 110)
+    playing = [b for b in batches if b.dither_m is not None]
+    assert (playing[0].seq0, playing[-1].seq0) == (reply.start_seq, reply.start_seq + 990)
+    assert computer.snapshot().dither is None
+
+
+def test_a_command_is_carried_out_once_for_ten_minutes(computer):
+    desk = ReplyCache(computer.execute)
+    first = desk.handle(dither_request("d"), 0.0)
+    assert first.accepted
+    assert desk.handle(dither_request("d"), 600.0) == first
+    other = desk.handle(loop_request("d", leak=0.5), 600.0)
+    assert other.reason.startswith("id: d was used for another command")
+    assert desk.handle(dither_request("d"), 601.0).reason.startswith("busy")

@@ -1,0 +1,154 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.wire import AckState, Manifest, layout_of, split
+from sim_rtc.computer.reconstructors import Staging, Terms, truncated_inverse
+
+TERMS = Terms(
+    n_slopes=12, n_controlled=(8, 6), basis_id="basis", config_id="sensor", system="small"
+)
+MATRIX = np.random.default_rng(1).standard_normal((6, 12)).astype(np.float32)
+CHUNK_BYTES = 100
+
+
+def manifest(matrix=MATRIX, **changes):
+    return (
+        Manifest(
+            id="m1",
+            layout=layout_of(matrix, CHUNK_BYTES),
+            alpha=None,
+            sigma=None,
+            im_id=None,
+            parent=None,
+            basis_id="basis",
+            config_id="sensor",
+            system="small",
+            created_ns=1,
+        )
+        if not changes
+        else replace(manifest(matrix), **changes)
+    )
+
+
+@pytest.fixture
+def staging():
+    return Staging(lambda: TERMS, limit_bytes=4 * 12 * 8)
+
+
+def send(staging, matrix=MATRIX, leave_out=(), matrix_id="m1"):
+    outcomes = [
+        staging.chunk(matrix_id, k, data)
+        for k, data in enumerate(split(matrix, CHUNK_BYTES))
+        if k not in leave_out
+    ]
+    return outcomes[-1]
+
+
+def states(outcome):
+    return [verdict.state for verdict in outcome.verdicts]
+
+
+@pytest.mark.parametrize("commit_first", [True, False])
+def test_a_whole_matrix_is_staged_in_whatever_order_it_comes(staging, commit_first):
+    if commit_first:
+        assert staging.commit(manifest(), 0.0).verdicts == []
+        outcome = send(staging)
+    else:
+        assert send(staging).verdicts == []
+        outcome = staging.commit(manifest(), 0.0)
+    assert states(outcome) == [AckState.STAGED]
+    np.testing.assert_array_equal(outcome.staged[0].matrix, MATRIX)
+    applied = staging.applied("m1", 1230)
+    assert (applied.state, applied.frame_seq) == (AckState.APPLIED, 1230)
+    assert staging.commit(manifest(), 5.0).verdicts == [applied]
+
+
+def test_missing_chunks_are_asked_for_after_two_seconds_and_given_up_after_four(staging):
+    staging.commit(manifest(), 10.0)
+    send(staging, leave_out=(1,))
+    assert staging.poll(11.9).missing == []
+    assert staging.poll(12.0).missing == [("m1", (1,))]
+    assert staging.poll(13.9).missing == []
+    outcome = staging.poll(14.0)
+    assert states(outcome) == [AckState.REJECTED]
+    assert outcome.verdicts[0].reason == "missing: chunks [1], 1 in all"
+
+
+def test_an_asked_for_chunk_completes_the_matrix(staging):
+    staging.commit(manifest(), 10.0)
+    send(staging, leave_out=(1,))
+    staging.poll(12.0)
+    outcome = staging.chunk("m1", 1, split(MATRIX, CHUNK_BYTES)[1])
+    assert states(outcome) == [AckState.STAGED]
+    assert staging.poll(20.0).verdicts == []
+
+
+def test_a_chunk_of_the_wrong_length_is_asked_for_again(staging):
+    staging.chunk("m1", 0, b"short")
+    staging.commit(manifest(), 0.0)
+    send(staging, leave_out=(0,))
+    assert staging.poll(2.0).missing == [("m1", (0,))]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"basis_id": "other"}, "id: basis_id 'other', expected 'basis'"),
+        ({"config_id": "other"}, "id: config_id 'other', expected 'sensor'"),
+        ({"system": "big"}, "id: system 'big', expected 'small'"),
+        (
+            {"layout": layout_of(MATRIX[:5], CHUNK_BYTES)},
+            "range: shape [5, 12], expected [8, 12] or [6, 12]",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_rejected_at_once(staging, changes, reason):
+    outcome = staging.commit(manifest(**changes), 0.0)
+    assert states(outcome) == [AckState.REJECTED]
+    assert outcome.verdicts[0].reason == reason
+    assert send(staging).verdicts == []
+
+
+def test_other_bytes_than_announced_are_rejected(staging):
+    staging.commit(manifest(), 0.0)
+    outcome = send(staging, 2 * MATRIX)
+    assert states(outcome) == [AckState.REJECTED]
+    assert "sha256" in outcome.verdicts[0].reason
+
+
+def test_an_id_is_never_used_again_for_another_matrix(staging):
+    send(staging)
+    staging.commit(manifest(), 0.0)
+    outcome = staging.commit(manifest(2 * MATRIX), 1.0)
+    assert states(outcome) == [AckState.REJECTED]
+    assert outcome.verdicts[0].reason.startswith("id: m1 was used with sha256")
+    assert states(staging.commit(manifest(), 2.0)) == [AckState.STAGED]
+
+
+def test_a_new_session_voids_what_is_not_applied(staging):
+    send(staging)
+    staging.commit(manifest(), 0.0)
+    staging.void()
+    assert staging.applied("m1", 10) is None
+    assert staging.commit(manifest(), 1.0).verdicts == []
+
+
+def test_only_a_few_matrices_are_collected_at_a_time(staging):
+    for name in "abcdef":
+        send(staging, leave_out=(0,), matrix_id=name)
+    for name in "abcdef":
+        staging.commit(manifest(id=name), 0.0)
+    # a and b were forgotten, c to f pushed out by them in turn.
+    assert len(staging.poll(2.0).missing) == 4
+
+
+def test_the_inverse_leaves_directions_the_sensor_hardly_sees():
+    rng = np.random.default_rng(2)
+    left, _ = np.linalg.qr(rng.standard_normal((20, 5)))
+    right, _ = np.linalg.qr(rng.standard_normal((5, 5)))
+    values = np.array([4.0, 3.0, 2.0, 1.0, 1e-4])
+    inverse = truncated_inverse((left * values @ right.T).astype(np.float32))
+    identity = inverse @ (left * values @ right.T)
+    np.testing.assert_allclose(identity, right[:, :4] @ right[:, :4].T, atol=1e-3)

@@ -1,0 +1,198 @@
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from service.model.misregistration import Misregistration
+from service.model.pupil import instrument_pupil
+from sim_rtc.telescope.diffractive import DiffractiveOptics, DiffractivePlant
+from sim_rtc.telescope.imperfections import (
+    SETS,
+    Imperfections,
+    SlopeErrors,
+    distorted,
+    non_common_path,
+)
+from sim_rtc.telescope.linear import LinearPlant
+
+ALIGNED = Misregistration()
+IDEAL = SETS["ideal"]
+VALID = np.ones((5, 5), dtype=bool)
+
+
+@pytest.fixture(scope="module")
+def pupil(small_instrument):
+    return instrument_pupil(small_instrument, 4)
+
+
+def plant(instrument, basis, **changes):
+    return LinearPlant(
+        instrument,
+        basis,
+        rng=np.random.default_rng(1),
+        imperfections=replace(IDEAL, **changes),
+    )
+
+
+def matrix(instrument, basis, **changes):
+    return plant(instrument, basis, **changes).optics(ALIGNED).slopes_per_command
+
+
+def test_the_realistic_mix_has_every_imperfection():
+    ideal, realistic = SETS["ideal"], SETS["realistic"]
+    same = [
+        f.name
+        for f in fields(Imperfections)
+        if getattr(ideal, f.name) == getattr(realistic, f.name)
+    ]
+    assert same == []
+    assert SETS["usual"] == Imperfections()
+
+
+def test_turned_axes_turn_the_slopes_and_keep_their_length():
+    errors = SlopeErrors(VALID, replace(IDEAL, slope_rotation_deg=90.0), np.random.default_rng(1))
+    slopes = np.arange(50, dtype=np.float32)
+    read = errors.applied(slopes)
+    np.testing.assert_allclose(read[25:], slopes[:25], atol=1e-5)
+    np.testing.assert_allclose(read[:25], -slopes[25:], atol=1e-5)
+
+
+def test_a_dead_pixel_silences_both_slopes_of_its_subaperture():
+    errors = SlopeErrors(VALID, replace(IDEAL, bad_pixels=3), np.random.default_rng(1))
+    read = errors.applied(np.ones((50, 4), dtype=np.float32))
+    silent = np.flatnonzero(errors.silent)
+    assert 1 <= len(silent) <= 3
+    assert set(np.flatnonzero((read == 0.0).all(axis=1))) == {*silent, *(silent + 25)}
+    assert not errors.absent
+
+
+def test_a_dead_pixel_is_dark_and_of_a_silent_subaperture():
+    valid = VALID.copy()
+    valid[0, :3] = False
+    errors = SlopeErrors(valid, replace(IDEAL, bad_pixels=4), np.random.default_rng(1))
+    assert errors.dark.sum() == 4
+    assert set(np.flatnonzero(errors.dark.any(axis=(0, 2))[valid])) == set(
+        np.flatnonzero(errors.silent)
+    )
+    assert not errors.dark.any(axis=(0, 2))[~valid].any()
+    light = np.ones((2, 5, 2, 5), dtype=np.float32)
+    read = errors.read(light)
+    assert read.dtype == np.float32
+    assert read.sum() == light.sum() - 4
+    assert not read[errors.dark].any()
+    assert light.all(), "what comes in is left alone"
+
+
+def test_light_on_pixels_that_live_is_left_alone():
+    light = np.ones((2, 5, 2, 5))
+    assert SlopeErrors(VALID, IDEAL, np.random.default_rng(1)).read(light) is light
+
+
+@pytest.mark.parametrize("kind", [LinearPlant, DiffractivePlant])
+def test_the_flux_of_dead_pixels_is_missing_from_images_and_from_the_mean(
+    small_instrument, small_basis, kind
+):
+    """Slopes are normalised by the mean flux: less of it makes those that are left larger."""
+
+    def optics(n_bad):
+        return kind(
+            small_instrument,
+            small_basis,
+            rng=np.random.default_rng(1),
+            imperfections=replace(IDEAL, bad_pixels=n_bad),
+        ).optics(ALIGNED)
+
+    def slopes(seen):
+        if isinstance(seen, DiffractiveOptics):
+            opd_m = 5e-9 * seen.opd_per_command[:, 0]
+            push, pull = (seen.slopes(sign * opd_m, None, None) for sign in (1, -1))
+            return (push - pull) / 1e-8
+        return seen.slopes_per_command[:, 0]
+
+    whole, flawed = optics(0), optics(8)
+    dark = (flawed.images == 0.0) & (whole.images > 0.0)
+    assert dark.sum() == 8
+    np.testing.assert_allclose(flawed.images[~dark], whole.images[~dark], rtol=1e-6)
+    heard = slopes(flawed) != 0.0
+    # a mean of about 60 subapertures of four pixels each; the aligned images are symmetric
+    lost = whole.images[dark].sum() / whole.images.sum()
+    ratio = slopes(flawed)[heard] @ slopes(whole)[heard] / (slopes(whole)[heard] ** 2).sum()
+    assert lost > 0.01
+    assert ratio == pytest.approx(1 / (1 - lost), rel=0.3 * lost)
+
+
+def test_more_dead_pixels_than_there_are_silence_everything():
+    errors = SlopeErrors(VALID, replace(IDEAL, bad_pixels=1000), np.random.default_rng(1))
+    assert errors.silent.all()
+
+
+def test_perfect_slopes_are_left_alone():
+    slopes = np.ones((50, 4), dtype=np.float32)
+    errors = SlopeErrors(VALID, IDEAL, np.random.default_rng(1))
+    assert errors.absent
+    assert errors.applied(slopes) is slopes
+
+
+def test_a_distortion_holds_no_registration(pupil):
+    points, weights = pupil.points, pupil.weights
+    moved = distorted(points, weights, replace(IDEAL, distortion_subap=0.2, anamorphosis=0.01))
+    error = moved - points
+    x, y = points.T
+    assert np.abs(weights @ error).max() < 1e-12
+    assert abs(weights @ (x * error[:, 0] + y * error[:, 1])) < 1e-12
+    assert abs(weights @ (x * error[:, 1] - y * error[:, 0])) < 1e-12
+    # Barrel: the edge goes out where the middle comes in, less the scale that was taken out
+    # (2/3 of a cubic over a disc).
+    on_x = np.abs(y) < 0.2
+    edge = on_x & (np.abs(x) > 4.7)
+    without = distorted(points, weights, replace(IDEAL, distortion_subap=0.2)) - points
+    outwards = (without * points).sum(axis=1) / np.hypot(x, y)
+    assert outwards[edge].mean() == pytest.approx(0.2 / 3, rel=0.3)
+    assert outwards[np.hypot(x, y) < 2].max() < 0.0
+
+
+def test_a_distortion_is_no_registration_to_the_matrix(small_instrument, small_basis):
+    perfect = matrix(small_instrument, small_basis)
+    bent = matrix(small_instrument, small_basis, distortion_subap=0.1)
+    change = np.linalg.norm(bent - perfect) / np.linalg.norm(perfect)
+    # 0.03 subapertures RMS against 0.7 radians per subaperture in the mean mode.
+    assert 0.002 < change < 0.05
+
+
+def test_a_wider_modulation_lowers_every_slope(small_instrument, small_basis):
+    perfect = matrix(small_instrument, small_basis)
+    wide = matrix(small_instrument, small_basis, modulation_error=0.1)
+    ratio = np.linalg.norm(wide, axis=0) / np.linalg.norm(perfect, axis=0)
+    # In the geometric limit the slope of a tilt goes with the inverse of the modulation.
+    assert ratio[:2] == pytest.approx([1 / 1.1] * 2, abs=0.02)
+    assert ratio.max() < 1.0
+
+
+def test_dead_pixels_silence_turbulence_and_mirror_alike(small_instrument, small_basis):
+    flawed = plant(small_instrument, small_basis, bad_pixels=4)
+    optics = flawed.optics(ALIGNED)
+    silent = np.tile(flawed.slope_errors.silent, 2)
+    assert silent.any()
+    assert not optics.slopes_per_phase[silent].any()
+    assert not optics.slopes_per_command[silent].any()
+    assert optics.slopes_per_phase[~silent].any(axis=1).all()
+
+
+def test_turned_axes_reach_turbulence_and_mirror_alike(small_instrument, small_basis):
+    straight = plant(small_instrument, small_basis).optics(ALIGNED)
+    turned = plant(small_instrument, small_basis, slope_rotation_deg=2.0).optics(ALIGNED)
+    angle = np.deg2rad(2.0)
+    for name in ("slopes_per_phase", "slopes_per_command"):
+        along_x, along_y = np.split(getattr(straight, name), 2)
+        expected = np.cos(angle) * along_x - np.sin(angle) * along_y
+        read = np.split(getattr(turned, name), 2)[0]
+        np.testing.assert_allclose(read, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_the_non_common_path_has_its_rms_and_no_tilt(pupil):
+    opd = non_common_path(
+        pupil.points, pupil.weights, replace(IDEAL, ncpa_nm=30.0), np.random.default_rng(1)
+    )
+    moments = [pupil.weights @ (opd * shape) for shape in (1.0, *pupil.points.T)]
+    assert np.sqrt(pupil.weights @ opd**2) == pytest.approx(30e-9, rel=1e-5)
+    assert np.abs(moments).max() < 1e-13

@@ -22,7 +22,7 @@ from service.errors import PyrcalError
 from service.link.events import LinkEvent
 from service.runtime.actions import Actions, Publishing
 from service.runtime.engine import Engine
-from service.runtime.estimates import fitted, listened, lost, watched
+from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.supervisor import WATCH_INTERVAL_S
 from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
@@ -143,7 +143,7 @@ class Observatory:
         self._with_poles = with_poles
         self._worker_free_ns = 0
         self._fitting = False
-        self._waiting: Spectra | Correlated | None = None
+        self._backlog = Backlog()
         self._begin()
 
     @property
@@ -272,25 +272,25 @@ class Observatory:
         )
 
     def fit(self, window: Spectra | Correlated) -> None:
-        """Fit a window at once if the worker has a hand free, else after the one under way."""
+        """Fit a window at once if the worker has a hand free, else after what it is at."""
+        if isinstance(window, Correlated):
+            self._actions.noisy.take(window, self.state)
+        given_up = self._backlog.put(window)
+        if given_up is not None:
+            self._post(ev.WindowLost(refused=given_up))
         if not self._fitting:
-            self._fit(window)
-            return
-        if self._waiting is not None:
-            reason = "the worker is too slow for the telemetry: a window was given up"
-            self._post(lost(self._waiting, reason))
-        self._waiting = window
+            self._fit_next()
 
-    def _fit(self, window: Spectra | Correlated) -> None:
-        self._fitting = True
+    def _fit_next(self) -> None:
+        window = self._backlog.take()
+        self._fitting = window is not None
+        if window is None:
+            return
         event = asyncio.run(fitted(window, self.state, self._workers, self._actions.matrix))
 
         def done() -> None:
-            self._fitting = False
             self._post(event)
-            waiting, self._waiting = self._waiting, None
-            if waiting is not None:
-                self._fit(waiting)
+            self._fit_next()
 
         self._at(self._worked(self.latencies.fit_s), done)
 

@@ -10,6 +10,7 @@ from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.runtime.engine import Engine
+from service.runtime.estimates import Backlog
 from service.runtime.recording import has_news, is_urgent, leave, taken_up
 from service.tracking import events as ev
 from service.tracking.reconstructors import restored
@@ -134,7 +135,7 @@ class Restartable(Observatory):
         leave(archive, old, now_ns)
         self._agenda.clear()
         self._link.sent.clear()
-        self._fitting, self._waiting, self._worker_free_ns = False, None, 0
+        self._fitting, self._backlog, self._worker_free_ns = False, Backlog(), 0
         shelf = restored(old.reconstructors)
         fresh = TrackerState(system=old.system, mode=mode, reconstructors=shelf)
         policy = self._engine.policy

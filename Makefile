@@ -16,7 +16,7 @@ $(STAMP): FORCE
 endif
 
 help:
-	@grep -E '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /:\t/' | expand -t 8
+	@grep -E '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /:\t/' | expand -t 11
 
 setup: $(STAMP) ## install pyrcal and its tools into .venv
 

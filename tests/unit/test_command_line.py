@@ -49,6 +49,26 @@ def test_a_command_line_that_makes_no_sense_is_refused(capsys, words):
     assert "pyrcal" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["fit", "a", "b", "--threads", "0"], "found '0', expected a whole number above 0"),
+        (["fit", "a", "b", "--threads", "1.5"], "found '1.5'"),
+        (["fit", "a", "b", "--modes", "1,1"], "found '1,1', expected no mode twice"),
+        (["fit", "a", "b", "--start", "-1,2"], "found '-1,2', expected X,Y,ROT,MAG"),
+        (["fit", "a", "b", "--arms", "0.9"], "expected WIDTH:DEG"),
+        (["fit", "a", "b", "--method", "best"], "'joint', 'paper', 'sensitivity'"),
+        (["reconstruct", "a", "0,0,0,1", "--output", "c", "--modes", "-3"], "found '-3'"),
+    ],
+)
+def test_an_option_that_makes_no_sense_is_named_with_what_was_expected(capsys, words, named):
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert named in line
+
+
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["status", "--help"]])
 def test_help_explains_the_commands(capsys, words):
     with pytest.raises(SystemExit) as end:

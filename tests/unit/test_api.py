@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import re
 import threading
 from dataclasses import dataclass, field, replace
 
@@ -882,6 +883,15 @@ async def test_every_reference_in_openapi_has_a_target(client):
         target = description
         for part in reference.removeprefix("#/").split("/"):
             target = target[part]
+
+
+async def test_what_records_say_of_themselves_is_true_of_json(client):
+    schemas = (await body_of(client, "/openapi.json"))["components"]["schemas"]
+    assert "null: not known" in schemas["AlphaView"]["properties"]["window_age_s"]["description"]
+    for name, schema in schemas.items():
+        texts = [schema, *schema.get("properties", {}).values()]
+        for text in (text.get("description", "") for text in texts):
+            assert not re.search(r"\bNone\b|NaN|numeric units|``\(4,\)``", text), (name, text)
 
 
 UNITS = ("_s", "_m", "_hz", "_ns", "_ns_utc", "_deg", "_subap", "_frames", "_seq")

@@ -20,7 +20,8 @@ from service.config import load_instrument
 from service.wire import MeasureRequest, Pattern
 from sim_rtc.assembly import build_telescope
 from sim_rtc.computer.computer import RealTimeComputer
-from sim_rtc.computer.measure import Circumstances, product
+from sim_rtc.computer.measure import product
+from sim_rtc.computer.telemetry import Identity
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.linear import LinearOptics
 
@@ -87,10 +88,8 @@ def measure(computer: RealTimeComputer, request: MeasureRequest, truth: Array) -
     n_frames = 0
     while not (ended := computer.take_measured()):
         n_frames += len(computer.next_batch().slopes)
-    where = Circumstances(
-        system="study", basis_id="basis", config_id="sensor", double_pass=False, created_ns=0
-    )
-    manifest, matrix = product(ended[0], where)
+    here = Identity(system="study", basis_id="basis", config_id="sensor")
+    manifest, matrix = product(ended[0], here, created_ns=0)
     if matrix is None:
         raise ValueError(f"{request.pattern}: {manifest.reason}")
     expected = truth[:, list(request.modes)]

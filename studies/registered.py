@@ -18,7 +18,8 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.wire import MeasureRequest, Pattern
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.computer.measure import Circumstances, product
+from sim_rtc.computer.measure import product
+from sim_rtc.computer.telemetry import Identity
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.diffractive import DiffractiveOptics
 
@@ -78,10 +79,8 @@ def measured_by_day(words: str, n_average: int) -> tuple[Array, Telescope]:
         raise ValueError(f"measurement: refused: {reply.reason}")
     while not (ended := computer.take_measured()):
         computer.next_batch()
-    where = Circumstances(
-        system="study", basis_id="basis", config_id="sensor", double_pass=True, created_ns=0
-    )
-    manifest, matrix = product(ended[0], where)
+    here = Identity(system="study", basis_id="basis", config_id="sensor", double_pass=True)
+    manifest, matrix = product(ended[0], here, created_ns=0)
     if matrix is None:
         raise ValueError(f"measurement: {manifest.reason}")
     return matrix.astype(np.float64) / PASSES, telescope

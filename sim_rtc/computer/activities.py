@@ -5,6 +5,7 @@ At most one of each at a time. What may be on the mirror together is decided her
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +13,14 @@ from numpy.typing import NDArray
 
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, LoopRequest
 from sim_rtc.computer.gains import Tuning
-from sim_rtc.computer.measure import Measured, Measurement, Measurements
+from sim_rtc.computer.measure import Measured, Measurement
 from sim_rtc.computer.telemetry import Batch, DitherLimits, LoopSettings
 
 Array32 = NDArray[np.float32]
+
+
+_MOST_ENDED = 4
+"""Ended measurements kept for whoever sends them."""
 
 
 class Activities:
@@ -25,7 +30,9 @@ class Activities:
         self._n_modes, self._n_slopes = n_modes, n_slopes
         self._frame_rate_hz = frame_rate_hz
         self._dither: Dither | None = None
-        self._measurements = Measurements()
+        self._measurement: Measurement | None = None
+        self._closes_again = False
+        self._ended: deque[Measured] = deque(maxlen=_MOST_ENDED)
         self._tuning: Tuning | None = None
         self.late_dither_frames = 0
         """After the announced frame, that dithers to come really begin."""
@@ -40,19 +47,18 @@ class Activities:
     @property
     def telemetry_dithers(self) -> bool:
         """Whether what is added to commands is told as a dither; strokes in open loop are not."""
-        current = self._measurements.current
-        return current is None or not current.needs_open_loop
+        return self._measurement is None or not self._measurement.needs_open_loop
 
     def in_the_loops_way(self) -> str:
         """Return what needs the loop as it is, in the wire's words; empty: nothing."""
         if self._tuning is not None:
             return f"busy: gain ramp {self._tuning.name} is under way; open the loop to end it"
-        return self._measurements.busy()
+        return self._measuring()
 
     def forbids(self, request: LoopRequest) -> str:
         """Return why the loop is not to be changed so now; a ramp lets it be opened."""
         if request.loop is Loop.OPEN:
-            return self._measurements.busy()
+            return self._measuring()
         return self.in_the_loops_way()
 
     def on_the_mirror(self) -> str:
@@ -62,7 +68,13 @@ class Activities:
                 f"busy: dither {self._dither.request.id} is on until frame "
                 f"{self._dither.stop_seq}; stop it first"
             )
-        return self._measurements.busy()
+        return self._measuring()
+
+    def _measuring(self) -> str:
+        if self._measurement is None:
+            return ""
+        name, stop_seq = self._measurement.request.id, self._measurement.stop_seq
+        return f"busy: matrix {name} is being measured until frame {stop_seq}"
 
     def begin_dither(self, request: DitherRequest, start_seq: int) -> None:
         """Let a dither begin at this frame."""
@@ -80,8 +92,7 @@ class Activities:
 
     def begin_measurement(self, measurement: Measurement, *, closes_again: bool) -> None:
         """Let a measurement begin at its frame; the loop may have to be closed after it."""
-        self._measurements.current = measurement
-        self._measurements.closes_again = closes_again
+        self._measurement, self._closes_again = measurement, closes_again
 
     def begin_ramp(self, tuning: Tuning, settings: LoopSettings) -> LoopSettings:
         """Let a gain ramp begin; return the settings that it asks for."""
@@ -98,15 +109,21 @@ class Activities:
 
     def end_all(self, settings: LoopSettings, session: str) -> LoopSettings:
         """End everything, for the loop starts over; return the settings that are left."""
-        self._measurements.end(
-            session, self._n_slopes, "the loop started over during the measurement"
-        )
+        self._end_measurement(session, "the loop started over during the measurement")
         self._dither = None
         return self.end_ramp(settings, "the loop started over")
 
+    def _end_measurement(self, session: str, failure: str = "") -> None:
+        measurement, self._measurement = self._measurement, None
+        if measurement is not None:
+            ended = Measured(
+                measurement=measurement, session=session, n_slopes=self._n_slopes, failure=failure
+            )
+            self._ended.append(ended)
+
     def commands(self, seq0: int, n_frames: int) -> Array32 | None:
         """Return what is added to the commands of the batch ``(n_frames, n_modes)``, metres."""
-        dither, measuring = self._dither, self._measurements.current
+        dither, measuring = self._dither, self._measurement
         commands = None
         if dither is not None:
             commands = dither.commands(seq0, n_frames)
@@ -119,9 +136,12 @@ class Activities:
 
         ``matrix`` is what multiplied its slopes.
         """
-        ended = self._measurements.take(batch.session, batch.seq0, batch.slopes, batch.commands_m)
-        if ended and self._measurements.closes_again:
-            settings = replace(settings, closed=True)
+        measuring = self._measurement
+        if measuring is not None:
+            measuring.take(batch.seq0, batch.slopes, batch.commands_m)
+            if batch.seq0 + len(batch.slopes) >= measuring.stop_seq:
+                self._end_measurement(batch.session)
+                settings = replace(settings, closed=settings.closed or self._closes_again)
         tuning = self._tuning
         if tuning is not None and batch.closed and tuning.look(batch, matrix):
             settings = replace(settings, gains=tuning.gains)
@@ -131,7 +151,9 @@ class Activities:
 
     def take_measured(self) -> list[Measured]:
         """Return the measurements that have ended since the last call."""
-        return self._measurements.take_ended()
+        ended = list(self._ended)
+        self._ended.clear()
+        return ended
 
 
 class Dither:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +19,6 @@ from sim_rtc.computer.strokes import (
     Demodulation,
     PushPull,
     Regression,
-    Solver,
     Tones,
     frames_per_shape,
     hadamard_order,
@@ -29,12 +27,10 @@ from sim_rtc.computer.strokes import (
     pokes,
     system_shapes,
 )
+from sim_rtc.computer.telemetry import Identity
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
-
-_MOST_ENDED = 4
-"""Ended measurements kept for whoever sends them."""
 
 _LINE_SPACING = 4.0
 """Least distance of two tones, in frequency bins: a Hann window's main lobe."""
@@ -54,7 +50,9 @@ class MeasureLimits:
 class Measurement:
     """One accepted measurement, from its first frame to its last."""
 
-    def __init__(self, request: MeasureRequest, strokes: PushPull | Tones, solver: Solver) -> None:
+    def __init__(
+        self, request: MeasureRequest, strokes: PushPull | Tones, solver: Regression | Demodulation
+    ) -> None:
         self.request = request
         self.needs_open_loop = request.pattern is not Pattern.SINE
         """Whether the loop must not answer the strokes."""
@@ -148,11 +146,9 @@ class MeasurementRules:
         Only system modes need the ``reconstructor`` in use, ``(n_controlled, n_slopes)``.
         """
         strokes = self._strokes(request, reconstructor)
-        solver: Solver
         if isinstance(strokes, Tones):
-            solver = Demodulation(strokes, n_slopes=self.n_slopes)
-        else:
-            solver = Regression(request.modes, n_modes=self.n_modes, n_slopes=self.n_slopes)
+            return Measurement(request, strokes, Demodulation(strokes, n_slopes=self.n_slopes))
+        solver = Regression(request.modes, n_modes=self.n_modes, n_slopes=self.n_slopes)
         return Measurement(request, strokes, solver)
 
     def _strokes(self, request: MeasureRequest, reconstructor: Array32 | None) -> PushPull | Tones:
@@ -238,73 +234,13 @@ class Measured:
     """Why there is no matrix; empty: there may be one."""
 
 
-class Measurements:
-    """At most one measurement under way, and those that have ended and were not yet taken.
+def product(
+    measured: Measured, identity: Identity, created_ns: int
+) -> tuple[MeasuredManifest, Array32 | None]:
+    """Return what is sent of a measurement: its manifest, and the matrix or None.
 
-    The caller sees to it that one thread is in here at a time.
+    ``created_ns`` is nanoseconds since the Unix epoch, UTC.
     """
-
-    def __init__(self) -> None:
-        self.current: Measurement | None = None
-        self.closes_again = False
-        """Whether the loop was closed before the one under way."""
-        self._ended: deque[Measured] = deque(maxlen=_MOST_ENDED)
-
-    def busy(self) -> str:
-        """Return what is being measured, in the wire's words; empty: nothing."""
-        if self.current is None:
-            return ""
-        name, stop_seq = self.current.request.id, self.current.stop_seq
-        return f"busy: matrix {name} is being measured until frame {stop_seq}"
-
-    def commands(self, seq0: int, n_frames: int) -> Array32 | None:
-        """Return the strokes of these frames ``(n_frames, n_modes)``, metres; None: not now."""
-        return None if self.current is None else self.current.commands(seq0, n_frames)
-
-    def take(self, session: str, seq0: int, slopes: Array32, commands_m: Array32) -> bool:
-        """Read these frames back; return whether the measurement ended with them."""
-        current = self.current
-        if current is None:
-            return False
-        current.take(seq0, slopes, commands_m)
-        if seq0 + len(slopes) < current.stop_seq:
-            return False
-        self.end(session, slopes.shape[1])
-        return True
-
-    def end(self, session: str, n_slopes: int, failure: str = "") -> None:
-        """Let the measurement under way, if any, be one that has ended."""
-        if self.current is not None:
-            self._ended.append(
-                Measured(
-                    measurement=self.current, session=session, n_slopes=n_slopes, failure=failure
-                )
-            )
-            self.current = None
-
-    def take_ended(self) -> list[Measured]:
-        """Return the measurements that have ended since the last call."""
-        ended = list(self._ended)
-        self._ended.clear()
-        return ended
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Circumstances:
-    """What a measured matrix belongs to."""
-
-    system: str
-    basis_id: str
-    config_id: str
-    double_pass: bool
-    """Whether the light sees the mirror twice: the matrix is then twice as large."""
-
-    created_ns: int
-    """Nanoseconds since the Unix epoch, UTC."""
-
-
-def product(measured: Measured, where: Circumstances) -> tuple[MeasuredManifest, Array32 | None]:
-    """Return what is sent of a measurement: its manifest, and the matrix or None."""
     failure, matrix = measured.failure, None
     if not failure:
         try:
@@ -331,11 +267,11 @@ def product(measured: Measured, where: Circumstances) -> tuple[MeasuredManifest,
         amplitude_m=request.amplitude_m,
         n_average=request.n_average or 1,
         pattern=request.pattern,
-        double_pass=where.double_pass,
+        double_pass=identity.double_pass,
         session=measured.session,
-        basis_id=where.basis_id,
-        config_id=where.config_id,
-        system=where.system,
-        created_ns=where.created_ns,
+        basis_id=identity.basis_id,
+        config_id=identity.config_id,
+        system=identity.system,
+        created_ns=created_ns,
     )
     return manifest, matrix

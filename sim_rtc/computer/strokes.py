@@ -8,7 +8,6 @@ perfect one.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,16 +129,6 @@ def pokes(mode_to_actuator: Array, amplitude_m: float) -> Array32:
 
 _SILENT = 1e-6
 """A mode with less than this share of the mean power was not moved: it has no column."""
-
-
-class Solver(Protocol):
-    """Turns what was read back into a matrix."""
-
-    def take(self, frame: NDArray[np.int64], slopes: Array32, commands_m: Array32) -> None:
-        """Take consecutive frames, counted from the first of the measurement."""
-
-    def matrix(self) -> Array32:
-        """Return ``(n_slopes, n_measured)``, slope per metre OPD."""
 
 
 class Regression:

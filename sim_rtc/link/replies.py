@@ -28,7 +28,7 @@ from service.wire import (
     split,
 )
 from sim_rtc.computer.computer import RealTimeComputer
-from sim_rtc.computer.measure import Circumstances, Measured, product
+from sim_rtc.computer.measure import Measured, product
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -156,15 +156,7 @@ class MeasuredPublisher:
 
     def _send(self, measured: Measured) -> None:
         """Send a matrix in parts, then its manifest, or why there is none."""
-        identity = self._computer.identity
-        circumstances = Circumstances(
-            system=identity.system,
-            basis_id=identity.basis_id,
-            config_id=identity.config_id,
-            double_pass=identity.double_pass,
-            created_ns=time.time_ns(),
-        )
-        manifest, matrix = product(measured, circumstances)
+        manifest, matrix = product(measured, self._computer.identity, time.time_ns())
         parts = [] if matrix is None else split(matrix, manifest.layout.chunk_bytes)
         for index, part in enumerate(parts):
             self._session.put(

@@ -23,7 +23,7 @@ from service.wire import (
 from sim_rtc.assembly import build_telescope
 from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import OpenLoopBlock
-from sim_rtc.computer.measure import Circumstances, MeasureLimits, MeasurementRules, product
+from sim_rtc.computer.measure import MeasureLimits, MeasurementRules, product
 from sim_rtc.computer.strokes import (
     PushPull,
     frames_per_shape,
@@ -41,9 +41,7 @@ RESPONSE = (2e6 * RNG.standard_normal((N_SLOPES, N_MODES))).astype(np.float32)
 MODE_TO_ACTUATOR = RNG.standard_normal((N_ACTUATORS, N_MODES))
 CONTROLLED = 5
 ALL = tuple(range(N_MODES))
-HERE = Circumstances(
-    system="small", basis_id="basis", config_id="sensor", double_pass=False, created_ns=7
-)
+HERE = Identity(system="small", basis_id="basis", config_id="sensor", double_pass=False)
 
 
 def optics():
@@ -148,7 +146,7 @@ def measured(computer, request):
         batches.append(computer.next_batch())
         ended = computer.take_measured()
         if ended:
-            return *product(ended[0], HERE), batches
+            return *product(ended[0], HERE, 7), batches
     raise AssertionError("the measurement never ended")
 
 
@@ -362,7 +360,7 @@ def test_a_restart_ends_the_measurement_and_says_so():
     computer.next_batch()
     computer.restart()
     (ended,) = computer.take_measured()
-    manifest, matrix = product(ended, HERE)
+    manifest, matrix = product(ended, HERE, 7)
     assert matrix is None
     assert manifest.reason == "the loop started over during the measurement"
     assert manifest.session == session
@@ -446,7 +444,7 @@ def test_by_day_the_light_meets_the_mirror_twice_and_the_manifest_says_so(
     assert computer.execute(request).accepted
     while not (ended := computer.take_measured()):
         computer.next_batch()
-    _, matrix = product(ended[0], HERE)
+    _, matrix = product(ended[0], HERE, 7)
     single = build_telescope(parse_options(words), small_instrument).optics.at(0.0)
     expected = factor * single.slopes_per_command[:, list(modes)]
     assert relative(matrix, expected) < 0.03

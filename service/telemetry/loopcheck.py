@@ -221,13 +221,14 @@ def obedience(
     if check.cm_id != loop.cm_id:
         return check, None
     check = _multiplied(check, loop)
-    seq = np.concatenate([batch.seq for batch in check.batches] or [np.empty(0, int)])
+    near = [b for b in check.batches if b.seq[-1] >= first_seq and b.seq[0] <= last_seq]
+    seq = np.concatenate([batch.seq for batch in near] or [np.empty(0, int)])
     chosen = (seq >= first_seq) & (seq <= last_seq)
     if np.count_nonzero(chosen) < enough:
         return check, None
-    asked = np.concatenate([b.asked_m for b in check.batches], axis=1)[:, chosen].astype(float)
-    taken = np.concatenate([b.taken_m for b in check.batches])[chosen].astype(float)
-    held = np.concatenate([b.held for b in check.batches])[chosen].mean(axis=0)
+    asked = np.concatenate([batch.asked_m for batch in near], axis=1)[:, chosen].astype(float)
+    taken = np.concatenate([batch.taken_m for batch in near])[chosen].astype(float)
+    held = np.concatenate([batch.held for batch in near])[chosen].mean(axis=0)
     return check, _judged(asked, taken, held, loop)
 
 
@@ -416,61 +417,68 @@ def judged(law: LoopLaw, loop: Loop, last_seq: int) -> tuple[LoopLaw, FoundLaw |
     if len(at) < ENOUGH_FRAMES:
         return law, None
     law = replace(law, judged_seq=int(law.seq[at[-1]]))
-    commands, seen = commands.astype(float), seen.astype(float)
-    fits = [_fitted(commands[:, m], seen[:, m], at, n_taps) for m in range(len(modes))]
-    clear = [number for number, fit in enumerate(fits) if fit is not None]
-    if 2 * len(clear) < len(fits) or not clear:
+    fits = _fitted(commands.astype(float), seen.astype(float), at, n_taps)
+    clear = np.flatnonzero(fits.clear)
+    if 2 * len(clear) < len(modes) or not len(clear):
         return law, None
-    gains = loop.gains[modes[clear]].astype(float)
-    return law, _compared([fit for fit in fits if fit is not None], gains, loop)
+    return law, _compared(fits, clear, loop.gains[modes].astype(float), loop)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Fit:
-    """The law of one mode."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Fits:
+    """The law of every mode watched, ``(n_watched,)`` each."""
 
-    leak: float
-    leak_sigma: float
-    gain: float
-    delay_frames: float
+    clear: NDArray[np.bool_]
+    """Whether the mode moves and follows a law."""
+
+    leak: Array
+    leak_sigma: Array
+    gain: Array
+    delay_frames: Array
 
 
-def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fit | None:
-    """Return the law of one mode; None: it does not follow one, or does not move."""
+def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
+    """Return the law of every mode, by the normal equations: a few unknowns, hundreds of frames.
+
+    A constant is free for every mode, and leaves with the means.
+    """
+    taps = np.arange(1, n_taps + 1)
     target, before = commands[at], commands[at - 1]
-    if np.std(target - before) < _STILL_LAW_M:
-        return None
-    inputs = np.column_stack(
-        [before, *(seen[at - tap] for tap in range(1, n_taps + 1)), np.ones(len(at))]
-    )
-    scale = np.linalg.norm(inputs, axis=0)
+    steps = target - before
+    inputs = np.stack([before, *(seen[at - tap] for tap in taps)]).transpose(2, 1, 0)
+    inputs = inputs - inputs.mean(axis=1, keepdims=True)
+    scale = np.linalg.norm(inputs, axis=1)
     scale[scale == 0.0] = 1.0
-    weights, _, _, _ = np.linalg.lstsq(inputs / scale, target)
-    left = float(np.sum((target - inputs / scale @ weights) ** 2))
-    if left > EXPLAINED * float(np.sum((target - before) ** 2)):
-        return None
-    spread = np.linalg.pinv((inputs / scale).T @ (inputs / scale)) * left / len(at)
-    taps = -(weights / scale)[1:-1]
-    gain = float(taps.sum())
-    late = float(taps @ np.arange(1, n_taps + 1)) / gain if gain else np.inf
-    return _Fit(
-        leak=float(weights[0] / scale[0]),
-        leak_sigma=float(np.sqrt(spread[0, 0]) / scale[0]),
+    inputs /= scale[:, None]
+    wanted = (target - target.mean(axis=0)).T[:, :, None]
+    transposed = inputs.transpose(0, 2, 1)
+    inverse = np.linalg.pinv(transposed @ inputs, hermitian=True)
+    weights = inverse @ (transposed @ wanted)
+    left = np.sum((wanted - inputs @ weights) ** 2, axis=(1, 2))
+    weights = weights[:, :, 0] / scale
+    gain = -weights[:, 1:].sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        late = -(weights[:, 1:] @ taps) / gain
+    moves = np.std(steps, axis=0) >= _STILL_LAW_M
+    return _Fits(
+        clear=moves & (left <= EXPLAINED * np.sum(steps**2, axis=0)),
+        leak=weights[:, 0],
+        leak_sigma=np.sqrt(inverse[:, 0, 0] * left / len(at)) / scale[:, 0],
         gain=gain,
-        delay_frames=late,
+        delay_frames=np.where(gain == 0.0, np.inf, late),
     )
 
 
-def _compared(fits: list[_Fit], gains: Array, loop: Loop) -> FoundLaw:
-    leak = float(np.median([fit.leak for fit in fits]))
-    sigma = float(np.median([fit.leak_sigma for fit in fits]))
-    ratios = np.array([fit.gain for fit in fits]) / gains
+def _compared(fits: _Fits, clear: Array, gains: Array, loop: Loop) -> FoundLaw:
+    leak, sigma, late = (
+        float(np.median(found[clear])) for found in (fits.leak, fits.leak_sigma, fits.delay_frames)
+    )
+    ratios = fits.gain[clear] / gains[clear]
     gain, spread = float(np.median(ratios)), float(np.median(np.abs(ratios - np.median(ratios))))
-    late = float(np.median([fit.delay_frames for fit in fits]))
     wrong = []
     if abs(leak - loop.leak) > LEAK_TOLERANCE + SIGNIFICANCE * sigma:
         wrong.append(f"leak {leak:.3f} found, {loop.leak:.3f} told")
-    tolerance = GAIN_TOLERANCE + SIGNIFICANCE * min(spread, abs(gain)) / np.sqrt(len(fits))
+    tolerance = GAIN_TOLERANCE + SIGNIFICANCE * min(spread, abs(gain)) / np.sqrt(len(clear))
     if abs(gain - 1.0) > tolerance:
         wrong.append(f"gain {gain:.3g} times the one told{_hint(gain)}")
     if abs(late - loop.delay_frames) > DELAY_TOLERANCE:

@@ -49,6 +49,8 @@ SAME_RATE = 1e-5
 
 def same_gains(some: Sequence[float], others: Sequence[float]) -> bool:
     """Return whether these are the gains of one loop."""
+    if some == others:  # as nearly always, and a hundred times as quick
+        return True
     return len(some) == len(others) and np.allclose(some, others, rtol=SAME_GAIN, atol=0.0)
 
 

@@ -6,53 +6,33 @@ night therefore replays exactly, and every reaction of the service can be tested
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+from service.tracking import (
+    dither,
+    loop_commands,
+    measuring,
+    operator,
+    reconstructors,
+    rtc,
+    windows,
+)
 from service.tracking import events as ev
-from service.tracking.acquisition import acquire, on_acquire
+from service.tracking.acquisition import abort_on_command, acquire, acquire_on_command
 from service.tracking.activity import refuse_if_occupied
-from service.tracking.alarms import logged, with_alarm
-from service.tracking.dither import on_dither, on_measured, on_silence, on_vibrations
-from service.tracking.dither_schedule import learnt
-from service.tracking.events import Command, Event, Step
-from service.tracking.loop_commands import close_again, on_loop
-from service.tracking.measuring import (
-    MEASURING,
-    awaits_its_dither,
-    gather,
-    meanwhile,
-    on_measurement,
-    on_noisy,
-)
-from service.tracking.operator import on_command
+from service.tracking.events import Command, Effect, Event
+from service.tracking.loop import CommandState
 from service.tracking.policy import Policy
-from service.tracking.reconstructors import (
-    on_acknowledgement,
-    on_fetched,
-    on_margin,
-    on_matrix,
-    on_proposal_judged,
-    shelved,
-)
-from service.tracking.rtc import (
-    on_failure,
-    on_new_session,
-    on_services,
-    on_status,
-    on_tick,
-    on_vanished,
-)
 from service.tracking.state import TrackerState
+from service.tracking.turn import Turn
 from service.tracking.updates import decide
-from service.tracking.validity import aged
-from service.tracking.validity import over as ended
-from service.tracking.windows import on_watchdog, on_window, refuse_window
-from service.tracking.worth import declined
+from service.tracking.validity import age, end_alarm, point
+from service.tracking.worth import note_declined
 
 __all__ = ["Command", "Event", "Policy", "step"]
 
 
-def step(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
+def step(
+    state: TrackerState, event: Event, policy: Policy, now_ns: int
+) -> tuple[TrackerState, tuple[Effect, ...]]:
     """Return the next state and what is to be done.
 
     Raises
@@ -63,99 +43,154 @@ def step(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step
         If it names a reconstructor nobody has heard of.
     """
     refuse_if_occupied(state, event, now_ns)
-    before = state
-    state, effects = _react(meanwhile(state, event, now_ns), event, policy, now_ns)
-    state = declined(before, state, event, now_ns)
-    if state.measuring is not None:
-        return state, effects
-    state, more = acquire(before, state, event, policy, now_ns)
-    effects = (*effects, *more)
-    if state.acquisition.under_way:
-        return state, effects
-    state, more = gather(state, event, policy, now_ns)
-    effects = (*effects, *more)
-    if awaits_its_dither(state):
-        return state, effects
-    state, more = decide(state, policy, now_ns)
-    return state, (*effects, *more)
+    turn = Turn(state, event, policy, now_ns)
+    measuring.watch_measurement(turn)
+    _react(turn)
+    note_declined(turn)
+    _go_on(turn)
+    return turn.state, tuple(turn.effects)
 
 
-def _react(  # noqa: C901 - one line for each event
-    state: TrackerState, event: Event, policy: Policy, now_ns: int
-) -> Step:
-    match event:
+def _go_on(turn: Turn) -> None:
+    """Let what runs go on, and decide what else is wanted: what has the mirror comes first."""
+    if turn.state.measuring is not None:
+        return
+    acquire(turn)
+    if turn.acquisition.under_way:
+        return
+    measuring.follow_noisy(turn)
+    if not measuring.awaits_its_dither(turn.state):
+        decide(turn)
+
+
+def _react(turn: Turn) -> None:  # noqa: C901 - one line for each event
+    match turn.event:
         case ev.Tick():
-            return close_again(aged(on_tick(state, now_ns), policy, now_ns), now_ns)
-        case ev.StatusSeen(rtc=rtc):
-            return on_status(state, rtc, now_ns), ()
+            rtc.on_tick(turn)
+            age(turn)
+            loop_commands.close_again(turn)
+        case ev.StatusSeen(rtc=status):
+            rtc.on_status(turn, status)
         case ev.SessionStarted(session=session):
-            return on_new_session(state, session, now_ns), ()
+            rtc.on_new_session(turn, session)
         case ev.RtcVanished():
-            return on_vanished(state, now_ns), ()
-        case ev.ServicesMet():
-            return on_services(state, event, now_ns), ()
-        case ev.Trouble(name=name, text=text, over=over):
-            if over:
-                return ended(state, name, now_ns, event.t_ns_utc), ()
-            return with_alarm(state, name, text, now_ns), ()
+            rtc.on_vanished(turn)
+        case ev.ServicesMet() as met:
+            rtc.on_services(turn, met)
+        case ev.Trouble(name=name, over=True, t_ns_utc=t_ns):
+            end_alarm(turn, name, t_ns)
+        case ev.Trouble(name=name, text=text):
+            turn.alarm(name, text)
         case ev.Noted(name=name, text=text, level=level):
-            return logged(state, name, text, now_ns, level), ()
-        case ev.Measure() | ev.GiveUp() | ev.MatrixMeasured():
-            return on_measurement(state, event, policy, now_ns)
-        case ev.JobFailed(effect=ev.AskMeasurement()):
-            return on_measurement(state, event, policy, now_ns)
-        case ev.MeasureNoisy() | ev.GiveUpNoisy() | ev.NoisyMade():
-            return on_noisy(state, event, policy, now_ns)
-        case ev.JobFailed(effect=ev.FinishNoisy()):
-            return on_noisy(state, event, policy, now_ns)
-        case ev.SetLoop() | ev.Ramp() | ev.LoopAnswered():
-            return on_loop(state, event, now_ns)
-        case ev.JobFailed(effect=ev.AskLoop() | ev.AskRamp()):
-            return on_loop(state, event, now_ns)
-        case ev.Acquire() | ev.AbortAcquisition():
-            return on_acquire(state, event, policy, now_ns)
+            turn.log(name, text, level)
         case ev.FarFitted():
-            return state, ()
-        case ev.MatrixMade(record=record) if state.acquisition.under_way:
-            return shelved(state, record, now_ns), ()
-        case ev.WindowFitted() if state.measuring is not None:
-            return refuse_window(state, MEASURING, now_ns), ()
-        case ev.WindowFitted(estimate=estimate):
-            after = on_window(state, event, policy, now_ns)
-            return learnt(state, after, estimate), ()
+            pass  # an acquisition's
+        case ev.WindowFitted() if turn.state.measuring is not None:
+            windows.refuse_window(turn, measuring.MEASURING)
+        case ev.WindowFitted(estimate=estimate) as fitted:
+            windows.on_window(turn, fitted)
+            dither.learn(turn, estimate)
         case ev.WindowLost(refused=refused):
-            return refuse_window(state, refused.reason, now_ns, mistold=refused.mistold), ()
-        case ev.Vibrations():
-            return on_vibrations(state, event, now_ns), ()
-        case ev.Watched():
-            return on_watchdog(state, event, policy, now_ns), ()
+            windows.refuse_window(turn, refused.reason, mistold=refused.mistold)
+        case ev.Watched() as watched:
+            windows.on_watchdog(turn, watched)
         case ev.Unwatched(text=text):
-            return replace(state, unwatched=text), ()
+            windows.cannot_watch(turn, text)
         case _:
-            return _react_to_matrices(state, event, policy, now_ns)
+            _react_to_answer(turn)
 
 
-def _react_to_matrices(  # noqa: C901 - one line for each event
-    state: TrackerState, event: Event, policy: Policy, now_ns: int
-) -> Step:
-    match event:
-        case ev.MatrixMade():
-            return on_matrix(state, event, now_ns)
-        case ev.MatrixFetched(record=record):
-            return on_fetched(state, record, now_ns), ()
-        case ev.MarginJudged():
-            return on_margin(state, event, now_ns), ()
-        case ev.ProposalJudged():
-            return on_proposal_judged(state, event, now_ns)
-        case ev.Acknowledged():
-            return on_acknowledgement(state, event, now_ns), ()
-        case ev.DitherAnswered():
-            return on_dither(state, event, now_ns), ()
-        case ev.DitherSilent():
-            return on_silence(state, event, now_ns), ()
-        case ev.DitherMeasured():
-            return on_measured(state, event, policy, now_ns)
-        case ev.JobFailed(effect=effect, text=text):
-            return on_failure(state, effect, text, now_ns), ()
+def _react_to_answer(turn: Turn) -> None:  # noqa: C901 - one line for each event
+    match turn.event:
+        case ev.MatrixMade(record=made) if turn.acquisition.under_way:
+            reconstructors.propose(turn, made)
+        case ev.MatrixMade() as event:
+            reconstructors.on_matrix(turn, event)
+        case ev.MatrixFetched(record=fetched):
+            reconstructors.on_fetched(turn, fetched)
+        case ev.MarginJudged() as judged:
+            reconstructors.on_margin(turn, judged)
+        case ev.ProposalJudged() as verdict:
+            reconstructors.on_proposal_judged(turn, verdict)
+        case ev.Acknowledged() as acknowledged:
+            reconstructors.on_acknowledgement(turn, acknowledged)
+        case ev.MatrixMeasured(record=measured):
+            measuring.on_measured(turn, measured)
+        case ev.NoisyMade(record=noisy):
+            measuring.on_noisy_made(turn, noisy)
+        case ev.DitherAnswered() as answer:
+            dither.on_answer(turn, answer)
+        case ev.DitherSilent() as silent:
+            dither.on_silence(turn, silent)
+        case ev.DitherMeasured() as heard:
+            loud = dither.why_too_strong(turn, heard)
+            if loud is not None:
+                measuring.cut_off(turn, f"its dither was too strong: {heard.text}")
+                dither.stop_too_strong(turn, heard.id, loud)
+        case ev.Vibrations() as vibrations:
+            dither.hear_vibrations(turn, vibrations)
+        case ev.LoopAnswered(id=name, accepted=accepted, reason=reason):
+            outcome = CommandState.ACCEPTED if accepted else CommandState.REFUSED
+            loop_commands.on_answer(turn, name, outcome, reason)
+        case ev.JobFailed() as failed:
+            _react_to_failure(turn, failed.effect, failed.text)
         case _:
-            return on_command(state, event, policy, now_ns)
+            _obey(turn)
+
+
+def _react_to_failure(turn: Turn, effect: Effect, text: str) -> None:
+    match effect:
+        case ev.AskMeasurement(record=record):
+            measuring.measurement_failed(turn, record, text)
+        case ev.FinishNoisy(record=noisy):
+            measuring.noisy_failed(turn, noisy, text)
+        case ev.AskLoop(id=command) | ev.AskRamp(id=command):
+            loop_commands.on_answer(turn, command, CommandState.FAILED, text)
+        case _:
+            rtc.on_failure(turn, effect, text)
+
+
+def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
+    match turn.event:
+        case ev.SetMode(mode=mode):
+            operator.set_mode(turn, mode)
+        case ev.SetPointing(pointing=pointing):
+            point(turn, pointing)
+        case ev.SetLoop() as command:
+            loop_commands.set_loop(turn, command)
+        case ev.Ramp() as command:
+            loop_commands.ramp(turn, command)
+        case ev.Acquire():
+            acquire_on_command(turn)
+        case ev.AbortAcquisition():
+            abort_on_command(turn)
+        case ev.StartDither() as command:
+            operator.start_dither(turn, command)
+        case ev.StopDither():
+            dither.stop_by_operator(turn)
+        case ev.Measure() as command:
+            measuring.measure(turn, command)
+        case ev.GiveUp(id=name):
+            measuring.give_up_measuring(turn, name)
+        case ev.MeasureNoisy() as command:
+            measuring.measure_noisy(turn, command)
+        case ev.GiveUpNoisy(id=name):
+            measuring.give_up_noisy(turn, name)
+        case _:
+            _obey_about_matrices(turn)
+
+
+def _obey_about_matrices(turn: Turn) -> None:
+    match turn.event:
+        case ev.Refit(n_modes=n_modes):
+            operator.refit(turn, n_modes)
+        case ev.Approve(id=name):
+            operator.approve(turn, name)
+        case ev.Reject(id=name, reason=reason):
+            operator.reject(turn, name, reason)
+        case ev.Publish(id=name):
+            operator.publish(turn, name)
+        case ev.Rollback():
+            operator.roll_back(turn)
+        case _:
+            raise TypeError(f"an event the tracker does not know: {turn.event!r}")

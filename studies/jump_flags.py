@@ -20,11 +20,13 @@ from service.config.policy import policy_of
 from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.tracking.estimate import Measured
+from service.tracking.events import Tick
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Source
 from service.tracking.state import TrackerState
+from service.tracking.turn import Turn
 from service.tracking.validity import taken
-from service.tracking.windows import with_window
+from service.tracking.windows import enter
 
 WINDOW_S = 2.0
 FIT_S = 0.5
@@ -121,7 +123,9 @@ def _flags(night: Night, rng: np.random.Generator, policy: Policy) -> list[tuple
     for k in range(1, night.n_windows + 1):
         end_s = k * WINDOW_S
         now_ns = START_NS + round((end_s + FIT_S) * SECOND_NS)
-        state = with_window(state, _measured(night, end_s, rng, policy), policy, now_ns)
+        turn = Turn(state, Tick(), policy, now_ns)
+        enter(turn, _measured(night, end_s, rng, policy))
+        state = turn.state
         new = [e for e in state.log if e.t_ns_utc == now_ns]
         if k > SETTLED:
             found += [(end_s + FIT_S, entry.name) for entry in new if entry.name in FLAGS]

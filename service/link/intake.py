@@ -18,6 +18,7 @@ from service.link.rivals import SessionWatch
 from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
 from service.telemetry.frames import FrameBlock
 from service.tracking import events as ev
+from service.tracking.alarms import OTHER_BASIS, SECOND_RTC
 from service.tracking.state import Level
 from service.wire import (
     FRAMES_PER_BATCH,
@@ -342,7 +343,7 @@ class Intake:
         rival = admission.rival
         if rival is not None and current and self._bursts.opens(f"second {rival}", now_s):
             told = f"two RTCs send at once, sessions {current} and {rival}: stop one of them"
-            self._queue.put(ev.Trouble(name="second-rtc", text=told))
+            self._queue.put(ev.Trouble(name=SECOND_RTC, text=told))
         return admission.accepted
 
     def _expected(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
@@ -360,7 +361,7 @@ class Intake:
                 f"the RTC's basis and configuration are {' and '.join(found)}, expected "
                 f"{' and '.join(expected)}: no estimate, no publication until they agree"
             )
-            self._queue.put(ev.Trouble(name="basis-mismatch", text=told))
+            self._queue.put(ev.Trouble(name=OTHER_BASIS, text=told))
         which = "basis" if basis_id != self._basis_id else "config"
         return which, f"{' and '.join(found)}, expected {' and '.join(expected)}"
 

@@ -32,8 +32,19 @@ from service.telemetry.random_dither import Correlated
 from service.telemetry.windows import WindowRefused
 from service.tracker import step
 from service.tracking import events as ev
-from service.tracking.alarms import OFF_LOOP, WRONG_LOOP, WRONG_UNIT, Act, forbidding
-from service.tracking.dither import NOT_AS_ASKED, OVER_BUDGET, SILENT_S
+from service.tracking.alarms import (
+    DIVERGING,
+    EDGE_SLIP,
+    NOT_AS_ASKED,
+    OFF_LOOP,
+    OTHER_INSTRUMENT,
+    OVER_BUDGET,
+    WRONG_LOOP,
+    WRONG_UNIT,
+    Act,
+    forbidding,
+)
+from service.tracking.dither import SILENT_S
 from service.tracking.events import Effect, Event
 from service.tracking.loop import RtcView
 from service.tracking.policy import Policy
@@ -231,11 +242,11 @@ def shape_news(streams: Streams, state: TrackerState) -> Event | None:
     if state.rtc is None:
         return None
     reason = shape_mismatch(streams.description, state.rtc)
-    known = any(alarm.name == "instrument-mismatch" for alarm in state.alarms)
+    known = any(alarm.name == OTHER_INSTRUMENT for alarm in state.alarms)
     if (reason is not None) is known:
         return None
     text = reason or "the RTC's telemetry fits the instrument file again"
-    return ev.Trouble(name="instrument-mismatch", text=text, over=known)
+    return ev.Trouble(name=OTHER_INSTRUMENT, text=text, over=known)
 
 
 def shape_mismatch(description: Description, rtc: RtcView) -> str | None:
@@ -272,7 +283,7 @@ def troubles(streams: Streams) -> list[tuple[str, str | None, str]]:
     return [
         (WRONG_UNIT, absurd if health.absurd else None, "commands are what a mirror can play"),
         (WRONG_LOOP, unlawful if n_verdicts >= VERDICTS else None, "the loop is as told again"),
-        ("loop-diverging", diverging if health.diverging else None, "the high modes are calm"),
-        ("edge-slip", slipped if edge.slipped else None, "the outer ring is back"),
+        (DIVERGING, diverging if health.diverging else None, "the high modes are calm"),
+        (EDGE_SLIP, slipped if edge.slipped else None, "the outer ring is back"),
         (OFF_LOOP, None if off is None else off.text, "commands obey the loop equation again"),
     ]

@@ -13,12 +13,14 @@ import structlog
 from service.archive import Archive, AuditEntry
 from service.errors import ArchiveError, StorageError
 from service.tracking import events as ev
-from service.tracking.alarms import ARCHIVE_FAILED, logged
+from service.tracking.alarms import ARCHIVE_FAILED
 from service.tracking.events import Command, Effect
+from service.tracking.operator import orders_of
 from service.tracking.policy import Policy
 from service.tracking.products import ReconstructorRecord
-from service.tracking.resume import orders_of, resumed, saved_of, with_orders
+from service.tracking.resume import resumed, saved_of, with_orders
 from service.tracking.state import Level, LogEntry, TrackerState
+from service.tracking.turn import logged
 
 RETRY_S = 2.0
 """Between two attempts while the disk refuses."""

@@ -30,11 +30,11 @@ from service.runtime.workers import WorkerPool
 from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
 from service.tracking import events as ev
-from service.tracking.alarms import new_lines
 from service.tracking.events import Command, Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.products import MeasureState
 from service.tracking.state import Level, TrackerState, Waiting
+from service.tracking.turn import new_lines
 from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, OpticsWorker
 

@@ -22,203 +22,101 @@ from service.telemetry.openloop import NOT_FOUND
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import (
     abort,
-    again,
-    begun,
-    entered,
-    fail,
+    begin,
+    enter_stage,
     far_stage,
     gains_for,
+    give_up,
+    go_on,
     left_open,
     on_far,
     on_missed,
-    told,
+    request_loop,
+    restart,
     why_needed,
     why_not_now,
-    without_dither,
 )
 from service.tracking.activity import ramping
-from service.tracking.alarms import Act, forbidding, logged, with_alarm, without_alarm
-from service.tracking.dither_schedule import choose_dither
-from service.tracking.events import Event, SetMode, Step
+from service.tracking.alarms import ACQUISITION, Act
+from service.tracking.dither import allow, choose_dither, make_way
 from service.tracking.loop import RtcView
 from service.tracking.measuring import cut_off
-from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import send, why_unsendable, why_worthless, with_state
+from service.tracking.reconstructors import (
+    change_state,
+    make,
+    send_with,
+    why_unsendable,
+    why_worthless,
+)
 from service.tracking.stages import Acquisition, AcquisitionStage, Interruption
-from service.tracking.state import Level, Mode, TrackerState
-from service.tracking.worth import fewer_than, half_of, limited, moved
+from service.tracking.state import Mode, TrackerState
+from service.tracking.turn import Turn
+from service.tracking.worth import fewer_than, half_of, limit_modes, moved
 
 ENOUGH_WINDOWS = 2
 """Ordinary windows that must have held with the last reconstructor."""
-
-_LOST = (MatrixState.REJECTED, MatrixState.FAILED)
-
-
-def closed_stage(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
-    """Make, send, close; then let ordinary windows sharpen α and go on to more modes."""
-    acquisition = state.acquisition
-    record = state.reconstructor(acquisition.matrix) if acquisition.matrix else None
-    if record is not None and record.state in _LOST:
-        return again(state, f"{record.id} was not applied: {record.reason}", now_ns)
-    if acquisition.stage is AcquisitionStage.WIDENING:
-        return _widened(state, rtc, record, policy, now_ns)
-    if record is None:
-        if acquisition.command is not None and rtc.leak > FORGIVING_LEAK:
-            return state, ()
-        return _make(state, acquisition.n_modes, rtc, now_ns)
-    if rtc.cm_id != record.id:
-        return state, ()
-    if rtc.loop == "open":
-        if acquisition.command is not None:
-            return state, ()
-        return told(state, ev.SetLoop(closed=True), now_ns)
-    acquisition = replace(acquisition, applied=record.id, windows=state.windows_accepted)
-    state = replace(state, acquisition=acquisition)
-    text = f"closed on {record.n_modes} modes: sharpening the registration"
-    return entered(state, AcquisitionStage.WIDENING, text, now_ns), ()
-
-
-def on_made(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
-    """Send a reconstructor that has passed the gate, with the gains it was judged with."""
-    record, acquisition, rtc = made.record, state.acquisition, state.rtc
-    if acquisition.stage not in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
-        return state, ()
-    if record.state is MatrixState.REFUSED:
-        return _refused(state, record, now_ns)
-    found = acquisition.found
-    if rtc is None or found is None:
-        return again(state, f"{record.id} cannot be sent: no RTC is there", now_ns)
-    gains = gains_for(found, record.n_modes, rtc.n_modes)
-    stale = why_worthless(state, record.judged, gains[: record.n_modes])
-    if stale is not None:
-        state = with_state(state, record.id, MatrixState.DISCARDED, f"while it was made, {stale}")
-        return logged(state, "reconstructor.discarded", f"{record.id}: {stale}", now_ns), ()
-    reason = why_unsendable(state, record)
-    if reason is not None:
-        return again(state, f"{record.id} cannot be sent: {reason}", now_ns)
-    state, _ = send(state, record.id, now_ns)
-    acquisition = replace(
-        acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None
-    )
-    if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
-        acquisition = replace(acquisition, most_modes=record.n_modes)
-    effect = ev.SendMatrix(id=record.id, n_modes=record.n_modes, gains=gains)
-    return replace(state, acquisition=acquisition), (effect,)
-
-
-def _refused(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> Step:
-    """With the loop closed be content with the modes there are; else try a leak for the edge."""
-    acquisition, gate, rtc = state.acquisition, record.gate, state.rtc
-    if acquisition.stage is AcquisitionStage.WIDENING:
-        acquisition = replace(acquisition, most_modes=acquisition.n_modes)
-        return replace(state, acquisition=acquisition), ()
-    slippery = gate is not None and gate.edge_motion_m is not None
-    if slippery and rtc is not None and rtc.leak > FORGIVING_LEAK:
-        text = f"a leak of {FORGIVING_LEAK} is to keep the outer ring in place"
-        state = logged(state, "acquisition.leak", text, now_ns)
-        return told(state, ev.SetLoop(leak=FORGIVING_LEAK), now_ns)
-    reason = gate.reason if gate is not None else record.reason
-    return fail(state, f"no number of modes passes the gate: {reason}", now_ns)
-
-
-def _widened(
-    state: TrackerState,
-    rtc: RtcView,
-    record: ReconstructorRecord | None,
-    policy: Policy,
-    now_ns: int,
-) -> Step:
-    acquisition = state.acquisition
-    slipped = forbidding(state, Act.HOLD)
-    if slipped is not None:
-        text = f"{slipped.name} with {acquisition.n_modes} modes"
-        return again(state, text, now_ns, slipped=True)
-    if rtc.loop == "open":
-        return again(state, "somebody opened the loop", now_ns)
-    doubted = state.registration is not None and bool(state.registration.doubt)
-    waiting = doubted or state.making_since_ns_utc is not None
-    if record is None or rtc.cm_id != record.id or waiting:
-        return choose_dither(state, rtc, policy, now_ns)
-    if record.applied_frame_seq is not None and acquisition.applied != record.id:
-        acquisition = replace(acquisition, applied=record.id, windows=state.windows_accepted)
-        state = replace(state, acquisition=acquisition)
-    seen = state.windows_accepted - acquisition.windows
-    goal = _goal(acquisition)
-    if seen >= 1 and (record.n_modes < goal or moved(state, record, policy)):
-        return _make(state, goal, rtc, now_ns, at_least=record.n_modes)
-    if seen >= ENOUGH_WINDOWS:
-        return _done(state, record, now_ns), ()
-    return choose_dither(state, rtc, policy, now_ns)
-
-
-def _make(
-    state: TrackerState, n_modes: int, rtc: RtcView, now_ns: int, *, at_least: int = 0
-) -> Step:
-    """Ask for a reconstructor of so many modes, or fewer but more than ``at_least``."""
-    found = state.acquisition.found
-    if state.making_since_ns_utc is not None or found is None or now_ns < state.retries.make_ns_utc:
-        return state, ()
-    effect = ev.MakeMatrix(
-        n_modes=n_modes,
-        why=f"acquisition: {n_modes} modes",
-        gains=gains_for(found, n_modes, rtc.n_modes),
-        fewer=tuple(rung for rung in fewer_than(n_modes) if rung > at_least),
-    )
-    return replace(state, making_since_ns_utc=now_ns), (effect,)
-
-
-def _goal(acquisition: Acquisition) -> int:
-    goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    return goal if acquisition.most_modes is None else min(goal, acquisition.most_modes)
-
-
-def _done(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> TrackerState:
-    acquisition = state.acquisition
-    goal = acquisition.found.n_controlled if acquisition.found is not None else record.n_modes
-    took_s = (now_ns - acquisition.started_ns_utc) / SECOND_NS
-    of_goal = "" if record.n_modes >= goal else f" of {goal}"
-    text = f"tracking after {took_s:.0f} s, {record.n_modes}{of_goal} modes controlled"
-    state = entered(state, AcquisitionStage.TRACKING, text, now_ns)
-    return without_alarm(state, "acquisition", now_ns)
-
-
-def forgotten(state: TrackerState, event: Event, now_ns: int) -> TrackerState:
-    """Return the state without an acquisition that holds back the next, once it need not.
-
-    One that had failed: when α is known without it, for whoever closed the loop has mended what it
-    could not, and the next trouble is another one. One that an operator ended: then too, or when an
-    operator sets the mode, which is to say what the service may do by itself.
-    """
-    acquisition = state.acquisition
-    failed = acquisition.stage is AcquisitionStage.FAILED
-    if not failed and not acquisition.held_off:
-        return state
-    if acquisition.held_off and isinstance(event, SetMode):
-        text = f"an operator has set the mode, {event.mode}, since the last was ended"
-    elif _followed(state):
-        text = f"{ENOUGH_WINDOWS} windows agree in the closed loop: none is needed any more"
-    else:
-        return state
-    idle = Acquisition(text=text, since_ns_utc=now_ns)
-    state = without_alarm(replace(state, acquisition=idle), "acquisition", now_ns)
-    return logged(state, "acquisition.idle", text, now_ns)
-
-
-def _followed(state: TrackerState) -> bool:
-    """Return whether windows that came since agree on α, in a closed loop."""
-    rtc, known = state.rtc, state.registration
-    if rtc is None or not rtc.in_loop or known is None:
-        return False
-    since = state.windows_accepted - state.acquisition.windows
-    believed = known.usable and known.candidate is None
-    return believed and min(since, known.n_windows) >= ENOUGH_WINDOWS
-
 
 NO_RTC = "no RTC is there: when one is, it begins anew or says why not; the loop may be open"
 
 _LASTING = (AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED)
 """Stages that an operator, or windows, must end."""
+
+PATIENCE_S = 180.0
+"""In one stage: a simulated RTC may be ten times slower than its timestamps."""
+
+_LOST = (MatrixState.REJECTED, MatrixState.FAILED)
+
+
+def acquire_on_command(turn: Turn) -> None:
+    """Begin one because an operator says so.
+
+    Raises
+    ------
+    CommandError
+        If none can begin now.
+    """
+    reason = why_not_now(turn.state, turn.policy)
+    if turn.rtc is None or reason is not None:
+        raise CommandError(f"acquisition: {reason}")
+    allow(turn)
+    _begin(turn, turn.rtc, "the operator asks", commanded=True)
+
+
+def abort_on_command(turn: Turn) -> None:
+    """End one because an operator says so.
+
+    Raises
+    ------
+    CommandError
+        If there is none.
+    """
+    interrupted = turn.acquisition.stage is AcquisitionStage.INTERRUPTED
+    if not turn.acquisition.under_way and not interrupted:
+        raise CommandError("acquisition: none is under way")
+    turn.calm(ACQUISITION)
+    abort(turn, "by the operator", held_off=True)
+
+
+def acquire(turn: Turn) -> None:
+    """Take an acquisition further after an event, or begin one where the service needs it."""
+    acquisition = turn.acquisition
+    if acquisition.stage is AcquisitionStage.INTERRUPTED:
+        _take_up(turn)
+    elif not acquisition.under_way:
+        if turn.state.windows_accepted > turn.before.windows_accepted:
+            go_on(turn, replace(acquisition, misses=0))
+        _forget_when_over(turn)
+        why = why_needed(turn.state, turn.policy, turn.now_ns)
+        if why is not None and turn.rtc and ramping(turn.state, turn.now_ns) is None:
+            _begin(turn, turn.rtc, why, commanded=False)
+    elif isinstance(turn.event, ev.RtcVanished):
+        # the state before still knows in which session that was
+        go_on(turn, _cut_off(turn.before, "the RTC vanished"))
+        _wait(turn, NO_RTC)
+    else:
+        _advance(turn)
 
 
 def left_behind(state: TrackerState) -> Acquisition | None:
@@ -235,6 +133,260 @@ def left_behind(state: TrackerState) -> Acquisition | None:
     return _kept(acquisition) if aborted or lasts else None
 
 
+def inherit(turn: Turn, left: Acquisition) -> None:
+    """Take over the acquisition that the service before this one has left."""
+    go_on(turn, left)
+    if left.stage is AcquisitionStage.FAILED:
+        turn.alarm(ACQUISITION, left.text)
+    elif left.stage is not AcquisitionStage.ABORTED:
+        _wait(turn, NO_RTC)
+
+
+def _begin(turn: Turn, rtc: RtcView, why: str, *, commanded: bool) -> None:
+    turn.calm(ACQUISITION)
+    make_way(turn)
+    cut_off(turn, "an acquisition has begun")
+    lost = _own_loop_lost(turn)
+    begin(turn, rtc, why=why, commanded=commanded)
+    turn.log("acquisition.begun", why)
+    if lost is not None:
+        most = half_of(rtc.n_controlled)
+        first = min(turn.acquisition.n_modes, most)
+        go_on(turn, replace(turn.acquisition, most_modes=most, n_modes=first))
+        limit_modes(turn, most, f"{lost} with {rtc.n_controlled} modes")
+    far_stage(turn, rtc)
+
+
+def _own_loop_lost(turn: Turn) -> str | None:
+    """Return the alarm of a loop that did not hold on a matrix made for where the mirror is.
+
+    On as many modes it would not hold the next time; the RTC's own matrix says nothing of that.
+    """
+    state = turn.state
+    record = state.reconstructor(state.in_use) if state.in_use is not None else None
+    if record is None or record.alpha is None:
+        return None
+    alarm = turn.forbidden(Act.HOLD)
+    return None if alarm is None else alarm.name
+
+
+def _advance(turn: Turn) -> None:
+    """Take one that is under way further."""
+    n_effects = len(turn.effects)
+    if not _end_by_event(turn):
+        _take_in(turn)
+    acted = len(turn.effects) > n_effects
+    if acted or not turn.acquisition.under_way or turn.rtc is None:
+        return
+    if turn.acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
+        _closed_stage(turn, turn.rtc)
+    else:
+        far_stage(turn, turn.rtc)
+
+
+def _end_by_event(turn: Turn) -> bool:
+    """End one that cannot go on after the event, or begin it anew; return whether that is so."""
+    acquisition, state = turn.acquisition, turn.state
+    late = turn.now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
+    match turn.event:
+        case ev.StopDither():
+            abort(turn, "because the dither was stopped")
+        case ev.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
+            abort(turn, f"because the mode is {mode}")
+        case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
+            restart(turn, "the RTC began a new session")
+        case ev.DitherMeasured(id=loud, text=text) if loud == state.dithering.loud_id and text:
+            give_up(turn, text)
+        case ev.Noted(name="dither.unusable", text=text):
+            give_up(turn, f"its dither cannot be read: {text}")
+        case ev.Tick() if late:
+            restart(turn, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s")
+        case _:
+            return _end_by_answer(turn)
+    return True
+
+
+def _end_by_answer(turn: Turn) -> bool:
+    acquisition = turn.acquisition
+    match turn.event:
+        case ev.LoopAnswered(id=acquisition.command, accepted=False, reason=reason):
+            give_up(turn, f"the RTC will not change its loop: {reason}")
+        case ev.JobFailed(effect=ev.AskLoop(id=acquisition.command), text=text):
+            restart(turn, text)
+        case _:
+            return False
+    return True
+
+
+def _take_in(turn: Turn) -> None:
+    match turn.event:
+        case ev.FarFitted():
+            on_far(turn, turn.event)
+        case ev.WindowLost(refused=refused) if refused.reason.startswith(NOT_FOUND):
+            on_missed(turn, refused.reason)
+        case ev.DitherAnswered(accepted=False, reason=reason):
+            on_missed(turn, f"the RTC refused the dither: {reason}")
+        case ev.MatrixMade():
+            _on_made(turn, turn.event)
+        case _:
+            pass
+
+
+def _closed_stage(turn: Turn, rtc: RtcView) -> None:
+    """Make, send, close; then let ordinary windows sharpen α and go on to more modes."""
+    acquisition = turn.acquisition
+    record = turn.state.reconstructor(acquisition.matrix) if acquisition.matrix else None
+    if record is not None and record.state in _LOST:
+        restart(turn, f"{record.id} was not applied: {record.reason}")
+    elif acquisition.stage is AcquisitionStage.WIDENING:
+        _widen(turn, rtc, record)
+    elif record is None:
+        if acquisition.command is None or rtc.leak <= FORGIVING_LEAK:
+            _make(turn, acquisition.n_modes, rtc)
+    elif rtc.cm_id != record.id:
+        return
+    elif rtc.loop == "open":
+        if acquisition.command is None:
+            request_loop(turn, ev.SetLoop(closed=True))
+    else:
+        n_windows = turn.state.windows_accepted
+        go_on(turn, replace(acquisition, applied=record.id, windows=n_windows))
+        text = f"closed on {record.n_modes} modes: sharpening the registration"
+        enter_stage(turn, AcquisitionStage.WIDENING, text)
+
+
+def _on_made(turn: Turn, made: ev.MatrixMade) -> None:
+    """Send a reconstructor that has passed the gate, with the gains it was judged with."""
+    record, acquisition, rtc = made.record, turn.acquisition, turn.rtc
+    if acquisition.stage not in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
+        return
+    if record.state is MatrixState.REFUSED:
+        _on_refused(turn, record)
+        return
+    found = acquisition.found
+    if rtc is None or found is None:
+        restart(turn, f"{record.id} cannot be sent: no RTC is there")
+        return
+    gains = gains_for(found, record.n_modes, rtc.n_modes)
+    stale = why_worthless(turn.state, record.judged, gains[: record.n_modes])
+    if stale is not None:
+        change_state(turn, record.id, MatrixState.DISCARDED, f"while it was made, {stale}")
+        turn.log("reconstructor.discarded", f"{record.id}: {stale}")
+        return
+    reason = why_unsendable(turn.state, record)
+    if reason is not None:
+        restart(turn, f"{record.id} cannot be sent: {reason}")
+        return
+    send_with(turn, record.id, gains)
+    most = acquisition.most_modes
+    if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
+        most = record.n_modes
+    sent = replace(acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None)
+    go_on(turn, replace(sent, most_modes=most))
+
+
+def _on_refused(turn: Turn, record: ReconstructorRecord) -> None:
+    """With the loop closed be content with the modes there are; else try a leak for the edge."""
+    acquisition, gate, rtc = turn.acquisition, record.gate, turn.rtc
+    slippery = gate is not None and gate.edge_motion_m is not None
+    if acquisition.stage is AcquisitionStage.WIDENING:
+        go_on(turn, replace(acquisition, most_modes=acquisition.n_modes))
+    elif slippery and rtc is not None and rtc.leak > FORGIVING_LEAK:
+        text = f"a leak of {FORGIVING_LEAK} is to keep the outer ring in place"
+        turn.log("acquisition.leak", text)
+        request_loop(turn, ev.SetLoop(leak=FORGIVING_LEAK))
+    else:
+        reason = gate.reason if gate is not None else record.reason
+        give_up(turn, f"no number of modes passes the gate: {reason}")
+
+
+def _widen(turn: Turn, rtc: RtcView, record: ReconstructorRecord | None) -> None:
+    acquisition, known = turn.acquisition, turn.known
+    slipped = turn.forbidden(Act.HOLD)
+    if slipped is not None:
+        restart(turn, f"{slipped.name} with {acquisition.n_modes} modes", slipped=True)
+        return
+    if rtc.loop == "open":
+        restart(turn, "somebody opened the loop")
+        return
+    doubted = known is not None and bool(known.doubt)
+    waiting = doubted or turn.state.making_since_ns_utc is not None
+    if record is not None and rtc.cm_id == record.id and not waiting:
+        if record.applied_frame_seq is not None and acquisition.applied != record.id:
+            n_windows = turn.state.windows_accepted
+            acquisition = replace(acquisition, applied=record.id, windows=n_windows)
+            go_on(turn, acquisition)
+        seen, goal = turn.state.windows_accepted - acquisition.windows, _goal(acquisition)
+        if seen >= 1 and (record.n_modes < goal or moved(turn.state, record, turn.policy)):
+            _make(turn, goal, rtc, at_least=record.n_modes)
+            return
+        if seen >= ENOUGH_WINDOWS:
+            _finish(turn, record)
+            return
+    choose_dither(turn, rtc)
+
+
+def _make(turn: Turn, n_modes: int, rtc: RtcView, *, at_least: int = 0) -> None:
+    """Ask for a reconstructor of so many modes, or fewer but more than ``at_least``."""
+    found, state = turn.acquisition.found, turn.state
+    if state.making_since_ns_utc is not None or found is None:
+        return
+    if turn.now_ns >= state.retries.make_ns_utc:
+        effect = ev.MakeMatrix(
+            n_modes=n_modes,
+            why=f"acquisition: {n_modes} modes",
+            gains=gains_for(found, n_modes, rtc.n_modes),
+            fewer=tuple(rung for rung in fewer_than(n_modes) if rung > at_least),
+        )
+        make(turn, effect)
+
+
+def _goal(acquisition: Acquisition) -> int:
+    goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
+    return goal if acquisition.most_modes is None else min(goal, acquisition.most_modes)
+
+
+def _finish(turn: Turn, record: ReconstructorRecord) -> None:
+    acquisition = turn.acquisition
+    goal = acquisition.found.n_controlled if acquisition.found is not None else record.n_modes
+    took_s = (turn.now_ns - acquisition.started_ns_utc) / SECOND_NS
+    of_goal = "" if record.n_modes >= goal else f" of {goal}"
+    text = f"tracking after {took_s:.0f} s, {record.n_modes}{of_goal} modes controlled"
+    enter_stage(turn, AcquisitionStage.TRACKING, text)
+    turn.calm(ACQUISITION)
+
+
+def _forget_when_over(turn: Turn) -> None:
+    """Forget an acquisition that holds back the next, once it need not.
+
+    One that had failed: when α is known without it, for whoever closed the loop has mended what it
+    could not, and the next trouble is another one. One that an operator ended: then too, or when an
+    operator sets the mode, which is to say what the service may do by itself.
+    """
+    acquisition, event = turn.acquisition, turn.event
+    if acquisition.stage is not AcquisitionStage.FAILED and not acquisition.held_off:
+        return
+    if acquisition.held_off and isinstance(event, ev.SetMode):
+        text = f"an operator has set the mode, {event.mode}, since the last was ended"
+    elif _followed(turn.state):
+        text = f"{ENOUGH_WINDOWS} windows agree in the closed loop: none is needed any more"
+    else:
+        return
+    go_on(turn, Acquisition(text=text, since_ns_utc=turn.now_ns))
+    turn.calm(ACQUISITION)
+    turn.log("acquisition.idle", text)
+
+
+def _followed(state: TrackerState) -> bool:
+    """Return whether windows that came since agree on α, in a closed loop."""
+    rtc, known = state.rtc, state.registration
+    if rtc is None or not rtc.in_loop or known is None:
+        return False
+    since = state.windows_accepted - state.acquisition.windows
+    believed = known.usable and known.candidate is None
+    return believed and min(since, known.n_windows) >= ENOUGH_WINDOWS
+
+
 def _kept(acquisition: Acquisition) -> Acquisition:
     """Return it without what is of telemetry and commands that have been overtaken."""
     return replace(acquisition, alpha=None, covariance=None, command=None, applied=None, windows=0)
@@ -247,83 +399,60 @@ def _cut_off(state: TrackerState, cause: str) -> Acquisition:
     return replace(_kept(state.acquisition), interruption=interruption)
 
 
-def on_gap(before: TrackerState, state: TrackerState, now_ns: int) -> TrackerState:
-    """Return the state in which an acquisition waits for an RTC that has vanished.
-
-    ``before`` still knows in which session that was.
-    """
-    state = replace(state, acquisition=_cut_off(before, "the RTC vanished"))
-    return _waiting(state, NO_RTC, now_ns)
-
-
-def inherited(state: TrackerState, left: Acquisition, now_ns: int) -> TrackerState:
-    """Return the state of a service to which the one before it has left this acquisition."""
-    state = replace(state, acquisition=left)
-    if left.stage is AcquisitionStage.FAILED:
-        return with_alarm(state, "acquisition", left.text, now_ns)
-    if left.stage is AcquisitionStage.ABORTED:
-        return state
-    return _waiting(state, NO_RTC, now_ns)
-
-
-def taken_up(state: TrackerState, policy: Policy, now_ns: int) -> Step:
+def _take_up(turn: Turn) -> None:
     """Begin an acquisition that was cut off anew, or say why not and what the operator can do."""
-    rtc = state.rtc
+    rtc = turn.rtc
     if rtc is None:
-        return state, ()
+        return
     if rtc.loop != "open":
-        return _closed(state, rtc, now_ns), ()
-    why_not = _why_not_by_itself(state, rtc, policy)
+        _note_closed(turn, rtc)
+        return
+    why_not = _why_not_by_itself(turn, rtc)
     if why_not is not None:
-        return _refusing(state, why_not, now_ns), ()
-    cause = _cause(state.acquisition)
-    state = replace(state, acquisition=replace(state.acquisition, interruption=None))
-    state = without_alarm(state, "acquisition", now_ns)
-    return again(state, cause, now_ns)
+        do = (
+            "The loop may be open, and its matrix is for a registration that was not believed: "
+            "acquire again, or close the loop on a matrix of your own"
+        )
+        _wait(turn, f"it does not begin anew by itself: {why_not}", do)
+        return
+    cause = _cause(turn.acquisition)
+    go_on(turn, replace(turn.acquisition, interruption=None))
+    turn.calm(ACQUISITION)
+    restart(turn, cause)
 
 
-def _why_not_by_itself(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
+def _why_not_by_itself(turn: Turn, rtc: RtcView) -> str | None:
+    state = turn.state
     if left_open(state, rtc) is None:
         return "the RTC has begun another session since, and who left its loop open is not known"
     if state.mode is not Mode.AUTO:
         return f"the mode is {state.mode}"
-    if not policy.acquires:
+    if not turn.policy.acquires:
         return "the settings forbid that"
     if state.dither_stopped:
         return "the dither was stopped"
-    return why_not_now(state, policy)
+    return why_not_now(state, turn.policy)
 
 
-def _refusing(state: TrackerState, why: str, now_ns: int) -> TrackerState:
-    """Return the state that says why what was cut off does not go on, and what to do."""
-    do = (
-        "The loop may be open, and its matrix is for a registration that was not believed: acquire "
-        "again, or close the loop on a matrix of your own"
-    )
-    return _waiting(state, f"it does not begin anew by itself: {why}", now_ns, do)
+def _wait(turn: Turn, what: str, do: str = "") -> None:
+    """Say what was going on, and what it waits for."""
+    text = f"{_said(turn.acquisition)}; {what}{'. ' if do else ''}{do}"
+    if any((alarm.name, alarm.text) == (ACQUISITION, text) for alarm in turn.state.alarms):
+        return
+    stage = AcquisitionStage.INTERRUPTED
+    go_on(turn, replace(turn.acquisition, stage=stage, text=text, since_ns_utc=turn.now_ns))
+    turn.warn("acquisition.interrupted", what)
+    turn.alarm(ACQUISITION, text)
 
 
-def _waiting(state: TrackerState, what: str, now_ns: int, do: str = "") -> TrackerState:
-    """Return the state that says what was going on, and what it waits for."""
-    text = f"{_said(state.acquisition)}; {what}{'. ' if do else ''}{do}"
-    if any((alarm.name, alarm.text) == ("acquisition", text) for alarm in state.alarms):
-        return state
-    acquisition = replace(
-        state.acquisition, stage=AcquisitionStage.INTERRUPTED, text=text, since_ns_utc=now_ns
-    )
-    state = replace(state, acquisition=acquisition)
-    state = logged(state, "acquisition.interrupted", what, now_ns, Level.WARNING)
-    return with_alarm(state, "acquisition", text, now_ns)
-
-
-def _closed(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
-    """Return the state after somebody, or the acquisition itself, has closed the loop."""
+def _note_closed(turn: Turn, rtc: RtcView) -> None:
+    """End it after somebody, or the acquisition itself, has closed the loop."""
     matrix, told = rtc.cm_id or "an unknown matrix", "which it has not judged"
-    if rtc.cm_id is not None and rtc.cm_id == state.acquisition.matrix:
+    if rtc.cm_id is not None and rtc.cm_id == turn.acquisition.matrix:
         told = "which had passed the gate: the registration is followed from there"
-    text = f"{_said(state.acquisition)}; the loop is closed on {matrix}, {told}"
-    state = without_alarm(state, "acquisition", now_ns)
-    return entered(state, AcquisitionStage.ABORTED, text, now_ns)
+    text = f"{_said(turn.acquisition)}; the loop is closed on {matrix}, {told}"
+    turn.calm(ACQUISITION)
+    enter_stage(turn, AcquisitionStage.ABORTED, text)
 
 
 def _said(acquisition: Acquisition) -> str:
@@ -335,136 +464,3 @@ def _said(acquisition: Acquisition) -> str:
 def _cause(acquisition: Acquisition) -> str:
     left = acquisition.interruption
     return "it was cut off" if left is None else left.cause
-
-
-PATIENCE_S = 180.0
-"""In one stage: a simulated RTC may be ten times slower than its timestamps."""
-
-
-def on_acquire(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
-    """Begin or abort an acquisition because an operator says so.
-
-    Raises
-    ------
-    CommandError
-        If there is none to abort, or none can begin now.
-    """
-    if isinstance(event, ev.AbortAcquisition):
-        interrupted = state.acquisition.stage is AcquisitionStage.INTERRUPTED
-        if not state.acquisition.under_way and not interrupted:
-            raise CommandError("acquisition: none is under way")
-        state = without_alarm(state, "acquisition", now_ns)
-        return abort(state, "by the operator", now_ns, held_off=True)
-    reason = why_not_now(state, policy)
-    if state.rtc is None or reason is not None:
-        raise CommandError(f"acquisition: {reason}")
-    state = replace(state, dither_stopped=False)
-    return _begin(state, policy, now_ns, "the operator asks", commanded=True)
-
-
-def acquire(
-    before: TrackerState, state: TrackerState, event: Event, policy: Policy, now_ns: int
-) -> Step:
-    """Take an acquisition further after an event, or begin one where the service needs it.
-
-    ``before`` is the state before anybody else had seen the event.
-    """
-    acquisition = state.acquisition
-    if acquisition.stage is AcquisitionStage.INTERRUPTED:
-        return taken_up(state, policy, now_ns)
-    if not acquisition.under_way:
-        if state.windows_accepted > before.windows_accepted:
-            state = replace(state, acquisition=replace(acquisition, misses=0))
-        state = forgotten(state, event, now_ns)
-        why = why_needed(state, policy, now_ns)
-        if why is None or ramping(state, now_ns) is not None:
-            return state, ()
-        return _begin(state, policy, now_ns, why, commanded=False)
-    if isinstance(event, ev.RtcVanished):
-        return on_gap(before, state, now_ns), ()
-    state, effects = _ended_by(state, event, now_ns) or _heard(state, event, policy, now_ns)
-    if effects or not state.acquisition.under_way or state.rtc is None:
-        return state, effects
-    if state.acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
-        return closed_stage(state, state.rtc, policy, now_ns)
-    return far_stage(state, state.rtc, policy, now_ns)
-
-
-def _begin(state: TrackerState, policy: Policy, now_ns: int, why: str, *, commanded: bool) -> Step:
-    rtc = state.rtc
-    if rtc is None:
-        return state, ()
-    state, effects = without_dither(without_alarm(state, "acquisition", now_ns))
-    state = cut_off(state, "an acquisition has begun", now_ns)
-    lost = _own_loop_lost(state)
-    state = begun(state, rtc, policy, now_ns, why=why, commanded=commanded)
-    state = logged(state, "acquisition.begun", why, now_ns)
-    if lost is not None:
-        most = half_of(rtc.n_controlled)
-        first = min(state.acquisition.n_modes, most)
-        acquisition = replace(state.acquisition, most_modes=most, n_modes=first)
-        state = replace(state, acquisition=acquisition)
-        state = limited(state, most, f"{lost} with {rtc.n_controlled} modes", now_ns)
-    state, more = far_stage(state, rtc, policy, now_ns)
-    return state, (*effects, *more)
-
-
-def _own_loop_lost(state: TrackerState) -> str | None:
-    """Return the alarm of a loop that did not hold on a matrix made for where the mirror is.
-
-    On as many modes it would not hold the next time; the RTC's own matrix says nothing of that.
-    """
-    record = state.reconstructor(state.in_use) if state.in_use is not None else None
-    if record is None or record.alpha is None:
-        return None
-    alarm = forbidding(state, Act.HOLD)
-    return None if alarm is None else alarm.name
-
-
-def _ended_by(state: TrackerState, event: Event, now_ns: int) -> Step | None:
-    """Return what an event makes of an acquisition that cannot go on, or None."""
-    acquisition = state.acquisition
-    match event:
-        case ev.StopDither():
-            return abort(state, "because the dither was stopped", now_ns)
-        case ev.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
-            return abort(state, f"because the mode is {mode}", now_ns)
-        case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
-            return again(state, "the RTC began a new session", now_ns)
-        case ev.DitherMeasured(id=loud, text=text) if loud == state.dithering.loud_id and text:
-            return fail(state, text, now_ns)
-        case ev.Noted(name="dither.unusable", text=text):
-            return fail(state, f"its dither cannot be read: {text}", now_ns)
-        case ev.Tick() if _late(acquisition, now_ns):
-            return again(state, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s", now_ns)
-        case _:
-            return _ended_by_answer(state, event, now_ns)
-
-
-def _ended_by_answer(state: TrackerState, event: Event, now_ns: int) -> Step | None:
-    asked = state.acquisition.command
-    match event:
-        case ev.LoopAnswered(id=command, accepted=False, reason=reason) if command == asked:
-            return fail(state, f"the RTC will not change its loop: {reason}", now_ns)
-        case ev.JobFailed(effect=ev.AskLoop(id=command), text=text) if command == asked:
-            return again(state, text, now_ns)
-        case _:
-            return None
-
-
-def _late(acquisition: Acquisition, now_ns: int) -> bool:
-    return now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
-
-
-def _heard(state: TrackerState, event: Event, policy: Policy, now_ns: int) -> Step:
-    match event:
-        case ev.FarFitted():
-            return on_far(state, event, policy, now_ns)
-        case ev.WindowLost(refused=refused) if refused.reason.startswith(NOT_FOUND):
-            return on_missed(state, refused.reason, now_ns)
-        case ev.DitherAnswered(accepted=False, reason=reason):
-            return on_missed(state, f"the RTC refused the dither: {reason}", now_ns)
-        case ev.MatrixMade():
-            return on_made(state, event, now_ns)
-        case _:
-            return state, ()

@@ -17,17 +17,19 @@ from service.control.dither import (
 )
 from service.model.misregistration import Misregistration
 from service.tracking import events as ev
-from service.tracking.alarms import Act, forbidding, forbids, logged, with_alarm
+from service.tracking.alarms import ACQUISITION, Act, forbidding, forbids
+from service.tracking.dither import ask_for, make_way
 from service.tracking.dither_plan import ACQUIRING_DITHER
-from service.tracking.events import Step
 from service.tracking.loop import DitherView, RtcView
-from service.tracking.loop_commands import on_loop
+from service.tracking.loop_commands import set_loop
 from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.reconstructors import forget_verdict
 from service.tracking.registration import Registration
 from service.tracking.stages import Acquisition, AcquisitionStage, LoopFound
 from service.tracking.state import Level, Mode, TrackerState
-from service.tracking.validity import taken, voided, why_void
-from service.tracking.worth import half_of, limited
+from service.tracking.turn import Turn
+from service.tracking.validity import forget, hold, taken, void, why_void
+from service.tracking.worth import half_of, limit_modes
 
 WINDOW_S = 2.0
 """Of telemetry in one far estimate."""
@@ -49,6 +51,31 @@ MISSES_DESPITE = 10
 
 NOT_CAPTURED = ("the fit did not settle", "outside the capture range")
 """How the reasons of such windows begin."""
+
+MOST_ATTEMPTS = 3
+"""Times the loop is opened for one acquisition."""
+
+HELD_OFF = (
+    "; none begins by itself until windows agree in a closed loop, the mode is set anew, or one is "
+    "asked for"
+)
+"""After an operator ended one, in the text of it."""
+
+_BELIEVED = (
+    AcquisitionStage.PARTIAL,
+    AcquisitionStage.WIDENING,
+    AcquisitionStage.INTERRUPTED,
+)
+"""Stages in which α, where there is one, has been found by this acquisition."""
+
+AGREE = 23.5
+"""χ² of the difference of two estimates (4 degrees of freedom) that one in 10^4 exceeds."""
+
+MOST_MISSES = 4
+"""Windows of a stage that lead nowhere before the loop is opened anew."""
+
+STOPS_WITHIN_S = 2.0
+"""A dither that was told to stop, by the status."""
 
 
 def reach_of(stage: AcquisitionStage) -> Band:
@@ -115,26 +142,25 @@ def gains_for(found: LoopFound, n_modes: int, of_basis: int) -> tuple[float, ...
     return (*found.gains[:n_modes], *(0.0,) * (of_basis - n_modes))
 
 
-def begun(
-    state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int, *, why: str, commanded: bool
-) -> TrackerState:
-    """Return the state in which an acquisition begins: nothing is known of α any more."""
-    left = left_open(state, rtc)
+def begin(turn: Turn, rtc: RtcView, *, why: str, commanded: bool) -> None:
+    """Begin one: nothing is known of α any more."""
+    left = left_open(turn.state, rtc)
     found = left.found if left is not None else None
-    found = found or loop_found(state, rtc, policy)
-    acquisition = Acquisition(
+    found = found or loop_found(turn.state, rtc, turn.policy)
+    turn.acquisition = Acquisition(
         stage=AcquisitionStage.OPENING,
         text=f"opening the loop: {why}",
-        started_ns_utc=now_ns,
-        since_ns_utc=now_ns,
+        started_ns_utc=turn.now_ns,
+        since_ns_utc=turn.now_ns,
         commanded=commanded,
         attempt=1,
         found=found,
         n_modes=first_closed(found.n_controlled),
         sent=left is not None and left.sent,
     )
-    state = voided(state, "the acquisition had not begun")
-    return replace(state, acquisition=acquisition, registration=None, margin=None)
+    void(turn, "the acquisition had not begun")
+    forget(turn)
+    forget_verdict(turn)
 
 
 def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
@@ -157,12 +183,10 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
     return None
 
 
-def missed(state: TrackerState, reason: str) -> TrackerState:
-    """Return the state that has counted a refused window, if α was out of its reach."""
-    acquisition = state.acquisition
-    if acquisition.under_way or not reason.startswith(NOT_CAPTURED):
-        return state
-    return replace(state, acquisition=replace(acquisition, misses=acquisition.misses + 1))
+def count_miss(turn: Turn, reason: str) -> None:
+    """Count a refused window, if α was out of its reach and no acquisition is under way."""
+    if not turn.acquisition.under_way and reason.startswith(NOT_CAPTURED):
+        turn.acquisition = replace(turn.acquisition, misses=turn.acquisition.misses + 1)
 
 
 def why_not_now(state: TrackerState, policy: Policy) -> str | None:
@@ -186,123 +210,176 @@ def sigma_of(acquisition: Acquisition) -> str:
     return f"{x:.3f}, {y:.3f} subap, {np.rad2deg(rotation):.2f} deg, {magnification:.3f} (1 sigma)"
 
 
-MOST_ATTEMPTS = 3
-"""Times the loop is opened for one acquisition."""
-
-HELD_OFF = (
-    "; none begins by itself until windows agree in a closed loop, the mode is set anew, or one is "
-    "asked for"
-)
-"""After an operator ended one, in the text of it."""
-
-_BELIEVED = (
-    AcquisitionStage.PARTIAL,
-    AcquisitionStage.WIDENING,
-    AcquisitionStage.INTERRUPTED,
-)
-"""Stages in which α, where there is one, has been found by this acquisition."""
+def go_on(turn: Turn, acquisition: Acquisition) -> None:
+    """Note how far it has come."""
+    turn.acquisition = acquisition
 
 
-def entered(state: TrackerState, stage: AcquisitionStage, text: str, now_ns: int) -> TrackerState:
-    """Return the state at the beginning of a stage."""
-    acquisition = replace(
-        state.acquisition, stage=stage, text=text, since_ns_utc=now_ns, misses=0, command=None
+def enter_stage(turn: Turn, stage: AcquisitionStage, text: str) -> None:
+    """Begin a stage."""
+    turn.acquisition = replace(
+        turn.acquisition, stage=stage, text=text, since_ns_utc=turn.now_ns, misses=0, command=None
     )
     level = Level.WARNING if stage is AcquisitionStage.FAILED else Level.INFO
-    state = replace(state, acquisition=acquisition)
-    return logged(state, f"acquisition.{stage}", text, now_ns, level)
+    turn.log(f"acquisition.{stage}", text, level)
 
 
-def told(state: TrackerState, command: ev.SetLoop, now_ns: int) -> Step:
-    """Tell the RTC to change its loop, and remember that it was told."""
-    state, effects = on_loop(state, command, now_ns)
-    asked = state.loop_command
-    acquisition = replace(state.acquisition, command=None if asked is None else asked.id)
-    return replace(state, acquisition=acquisition), effects
+def request_loop(turn: Turn, command: ev.SetLoop) -> None:
+    """Ask the RTC to change its loop, and remember having asked."""
+    set_loop(turn, command)
+    asked = turn.state.loop_command
+    turn.acquisition = replace(turn.acquisition, command=None if asked is None else asked.id)
 
 
-def without_dither(state: TrackerState) -> Step:
-    """Stop the dither that runs, if one does; nobody takes it for a dither to be adopted."""
-    running = state.dither.id if state.dither is not None else None
-    if running is None and state.rtc is not None:
-        running = state.rtc.dither_id
-    if running is None:
-        return state, ()
-    dithering = replace(state.dithering, stopped_id=running)
-    return replace(state, dither=None, dithering=dithering), (ev.AskNoDither(),)
-
-
-def again(state: TrackerState, reason: str, now_ns: int, *, slipped: bool = False) -> Step:
+def restart(turn: Turn, reason: str, *, slipped: bool = False) -> None:
     """Begin anew with the loop opened again, at once, a few times; then give up.
 
     A loop that has slipped is closed on half as many modes next time.
     """
-    acquisition = state.acquisition
+    acquisition = turn.acquisition
     if acquisition.attempt >= MOST_ATTEMPTS:
-        return fail(state, f"{reason}, after {acquisition.attempt} attempts", now_ns)
+        give_up(turn, f"{reason}, after {acquisition.attempt} attempts")
+        return
     most = acquisition.most_modes
     if slipped:
         most = half_of(acquisition.n_modes)
-        state = limited(state, most, reason, now_ns)
+        limit_modes(turn, most, reason)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    state, effects = without_dither(voided(state, "the acquisition had not begun anew"))
-    state = replace(
-        state,
-        registration=None,
-        acquisition=replace(
-            acquisition,
-            attempt=acquisition.attempt + 1,
-            alpha=None,
-            covariance=None,
-            matrix=None,
-            most_modes=most,
-            n_modes=min(acquisition.n_modes, most or goal),
-        ),
+    void(turn, "the acquisition had not begun anew")
+    make_way(turn)
+    forget(turn)
+    turn.acquisition = replace(
+        acquisition,
+        attempt=acquisition.attempt + 1,
+        alpha=None,
+        covariance=None,
+        matrix=None,
+        most_modes=most,
+        n_modes=min(acquisition.n_modes, most or goal),
     )
-    state = entered(state, AcquisitionStage.OPENING, f"opening the loop again: {reason}", now_ns)
-    if state.rtc is None or state.rtc.loop == "open":
-        return state, effects
-    state, more = told(state, ev.SetLoop(closed=False), now_ns)
-    return state, (*effects, *more)
+    enter_stage(turn, AcquisitionStage.OPENING, f"opening the loop again: {reason}")
+    if turn.rtc is not None and turn.rtc.loop != "open":
+        request_loop(turn, ev.SetLoop(closed=False))
 
 
-def fail(state: TrackerState, reason: str, now_ns: int) -> Step:
+def give_up(turn: Turn, reason: str) -> None:
     """Give up: the loop stays as it is, but one that is out of hand is opened."""
-    closed = state.rtc is not None and state.rtc.loop != "open"
-    out_of_hand = forbidding(state, Act.HOLD) is not None
-    state, effects = without_dither(state)
-    over = replace(state.acquisition, windows=state.windows_accepted)
-    state = replace(state, registration=None, acquisition=over)
+    closed = turn.rtc is not None and turn.rtc.loop != "open"
+    out_of_hand = turn.forbidden(Act.HOLD) is not None
+    make_way(turn)
+    forget(turn)
+    turn.acquisition = replace(turn.acquisition, windows=turn.state.windows_accepted)
     if closed and out_of_hand:
-        state, more = told(state, ev.SetLoop(closed=False), now_ns)
-        effects = (*effects, *more)
+        request_loop(turn, ev.SetLoop(closed=False))
     text = (
         f"no registration was acquired: {reason}; see the log, then acquire again, or close the "
         "loop on a matrix of your own"
     )
-    state = entered(state, AcquisitionStage.FAILED, text, now_ns)
-    return with_alarm(state, "acquisition", text, now_ns), effects
+    enter_stage(turn, AcquisitionStage.FAILED, text)
+    turn.alarm(ACQUISITION, text)
 
 
-def abort(state: TrackerState, why: str, now_ns: int, *, held_off: bool = False) -> Step:
+def abort(turn: Turn, why: str, *, held_off: bool = False) -> None:
     """End it at once: the loop as it was found, if it held then and nothing was sent; else as is.
 
     As is means open, or closed on a reconstructor that has passed the gate. ``held_off``: none
     begins by itself for now, though what made this one begin may last.
     """
-    acquisition = state.acquisition
-    state, effects = without_dither(state)
-    if acquisition.stage not in _BELIEVED:
-        state = replace(state, registration=None)
-    left, found = "left as it is", _to_give_back(state)
+    make_way(turn)
+    if turn.acquisition.stage not in _BELIEVED:
+        forget(turn)
+    left, found = "left as it is", _to_give_back(turn.state)
     if found is not None:
         left = "closed as it was found"
-        state, more = told(state, ev.SetLoop(closed=True, leak=found.leak), now_ns)
-        effects = (*effects, *more)
+        request_loop(turn, ev.SetLoop(closed=True, leak=found.leak))
     text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
-    over = replace(state.acquisition, held_off=held_off, windows=state.windows_accepted)
-    state = replace(state, acquisition=over)
-    return entered(state, AcquisitionStage.ABORTED, text, now_ns), effects
+    over = replace(turn.acquisition, held_off=held_off, windows=turn.state.windows_accepted)
+    turn.acquisition = over
+    enter_stage(turn, AcquisitionStage.ABORTED, text)
+
+
+def far_stage(turn: Turn, rtc: RtcView) -> None:
+    """Open the loop, then keep the dither of the stage running."""
+    acquisition = turn.acquisition
+    if acquisition.stage is AcquisitionStage.OPENING:
+        if rtc.loop != "open":
+            if acquisition.command is None:
+                request_loop(turn, ev.SetLoop(closed=False))
+            return
+        text = "looking for the registration with the loop open, on smooth modes"
+        enter_stage(turn, AcquisitionStage.COARSE, text)
+    elif rtc.loop != "open":
+        restart(turn, "somebody closed the loop")
+        return
+    _keep_dithering(turn, rtc)
+
+
+def on_far(turn: Turn, event: ev.FarFitted) -> None:
+    """Take over where a window puts the mirror, or hold it against where another one did."""
+    rtc, before, estimate = turn.rtc, turn.acquisition, event.found.estimate
+    if why_void(turn.state, taken(event.began_ns_utc, estimate.t_ns_utc)) is not None:
+        return
+    if rtc is None or not before.looks_afar or estimate.session != rtc.session:
+        return
+    if not _of_stage(turn, rtc, estimate.modes):
+        return
+    covariance = estimate.covariance + np.diag(reach_of(before.stage).floor ** 2)
+    turn.acquisition = replace(before, alpha=estimate.alpha, covariance=covariance)
+    place = f"{_said(estimate.alpha)} +- {sigma_of(turn.acquisition)}"
+    if before.stage is AcquisitionStage.COARSE or before.alpha is None or before.covariance is None:
+        make_way(turn)
+        enter_stage(turn, AcquisitionStage.CONFIRMING, f"{place}: other modes must confirm it")
+        return
+    difference = estimate.alpha.vector - before.alpha.vector
+    chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
+    if chi2 > AGREE:
+        turn.acquisition = before
+        reason = (
+            f"two sets of modes disagree: {_said(before.alpha)} and {_said(estimate.alpha)}, "
+            f"chi2 {chi2:.0f}, expected at most {AGREE}"
+        )
+        restart(turn, reason)
+        return
+    registration = Registration(
+        alpha=estimate.alpha,
+        covariance=covariance,
+        floor=turn.policy.floor,
+        t_ns_utc=estimate.t_ns_utc,
+        arrived_ns_utc=turn.now_ns,
+        n_windows=1,
+        basis_id=turn.state.basis_id,
+        config_id=turn.state.config_id,
+    )
+    hold(turn, registration)
+    make_way(turn)
+    enter_stage(turn, AcquisitionStage.PARTIAL, f"{place}: closing the loop")
+
+
+def on_missed(turn: Turn, reason: str) -> None:
+    """Count a window that led nowhere; after a few begin anew."""
+    misses = turn.acquisition.misses + 1
+    if misses >= MOST_MISSES:
+        restart(turn, reason)
+    else:
+        turn.acquisition = replace(turn.acquisition, misses=misses)
+
+
+def _keep_dithering(turn: Turn, rtc: RtcView) -> None:
+    """Ask for the dither of the stage once no other one runs."""
+    if turn.dither is not None or turn.now_ns < turn.state.retries.dither_ns_utc:
+        return
+    if rtc.dither_id is not None:
+        stopping = rtc.dither_id == turn.dithering.stopped_id
+        since_s = (turn.now_ns - turn.acquisition.since_ns_utc) / SECOND_NS
+        if not (stopping and since_s < STOPS_WITHIN_S):
+            turn.put_off(dither_s=STOPS_WITHIN_S)
+            turn.ask(ev.AskNoDither())
+        return
+    dither = far_dither(turn.acquisition.stage, rtc, turn.policy, turn.now_ns)
+    if isinstance(dither, str):
+        give_up(turn, dither)
+    else:
+        ask_for(turn, dither)
 
 
 def _to_give_back(state: TrackerState) -> LoopFound | None:
@@ -316,106 +393,9 @@ def _to_give_back(state: TrackerState) -> LoopFound | None:
     return found
 
 
-AGREE = 23.5
-"""χ² of the difference of two estimates (4 degrees of freedom) that one in 10^4 exceeds."""
-
-MOST_MISSES = 4
-"""Windows of a stage that lead nowhere before the loop is opened anew."""
-
-STOPS_WITHIN_S = 2.0
-"""A dither that was told to stop, by the status."""
-
-
-def far_stage(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
-    """Open the loop, then keep the dither of the stage running."""
-    acquisition = state.acquisition
-    if acquisition.stage is AcquisitionStage.OPENING:
-        if rtc.loop != "open":
-            if acquisition.command is not None:
-                return state, ()
-            return told(state, ev.SetLoop(closed=False), now_ns)
-        text = "looking for the registration with the loop open, on smooth modes"
-        state = entered(state, AcquisitionStage.COARSE, text, now_ns)
-    elif rtc.loop != "open":
-        return again(state, "somebody closed the loop", now_ns)
-    return _dithered(state, rtc, policy, now_ns)
-
-
-def on_far(state: TrackerState, event: ev.FarFitted, policy: Policy, now_ns: int) -> Step:
-    """Take over where a window puts the mirror, or hold it against where another one did."""
-    rtc, acquisition, estimate = state.rtc, state.acquisition, event.found.estimate
-    if why_void(state, taken(event.began_ns_utc, estimate.t_ns_utc)) is not None:
-        return state, ()
-    if acquisition.stage not in {AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING}:
-        return state, ()
-    if (
-        rtc is None
-        or estimate.session != rtc.session
-        or not _of_stage(state, rtc, policy, estimate.modes)
-    ):
-        return state, ()
-    covariance = estimate.covariance + np.diag(reach_of(acquisition.stage).floor ** 2)
-    before = acquisition
-    acquisition = replace(acquisition, alpha=estimate.alpha, covariance=covariance)
-    if before.stage is AcquisitionStage.COARSE or before.alpha is None or before.covariance is None:
-        state, effects = without_dither(replace(state, acquisition=acquisition))
-        text = f"{_said(estimate.alpha)} +- {sigma_of(acquisition)}: other modes must confirm it"
-        return entered(state, AcquisitionStage.CONFIRMING, text, now_ns), effects
-    difference = estimate.alpha.vector - before.alpha.vector
-    chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
-    if chi2 > AGREE:
-        reason = (
-            f"two sets of modes disagree: {_said(before.alpha)} and {_said(estimate.alpha)}, "
-            f"chi2 {chi2:.0f}, expected at most {AGREE}"
-        )
-        return again(state, reason, now_ns)
-    registration = Registration(
-        alpha=estimate.alpha,
-        covariance=covariance,
-        floor=policy.floor,
-        t_ns_utc=estimate.t_ns_utc,
-        arrived_ns_utc=now_ns,
-        n_windows=1,
-        basis_id=state.basis_id,
-        config_id=state.config_id,
-    )
-    state = replace(state, acquisition=acquisition, registration=registration)
-    state, effects = without_dither(state)
-    text = f"{_said(estimate.alpha)} +- {sigma_of(acquisition)}: closing the loop"
-    return entered(state, AcquisitionStage.PARTIAL, text, now_ns), effects
-
-
-def on_missed(state: TrackerState, reason: str, now_ns: int) -> Step:
-    """Count a window that led nowhere; after a few begin anew."""
-    misses = state.acquisition.misses + 1
-    if misses >= MOST_MISSES:
-        return again(state, reason, now_ns)
-    return replace(state, acquisition=replace(state.acquisition, misses=misses)), ()
-
-
-def _dithered(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
-    """Ask for the dither of the stage once no other one runs."""
-    if state.dither is not None:
-        return state, ()
-    if rtc.dither_id is not None:
-        stopping = rtc.dither_id == state.dithering.stopped_id
-        since_s = (now_ns - state.acquisition.since_ns_utc) / SECOND_NS
-        if now_ns < state.retries.dither_ns_utc or (stopping and since_s < STOPS_WITHIN_S):
-            return state, ()
-        retry_ns = now_ns + round(STOPS_WITHIN_S * SECOND_NS)
-        retries = state.retries.later(dither_ns_utc=retry_ns)
-        return replace(state, retries=retries), (ev.AskNoDither(),)
-    if now_ns < state.retries.dither_ns_utc:
-        return state, ()
-    dither = far_dither(state.acquisition.stage, rtc, policy, now_ns)
-    if isinstance(dither, str):
-        return fail(state, dither, now_ns)
-    return replace(state, dither=dither), (ev.AskDither(dither=dither),)
-
-
-def _of_stage(state: TrackerState, rtc: RtcView, policy: Policy, modes: tuple[int, ...]) -> bool:
+def _of_stage(turn: Turn, rtc: RtcView, modes: tuple[int, ...]) -> bool:
     """Return whether these are the modes of the present stage."""
-    dither = far_dither(state.acquisition.stage, rtc, policy, 0)
+    dither = far_dither(turn.acquisition.stage, rtc, turn.policy, 0)
     return not isinstance(dither, str) and dither.modes == modes
 
 

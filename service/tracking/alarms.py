@@ -1,136 +1,87 @@
-"""Alarms and log inside the state, and what each alarm forbids for as long as it lasts."""
+"""The alarms by name, and what each forbids for as long as it lasts: the one table of it.
+
+An alarm that is not in it is for the operator to see; it forbids nothing.
+"""
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum, auto
 
-from service.tracking.policy import SECOND_NS
-from service.tracking.state import Alarm, Level, LogEntry, TrackerState
+from service.tracking.state import Alarm, TrackerState
 
-LOG_LENGTH = 500
+ACQUISITION = "acquisition"
+"""An acquisition has failed, or was cut off."""
 
-BURST_NS = 60 * SECOND_NS
-"""A line that comes again within this is counted, not told."""
+VANISHED = "rtc-vanished"
+"""The RTC's token is gone."""
 
-REPEATING = frozenset(
-    {
-        "acknowledgement.unknown",
-        "dither.lost",
-        "dither.unusable",
-        "job.failed",
-        "measurement.ignored",
-        "message.malformed",
-        "reconstructor.not-offered",
-        "watchdog.failed",
-        "window.outlier",
-        "window.refused",
-    }
-)
-"""Lines that say the same though their numbers differ: what becomes of telemetry, and of deeds that
-are tried again."""
+LOOP_OPEN = "loop-open"
+"""No mode is in the loop, and nobody here has opened it."""
 
-LOOKED_BACK = 30
-"""So many lines back the beginning of a burst is looked for."""
+SECOND_RTC = "second-rtc"
+OTHER_BASIS = "basis-mismatch"
+OTHER_INSTRUMENT = "instrument-mismatch"
+DIVERGING = "loop-diverging"
+EDGE_SLIP = "edge-slip"
+MISALIGNED = "columns-misaligned"
 
-_NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
+STALE = "estimate-stale"
+"""A closed loop runs on an α that is not worth much, or no window is accepted."""
 
+SUSPECTED = "jump-suspected"
+"""A window far out waits for the one that decides about it."""
 
-def logged(
-    state: TrackerState, name: str, text: str, now_ns: int, level: Level = Level.INFO
-) -> TrackerState:
-    """Return the state with one more line in its log; one that repeats is counted instead."""
-    entry = LogEntry(t_ns_utc=now_ns, level=level, name=name, text=text)
-    for back, before in enumerate(reversed(state.log[-LOOKED_BACK:]), start=1):
-        # the very last line may be any; what lies between makes a story of two equal ones
-        if (back == 1 or name in REPEATING) and _same(before, entry):
-            counted = replace(before, times=before.times + 1, last_ns_utc=now_ns)
-            log = list(state.log)
-            log[-back] = counted
-            return replace(state, log=tuple(log))
-    return replace(state, log=(*state.log, entry)[-LOG_LENGTH:])
+DISAGREES = "watchdog"
+"""Ordinary telemetry contradicts α."""
 
+SHORT_MARGIN = "margin"
+"""The gate would not let the matrix in use through now."""
 
-def _same(before: LogEntry, entry: LogEntry) -> bool:
-    if before.name != entry.name or entry.t_ns_utc - before.t_ns_utc >= BURST_NS:
-        return False
-    if entry.name not in REPEATING:
-        return before.text == entry.text
-    return _NUMBERS.sub("", before.text) == _NUMBERS.sub("", entry.text)
+NOT_ACKNOWLEDGED = "no-acknowledgement"
+"""A reconstructor was sent, and nobody says that it is in use."""
 
+NO_DITHER = "dither"
+"""The dither that is wanted was refused, or cannot be read."""
 
-def counted(state: TrackerState, now_ns: int) -> TrackerState:
-    """Return the state with a line for each burst that is over, which says how often it was."""
-    for entry in state.log:
-        if entry.times > 1 and now_ns - entry.t_ns_utc >= BURST_NS:
-            lasted_s = (entry.last_ns_utc - entry.t_ns_utc) / SECOND_NS
-            told = replace(
-                entry,
-                t_ns_utc=now_ns,
-                text=f"{entry.text} ({entry.times} times in {lasted_s:.0f} s)",
-                times=1,
-            )
-            log = tuple(replace(e, times=1) if e is entry else e for e in state.log)
-            state = replace(state, log=(*log, told)[-LOG_LENGTH:])
-    return state
+DITHER_LOST = "dither-lost"
+"""A dither was accepted, and does not reach the mirror."""
 
+NOT_STOPPED = "dither-not-stopped"
+"""A dither goes on that was asked to stop."""
 
-def new_lines(before: TrackerState, after: TrackerState) -> list[LogEntry]:
-    """Return the lines that were added; one that was only counted is not among them."""
-    if after.log is before.log:
-        return []
-    known = {entry.line for entry in before.log}
-    return [entry for entry in after.log if entry.line not in known]
+OVER_BUDGET = "dither-over-budget"
+"""From when the RTC plays a dither stronger than it may until it plays one as it may."""
 
-
-def with_alarm(state: TrackerState, name: str, text: str, now_ns: int) -> TrackerState:
-    """Return the state with this alarm raised; one already raised keeps its beginning."""
-    before = next((a for a in state.alarms if a.name == name), None)
-    raised = before
-    if raised is None:
-        t_ns = 0 if state.rtc is None else state.rtc.t_ns_utc
-        raised = Alarm(name=name, since_ns_utc=now_ns, text=text, t_ns_utc=t_ns)
-    alarm = replace(raised, text=text, seen_ns_utc=now_ns)
-    others = tuple(a for a in state.alarms if a.name != name)
-    state = replace(state, alarms=(*others, alarm))
-    return state if before is not None else logged(state, name, text, now_ns, Level.ALARM)
-
-
-def without_alarm(state: TrackerState, name: str, now_ns: int) -> TrackerState:
-    """Return the state without this alarm."""
-    if all(a.name != name for a in state.alarms):
-        return state
-    state = replace(state, alarms=tuple(a for a in state.alarms if a.name != name))
-    return logged(state, name, f"{name}: over", now_ns)
-
+NOT_AS_ASKED = "dither-not-as-asked"
+"""The frames hold another dither than the one that was asked for."""
 
 OFF_LOOP = "commands-off-loop"
-"""The alarm of a saturated mirror, or of an RTC whose account of its loop is wrong."""
+"""A saturated mirror, or an RTC whose account of its loop is wrong."""
 
 WRONG_MATRIX = "matrix-mismatch"
-"""The alarm of an RTC whose own matrix is of other slopes or commands than the file tells."""
+"""An RTC whose own matrix is of other slopes or commands than the file tells."""
 
 WRONG_ANSWER = "response-mismatch"
-"""The alarm of slopes that answer a dither otherwise than the file tells."""
+"""Slopes that answer a dither otherwise than the file tells."""
 
 WRONG_LOOP = "loop-law"
-"""The alarm of an RTC whose leak, gains or delay are others than its status says."""
+"""An RTC whose leak, gains or delay are others than its status says."""
 
 WRONG_UNIT = "command-unit"
-"""The alarm of commands that no mirror can play."""
+"""Commands that no mirror can play."""
 
 ARCHIVE_FAILED = "archive-failed"
-"""The alarm of a disk that refuses: what cannot be recorded is not done."""
+"""A disk that refuses: what cannot be recorded is not done."""
 
 OTHER_SUM = "wrong-matrix"
-"""The alarm of an RTC that acknowledges, or holds, other numbers than were sent."""
+"""An RTC that acknowledges, or holds, other numbers than were sent."""
 
 SECOND_SERVICE = "second-service"
-"""The alarm of two services for one RTC; it forbids nothing to the one that drives."""
+"""Two services for one RTC; it forbids nothing to the one that drives."""
 
 STANDING_BY = "standing-by"
-"""The alarm of a service that leaves the RTC to another one."""
+"""A service that leaves the RTC to another one."""
 
 
 class Act(Enum):
@@ -170,11 +121,11 @@ _MISTOLD = frozenset({Act.MEASURE, Act.SEND_NEW, Act.SEND_KNOWN})
 _OUT_OF_HAND = frozenset({Act.MEASURE, Act.DECIDE, Act.HOLD})
 
 RULES: dict[str, Rule] = {
-    "second-rtc": Rule("two RTCs were sending", _STRANGER),
-    "basis-mismatch": Rule("the RTC had another basis or configuration", _STRANGER),
-    "instrument-mismatch": Rule("the RTC was not of the instrument in the file", _STRANGER),
-    "loop-diverging": Rule("the loop was diverging", _OUT_OF_HAND),
-    "edge-slip": Rule("the edge had slipped", _OUT_OF_HAND),
+    SECOND_RTC: Rule("two RTCs were sending", _STRANGER),
+    OTHER_BASIS: Rule("the RTC had another basis or configuration", _STRANGER),
+    OTHER_INSTRUMENT: Rule("the RTC was not of the instrument in the file", _STRANGER),
+    DIVERGING: Rule("the loop was diverging", _OUT_OF_HAND),
+    EDGE_SLIP: Rule("the edge had slipped", _OUT_OF_HAND),
     WRONG_MATRIX: Rule("the RTC's matrix was of other slopes or commands", _MISTOLD),
     WRONG_LOOP: Rule("the loop was not what the RTC tells of it", _MISTOLD | {Act.DECIDE}),
     WRONG_UNIT: Rule("the commands were in another unit", _MISTOLD | {Act.DECIDE}),

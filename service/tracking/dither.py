@@ -1,27 +1,46 @@
-"""A dither's life: accepted, playing, ended, lost on its way to the mirror, or not wanted."""
+"""The dither: asked for when it is due, adopted, playing, ended, lost, unwanted or too strong.
+
+A dither that runs already, from before a restart of the service or in a replayed night, is as good
+as a new one, and the RTC plays no second one beside it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from service.control.dither import forgetting_mean, measured_ratio
+from service.telemetry.lockin import WindowEstimate
+from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
 from service.tracking.activity import GONE_WITHIN_S
-from service.tracking.alarms import logged, with_alarm, without_alarm
-from service.tracking.dither_plan import OUR_DITHERS, OWN_DITHER, budget_m, total_m
-from service.tracking.events import AskNoDither, Step
+from service.tracking.alarms import (
+    DITHER_LOST,
+    NO_DITHER,
+    NOT_AS_ASKED,
+    NOT_STOPPED,
+    OVER_BUDGET,
+    Act,
+)
+from service.tracking.dither_plan import (
+    NOISY_DITHER,
+    OUR_DITHERS,
+    OWN_DITHER,
+    SHORTEST_PAUSE_S,
+    Wish,
+    budget_m,
+    on_vibrations,
+    plan_dither,
+    total_m,
+    wanted,
+    why_unusable,
+    window_lengths_s,
+)
 from service.tracking.loop import DitherKind, DitherView, RtcView
-from service.tracking.measuring import cut_off
-from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.state import Level, TrackerState
-
-NOT_STOPPED = "dither-not-stopped"
-"""Alarm while a dither goes on that was asked to stop."""
-
-OVER_BUDGET = "dither-over-budget"
-"""Alarm from when the RTC plays a dither stronger than it may until it plays one as it may."""
-
-NOT_AS_ASKED = "dither-not-as-asked"
-"""Alarm while the frames hold another dither than the one that was asked for."""
+from service.tracking.policy import SECOND_NS
+from service.tracking.stages import DitherPhase, Precision
+from service.tracking.turn import Turn
 
 MEASURED = 1.1
 """What a second of frames may hold more than is allowed, before it is too strong."""
@@ -34,149 +53,6 @@ CALM_S = 60.0
 
 TELL_EVERY_S = 2.0
 
-
-def own_sine(dither: DitherView) -> bool:
-    """Return whether a dither is one that the service has chosen by itself."""
-    return dither.id.startswith(OWN_DITHER) and dither.kind is DitherKind.SINE
-
-
-def without_unwanted(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
-    """Ask the RTC, again and again, to stop what it should not play."""
-    running, loud = rtc.dither_id, _too_strong(state, rtc, policy)
-    why = loud or _why_unwanted(state, rtc, policy)
-    if running is None or why is None:
-        return _forgiven(gone(state, now_ns), rtc, policy, now_ns), ()
-    if state.dithering.unwanted_id != running:
-        state = _met(state, running, now_ns)
-        state = state if loud is None else _alarmed(state, running, loud, now_ns)
-    if now_ns - state.dithering.unwanted_since_ns_utc >= GONE_WITHIN_S * SECOND_NS:
-        text = (
-            f"{why}, and the RTC goes on playing {running}: it is asked every {TELL_EVERY_S:.0f} s "
-            "to stop it; stop it at the RTC"
-        )
-        state = with_alarm(state, NOT_STOPPED, text, now_ns)
-    if now_ns - state.dithering.told_ns_utc < TELL_EVERY_S * SECOND_NS:
-        return state, ()
-    return told_to_stop(state, now_ns), (AskNoDither(),)
-
-
-def on_measured(state: TrackerState, event: ev.DitherMeasured, policy: Policy, now_ns: int) -> Step:
-    """Name a dither that the frames show to be otherwise than asked; stop one that is too strong.
-
-    What the commands hold is what the mirror does, whatever the RTC's status says.
-    """
-    rtc, dither = state.rtc, state.dither
-    if not event.text:
-        state = replace(state, dithering=replace(state.dithering, loud_text="", amiss_id=None))
-        return without_alarm(without_alarm(state, NOT_AS_ASKED, now_ns), OVER_BUDGET, now_ns), ()
-    if rtc is None or dither is None or dither.id != event.id:
-        return state, ()
-    dithering = replace(state.dithering, amiss_id=event.id, amiss_m=event.found_m)
-    state = replace(state, dithering=dithering)
-    most_m = budget_m(rtc, policy)
-    if event.found_m <= MEASURED * max(event.asked_m, most_m):
-        text = f"{event.text}; look at the RTC's dither"
-        return with_alarm(state, NOT_AS_ASKED, text, now_ns), ()
-    loud = f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
-    state = cut_off(state, f"its dither was too strong: {event.text}", now_ns)
-    state = _met(state, event.id, now_ns)
-    dithering = replace(state.dithering, loud_id=event.id, loud_text=loud)
-    state = _alarmed(replace(state, dithering=dithering), event.id, loud, now_ns)
-    return told_to_stop(state, now_ns), (AskNoDither(),)
-
-
-def stopped(state: TrackerState, dither_id: str, now_ns: int) -> TrackerState:
-    """Note that the RTC is asked to stop a dither, and since when."""
-    if state.dithering.stopped_id == dither_id:
-        return state
-    dithering = replace(state.dithering, stopped_id=dither_id, ended_ns_utc=None)
-    return replace(state, dithering=replace(dithering, stopped_ns_utc=now_ns))
-
-
-def told_to_stop(state: TrackerState, now_ns: int) -> TrackerState:
-    """Return the state in which the RTC has just been told to play no dither."""
-    return replace(state, dithering=replace(state.dithering, told_ns_utc=now_ns))
-
-
-def gone(state: TrackerState, now_ns: int) -> TrackerState:
-    """Return the state in which no unwanted dither plays, or nobody knows of one."""
-    if state.dithering.unwanted_id is None:
-        return state
-    state = replace(state, dithering=replace(state.dithering, unwanted_id=None))
-    return without_alarm(state, NOT_STOPPED, now_ns)
-
-
-def calm_ns_utc(state: TrackerState) -> int:
-    """Return until when no dither is tried because the last one was too strong; 0: none was."""
-    loud_ns = state.dithering.loud_ns_utc
-    return loud_ns and loud_ns + round(CALM_S * SECOND_NS)
-
-
-def _met(state: TrackerState, running: str, now_ns: int) -> TrackerState:
-    """Return the state that knows of a dither that must go, and follows it no more."""
-    state = stopped(state, running, now_ns)
-    if state.dither is not None and state.dither.id == running:
-        state = replace(state, dither=None)
-    dithering = replace(state.dithering, unwanted_id=running, unwanted_since_ns_utc=now_ns)
-    return replace(state, dithering=dithering)
-
-
-def _alarmed(state: TrackerState, running: str, loud: str, now_ns: int) -> TrackerState:
-    text = (
-        f"{loud}: it was told to stop {running}, and another is tried after {CALM_S:.0f} s; look "
-        "at the RTC's dither, or stop the dither to do without"
-    )
-    state = replace(state, dithering=replace(state.dithering, loud_ns_utc=now_ns))
-    return with_alarm(state, OVER_BUDGET, text, now_ns)
-
-
-def _forgiven(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> TrackerState:
-    """End the alarm of a dither too strong once one is played as it may, or none is wanted."""
-    by_frames = bool(state.dithering.loud_text)
-    fine = (
-        not by_frames
-        and state.dither is not None
-        and rtc.dither is not None
-        and rtc.dither.id == state.dither.id
-    )
-    given_up = state.dither_stopped or not policy.dither_enabled
-    if given_up:
-        state = without_alarm(state, NOT_AS_ASKED, now_ns)
-    return without_alarm(state, OVER_BUDGET, now_ns) if fine or given_up else state
-
-
-def _too_strong(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
-    """Return why a dither that is played costs more than it may, or None.
-
-    An operator's own may cost more than the budget, but not more than was asked for.
-    """
-    running = rtc.dither
-    if running is None:
-        return None
-    found_m, most_m = total_m(running), budget_m(rtc, policy)
-    over = own_sine(running) and found_m > ROUNDING * most_m
-    if not over and running.id != state.dithering.loud_id:
-        return None
-    if running.id == state.dithering.loud_id and state.dithering.loud_text:
-        return state.dithering.loud_text
-    return (
-        f"the RTC plays a dither of {1e9 * found_m:.3g} nm RMS in all, more than the budget of "
-        f"{1e9 * most_m:.3g} nm"
-    )
-
-
-def _why_unwanted(state: TrackerState, rtc: RtcView, policy: Policy) -> str | None:
-    running = rtc.dither_id
-    if running is None or not running.startswith(OUR_DITHERS):
-        return None
-    wanted = state.dither is not None and state.dither.id == running
-    if state.dither_stopped and not wanted:
-        return "the operator wants no dither"
-    if not policy.dither_enabled and state.dither is None and running.startswith(OWN_DITHER):
-        return "the settings forbid a dither"
-    return None
-
-
 SILENT_S = 1.0
 """Of frames without the dither, before it is missed."""
 
@@ -185,117 +61,488 @@ PATIENCE_S = 1.5
 
 LONGEST_PATIENCE_S = 60.0
 
+RESULT_WITHIN_S = 10.0
+"""For the estimate of a window whose dither has ended."""
+
+SOON_OVER_S = 2.0
+"""A dither that ends by itself so soon is not worth a command."""
+
+STOPPED_WITHIN_S = 5.0
+"""An RTC still playing a dither so long after it was asked to stop does not stop dithers."""
+
+MEMORY_S = 600.0
+"""Of the mean cost that is shown."""
+
 _ON_ITS_WAY_S = 2.0
 """For a status made before the dither began, where it does not tell its own frame."""
 
 _SAME_LINE_HZ = 2.5
 
-DITHER_LOST = "dither-lost"
+
+def own_sine(dither: DitherView) -> bool:
+    """Return whether a dither is one that the service has chosen by itself."""
+    return dither.id.startswith(OWN_DITHER) and dither.kind is DitherKind.SINE
 
 
-def on_dither(state: TrackerState, event: ev.DitherAnswered, now_ns: int) -> TrackerState:
+def choose_dither(turn: Turn, rtc: RtcView) -> None:
+    """Dither as much and as often as the policy asks while the loop is closed, its matrix known."""
+    _account(turn, rtc)
+    stop_unwanted(turn, rtc)
+    dither = turn.dither
+    if dither is not None and not own_sine(dither):
+        _show(turn, DitherPhase.OPERATOR, f"{dither.id} runs")
+        return
+    forbidden = _why_none(turn, rtc)
+    if forbidden is not None:
+        _show(turn, DitherPhase.OFF, forbidden)
+        return
+    wish, plan = wanted(turn.state, rtc, turn.policy, turn.now_ns)
+    turn.dithering = replace(
+        turn.dithering,
+        plan=plan,
+        next_ns_utc=wish.next_ns_utc if wish.next_ns_utc > turn.now_ns else None,
+        avoided_hz=wish.choice.avoid_hz,
+    )
+    _show(turn, wish.phase, wish.reason)
+    if dither is not None:
+        _end_when_done(turn, dither, wish)
+    elif not _adopt(turn, rtc):
+        _begin(turn, rtc, wish)
+
+
+def ask_for(turn: Turn, dither: DitherView) -> None:
+    """Ask for a dither and follow it."""
+    turn.dither = dither
+    turn.ask(ev.AskDither(dither=dither))
+
+
+def drop(turn: Turn) -> None:
+    """Follow no dither any more."""
+    turn.dither = None
+
+
+def make_way(turn: Turn) -> bool:
+    """Stop the dither that runs, and adopt it no more; return whether one did."""
+    running = turn.dither.id if turn.dither is not None else None
+    if running is None and turn.rtc is not None:
+        running = turn.rtc.dither_id
+    if running is None:
+        return False
+    turn.dithering = replace(turn.dithering, stopped_id=running)
+    turn.dither = None
+    turn.ask(ev.AskNoDither())
+    return True
+
+
+def make_way_for_noisy(turn: Turn) -> None:
+    """Stop whatever is played; a dither of the service's own ends without a result."""
+    own = turn.dither
+    if own is not None:
+        turn.dithering = replace(turn.dithering, stopped_id=own.id, ended_ns_utc=None)
+        turn.dither = None
+    turn.ask(ev.AskNoDither())
+
+
+def allow(turn: Turn, *, allowed: bool = True) -> None:
+    """Let the service dither by itself, or not any more."""
+    turn.state = replace(turn.state, dither_stopped=not allowed)
+
+
+def stop_by_operator(turn: Turn) -> None:
+    """Stop the dither, and start none until told to."""
+    drop(turn)
+    allow(turn, allowed=False)
+    found_again(turn)
+    tell_to_stop(turn)
+    turn.log("dither.stopped", "by the operator")
+
+
+def tell_to_stop(turn: Turn) -> None:
+    """Ask the RTC to play no dither."""
+    turn.dithering = replace(turn.dithering, told_ns_utc=turn.now_ns)
+    turn.ask(ev.AskNoDither())
+
+
+def on_answer(turn: Turn, event: ev.DitherAnswered) -> None:
     """Note when the dither starts, or why it does not."""
-    if state.dither is None or state.dither.id != event.id:
-        return state
+    if turn.dither is None or turn.dither.id != event.id:
+        return
     if event.accepted:
-        state = replace(
-            state, dither=replace(state.dither, start_seq=event.start_seq, asked_ns_utc=now_ns)
-        )
-        text = f"{event.id} starts at frame {event.start_seq}"
-        return logged(without_alarm(state, "dither", now_ns), "dither.started", text, now_ns)
-    retries = state.retries.later(dither_ns_utc=now_ns + 10 * SECOND_NS)
-    state = replace(state, dither=None, retries=retries)
-    return with_alarm(state, "dither", f"the RTC refused the dither: {event.reason}", now_ns)
+        turn.dither = replace(turn.dither, start_seq=event.start_seq, asked_ns_utc=turn.now_ns)
+        turn.calm(NO_DITHER)
+        turn.log("dither.started", f"{event.id} starts at frame {event.start_seq}")
+        return
+    turn.put_off(dither_s=10.0)
+    turn.dither = None
+    turn.alarm(NO_DITHER, f"the RTC refused the dither: {event.reason}")
 
 
-def on_vibrations(state: TrackerState, event: ev.Vibrations, now_ns: int) -> TrackerState:
+def hear_vibrations(turn: Turn, event: ev.Vibrations) -> None:
     """Note where the slopes vibrate; the next dither keeps clear of it."""
-    before, lines = state.vibrations_hz, event.lines_hz
-    state = replace(state, vibrations_hz=lines)
+    before, lines = turn.state.vibrations_hz, event.lines_hz
+    turn.state = replace(turn.state, vibrations_hz=lines)
     # a line between two bins of the spectrum shows now in one, now in the other
-    near = (any(abs(line - known) < _SAME_LINE_HZ for known in before) for line in lines)
-    if all(near):
-        return state
-    text = f"vibrations at {', '.join(f'{line:.0f}' for line in lines)} Hz"
-    return logged(state, "vibrations", text, now_ns)
+    if not all(any(abs(line - known) < _SAME_LINE_HZ for known in before) for line in lines):
+        turn.log("vibrations", f"vibrations at {', '.join(f'{f:.0f}' for f in lines)} Hz")
 
 
-def follow_status(state: TrackerState, rtc: RtcView, now_ns: int) -> TrackerState:
+def follow_status(turn: Turn, rtc: RtcView) -> None:
     """Compare the dither that should run with the one the RTC's status shows."""
-    dither = state.dither
+    dither = turn.dither
     if dither is None or dither.start_seq is None:
-        return state
+        return
     if rtc.dither_id == dither.id:
-        return _corrected(state, dither, rtc.dither, now_ns)
-    elapsed_s = (now_ns - dither.asked_ns_utc) / SECOND_NS
+        _correct(turn, dither, rtc.dither)
+        return
+    elapsed_s = (turn.now_ns - dither.asked_ns_utc) / SECOND_NS
     if rtc.seq < dither.start_seq if rtc.seq >= 0 else elapsed_s <= _ON_ITS_WAY_S:
-        return state
+        return
     played_s = (rtc.seq - dither.start_seq) / rtc.frame_rate_hz if rtc.seq >= 0 else elapsed_s
-    told_to_stop = dither.id == state.dithering.stopped_id
+    asked_to_stop = dither.id == turn.dithering.stopped_id
     # a status a second old may be the first to show the end
-    if told_to_stop or played_s >= dither.duration_s - SILENT_S:
-        dithering = replace(state.dithering, ended_ns_utc=now_ns)
-        state = replace(state, dither=None, dithering=dithering)
-        state = without_alarm(state, DITHER_LOST, now_ns)
-        return logged(state, "dither.ended", f"{dither.id} has ended", now_ns)
+    if asked_to_stop or played_s >= dither.duration_s - SILENT_S:
+        turn.dithering = replace(turn.dithering, ended_ns_utc=turn.now_ns)
+        turn.dither = None
+        turn.calm(DITHER_LOST)
+        turn.log("dither.ended", f"{dither.id} has ended")
+        return
+    if turn.state.dither_losses:
+        turn.put_off(dither_s=_patience_s(turn))
     text = f"the RTC's status shows no {dither.id} although it was accepted: it is asked for again"
-    wait_s = 0.0 if state.dither_losses == 0 else _patience_s(state)
-    retries = state.retries.later(dither_ns_utc=now_ns + round(wait_s * SECOND_NS))
-    state = replace(state, retries=retries)
-    return _lost(state, dither, text, now_ns)
+    _lose(turn, dither, text)
 
 
-def on_silence(state: TrackerState, event: ev.DitherSilent, now_ns: int) -> TrackerState:
+def on_silence(turn: Turn, event: ev.DitherSilent) -> None:
     """Miss a dither that the frames do not show, whatever the status says; then ask anew.
 
     The frames have the last word. One the RTC only applies late comes in time for a longer
     patience.
     """
-    dither = state.dither
+    dither = turn.dither
     if dither is None or dither.id != event.id:
-        return state
+        return
     text = (
         f"the RTC accepted {dither.id}, and for {event.silent_s:.1f} s its frames have held none "
         "of it: α is not measured"
     )
-    if event.silent_s < _patience_s(state):
-        return with_alarm(state, DITHER_LOST, text, now_ns)
-    return _lost(state, dither, text, now_ns)
+    if event.silent_s < _patience_s(turn):
+        turn.alarm(DITHER_LOST, text)
+    else:
+        _lose(turn, dither, text)
 
 
-def _corrected(
-    state: TrackerState, asked: DitherView, running: DitherView | None, now_ns: int
-) -> TrackerState:
+def found_again(turn: Turn) -> None:
+    """Miss it no more: a window held the dither, or none is wanted any more."""
+    turn.state = replace(turn.state, dither_lost=None, dither_losses=0)
+    turn.calm(DITHER_LOST)
+
+
+def learn(turn: Turn, estimate: WindowEstimate | RandomEstimate) -> None:
+    """Take over from an accepted window what it says of the precision of windows."""
+    rtc, known = turn.rtc, turn.dithering.precision
+    accepted = turn.state.windows_accepted > turn.before.windows_accepted
+    if isinstance(estimate, RandomEstimate) or not accepted or rtc is None:
+        return
+    if estimate.dither_m > 0.0:
+        ratio = measured_ratio(
+            estimate.covariance, estimate.dither_m, estimate.window_s, rtc.magnitude
+        )
+        n_windows = 0 if known is None else known.n_windows
+        mean = forgetting_mean(None if known is None else known.ratio, n_windows, ratio)
+        precision = Precision(ratio=mean, n_windows=n_windows + 1)
+        turn.dithering = replace(turn.dithering, precision=precision)
+
+
+def why_too_strong(turn: Turn, event: ev.DitherMeasured) -> str | None:
+    """Name a dither that the frames show to be otherwise than asked; return why it must go.
+
+    What the commands hold is what the mirror does, whatever the RTC's status says.
+    """
+    rtc, dither = turn.rtc, turn.dither
+    if not event.text:
+        turn.dithering = replace(turn.dithering, loud_text="", amiss_id=None)
+        turn.calm(NOT_AS_ASKED)
+        turn.calm(OVER_BUDGET)
+        return None
+    if rtc is None or dither is None or dither.id != event.id:
+        return None
+    turn.dithering = replace(turn.dithering, amiss_id=event.id, amiss_m=event.found_m)
+    most_m = budget_m(rtc, turn.policy)
+    if event.found_m > MEASURED * max(event.asked_m, most_m):
+        return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
+    turn.alarm(NOT_AS_ASKED, f"{event.text}; look at the RTC's dither")
+    return None
+
+
+def stop_too_strong(turn: Turn, dither_id: str, loud: str) -> None:
+    """Stop a dither that the frames show to be too strong."""
+    _meet_unwanted(turn, dither_id)
+    turn.dithering = replace(turn.dithering, loud_id=dither_id, loud_text=loud)
+    _blame(turn, dither_id, loud)
+    tell_to_stop(turn)
+
+
+def stop_unwanted(turn: Turn, rtc: RtcView) -> None:
+    """Ask the RTC, again and again, to stop what it should not play."""
+    running, loud = rtc.dither_id, _too_strong(turn, rtc)
+    why = loud or _why_unwanted(turn, rtc)
+    if running is None or why is None:
+        forget_unwanted(turn)
+        _forgive(turn, rtc)
+        return
+    if turn.dithering.unwanted_id != running:
+        _meet_unwanted(turn, running)
+        if loud is not None:
+            _blame(turn, running, loud)
+    if turn.now_ns - turn.dithering.unwanted_since_ns_utc >= GONE_WITHIN_S * SECOND_NS:
+        text = (
+            f"{why}, and the RTC goes on playing {running}: it is asked every {TELL_EVERY_S:.0f} s "
+            "to stop it; stop it at the RTC"
+        )
+        turn.alarm(NOT_STOPPED, text)
+    if turn.now_ns - turn.dithering.told_ns_utc >= TELL_EVERY_S * SECOND_NS:
+        tell_to_stop(turn)
+
+
+def forget_unwanted(turn: Turn) -> None:
+    """Note that no unwanted dither plays, or nobody knows of one."""
+    if turn.dithering.unwanted_id is not None:
+        turn.dithering = replace(turn.dithering, unwanted_id=None)
+        turn.calm(NOT_STOPPED)
+
+
+def _begin(turn: Turn, rtc: RtcView, wish: Wish) -> None:
+    """Ask for a dither if it is time, and nothing left behind is in its way."""
+    loud_ns = turn.dithering.loud_ns_utc
+    if loud_ns and turn.now_ns < loud_ns + round(CALM_S * SECOND_NS):
+        _show(turn, DitherPhase.OFF, "the RTC has played the last one too strong")
+        return
+    if turn.now_ns < turn.state.retries.dither_ns_utc:
+        return
+    if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
+        # left behind by this service: its window of another length, or to stop
+        turn.put_off(dither_s=2.0)
+        _note_stop(turn, rtc.dither_id)
+        turn.ask(ev.AskNoDither())
+    elif turn.now_ns >= wish.next_ns_utc and not _awaits_a_result(turn, wish):
+        _ask(turn, rtc, wish)
+
+
+def _ask(turn: Turn, rtc: RtcView, wish: Wish) -> None:
+    dither = plan_dither(rtc, turn.policy, turn.now_ns, choice=wish.choice)
+    reason = why_unusable(dither, rtc, turn.policy)
+    if reason is not None:
+        text = (
+            f"no usable dither: {reason}; random signs need no lines, and α can be measured with "
+            'them: POST /v1/dither with kind "binary"'
+        )
+        turn.put_off(dither_s=60.0)
+        turn.alarm(NO_DITHER, text)
+        return
+    shaken = on_vibrations(dither, wish.choice.avoid_hz)
+    if shaken and dither.frequency_hz != turn.dithering.lines_hz:
+        text = f"lines at {shaken} Hz are on vibrations: there is no room, or the settings fix them"
+        turn.warn("dither.on-vibrations", text)
+    turn.dithering = replace(
+        turn.dithering,
+        lines_hz=dither.frequency_hz,
+        results_due=turn.state.windows_accepted + wish.choice.n_windows,
+        ended_ns_utc=None,
+        next_ns_utc=None,
+    )
+    ask_for(turn, dither)
+
+
+def _awaits_a_result(turn: Turn, wish: Wish) -> bool:
+    """Return whether the window of the dither that ended last may still be on its way."""
+    dithering = turn.dithering
+    if wish.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
+        return False
+    late = turn.now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
+    return not late and turn.state.windows_accepted < dithering.results_due
+
+
+def _end_when_done(turn: Turn, dither: DitherView, wish: Wish) -> None:
+    """Stop a dither that has done its work, or is too weak for what has come up meanwhile."""
+    left_s = dither.duration_s - (turn.now_ns - dither.asked_ns_utc) / SECOND_NS
+    deaf = dither.id == turn.dithering.stopped_id
+    if dither.start_seq is None or left_s < SOON_OVER_S or deaf:
+        return
+    seen = turn.known is not None and turn.known.window_ns_utc > dither.asked_ns_utc
+    pause_s = (wish.next_ns_utc - turn.now_ns) / SECOND_NS
+    done = seen and wish.phase is DitherPhase.SPARSE and pause_s >= SHORTEST_PAUSE_S
+    weak = wish.phase is DitherPhase.ACQUIRE and 2.0 * total_m(dither) < wish.choice.total_m
+    if done or weak:
+        _note_stop(turn, dither.id)
+        turn.dither = None
+        # the next one must not overtake the command to stop
+        turn.put_off(dither_s=1.0)
+        weakness = "" if done else " is too weak"
+        turn.log("dither.stopped", f"{dither.id}{weakness}: {wish.reason}")
+        turn.ask(ev.AskNoDither())
+
+
+def _adopt(turn: Turn, rtc: RtcView) -> bool:
+    """Take over a dither that runs, if it can be read; return whether there is one."""
+    running, dithering = rtc.dither, turn.dithering
+    if running is None or running.id == turn.state.dither_lost:
+        return False
+    over = own_sine(running) and total_m(running) > ROUNDING * dithering.budget_m
+    asked_to_stop = running.id == dithering.stopped_id
+    # a recorded night stops nothing: what it goes on playing is read all the same
+    heard_ns = dithering.stopped_ns_utc + round(STOPPED_WITHIN_S * SECOND_NS)
+    if turn.now_ns < heard_ns if asked_to_stop else over:
+        return False
+    for window_s in window_lengths_s(turn.policy):
+        dither = replace(running, asked_ns_utc=turn.now_ns, window_s=window_s)
+        if why_unusable(dither, rtc, turn.policy) is None:
+            turn.dither = dither
+            turn.calm(NO_DITHER)
+            turn.log("dither.adopted", f"{running.id} runs since frame {running.start_seq}")
+            return True
+    return False
+
+
+def _account(turn: Turn, rtc: RtcView) -> None:
+    """Keep count of what the dither costs, and of who has looked at α last."""
+    dithering, known, dither = turn.dithering, turn.known, turn.dither
+    on = dither is not None and dither.start_seq is not None
+    # what nobody has asked for costs as much
+    playing = dither if on else rtc.dither
+    power = 0.0 if playing is None else total_m(playing) ** 2
+    since_ns = turn.now_ns if dithering.seen_ns_utc is None else dithering.seen_ns_utc
+    share = -np.expm1(-max(turn.now_ns - since_ns, 0) / (MEMORY_S * SECOND_NS))
+    passive_ns = dithering.passive_ns_utc
+    if known is not None and known.window_ns_utc and known.arrived_ns_utc > known.window_ns_utc:
+        passive_ns = known.arrived_ns_utc
+    turn.dithering = replace(
+        dithering,
+        budget_m=budget_m(rtc, turn.policy),
+        mean_square_m2=float(dithering.mean_square_m2 * (1.0 - share) + power * share),
+        seen_ns_utc=turn.now_ns,
+        passive_ns_utc=passive_ns,
+    )
+
+
+def _show(turn: Turn, phase: DitherPhase, reason: str) -> None:
+    turn.dithering = replace(turn.dithering, phase=phase, reason=reason)
+    if phase in {DitherPhase.OFF, DitherPhase.OPERATOR}:
+        turn.dithering = replace(turn.dithering, next_ns_utc=None)
+
+
+def _why_none(turn: Turn, rtc: RtcView) -> str | None:
+    state, still = turn.state, turn.dithering.unwanted_id
+    left = "" if still is None else f"; the RTC still plays {still}"
+    if state.dither_stopped:
+        return f"stopped by the operator{left}"
+    if not turn.policy.dither_enabled and turn.dither is None:
+        return f"the settings forbid it{left}"
+    if not rtc.in_loop:
+        return rtc.why_open
+    unnamed = rtc.cm_id is None or state.unfetched
+    if state.in_use is None and not unnamed and turn.dither is None and rtc.dither is None:
+        return "the reconstructor in use is not known yet"
+    alarm = turn.forbidden(Act.MEASURE)
+    return None if alarm is None else f"nothing would be measured under {alarm.name}"
+
+
+def _correct(turn: Turn, asked: DitherView, running: DitherView | None) -> None:
     """Take the RTC's word on what it plays, where that is not what was asked for.
 
     It is true, and not for that tolerated: one too strong is stopped.
     """
     if running is None:
-        return state
+        return
     running = replace(running, asked_ns_utc=asked.asked_ns_utc, window_s=asked.window_s)
     if running == asked:
-        return state
-    if total_m(running) > ROUNDING * max(total_m(asked), state.dithering.budget_m):
-        state = replace(state, dithering=replace(state.dithering, loud_id=running.id, loud_text=""))
+        return
+    if total_m(running) > ROUNDING * max(total_m(asked), turn.dithering.budget_m):
+        turn.dithering = replace(turn.dithering, loud_id=running.id, loud_text="")
     text = (
         f"{asked.id}: the RTC plays modes {running.modes}, {running.frequency_hz} Hz, "
         f"{running.amplitude_m} m from frame {running.start_seq}; asked for were modes "
         f"{asked.modes}, {asked.frequency_hz} Hz, {asked.amplitude_m} m from {asked.start_seq}"
     )
-    return logged(replace(state, dither=running), "dither.other", text, now_ns, Level.WARNING)
+    turn.dither = running
+    turn.warn("dither.other", text)
 
 
-def _lost(state: TrackerState, dither: DitherView, text: str, now_ns: int) -> TrackerState:
-    state = with_alarm(state, DITHER_LOST, text, now_ns)
-    state = logged(state, "dither.lost", text, now_ns, Level.WARNING)
-    return replace(state, dither=None, dither_lost=dither.id, dither_losses=state.dither_losses + 1)
+def _lose(turn: Turn, dither: DitherView, text: str) -> None:
+    turn.alarm(DITHER_LOST, text)
+    turn.warn("dither.lost", text)
+    turn.dither = None
+    losses = turn.state.dither_losses + 1
+    turn.state = replace(turn.state, dither_lost=dither.id, dither_losses=losses)
 
 
-def _patience_s(state: TrackerState) -> float:
-    return min(PATIENCE_S * 2.0**state.dither_losses, LONGEST_PATIENCE_S)
+def _patience_s(turn: Turn) -> float:
+    return min(PATIENCE_S * 2.0**turn.state.dither_losses, LONGEST_PATIENCE_S)
 
 
-def found_again(state: TrackerState, now_ns: int) -> TrackerState:
-    """Return the state after a window that held the dither, or when none is wanted any more."""
-    state = replace(state, dither_lost=None, dither_losses=0)
-    return without_alarm(state, DITHER_LOST, now_ns)
+def _note_stop(turn: Turn, dither_id: str) -> None:
+    """Note that the RTC is asked to stop a dither, and since when."""
+    if turn.dithering.stopped_id != dither_id:
+        turn.dithering = replace(
+            turn.dithering, stopped_id=dither_id, ended_ns_utc=None, stopped_ns_utc=turn.now_ns
+        )
+
+
+def _meet_unwanted(turn: Turn, running: str) -> None:
+    """Note that a dither must go, and follow it no more."""
+    _note_stop(turn, running)
+    if turn.dither is not None and turn.dither.id == running:
+        turn.dither = None
+    turn.dithering = replace(turn.dithering, unwanted_id=running, unwanted_since_ns_utc=turn.now_ns)
+
+
+def _blame(turn: Turn, running: str, loud: str) -> None:
+    text = (
+        f"{loud}: it was told to stop {running}, and another is tried after {CALM_S:.0f} s; look "
+        "at the RTC's dither, or stop the dither to do without"
+    )
+    turn.dithering = replace(turn.dithering, loud_ns_utc=turn.now_ns)
+    turn.alarm(OVER_BUDGET, text)
+
+
+def _forgive(turn: Turn, rtc: RtcView) -> None:
+    """End the alarm of a dither too strong once one is played as it may, or none is wanted."""
+    own, played = turn.dither, rtc.dither
+    by_frames = bool(turn.dithering.loud_text)
+    fine = not by_frames and own is not None and played is not None and played.id == own.id
+    given_up = turn.state.dither_stopped or not turn.policy.dither_enabled
+    if given_up:
+        turn.calm(NOT_AS_ASKED)
+    if fine or given_up:
+        turn.calm(OVER_BUDGET)
+
+
+def _too_strong(turn: Turn, rtc: RtcView) -> str | None:
+    """Return why a dither that is played costs more than it may, or None.
+
+    An operator's own may cost more than the budget, but not more than was asked for.
+    """
+    running, dithering = rtc.dither, turn.dithering
+    if running is None:
+        return None
+    found_m, most_m = total_m(running), budget_m(rtc, turn.policy)
+    over = own_sine(running) and found_m > ROUNDING * most_m
+    if not over and running.id != dithering.loud_id:
+        return None
+    if running.id == dithering.loud_id and dithering.loud_text:
+        return dithering.loud_text
+    return (
+        f"the RTC plays a dither of {1e9 * found_m:.3g} nm RMS in all, more than the budget of "
+        f"{1e9 * most_m:.3g} nm"
+    )
+
+
+def _why_unwanted(turn: Turn, rtc: RtcView) -> str | None:
+    running = rtc.dither_id
+    if running is None or not running.startswith(OUR_DITHERS):
+        return None
+    followed = turn.dither is not None and turn.dither.id == running
+    if turn.state.dither_stopped and not followed:
+        return "the operator wants no dither"
+    if not turn.policy.dither_enabled and turn.dither is None and running.startswith(OWN_DITHER):
+        return "the settings forbid a dither"
+    return None

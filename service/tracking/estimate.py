@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
 from service.telemetry.kalman import Drift, Joint, begin_joint, predicted
-from service.tracking.alarms import without_alarm
+from service.tracking.alarms import DISAGREES, SUSPECTED
 from service.tracking.jumps import last_of
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
@@ -22,15 +22,17 @@ from service.tracking.registration import (
     Source,
 )
 from service.tracking.state import TrackerState
+from service.tracking.turn import Turn
 from service.tracking.validity import (
     CLOCK_SET_BACK_S,
     Taken,
-    aged,
+    age,
     flexure,
+    have_window,
+    hold,
     pointing_at,
     precedes,
     slewed_deg,
-    without_dither_due,
 )
 
 MODES_KEPT = 64
@@ -98,12 +100,6 @@ def _followed(
 
 
 HISTORY_LENGTH = 5000
-
-SUSPECTED = "jump-suspected"
-"""Alarm while a window far out waits for the one that decides about it."""
-
-DISAGREES = "watchdog"
-"""Alarm while ordinary telemetry contradicts α."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -198,9 +194,10 @@ def bias_of(
     )
 
 
-def remembered(state: TrackerState, entry: HistoryEntry) -> TrackerState:
-    """Return the state with one more line in its history."""
-    return replace(state, history=(*state.history, entry)[-HISTORY_LENGTH:])
+def remember(turn: Turn, entry: HistoryEntry) -> None:
+    """Keep one more line of history."""
+    history = (*turn.state.history, entry)[-HISTORY_LENGTH:]
+    turn.state = replace(turn.state, history=history)
 
 
 def counted(state: TrackerState, known: Registration, prior: Joint, policy: Policy) -> int:
@@ -210,23 +207,20 @@ def counted(state: TrackerState, known: Registration, prior: Joint, policy: Poli
     return 1 if alone else known.n_windows + 1
 
 
-def accepted(
-    state: TrackerState, folded: Folded, measured: Measured, policy: Policy, now_ns: int
-) -> TrackerState:
-    """Return the state whose registration is what the filter says after a window."""
-    joint, when = folded.joint, measured.when
-    known = state.registration
+def accept(turn: Turn, folded: Folded, measured: Measured, *, n_accepted: int = 1) -> None:
+    """Take what the filter says after a window for what is known; it may be the second accepted."""
+    joint, when, known = folded.joint, measured.when, turn.known
     bias = None if known is None else known.bias
-    doubted = _still_doubted(state, folded, when)
+    doubted = _still_doubted(turn.state, folded, when)
     anew = folded.jumped or (known is not None and known.candidate is not None)
     registration = Registration(
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
         floor=measured.floor,
         t_ns_utc=when.ended_ns_utc,
-        arrived_ns_utc=now_ns,
+        arrived_ns_utc=turn.now_ns,
         n_windows=folded.n_windows,
-        window_ns_utc=now_ns,
+        window_ns_utc=turn.now_ns,
         window_began_ns_utc=when.began_ns_utc,
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
@@ -238,21 +232,23 @@ def accepted(
         ),
         passive_after_ns_utc=known.passive_after_ns_utc if known is not None else 0,
         earlier=None if anew else _earlier(known, folded, measured),
-        jumped_ns_utc=_jumped_ns_utc(known, folded, now_ns),
+        jumped_ns_utc=_jumped_ns_utc(known, folded, turn.now_ns),
         doubt=known.doubt if known is not None and doubted else "",
         doubted_ns_utc=known.doubted_ns_utc if known is not None and doubted else 0,
-        pointing=pointing_at(state, when.ended_ns_utc),
-        window_pointing=pointing_at(state, when.began_ns_utc),
+        pointing=pointing_at(turn.state, when.ended_ns_utc),
+        window_pointing=pointing_at(turn.state, when.began_ns_utc),
         restored_ns_utc=known.restored_ns_utc if known is not None else None,
-        basis_id=state.basis_id,
-        config_id=state.config_id,
+        basis_id=turn.state.basis_id,
+        config_id=turn.state.config_id,
     )
-    state = replace(state, registration=registration, windows_accepted=state.windows_accepted + 1)
+    hold(turn, registration)
+    turn.state = replace(turn.state, windows_accepted=turn.state.windows_accepted + n_accepted)
     if not doubted:
-        state = without_alarm(without_dither_due(state), SUSPECTED, now_ns)
-        state = without_alarm(state, DISAGREES, now_ns)
-    state = remembered(state, entry_of(measured, registration, folded.innovation))
-    return aged(state, policy, now_ns)
+        have_window(turn)
+        turn.calm(SUSPECTED)
+        turn.calm(DISAGREES)
+    remember(turn, entry_of(measured, registration, folded.innovation))
+    age(turn)
 
 
 def _still_doubted(state: TrackerState, folded: Folded, when: Taken) -> bool:

@@ -22,7 +22,7 @@ from service.tracking.products import (
     NoisyRecord,
     ReconstructorRecord,
 )
-from service.tracking.state import Level, Mode, TrackerState
+from service.tracking.state import Level, Mode
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -638,6 +638,3 @@ Event = (
     | NoisyMade
     | JobFailed
 )
-
-Step = tuple[TrackerState, tuple[Effect, ...]]
-"""The next state, and what is to be done."""

@@ -10,24 +10,12 @@ import numpy as np
 from service.control.gains import GainTable, gain_table
 from service.errors import CommandError
 from service.tracking import events as ev
-from service.tracking.alarms import logged
-from service.tracking.events import Event, Step
 from service.tracking.loop import CommandState, LoopCommand, RtcView
 from service.tracking.policy import SECOND_NS
 from service.tracking.reconstructors import extended_gains
 from service.tracking.registration import ModeGain
-from service.tracking.state import Level, TrackerState
-
-
-def table_of(measured: tuple[ModeGain, ...], n_modes: int) -> GainTable:
-    """Return the table of the first ``n_modes`` modes; nothing measured: what is expected."""
-    return gain_table(
-        np.array([gain.mode for gain in measured], dtype=np.intp),
-        np.array([gain.gain for gain in measured]),
-        np.array([gain.sigma for gain in measured]),
-        n_modes,
-    )
-
+from service.tracking.state import Level
+from service.tracking.turn import Turn
 
 RAMP_GROUPS = ((0, 1), (2, 99), (100, None))
 """Tip and tilt, to mode 100, the rest: the paper's groups (Heritier et al. 2018, section 5)."""
@@ -43,66 +31,111 @@ CLOSE_AGAIN_FOR_S = 3600.0
 """Then somebody wants the loop open."""
 
 
-def on_loop(state: TrackerState, event: Event, now_ns: int) -> Step:
-    """Ask for a change of the loop, or note what became of one.
+def table_of(measured: tuple[ModeGain, ...], n_modes: int) -> GainTable:
+    """Return the table of the first ``n_modes`` modes; nothing measured: what is expected."""
+    return gain_table(
+        np.array([gain.mode for gain in measured], dtype=np.intp),
+        np.array([gain.gain for gain in measured]),
+        np.array([gain.sigma for gain in measured]),
+        n_modes,
+    )
+
+
+def set_loop(turn: Turn, command: ev.SetLoop) -> None:
+    """Ask the RTC to change its loop.
 
     Raises
     ------
     CommandError
         If it makes no sense in this state.
     """
-    match event:
-        case ev.SetLoop():
-            return _set(state, event, now_ns)
-        case ev.Ramp():
-            return _ramp(state, event, now_ns)
-        case ev.LoopAnswered():
-            return _answered(state, event, now_ns), ()
-        case ev.JobFailed(effect=ev.AskLoop(id=command) | ev.AskRamp(id=command), text=text):
-            return _ended(state, command, CommandState.FAILED, text, now_ns), ()
-        case _:
-            raise TypeError(f"no event of the loop: {event!r}")
-
-
-def close_again(state: TrackerState, now_ns: int) -> Step:
-    """Close the loop that a measurement opened which was then given up, as often as it takes."""
-    since_ns, rtc = state.close_since_ns_utc, state.rtc
-    if since_ns is None or rtc is None:
-        return state, ()
-    waited_s = (now_ns - since_ns) / SECOND_NS
-    if rtc.loop != "open":
-        # a measurement only just asked for may open it yet
-        over = waited_s > CLOSE_AGAIN_EVERY_S
-        return (replace(state, close_since_ns_utc=None) if over else state), ()
-    if waited_s > CLOSE_AGAIN_FOR_S:
-        return replace(state, close_since_ns_utc=None), ()
-    last = state.loop_command
-    if last is not None and now_ns - last.asked_ns_utc < CLOSE_AGAIN_EVERY_S * SECOND_NS:
-        return state, ()
-    effect = ev.AskLoop(id=f"loop-{now_ns}", closed=True)
-    return _asked(state, effect.id, "close again after a measurement given up", now_ns), (effect,)
-
-
-def _set(state: TrackerState, command: ev.SetLoop, now_ns: int) -> Step:
-    rtc = _there(state, "loop")
+    rtc = _there(turn, "loop")
     n_controlled = command.n_controlled
     if n_controlled is not None and not 1 <= n_controlled <= rtc.n_modes:
         raise CommandError(f"loop: found {n_controlled} modes; expected 1 to {rtc.n_modes}")
     groups, n_modes = command.gains, n_controlled or rtc.n_controlled
     gains = None if groups is None else _gains(rtc, groups, n_modes)
     if command.effective_gain is not None:
-        gains = _compensated(state, rtc, command.effective_gain, n_modes)
-    effect = ev.AskLoop(
-        id=f"loop-{now_ns}",
-        closed=command.closed,
-        gains=gains,
-        judged=command.effective_gain is not None,
-        leak=command.leak,
-        n_controlled=n_controlled,
-    )
+        gains = _compensated(turn, rtc, command.effective_gain, n_modes)
     if command.closed is not None:
-        state = replace(state, close_since_ns_utc=None)
-    return _asked(state, effect.id, _said(command), now_ns), (effect,)
+        turn.state = replace(turn.state, close_since_ns_utc=None)
+    _ask(
+        turn,
+        ev.AskLoop(
+            id=f"loop-{turn.now_ns}",
+            closed=command.closed,
+            gains=gains,
+            judged=command.effective_gain is not None,
+            leak=command.leak,
+            n_controlled=n_controlled,
+        ),
+        _said(command),
+    )
+
+
+def ramp(turn: Turn, command: ev.Ramp) -> None:
+    """Ask the RTC to try gains on groups of modes.
+
+    Raises
+    ------
+    CommandError
+        If it makes no sense in this state.
+    """
+    rtc = _there(turn, "ramp")
+    if rtc.loop == "open":
+        raise CommandError("ramp: found the loop open; expected it closed, to see its residual")
+    groups = command.groups or _paper_groups(rtc.n_controlled)
+    _check_ranges("ramp", groups, rtc.n_controlled)
+    gains = command.gains or RAMP_GAINS
+    n_frames = max(1, round((command.step_s or RAMP_STEP_S) * rtc.frame_rate_hz))
+    lasts_s = len(groups) * len(gains) * n_frames / rtc.frame_rate_hz
+    spans = ", ".join(f"{first} to {last}" for first, last in groups)
+    text = f"{len(gains)} gains on modes {spans}: {lasts_s:.0f} s"
+    name = f"ramp-{turn.now_ns}"
+    effect = ev.AskRamp(id=name, groups=groups, gains=gains, frames_per_gain=n_frames)
+    _ask(turn, effect, text, lasts_s)
+
+
+def on_answer(turn: Turn, command: str, outcome: CommandState, reason: str) -> None:
+    """Note what became of a command; one that a later one has replaced is only logged."""
+    asked, text = turn.state.loop_command, command
+    if asked is not None and asked.id == command:
+        until_ns = turn.now_ns + round(asked.lasts_s * SECOND_NS)
+        ended = replace(asked, state=outcome, reason=reason, until_ns_utc=until_ns)
+        turn.state = replace(turn.state, loop_command=ended)
+        text = asked.text
+    level = Level.INFO if outcome is CommandState.ACCEPTED else Level.WARNING
+    turn.log(f"loop.{outcome}", f"{text}: {reason}" if reason else text, level)
+
+
+def end_ramp(turn: Turn) -> None:
+    """Note that no ramp can be under way: the RTC has begun a new session."""
+    asked = turn.state.loop_command
+    turn.state = replace(turn.state, loop_command=asked and replace(asked, lasts_s=0.0))
+
+
+def begin_closing(turn: Turn) -> None:
+    """Close the loop again that a measurement has opened which was given up."""
+    turn.state = replace(turn.state, close_since_ns_utc=turn.now_ns)
+    close_again(turn)
+
+
+def close_again(turn: Turn) -> None:
+    """Close the loop that a measurement opened which was then given up, as often as it takes."""
+    since_ns, rtc = turn.state.close_since_ns_utc, turn.rtc
+    if since_ns is None or rtc is None:
+        return
+    waited_s = (turn.now_ns - since_ns) / SECOND_NS
+    # a measurement only just asked for may open it yet
+    closed = rtc.loop != "open"
+    if waited_s > (CLOSE_AGAIN_EVERY_S if closed else CLOSE_AGAIN_FOR_S):
+        turn.state = replace(turn.state, close_since_ns_utc=None)
+        return
+    last = turn.state.loop_command
+    recent = last is not None and turn.now_ns - last.asked_ns_utc < CLOSE_AGAIN_EVERY_S * SECOND_NS
+    if not closed and not recent:
+        effect = ev.AskLoop(id=f"loop-{turn.now_ns}", closed=True)
+        _ask(turn, effect, "close again after a measurement given up")
 
 
 def _gains(rtc: RtcView, groups: tuple[ev.GainGroup, ...], n_modes: int) -> tuple[float, ...]:
@@ -124,11 +157,9 @@ def _gains(rtc: RtcView, groups: tuple[ev.GainGroup, ...], n_modes: int) -> tupl
     return tuple(gains)
 
 
-def _compensated(
-    state: TrackerState, rtc: RtcView, in_effect: float, n_modes: int
-) -> tuple[float, ...]:
+def _compensated(turn: Turn, rtc: RtcView, in_effect: float, n_modes: int) -> tuple[float, ...]:
     """Return the gains that act alike on every controlled mode; the others stay at 0."""
-    known = state.registration
+    known = turn.known
     if known is None or not known.optical_gains:
         raise CommandError(
             "loop: found no measured optical gain; expected a dithered window before gains are "
@@ -136,21 +167,6 @@ def _compensated(
         )
     gains = table_of(known.optical_gains, n_modes).loop_gains(in_effect)
     return (*gains.tolist(), *(0.0,) * (rtc.n_modes - n_modes))
-
-
-def _ramp(state: TrackerState, command: ev.Ramp, now_ns: int) -> Step:
-    rtc = _there(state, "ramp")
-    if rtc.loop == "open":
-        raise CommandError("ramp: found the loop open; expected it closed, to see its residual")
-    groups = command.groups or _paper_groups(rtc.n_controlled)
-    _check_ranges("ramp", groups, rtc.n_controlled)
-    gains = command.gains or RAMP_GAINS
-    n_frames = max(1, round((command.step_s or RAMP_STEP_S) * rtc.frame_rate_hz))
-    effect = ev.AskRamp(id=f"ramp-{now_ns}", groups=groups, gains=gains, frames_per_gain=n_frames)
-    lasts_s = len(groups) * len(gains) * n_frames / rtc.frame_rate_hz
-    spans = ", ".join(f"{first} to {last}" for first, last in groups)
-    text = f"{len(gains)} gains on modes {spans}: {lasts_s:.0f} s"
-    return _asked(state, effect.id, text, now_ns, lasts_s), (effect,)
 
 
 def _paper_groups(n_controlled: int) -> tuple[tuple[int, int], ...]:
@@ -185,36 +201,20 @@ def _said(command: ev.SetLoop) -> str:
     return ", ".join(said) or "no change"
 
 
-def _asked(
-    state: TrackerState, command: str, text: str, now_ns: int, lasts_s: float = 0.0
-) -> TrackerState:
+def _ask(turn: Turn, effect: ev.AskLoop | ev.AskRamp, text: str, lasts_s: float = 0.0) -> None:
     asked = LoopCommand(
-        id=command, text=text, state=CommandState.ASKED, asked_ns_utc=now_ns, lasts_s=lasts_s
+        id=effect.id,
+        text=text,
+        state=CommandState.ASKED,
+        asked_ns_utc=turn.now_ns,
+        lasts_s=lasts_s,
     )
-    return logged(replace(state, loop_command=asked), "loop.asked", text, now_ns)
+    turn.state = replace(turn.state, loop_command=asked)
+    turn.log("loop.asked", text)
+    turn.ask(effect)
 
 
-def _answered(state: TrackerState, event: ev.LoopAnswered, now_ns: int) -> TrackerState:
-    outcome = CommandState.ACCEPTED if event.accepted else CommandState.REFUSED
-    return _ended(state, event.id, outcome, event.reason, now_ns)
-
-
-def _ended(
-    state: TrackerState, command: str, outcome: CommandState, reason: str, now_ns: int
-) -> TrackerState:
-    """Note what became of a command; one that a later one has replaced is only logged."""
-    asked = state.loop_command
-    text = command
-    if asked is not None and asked.id == command:
-        until_ns = now_ns + round(asked.lasts_s * SECOND_NS)
-        ended = replace(asked, state=outcome, reason=reason, until_ns_utc=until_ns)
-        state = replace(state, loop_command=ended)
-        text = asked.text
-    level = Level.INFO if outcome is CommandState.ACCEPTED else Level.WARNING
-    return logged(state, f"loop.{outcome}", f"{text}: {reason}" if reason else text, now_ns, level)
-
-
-def _there(state: TrackerState, what: str) -> RtcView:
-    if state.rtc is None:
+def _there(turn: Turn, what: str) -> RtcView:
+    if turn.rtc is None:
         raise CommandError(f"{what}: no RTC is there")
-    return state.rtc
+    return turn.rtc

@@ -1,4 +1,4 @@
-"""What an operator asks for."""
+"""What an operator asks for: the mode, dithers, reconstructors."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from dataclasses import replace
 
 from service.errors import CommandError
 from service.tracking import events as ev
-from service.tracking.alarms import logged
-from service.tracking.dither import found_again, told_to_stop
+from service.tracking.dither import allow, ask_for
 from service.tracking.dither_plan import (
     ASKED_DITHER,
     RANDOM_TOTAL_M,
@@ -19,84 +18,165 @@ from service.tracking.dither_plan import (
     total_m,
     why_unusable,
 )
-from service.tracking.events import Event, Step
 from service.tracking.loop import DitherKind, DitherView, RtcView
 from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, ModeSet
-from service.tracking.reconstructors import known_record, send_once_judged, with_state
-from service.tracking.resume import with_mode
-from service.tracking.state import Mode, TrackerState
-from service.tracking.validity import pointed
+from service.tracking.reconstructors import change_state, known_record, make, send_once_judged
+from service.tracking.state import Mode, Orders, TrackerState
+from service.tracking.turn import Turn
 from service.tracking.worth import outdated
 
 
-def on_command(  # noqa: C901 - one line for each command
-    state: TrackerState, event: Event, policy: Policy, now_ns: int
-) -> Step:
-    """Carry out an operator's command, or say why it cannot be.
+def set_mode(turn: Turn, mode: Mode) -> None:
+    """Go on in the mode an operator orders; that of the settings is remembered."""
+    of_settings = turn.state.settings_mode or turn.state.mode
+    _order(turn, mode, None if mode is of_settings else of_settings)
+    turn.log("mode", f"mode is {mode}")
+
+
+def orders_of(state: TrackerState) -> Orders:
+    """Return what the next service has to obey; the default is nothing."""
+    return Orders(
+        mode=None if state.settings_mode is None else state.mode,
+        settings_mode=state.settings_mode,
+        dither_stopped=state.dither_stopped,
+    )
+
+
+def obey(turn: Turn, orders: Orders) -> None:
+    """Take over what was ordered before a restart, the mode being the settings' so far.
+
+    What was said last counts: an order outlives the service, and ends with the next one, or when
+    the settings say something else than they did when it was given.
+    """
+    if orders.dither_stopped:
+        allow(turn, allowed=False)
+        text = "by an operator before the restart; POST /v1/dither with start lets it dither again"
+        turn.warn("dither.stopped", text)
+    of_settings, ordered = turn.state.mode, orders.mode
+    if ordered is None or ordered is of_settings:
+        return
+    if of_settings is not orders.settings_mode:
+        text = (
+            f"mode is {of_settings}: the settings, which said {orders.settings_mode} when an "
+            f"operator set {ordered}, have been changed since"
+        )
+    else:
+        text = (
+            f"mode is {ordered}, as an operator set it before the restart, and not {of_settings} "
+            "as the settings say: PUT /v1/mode changes it"
+        )
+        _order(turn, ordered, of_settings)
+    turn.warn("mode", text)
+
+
+def approve(turn: Turn, matrix_id: str) -> None:
+    """Send a proposal, judged anew where need be, unless α is no longer what it was made for.
 
     Raises
     ------
     CommandError
-        If it makes no sense in this state.
+        If it is none, or cannot be sent.
     """
-    match event:
-        case ev.SetMode(mode=mode):
-            return logged(with_mode(state, mode), "mode", f"mode is {mode}", now_ns), ()
-        case ev.SetPointing(pointing=pointing):
-            return pointed(state, pointing), ()
-        case ev.StopDither():
-            state = found_again(replace(state, dither=None, dither_stopped=True), now_ns)
-            state = told_to_stop(state, now_ns)
-            return logged(state, "dither.stopped", "by the operator", now_ns), (ev.AskNoDither(),)
-        case ev.StartDither():
-            return _start_dither(state, event, policy, now_ns)
-        case ev.Refit(n_modes=n_modes):
-            return _refit(state, n_modes, now_ns)
-        case ev.Approve(id=matrix_id):
-            return _approve(state, matrix_id, policy, now_ns)
-        case ev.Reject(id=matrix_id, reason=reason):
-            _proposed(state, matrix_id)
-            state = with_state(state, matrix_id, MatrixState.DISCARDED, reason or "by the operator")
-            return logged(state, "reconstructor.discarded", matrix_id, now_ns), ()
-        case ev.Publish(id=matrix_id):
-            _judgeable(state, matrix_id)
-            return _copy(state, matrix_id, f"the operator publishes {matrix_id} again", now_ns)
-        case ev.Rollback():
-            return _rollback(state, now_ns)
-        case _:
-            raise TypeError(f"an event the tracker does not know: {event!r}")
-
-
-def _approve(state: TrackerState, matrix_id: str, policy: Policy, now_ns: int) -> Step:
-    """Send a proposal, judged anew where need be, unless α is no longer what it was made for."""
-    _proposed(state, matrix_id)
-    known = state.registration
+    _check_proposed(turn, matrix_id)
+    known = turn.known
     if known is not None and not known.usable:
         raise CommandError(f"{matrix_id} cannot be judged: α is invalid ({known.standing.reason})")
-    if outdated(state, known_record(state, matrix_id)):
+    if outdated(turn.state, known_record(turn.state, matrix_id)):
         raise CommandError(f"{matrix_id} was made for another α than the present one: refit")
-    return send_once_judged(state, matrix_id, now_ns)
+    send_once_judged(turn, matrix_id)
 
 
-def _start_dither(state: TrackerState, event: ev.StartDither, policy: Policy, now_ns: int) -> Step:
-    rtc = state.rtc
+def reject(turn: Turn, matrix_id: str, reason: str) -> None:
+    """Discard a proposal.
+
+    Raises
+    ------
+    CommandError
+        If it is none.
+    """
+    _check_proposed(turn, matrix_id)
+    change_state(turn, matrix_id, MatrixState.DISCARDED, reason or "by the operator")
+    turn.log("reconstructor.discarded", matrix_id)
+
+
+def publish(turn: Turn, matrix_id: str) -> None:
+    """Offer a reconstructor again; what has never been in use only if the gate can judge it.
+
+    Raises
+    ------
+    CommandError
+        If it cannot, or no RTC is there.
+    """
+    used = {MatrixState.APPLIED, MatrixState.SUPERSEDED}
+    if known_record(turn.state, matrix_id).state not in used and turn.known is None:
+        raise CommandError(
+            f"{matrix_id} cannot be judged: α is not known yet; start a dither, wait for a window"
+        )
+    _copy(turn, matrix_id, f"the operator publishes {matrix_id} again")
+
+
+def roll_back(turn: Turn) -> None:
+    """Offer the reconstructor again that was in use before.
+
+    Raises
+    ------
+    CommandError
+        If there was none, or no RTC is there.
+    """
+    states = MatrixState.SUPERSEDED
+    earlier = [r.id for r in turn.state.reconstructors if r.state is states]
+    if not earlier:
+        raise CommandError("rollback: no earlier reconstructor has been in use")
+    _copy(turn, earlier[-1], f"the operator goes back to {earlier[-1]}")
+
+
+def refit(turn: Turn, n_modes: int | None) -> None:
+    """Make a reconstructor for the present α.
+
+    Raises
+    ------
+    CommandError
+        If α is not known, no RTC is there, or it has no such number of modes.
+    """
+    rtc = turn.rtc
+    if rtc is None:
+        raise CommandError("refit: no RTC is there")
+    if turn.known is None:
+        raise CommandError("refit: α is not known yet; start a dither and wait for a window")
+    asked = n_modes or rtc.n_controlled
+    if not 0 < asked <= rtc.n_modes:
+        raise CommandError(f"refit: found {asked} modes; expected 1 to {rtc.n_modes}")
+    make(turn, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
+
+
+def start_dither(turn: Turn, command: ev.StartDither) -> None:
+    """Start a dither; what is not said of it is the service's own choice.
+
+    Raises
+    ------
+    CommandError
+        If it cannot be played or read, or costs more than the budget.
+    """
+    rtc = turn.rtc
     if rtc is None or rtc.loop == "open":
         raise CommandError("a dither needs an RTC with its loop closed")
-    dither = _planned_dither(event, by_hand(state, rtc, policy), rtc, policy, now_ns)
-    found_nm, budget_nm = 1e9 * total_m(dither), 1e9 * policy.dither_budget_m
+    choice = by_hand(turn.state, rtc, turn.policy)
+    dither = _planned(command, choice, rtc, turn.policy, turn.now_ns)
+    found_nm, budget_nm = 1e9 * total_m(dither), 1e9 * turn.policy.dither_budget_m
     cost = f"{found_nm:.3g} nm RMS in all, budget {budget_nm:.3g} nm"
     over = found_nm > budget_nm * (1.0 + 1e-9)
-    if over and not event.over_budget:
+    if over and not command.over_budget:
         raise CommandError(f"dither: {cost}; say over_budget if that is meant")
-    state = replace(state, dither=dither, dither_stopped=False)
+    allow(turn)
     modes = f"modes {dither.modes}" if len(dither.modes) < 10 else f"{len(dither.modes)} modes"
     text = f"{dither.kind}, {modes}, {cost}" + (": over budget, as asked" if over else "")
-    return logged(state, "dither.asked", text, now_ns), (ev.AskDither(dither=dither),)
+    turn.log("dither.asked", text)
+    ask_for(turn, dither)
 
 
-def _planned_dither(
-    event: ev.StartDither, choice: Choice, rtc: RtcView, policy: Policy, now_ns: int
+def _planned(
+    command: ev.StartDither, choice: Choice, rtc: RtcView, policy: Policy, now_ns: int
 ) -> DitherView:
     """Return the dither to ask for.
 
@@ -105,12 +185,12 @@ def _planned_dither(
     CommandError
         If it could not be played, or not be read.
     """
-    if event.kind is DitherKind.BINARY or isinstance(event.modes, ModeSet):
+    if command.kind is DitherKind.BINARY or isinstance(command.modes, ModeSet):
         asked = RandomChoice(
             id=f"{ASKED_DITHER}{now_ns}",
-            modes=event.modes or ModeSet.CONTROLLED,
-            total_m=event.total_m or min(RANDOM_TOTAL_M, policy.dither_budget_m),
-            duration_s=event.duration_s or policy.dither_duration_s,
+            modes=command.modes or ModeSet.CONTROLLED,
+            total_m=command.total_m or min(RANDOM_TOTAL_M, policy.dither_budget_m),
+            duration_s=command.duration_s or policy.dither_duration_s,
         )
         return plan_random(asked, rtc, policy, now_ns)
     dither = plan_dither(
@@ -118,10 +198,10 @@ def _planned_dither(
         policy,
         now_ns,
         choice=choice,
-        modes=event.modes,
-        amplitude_m=event.amplitude_m,
-        frequency_hz=event.frequency_hz,
-        duration_s=event.duration_s,
+        modes=command.modes,
+        amplitude_m=command.amplitude_m,
+        frequency_hz=command.frequency_hz,
+        duration_s=command.duration_s,
     )
     if max(dither.modes) >= rtc.n_modes:
         raise CommandError(
@@ -133,44 +213,21 @@ def _planned_dither(
     return dither
 
 
-def _refit(state: TrackerState, n_modes: int | None, now_ns: int) -> Step:
-    if state.rtc is None:
-        raise CommandError("refit: no RTC is there")
-    if state.registration is None:
-        raise CommandError("refit: α is not known yet; start a dither and wait for a window")
-    wanted = n_modes or state.rtc.n_controlled
-    if not 0 < wanted <= state.rtc.n_modes:
-        raise CommandError(f"refit: found {wanted} modes; expected 1 to {state.rtc.n_modes}")
-    state = replace(state, making_since_ns_utc=now_ns)
-    return state, (ev.MakeMatrix(n_modes=wanted, why="the operator asked"),)
-
-
-def _copy(state: TrackerState, source: str, why: str, now_ns: int) -> Step:
+def _copy(turn: Turn, source: str, why: str) -> None:
     """Offer an earlier matrix again; hold, or the service would replace it at once."""
-    if state.rtc is None:
+    if turn.rtc is None:
         raise CommandError("no RTC is there")
-    state = replace(with_mode(state, Mode.HOLD), making_since_ns_utc=now_ns)
-    state = logged(state, "mode", f"hold: {why}", now_ns)
-    return state, (ev.CopyMatrix(source=source, why=why),)
+    of_settings = turn.state.settings_mode or turn.state.mode
+    _order(turn, Mode.HOLD, None if of_settings is Mode.HOLD else of_settings)
+    make(turn, ev.CopyMatrix(source=source, why=why))
+    turn.log("mode", f"hold: {why}")
 
 
-def _rollback(state: TrackerState, now_ns: int) -> Step:
-    earlier = [r.id for r in state.reconstructors if r.state is MatrixState.SUPERSEDED]
-    if not earlier:
-        raise CommandError("rollback: no earlier reconstructor has been in use")
-    return _copy(state, earlier[-1], f"the operator goes back to {earlier[-1]}", now_ns)
+def _order(turn: Turn, mode: Mode, of_settings: Mode | None) -> None:
+    turn.state = replace(turn.state, mode=mode, settings_mode=of_settings)
 
 
-def _proposed(state: TrackerState, matrix_id: str) -> None:
-    record = known_record(state, matrix_id)
+def _check_proposed(turn: Turn, matrix_id: str) -> None:
+    record = known_record(turn.state, matrix_id)
     if record.state is not MatrixState.PROPOSED:
         raise CommandError(f"{matrix_id} is {record.state}, not proposed")
-
-
-def _judgeable(state: TrackerState, matrix_id: str) -> None:
-    """Refuse what has never been in use while the gate cannot judge it."""
-    used = known_record(state, matrix_id).state in {MatrixState.APPLIED, MatrixState.SUPERSEDED}
-    if state.registration is None and not used:
-        raise CommandError(
-            f"{matrix_id} cannot be judged: α is not known yet; start a dither, wait for a window"
-        )

@@ -8,13 +8,13 @@ import numpy as np
 
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
-from service.tracking.alarms import OTHER_SUM, Act, forbidding, logged, with_alarm, without_alarm
-from service.tracking.events import Step
+from service.tracking.alarms import NOT_ACKNOWLEDGED, OTHER_SUM, SHORT_MARGIN, Act, forbidding
 from service.tracking.loop import SAME_DELAY, SAME_LEAK, RtcView, same_gains
 from service.tracking.products import Assessment, Judged, MatrixState, ReconstructorRecord
 from service.tracking.registration import Registration
 from service.tracking.state import Level, Mode, TrackerState
-from service.tracking.worth import outdated, with_limit
+from service.tracking.turn import Turn
+from service.tracking.worth import note_limit, outdated
 
 RECONSTRUCTORS_KEPT = 200
 
@@ -27,11 +27,20 @@ UNSENT_KEPT = 50
 _UNSENT = frozenset({MatrixState.REFUSED, MatrixState.DISCARDED})
 _SPARE = frozenset({MatrixState.REJECTED, MatrixState.FAILED, MatrixState.SUPERSEDED})
 
+_SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
+
 _RESTARTED = {
     MatrixState.PUBLISHED: MatrixState.FAILED,
     MatrixState.STAGED: MatrixState.FAILED,
     MatrixState.PROPOSED: MatrixState.DISCARDED,
 }
+
+MIN_WINDOWS = 2
+"""Windows that must agree before anything is made from them."""
+
+REACH = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
+"""Half of what 594 modes tolerate without loss (Heritier et al. 2018): a verdict is as good so far
+beyond α ± 3σ (numeric units)."""
 
 
 def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRecord, ...]:
@@ -50,40 +59,6 @@ def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRec
     return _thinned(taken_over, None)
 
 
-def with_record(state: TrackerState, record: ReconstructorRecord) -> TrackerState:
-    """Return the state with one more reconstructor; what is needed least gives way."""
-    shelf = [*(r for r in state.reconstructors if r.id != record.id), record]
-    return replace(state, reconstructors=_thinned(shelf, state.in_use))
-
-
-def _thinned(
-    shelf: list[ReconstructorRecord], in_use: str | None
-) -> tuple[ReconstructorRecord, ...]:
-    """Return as many as are kept, oldest first.
-
-    First to go is what was never sent, however new what is worth going back to: a flood of
-    proposals that nobody wants must not wash away the way back.
-    """
-    excess = len(shelf) - RECONSTRUCTORS_KEPT
-    if excess <= 0:
-        return tuple(shelf)
-    unsent = [r.id for r in shelf if r.state in _UNSENT and r.id != in_use]
-    used = [r.id for r in shelf if r.state is MatrixState.SUPERSEDED]
-    kept = frozenset((*used[-RETURNS_KEPT:], in_use))
-    spare = [r.id for r in shelf if r.state in _SPARE and r.id not in kept]
-    first_to_go = [*unsent[:-UNSENT_KEPT], *spare, *unsent[-UNSENT_KEPT:]]
-    gone = frozenset(first_to_go[:excess])
-    return tuple(r for r in shelf if r.id not in gone)
-
-
-def with_changed(state: TrackerState, record: ReconstructorRecord) -> TrackerState:
-    """Return the state with the record of the same id replaced."""
-    return replace(
-        state,
-        reconstructors=tuple(record if r.id == record.id else r for r in state.reconstructors),
-    )
-
-
 def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
     """Return the record of this id.
 
@@ -98,28 +73,326 @@ def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
     return record
 
 
-def with_state(state: TrackerState, matrix_id: str, to: MatrixState, reason: str) -> TrackerState:
-    """Return the state with one reconstructor further on its way."""
-    return with_changed(state, replace(known_record(state, matrix_id), state=to, reason=reason))
+def keep(turn: Turn, record: ReconstructorRecord) -> None:
+    """Keep one more reconstructor; what is needed least gives way."""
+    records = [*(r for r in turn.state.reconstructors if r.id != record.id), record]
+    kept = _thinned(records, turn.state.in_use)
+    turn.state = replace(turn.state, reconstructors=kept)
 
 
-def with_in_use(state: TrackerState, matrix_id: str) -> TrackerState:
+def change(turn: Turn, record: ReconstructorRecord) -> None:
+    """Replace the record of the same id."""
+    records = tuple(record if r.id == record.id else r for r in turn.state.reconstructors)
+    turn.state = replace(turn.state, reconstructors=records)
+
+
+def change_state(turn: Turn, matrix_id: str, to: MatrixState, reason: str) -> None:
+    """Take one reconstructor further on its way."""
+    change(turn, replace(known_record(turn.state, matrix_id), state=to, reason=reason))
+
+
+def use(turn: Turn, matrix_id: str) -> None:
     """Mark one reconstructor as applied; whichever was, has been superseded."""
-    if state.in_use == matrix_id and known_record(state, matrix_id).state is MatrixState.APPLIED:
-        return state
-    for record in state.reconstructors:
-        if record.id != matrix_id and record.state is MatrixState.APPLIED:
-            state = with_state(state, record.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
-    state = with_state(state, matrix_id, MatrixState.APPLIED, known_record(state, matrix_id).reason)
-    return replace(state, in_use=matrix_id, margin=None, assessment=None, judged_ns_utc=None)
+    record = known_record(turn.state, matrix_id)
+    if turn.state.in_use == matrix_id and record.state is MatrixState.APPLIED:
+        return
+    for other in turn.state.reconstructors:
+        if other.id != matrix_id and other.state is MatrixState.APPLIED:
+            change_state(turn, other.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
+    change(turn, replace(record, state=MatrixState.APPLIED))
+    forget_verdict(turn)
+    turn.state = replace(turn.state, in_use=matrix_id, assessment=None, judged_ns_utc=None)
 
 
-MIN_WINDOWS = 2
-"""Windows that must agree before anything is made from them."""
+def forget_verdict(turn: Turn) -> None:
+    """Forget the margin of the matrix in use: what it was judged at is not so any more."""
+    turn.state = replace(turn.state, margin=None)
 
-REACH = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
-"""Half of what 594 modes tolerate without loss (Heritier et al. 2018): a verdict is as good so far
-beyond α ± 3σ (numeric units)."""
+
+def judge_again(turn: Turn) -> None:
+    """Have the matrix in use judged again, whenever that was done last."""
+    turn.state = replace(turn.state, judged_ns_utc=None)
+
+
+def forget_session(turn: Turn) -> None:
+    """Note that the RTC has begun a new session: nobody knows what it multiplies with."""
+    for record in turn.state.reconstructors:
+        if record.state in _SENT:
+            change_state(turn, record.id, MatrixState.FAILED, "the RTC restarted")
+    turn.state = replace(
+        turn.state,
+        in_use=None,
+        wrong_matrix=None,
+        applied_asked_ns_utc=0,
+        unfetched="",
+        margin=None,
+        assessment=None,
+        judged_ns_utc=None,
+    )
+
+
+def fetch(turn: Turn, rtc: RtcView) -> None:
+    """Ask the RTC for the matrix it uses."""
+    turn.state = replace(turn.state, applied_asked_ns_utc=turn.now_ns)
+    turn.ask(ev.FetchMatrix(id=rtc.cm_id))
+
+
+def not_fetched(turn: Turn, why: str) -> None:
+    """Note why the matrix in use is not to be had."""
+    turn.state = replace(turn.state, unfetched=why)
+
+
+def make(turn: Turn, effect: ev.MakeMatrix | ev.CopyMatrix) -> None:
+    """Have a reconstructor computed, or copied."""
+    turn.state = replace(turn.state, making_since_ns_utc=turn.now_ns)
+    turn.ask(effect)
+
+
+def made_none(turn: Turn) -> None:
+    """Note that no reconstructor is being computed."""
+    turn.state = replace(turn.state, making_since_ns_utc=None)
+
+
+def judge(turn: Turn, matrix_id: str) -> None:
+    """Have the matrix in use judged."""
+    turn.state = replace(turn.state, judged_ns_utc=turn.now_ns)
+    turn.ask(ev.JudgeMatrix(id=matrix_id))
+
+
+def on_matrix(turn: Turn, made: ev.MatrixMade) -> None:
+    """Keep a new reconstructor; send it if it passed the gate and nobody need approve.
+
+    What an operator wants is sent whatever else is known; what nobody asked for only to a closed
+    loop that behaves, and if α may be believed.
+    """
+    record, wanted = made.record, made.wanted
+    overtaken = not wanted and _jumped_since(turn.state, record)
+    propose(turn, record)
+    if made.asked_modes is not None:
+        note_limit(turn, record, made.asked_modes, made.why_fewer)
+    if record.state is MatrixState.REFUSED:
+        return
+    if overtaken:
+        text = f"{record.id}: the mirror jumped while it was made"
+        change_state(turn, record.id, MatrixState.DISCARDED, text)
+        turn.log("reconstructor.discarded", text)
+        return
+    held = why_unsendable(turn.state, record) or _beyond_judging(turn.state, record)
+    if not held and (wanted or _may_follow(turn.state)):
+        send_once_judged(turn, record.id, wanted=wanted)
+
+
+def propose(turn: Turn, record: ReconstructorRecord) -> None:
+    """Keep a new reconstructor in place of any proposal."""
+    made_none(turn)
+    for older in turn.state.reconstructors:
+        if older.state is MatrixState.PROPOSED:
+            change_state(turn, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
+    keep(turn, record)
+    verdict = record.gate.reason if record.gate is not None else record.reason
+    if record.state is MatrixState.REFUSED:
+        turn.warn("reconstructor.refused", f"{record.id}: {verdict}")
+    else:
+        turn.log("reconstructor.made", f"{record.id}, {record.n_modes} modes, {verdict}")
+
+
+def send_once_judged(turn: Turn, matrix_id: str, *, wanted: bool = True) -> None:
+    """Send a reconstructor; where its verdict is not of the present loop and α, judge it first.
+
+    Raises
+    ------
+    CommandError
+        If it cannot be sent now, whatever the gate would say.
+    """
+    record, rtc = _sendable(turn, matrix_id)
+    gains = commanded_gains(rtc, record.n_modes)
+    stale = why_stale(turn.state, record.judged, gains)
+    if stale is None or (rtc.loop == "open" and record.gate is None):
+        send(turn, matrix_id)
+        return
+    if _beyond_judging(turn.state, record):
+        raise CommandError(f"{matrix_id}: an open loop does not tell its gains: close it first")
+    if rtc.loop == "open" and record.judged is not None:
+        gains = record.judged.gains
+    text = f"{matrix_id} is judged again before it is sent: {stale}"
+    turn.log("reconstructor.judged-again", text)
+    turn.ask(ev.JudgeProposal(id=matrix_id, gains=gains, wanted=wanted))
+
+
+def on_proposal_judged(turn: Turn, event: ev.ProposalJudged) -> None:
+    """Send a reconstructor that has passed the gate anew; what has changed meanwhile ends it."""
+    record, rtc = turn.state.reconstructor(event.id), turn.rtc
+    if record is None or record.state is not MatrixState.PROPOSED:
+        return
+    verdict = event.verdict
+    record = replace(record, gate=verdict, judged=event.judged)
+    if not verdict.accepted:
+        change(turn, replace(record, state=MatrixState.REFUSED, reason=verdict.reason))
+        turn.warn("reconstructor.refused", f"{record.id}: {verdict.reason}")
+        return
+    change(turn, record)
+    reason = why_unsendable(turn.state, record)
+    if reason is None and not event.wanted and not _may_follow(turn.state):
+        alarm = turn.forbidden(Act.DECIDE)
+        reason = f"{alarm.name}: {alarm.text}" if alarm else "the mode, the loop or α has changed"
+    if rtc is not None and reason is None:
+        reason = why_stale(turn.state, record.judged, commanded_gains(rtc, record.n_modes))
+    if reason is None:
+        send(turn, record.id)
+        return
+    text = f"{record.id} was not sent: while it was judged, {reason}; approve it again"
+    turn.warn("reconstructor.not-sent", text)
+
+
+def send(turn: Turn, matrix_id: str) -> None:
+    """Mark a reconstructor as published and ask for it to be sent, with the gains in force.
+
+    Raises
+    ------
+    CommandError
+        If no RTC is there, it may be the wrong one, or the gate's latest verdict is no.
+    """
+    record, rtc = _sendable(turn, matrix_id)
+    same = record.n_modes == rtc.n_controlled
+    send_with(turn, matrix_id, None if same else extended_gains(rtc, record.n_modes))
+
+
+def send_with(turn: Turn, matrix_id: str, gains: tuple[float, ...] | None) -> None:
+    """Do the same with these gains.
+
+    Raises
+    ------
+    CommandError
+        As above.
+    """
+    record, _ = _sendable(turn, matrix_id)
+    unjudged = _why_unjudged(record)
+    change(
+        turn,
+        replace(record, state=MatrixState.PUBLISHED, published_ns_utc=turn.now_ns, reason=unjudged),
+    )
+    text = f"{matrix_id} sent to the RTC{'; ' if unjudged else ''}{unjudged}"
+    turn.log("reconstructor.published", text, Level.WARNING if unjudged else Level.INFO)
+    turn.ask(ev.SendMatrix(id=matrix_id, n_modes=record.n_modes, gains=gains))
+
+
+def on_acknowledgement(turn: Turn, event: ev.Acknowledged) -> None:
+    """Fold the RTC's answer to a reconstructor back in; a late one is accepted."""
+    record = _meant(turn.state, event)
+    if record is None:
+        text = f"an acknowledgement for {event.id}, which this service never sent"
+        turn.warn("acknowledgement.unknown", text)
+        return
+    if _is_old(turn.state, record, event):
+        return
+    if record.sha256 and event.sha256 not in {None, record.sha256}:
+        _distrust(turn, record, event.state, event.sha256)
+        return
+    reason = event.reason
+    if event.state in {MatrixState.APPLIED, MatrixState.STAGED}:
+        reason = reason or _why_unjudged(record)
+    if event.state is MatrixState.APPLIED:
+        _trust(turn, record.id)
+        record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
+        change(turn, record)
+        use(turn, record.id)
+        turn.calm(NOT_ACKNOWLEDGED)
+        turn.calm(SHORT_MARGIN)
+        gains = () if turn.rtc is None else commanded_gains(turn.rtc, record.n_modes)
+        of_other = why_worthless(turn.state, record.judged, gains)
+        turn.state = replace(
+            turn.state,
+            margin=None if of_other else record.gate,
+            judged_ns_utc=None if of_other else turn.now_ns,
+        )
+        turn.log("reconstructor.applied", f"{record.id} applied from frame {event.frame_seq}")
+        return
+    change_state(turn, record.id, event.state, reason)
+    if event.state is MatrixState.REJECTED:
+        turn.warn("reconstructor.rejected", f"the RTC rejected {record.id}: {event.reason}")
+
+
+def on_fetched(turn: Turn, record: ReconstructorRecord) -> None:
+    """Keep the matrix the RTC uses, which the service did not make, or find its own again."""
+    not_fetched(turn, "")
+    known = turn.state.reconstructor(record.id)
+    if known is not None and known.sha256 not in {"", record.sha256}:
+        _distrust(turn, known, MatrixState.APPLIED, record.sha256)
+        return
+    _trust(turn, record.id)
+    if known is not None and turn.state.in_use == record.id:
+        return
+    if known is None:
+        keep(turn, record)
+    use(turn, record.id)
+    turn.log("reconstructor.adopted", f"the RTC uses {record.id}, {record.n_modes} modes")
+
+
+def on_margin(turn: Turn, event: ev.MarginJudged) -> None:
+    """Note margin and loss of the matrix in use; raise an alarm when the margin is short."""
+    record, verdict, judged = turn.state.reconstructor(event.id), event.verdict, event.judged
+    if record is None:
+        return
+    used = event.id == turn.state.in_use
+    gains = () if turn.rtc is None else turn.rtc.gains[: record.n_modes]
+    if judged is not None and why_worthless(turn.state, judged, gains) is not None:
+        if used:
+            judge_again(turn)
+        return
+    change(turn, replace(record, gate=verdict, judged=judged))
+    if not used:
+        return
+    assessment = None
+    if event.alpha is not None and event.expected is not None:
+        assessment = Assessment(
+            id=event.id, alpha=event.alpha, expected=event.expected, t_ns_utc=turn.now_ns
+        )
+    turn.state = replace(turn.state, margin=verdict, assessment=assessment)
+    if verdict.accepted:
+        turn.calm(SHORT_MARGIN)
+    else:
+        turn.alarm(SHORT_MARGIN, f"{event.id}: {verdict.reason}")
+
+
+def _sendable(turn: Turn, matrix_id: str) -> tuple[ReconstructorRecord, RtcView]:
+    """Return a reconstructor that may be sent, and to whom.
+
+    Raises
+    ------
+    CommandError
+        If it cannot be sent now.
+    """
+    record, rtc = known_record(turn.state, matrix_id), turn.rtc
+    reason = why_unsendable(turn.state, record)
+    if record.gate is not None and not record.gate.accepted:
+        reason = record.gate.reason
+    if rtc is None or reason is not None:
+        raise CommandError(f"{matrix_id} cannot be sent: {reason}")
+    return record, rtc
+
+
+def _distrust(
+    turn: Turn, record: ReconstructorRecord, state: MatrixState, sha256: str | None
+) -> None:
+    """Believe that the RTC holds other numbers than were sent: nothing more goes out."""
+    text = (
+        f"the RTC has {state} other numbers as {record.id}: sha256 {sha256}, sent were "
+        f"{record.sha256}; nothing is published until it holds what was sent (rtc/cm/applied) or "
+        "begins a new session: open the loop if it suffers, look at the RTC's log"
+    )
+    change_state(turn, record.id, MatrixState.FAILED, text)
+    if state is MatrixState.APPLIED:
+        turn.state = replace(turn.state, in_use=None, margin=None, assessment=None)
+    turn.state = replace(turn.state, wrong_matrix=record.id, applied_asked_ns_utc=turn.now_ns)
+    turn.alarm(OTHER_SUM, text)
+
+
+def _trust(turn: Turn, matrix_id: str) -> None:
+    """Note that the RTC holds the numbers that it should."""
+    if turn.state.wrong_matrix is not None:
+        turn.state = replace(turn.state, wrong_matrix=None)
+        turn.log("reconstructor.right", f"the RTC holds {matrix_id} as it was sent")
+        turn.calm(OTHER_SUM)
 
 
 def settled(known: Registration) -> bool:
@@ -177,164 +450,6 @@ def why_of_another_loop(
     return None if same else "the gains have changed"
 
 
-def on_matrix(state: TrackerState, made: ev.MatrixMade, now_ns: int) -> Step:
-    """Shelve a new reconstructor; send it if it passed the gate and nobody need approve.
-
-    What an operator wants is sent whatever else is known; what nobody asked for only to a closed
-    loop that behaves, and if α may be believed.
-    """
-    record, wanted = made.record, made.wanted
-    overtaken = not wanted and _jumped_since(state, record, state.making_since_ns_utc)
-    state = shelved(state, record, now_ns)
-    if made.asked_modes is not None:
-        state = with_limit(state, record, made.asked_modes, made.why_fewer, now_ns)
-    if record.state is MatrixState.REFUSED:
-        return state, ()
-    if overtaken:
-        text = f"{record.id}: the mirror jumped while it was made"
-        state = with_state(state, record.id, MatrixState.DISCARDED, text)
-        return logged(state, "reconstructor.discarded", text, now_ns), ()
-    sendable = why_unsendable(state, record) is None and not _beyond_judging(state, record)
-    if sendable and (wanted or _may_follow(state)):
-        return send_once_judged(state, record.id, now_ns, wanted=wanted)
-    return state, ()
-
-
-def _may_follow(state: TrackerState) -> bool:
-    """Return whether a reconstructor that nobody asked for may be sent."""
-    rtc, known = state.rtc, state.registration
-    if state.mode is not Mode.AUTO or rtc is None or not rtc.in_loop:
-        return False
-    if forbidding(state, Act.DECIDE) is not None:
-        return False
-    return known is not None and settled(known)
-
-
-def _why_not_by_itself(state: TrackerState) -> str:
-    """Return why nothing is sent that nobody asked for, where that is so."""
-    alarm = forbidding(state, Act.DECIDE)
-    if alarm is not None:
-        return f"{alarm.name}: {alarm.text}"
-    return "the mode, the loop or α has changed"
-
-
-def send_once_judged(
-    state: TrackerState, matrix_id: str, now_ns: int, *, wanted: bool = True
-) -> Step:
-    """Send a reconstructor; where its verdict is not of the present loop and α, judge it first.
-
-    Raises
-    ------
-    CommandError
-        If it cannot be sent now, whatever the gate would say.
-    """
-    record, rtc = known_record(state, matrix_id), state.rtc
-    reason = why_unsendable(state, record)
-    if record.gate is not None and not record.gate.accepted:
-        reason = record.gate.reason
-    if rtc is None or reason is not None:
-        raise CommandError(f"{matrix_id} cannot be sent: {reason}")
-    gains = commanded_gains(rtc, record.n_modes)
-    stale = why_stale(state, record.judged, gains)
-    if stale is None:
-        return send(state, matrix_id, now_ns)
-    if rtc.loop == "open" and record.gate is None:
-        return send(state, matrix_id, now_ns)
-    if _beyond_judging(state, record):
-        raise CommandError(f"{matrix_id}: an open loop does not tell its gains: close it first")
-    if rtc.loop == "open" and record.judged is not None:
-        gains = record.judged.gains
-    text = f"{matrix_id} is judged again before it is sent: {stale}"
-    state = logged(state, "reconstructor.judged-again", text, now_ns)
-    return state, (ev.JudgeProposal(id=matrix_id, gains=gains, wanted=wanted),)
-
-
-def _beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
-    """Return whether nobody knows the gains it was judged with, nor those it would run with."""
-    opened = state.rtc is not None and state.rtc.loop == "open"
-    return opened and record.gate is not None and record.judged is None
-
-
-def on_proposal_judged(state: TrackerState, event: ev.ProposalJudged, now_ns: int) -> Step:
-    """Send a reconstructor that has passed the gate anew; what has changed meanwhile ends it."""
-    record, rtc = state.reconstructor(event.id), state.rtc
-    if record is None or record.state is not MatrixState.PROPOSED:
-        return state, ()
-    verdict = event.verdict
-    record = replace(record, gate=verdict, judged=event.judged)
-    if not verdict.accepted:
-        record = replace(record, state=MatrixState.REFUSED, reason=verdict.reason)
-        state = with_changed(state, record)
-        text = f"{record.id}: {verdict.reason}"
-        return logged(state, "reconstructor.refused", text, now_ns, Level.WARNING), ()
-    state = with_changed(state, record)
-    reason = why_unsendable(state, record)
-    if reason is None and not event.wanted and not _may_follow(state):
-        reason = _why_not_by_itself(state)
-    if rtc is not None and reason is None:
-        reason = why_stale(state, record.judged, commanded_gains(rtc, record.n_modes))
-    if reason is None:
-        return send(state, record.id, now_ns)
-    text = f"{record.id} was not sent: while it was judged, {reason}; approve it again"
-    return logged(state, "reconstructor.not-sent", text, now_ns, Level.WARNING), ()
-
-
-def _jumped_since(
-    state: TrackerState, record: ReconstructorRecord, began_ns_utc: int | None
-) -> bool:
-    """Return whether a jump has been named since, to where the gate's verdict does not reach."""
-    known = state.registration
-    if known is None or known.jumped_ns_utc is None or began_ns_utc is None:
-        return False
-    return known.jumped_ns_utc >= began_ns_utc and outdated(state, record)
-
-
-def shelved(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> TrackerState:
-    """Put a new reconstructor on the shelf in place of any proposal."""
-    state = replace(state, making_since_ns_utc=None)
-    for older in state.reconstructors:
-        if older.state is MatrixState.PROPOSED:
-            state = with_state(state, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
-    state = with_record(state, record)
-    verdict = record.gate.reason if record.gate is not None else record.reason
-    if record.state is MatrixState.REFUSED:
-        text = f"{record.id}: {verdict}"
-        return logged(state, "reconstructor.refused", text, now_ns, Level.WARNING)
-    text = f"{record.id}, {record.n_modes} modes, {verdict}"
-    return logged(state, "reconstructor.made", text, now_ns)
-
-
-def send(state: TrackerState, matrix_id: str, now_ns: int) -> Step:
-    """Mark a reconstructor as published and ask for it to be sent.
-
-    Raises
-    ------
-    CommandError
-        If no RTC is there, it may be the wrong one, or the gate's latest verdict is no.
-    """
-    record, rtc = known_record(state, matrix_id), state.rtc
-    reason = why_unsendable(state, record)
-    if record.gate is not None and not record.gate.accepted:
-        reason = record.gate.reason
-    if rtc is None or reason is not None:
-        raise CommandError(f"{matrix_id} cannot be sent: {reason}")
-    unjudged = _why_unjudged(record)
-    sent = replace(record, state=MatrixState.PUBLISHED, published_ns_utc=now_ns, reason=unjudged)
-    text = f"{matrix_id} sent to the RTC{'; ' if unjudged else ''}{unjudged}"
-    level = Level.WARNING if unjudged else Level.INFO
-    state = logged(with_changed(state, sent), "reconstructor.published", text, now_ns, level)
-    gains = None
-    if record.n_modes != rtc.n_controlled:
-        gains = extended_gains(rtc, record.n_modes)
-    return state, (ev.SendMatrix(id=matrix_id, n_modes=record.n_modes, gains=gains),)
-
-
-def _why_unjudged(record: ReconstructorRecord) -> str:
-    """Return why the gate has said nothing of one on its way to the RTC; empty: it has."""
-    on_its_way = {MatrixState.PROPOSED, MatrixState.PUBLISHED, MatrixState.STAGED}
-    return record.reason if record.gate is None and record.state in on_its_way else ""
-
-
 def why_unsendable(state: TrackerState, record: ReconstructorRecord) -> str | None:
     """Return why a reconstructor may not be published now, whoever wants it, or None."""
     if state.rtc is None:
@@ -368,41 +483,34 @@ def extended_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:
     return (*kept, *(last,) * (n_modes - len(kept)), *(0.0,) * (rtc.n_modes - n_modes))
 
 
-def on_acknowledgement(state: TrackerState, event: ev.Acknowledged, now_ns: int) -> TrackerState:
-    """Fold the RTC's answer to a reconstructor back in; a late one is accepted."""
-    record = _meant(state, event)
-    if record is None:
-        text = f"an acknowledgement for {event.id}, which this service never sent"
-        return logged(state, "acknowledgement.unknown", text, now_ns, Level.WARNING)
-    event = replace(event, id=record.id)
-    if _is_old(state, record, event):
-        return state
-    if record.sha256 and event.sha256 not in {None, record.sha256}:
-        return _wrong(state, record, event, now_ns)
-    if event.state is MatrixState.APPLIED:
-        state = _right(state, record.id, now_ns)
-        reason = event.reason or _why_unjudged(record)
-        record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
-        state = with_in_use(with_changed(state, record), record.id)
-        state = without_alarm(state, "no-acknowledgement", now_ns)
-        state = without_alarm(state, "margin", now_ns)
-        gains = () if state.rtc is None else commanded_gains(state.rtc, record.n_modes)
-        of_other = why_worthless(state, record.judged, gains)
-        state = replace(
-            state,
-            margin=None if of_other else record.gate,
-            judged_ns_utc=None if of_other else now_ns,
-        )
-        text = f"{event.id} applied from frame {event.frame_seq}"
-        return logged(state, "reconstructor.applied", text, now_ns)
-    reason = event.reason
-    if event.state is MatrixState.STAGED:
-        reason = reason or _why_unjudged(record)
-    state = with_state(state, record.id, event.state, reason)
-    if event.state is MatrixState.REJECTED:
-        text = f"the RTC rejected {event.id}: {event.reason}"
-        return logged(state, "reconstructor.rejected", text, now_ns, Level.WARNING)
-    return state
+def _may_follow(state: TrackerState) -> bool:
+    """Return whether a reconstructor that nobody asked for may be sent."""
+    rtc, known = state.rtc, state.registration
+    if state.mode is not Mode.AUTO or rtc is None or not rtc.in_loop:
+        return False
+    if forbidding(state, Act.DECIDE) is not None:
+        return False
+    return known is not None and settled(known)
+
+
+def _beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether nobody knows the gains it was judged with, nor those it would run with."""
+    opened = state.rtc is not None and state.rtc.loop == "open"
+    return opened and record.gate is not None and record.judged is None
+
+
+def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether a jump has been named since it was asked for, beyond the gate's verdict."""
+    known, began_ns = state.registration, state.making_since_ns_utc
+    if known is None or known.jumped_ns_utc is None or began_ns is None:
+        return False
+    return known.jumped_ns_utc >= began_ns and outdated(state, record)
+
+
+def _why_unjudged(record: ReconstructorRecord) -> str:
+    """Return why the gate has said nothing of one on its way to the RTC; empty: it has."""
+    on_its_way = {MatrixState.PROPOSED, MatrixState.PUBLISHED, MatrixState.STAGED}
+    return record.reason if record.gate is None and record.state in on_its_way else ""
 
 
 def _meant(state: TrackerState, event: ev.Acknowledged) -> ReconstructorRecord | None:
@@ -411,31 +519,6 @@ def _meant(state: TrackerState, event: ev.Acknowledged) -> ReconstructorRecord |
         return state.reconstructor(event.id)
     sent = {MatrixState.PUBLISHED, MatrixState.STAGED}
     return next((r for r in reversed(state.reconstructors) if r.state in sent), None)
-
-
-def _wrong(
-    state: TrackerState, record: ReconstructorRecord, event: ev.Acknowledged, now_ns: int
-) -> TrackerState:
-    """Believe that the RTC holds other numbers than were sent: nothing more goes out."""
-    text = (
-        f"the RTC has {event.state} other numbers as {record.id}: sha256 {event.sha256}, sent were "
-        f"{record.sha256}; nothing is published until it holds what was sent (rtc/cm/applied) or "
-        "begins a new session: open the loop if it suffers, look at the RTC's log"
-    )
-    state = with_state(state, record.id, MatrixState.FAILED, text)
-    if event.state is MatrixState.APPLIED:
-        state = replace(state, in_use=None, margin=None, assessment=None)
-    state = replace(state, wrong_matrix=record.id, applied_asked_ns_utc=now_ns)
-    return with_alarm(state, OTHER_SUM, text, now_ns)
-
-
-def _right(state: TrackerState, matrix_id: str, now_ns: int) -> TrackerState:
-    """Return the state once the RTC holds the numbers that it should."""
-    if state.wrong_matrix is None:
-        return state
-    text = f"the RTC holds {matrix_id} as it was sent"
-    state = logged(replace(state, wrong_matrix=None), "reconstructor.right", text, now_ns)
-    return without_alarm(state, OTHER_SUM, now_ns)
 
 
 def _is_old(state: TrackerState, record: ReconstructorRecord, event: ev.Acknowledged) -> bool:
@@ -448,48 +531,21 @@ def _is_old(state: TrackerState, record: ReconstructorRecord, event: ev.Acknowle
     return record.state is MatrixState.SUPERSEDED and repeated
 
 
-def on_fetched(state: TrackerState, record: ReconstructorRecord, now_ns: int) -> TrackerState:
-    """Shelve the matrix the RTC uses, which the service did not make, or find its own again."""
-    state = replace(state, unfetched="")
-    known = state.reconstructor(record.id)
-    if known is not None and known.sha256 not in {"", record.sha256}:
-        event = ev.Acknowledged(
-            id=record.id,
-            sha256=record.sha256,
-            state=MatrixState.APPLIED,
-            reason="",
-            frame_seq=known.applied_frame_seq,
-        )
-        return _wrong(state, known, event, now_ns)
-    state = _right(state, record.id, now_ns)
-    if known is not None and state.in_use == record.id:
-        return state
-    state = state if known is not None else with_record(state, record)
-    state = with_in_use(state, record.id)
-    text = f"the RTC uses {record.id}, {record.n_modes} modes"
-    return logged(state, "reconstructor.adopted", text, now_ns)
+def _thinned(
+    shelf: list[ReconstructorRecord], in_use: str | None
+) -> tuple[ReconstructorRecord, ...]:
+    """Return as many as are kept, oldest first.
 
-
-def on_margin(state: TrackerState, judged: ev.MarginJudged, now_ns: int) -> TrackerState:
-    """Note margin and loss of the matrix in use; raise an alarm when the margin is short."""
-    matrix_id, verdict = judged.id, judged.verdict
-    record = state.reconstructor(matrix_id)
-    if record is None:
-        return state
-    gains = () if state.rtc is None else state.rtc.gains[: record.n_modes]
-    of = judged.judged
-    if of is not None and why_worthless(state, of, gains) is not None:
-        return replace(state, judged_ns_utc=None) if matrix_id == state.in_use else state
-    state = with_changed(state, replace(record, gate=verdict, judged=of))
-    if matrix_id != state.in_use:
-        return state
-    state = replace(state, margin=verdict, assessment=_assessment(judged, now_ns))
-    if verdict.accepted:
-        return without_alarm(state, "margin", now_ns)
-    return with_alarm(state, "margin", f"{matrix_id}: {verdict.reason}", now_ns)
-
-
-def _assessment(judged: ev.MarginJudged, now_ns: int) -> Assessment | None:
-    if judged.alpha is None or judged.expected is None:
-        return None
-    return Assessment(id=judged.id, alpha=judged.alpha, expected=judged.expected, t_ns_utc=now_ns)
+    First to go is what was never sent, however new what is worth going back to: a flood of
+    proposals that nobody wants must not wash away the way back.
+    """
+    excess = len(shelf) - RECONSTRUCTORS_KEPT
+    if excess <= 0:
+        return tuple(shelf)
+    unsent = [r.id for r in shelf if r.state in _UNSENT and r.id != in_use]
+    used = [r.id for r in shelf if r.state is MatrixState.SUPERSEDED]
+    kept = frozenset((*used[-RETURNS_KEPT:], in_use))
+    spare = [r.id for r in shelf if r.state in _SPARE and r.id not in kept]
+    first_to_go = [*unsent[:-UNSENT_KEPT], *spare, *unsent[-UNSENT_KEPT:]]
+    gone = frozenset(first_to_go[:excess])
+    return tuple(r for r in shelf if r.id not in gone)

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from service.tracking.activity import ramping
-from service.tracking.alarms import Act, forbidding
-from service.tracking.dither import without_unwanted
-from service.tracking.dither_schedule import choose_dither
-from service.tracking.events import Effect, FetchMatrix, JudgeMatrix, MakeMatrix, Step
+from service.tracking.alarms import Act
+from service.tracking.dither import choose_dither, stop_unwanted
+from service.tracking.events import MakeMatrix
 from service.tracking.loop import RtcView
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import settled
+from service.tracking.reconstructors import fetch, judge, make, settled
 from service.tracking.registration import Registration
 from service.tracking.state import Mode, TrackerState
+from service.tracking.turn import Turn
 from service.tracking.worth import fewer_than, more_to_try, outdated, why_worthwhile
+
+ASK_FIRST_S = 3.0
+"""For the RTC's matrix to come before it is asked for again."""
+
+ASK_AGAIN_S = 10.0
+"""Between two questions for a matrix that was not to be had, or has no name."""
 
 JUDGE_INTERVAL_S = 15.0
 """Least time between two looks at the margin of the matrix in use, while α stays: with 594 modes
@@ -32,14 +36,41 @@ NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 _SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
 
 
-def judge_in_use(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+def decide(turn: Turn) -> None:
+    """Ask for what is wanted now."""
+    rtc = turn.rtc
+    if rtc is None or turn.forbidden(Act.ASK) is not None:
+        return
+    idle = turn.forbidden(Act.DECIDE) is not None or ramping(turn.state, turn.now_ns) is not None
+    if not idle or turn.state.wrong_matrix is not None:
+        _fetch(turn, rtc)
+    if idle:
+        stop_unwanted(turn, rtc)
+        return
+    choose_dither(turn, rtc)
+    _judge_in_use(turn)
+    _choose_update(turn, rtc)
+
+
+def _fetch(turn: Turn, rtc: RtcView) -> None:
+    """Ask for the matrix in use when nobody here has it, its name, or a reason to trust it."""
+    state = turn.state
+    known = rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None
+    if known and state.wrong_matrix is None:
+        return
+    anew = rtc.cm_id is not None and not state.unfetched and state.wrong_matrix is None
+    every_s = ASK_FIRST_S if anew else ASK_AGAIN_S
+    if turn.now_ns - state.applied_asked_ns_utc >= every_s * SECOND_NS:
+        fetch(turn, rtc)
+
+
+def _judge_in_use(turn: Turn) -> None:
     """Look at the margin of the matrix in use once α is known, when it moves, and now and then."""
-    known = state.registration
+    state, known = turn.state, turn.known
     if known is None or state.in_use is None or not settled(known):
-        return state, ()
-    if state.making_since_ns_utc is not None or not _judgement_due(state, known, now_ns):
-        return state, ()
-    return replace(state, judged_ns_utc=now_ns), (JudgeMatrix(id=state.in_use),)
+        return
+    if state.making_since_ns_utc is None and _judgement_due(state, known, turn.now_ns):
+        judge(turn, state.in_use)
 
 
 def _judgement_due(state: TrackerState, known: Registration, now_ns: int) -> bool:
@@ -54,31 +85,27 @@ def _judgement_due(state: TrackerState, known: Registration, now_ns: int) -> boo
     return waited_s > JUDGE_AGAIN_S and bool(np.any(moved > np.maximum(NOTICED, noise)))
 
 
-def choose_update(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
+def _choose_update(turn: Turn, rtc: RtcView) -> None:
     """Compute a reconstructor when it is worthwhile, or could command more modes."""
-    known = state.registration
+    state, known, now_ns = turn.state, turn.known, turn.now_ns
     if state.mode is Mode.HOLD or known is None or not settled(known):
-        return state, ()
+        return
     if not rtc.in_loop or state.making_since_ns_utc is not None:
-        return state, ()
-    if forbidding(state, Act.SEND_NEW) is not None:
-        return state, ()
-    first_ns = max(_next_attempt_ns(state, rtc, policy), state.retries.make_ns_utc)
-    if _busy(state) or now_ns < first_ns:
-        return state, ()
+        return
+    if turn.forbidden(Act.SEND_NEW) is not None:
+        return
+    first_ns = max(_next_attempt_ns(state, rtc, turn.policy), state.retries.make_ns_utc)
     in_use = state.reconstructor(state.in_use) if state.in_use else None
-    if in_use is None:
-        return state, ()
-    why, n_now = why_worthwhile(state, in_use, policy, now_ns), rtc.n_controlled
-    more = () if why is not None else more_to_try(state, rtc, policy, now_ns)
+    if _busy(state) or now_ns < first_ns or in_use is None:
+        return
+    why, n_now = why_worthwhile(state, in_use, turn.policy, now_ns), rtc.n_controlled
     if why is not None:
-        effect = MakeMatrix(n_modes=n_now, why=why, fewer=fewer_than(n_now))
-    elif more:
+        make(turn, MakeMatrix(n_modes=n_now, why=why, fewer=fewer_than(n_now)))
+        return
+    more = more_to_try(state, rtc, turn.policy, now_ns)
+    if more:
         why = f"{n_now} of {more[0]} modes controlled"
-        effect = MakeMatrix(n_modes=more[0], why=why, fewer=more[1:])
-    else:
-        return state, ()
-    return replace(state, making_since_ns_utc=now_ns), (effect,)
+        make(turn, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
 
 
 def _busy(state: TrackerState) -> bool:
@@ -115,36 +142,3 @@ def _next_attempt_ns(state: TrackerState, rtc: RtcView, policy: Policy) -> int:
 def _overtaken(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether a reconstructor was never sent, and α is elsewhere by now."""
     return record.state is MatrixState.DISCARDED and outdated(state, record)
-
-
-ASK_FIRST_S = 3.0
-"""For the RTC's matrix to come before it is asked for again."""
-
-ASK_AGAIN_S = 10.0
-"""Between two questions for a matrix that was not to be had, or has no name."""
-
-
-def decide(state: TrackerState, policy: Policy, now_ns: int) -> Step:
-    """Return what is to be done now, and the state that remembers having asked for it."""
-    if state.rtc is None or forbidding(state, Act.ASK) is not None:
-        return state, ()
-    chosen = [_fetch, choose_dither, judge_in_use, choose_update]
-    if forbidding(state, Act.DECIDE) is not None or ramping(state, now_ns) is not None:
-        chosen = [without_unwanted] if state.wrong_matrix is None else [_fetch, without_unwanted]
-    effects: list[Effect] = []
-    for choose in chosen:
-        state, wanted = choose(state, state.rtc, policy, now_ns)
-        effects += wanted
-    return state, tuple(effects)
-
-
-def _fetch(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> Step:
-    """Ask for the matrix in use when nobody here has it, its name, or a reason to trust it."""
-    known = rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None
-    if known and state.wrong_matrix is None:
-        return state, ()
-    anew = rtc.cm_id is not None and not state.unfetched and state.wrong_matrix is None
-    every_s = ASK_FIRST_S if anew else ASK_AGAIN_S
-    if now_ns - state.applied_asked_ns_utc < every_s * SECOND_NS:
-        return state, ()
-    return replace(state, applied_asked_ns_utc=now_ns), (FetchMatrix(id=rtc.cm_id),)

@@ -1,4 +1,9 @@
-"""When telemetry was taken, what it can therefore tell of, and how long α may be relied on."""
+"""What is known of α, when telemetry was taken that can tell of it, and how long it is valid.
+
+A window is fitted seconds after it was taken, by a busy worker later still. What casts a doubt, or
+says that nothing the loop does is a measurement, has a time by the RTC's clock; what was taken
+before that time ends neither, whenever it is worked out.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.tracking.alarms import RULES, Act, forbids, logged, with_alarm, without_alarm
+from service.tracking.alarms import RULES, STALE, Act, forbids
 from service.tracking.loop import Pointing
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration, Standing, Validity
 from service.tracking.state import TrackerState
+from service.tracking.turn import Turn
 
 CLOCK_SET_BACK_S = 60.0
 """Telemetry is never so much older than what is known: the RTC's clock has gone back."""
@@ -23,6 +29,23 @@ _ROUNDING_NS = 1_000_000
 _POINTINGS_KEPT = 120
 _TURNED_DEG = 0.05
 """By how much the telescope turns before another line of its way is kept."""
+
+USELESS_SIGMA = np.array([0.1, 0.1, np.deg2rad(0.3), 0.01])
+"""1 σ that says nothing worth keeping, of a window or of α (numeric units)."""
+
+AGEING_SHARE = 0.5
+"""Share of the stale limit from which on α is ageing."""
+
+STALE_AFTER_S = 60.0
+"""Of a running dither without an accepted window. A simulated RTC may be ten times slower than its
+timestamps: a window then takes 20 s."""
+
+CANDIDATE_FOR_S = 60.0
+"""A jump that nothing has confirmed or denied for so long is no longer waited for."""
+
+_WORTHLESS = (Validity.STALE, Validity.INVALID)
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,22 +78,21 @@ def why_void(state: TrackerState, when: Taken) -> str | None:
     return f"{state.void_because} when it was taken: its telemetry is no measurement"
 
 
-def voided(state: TrackerState, because: str, t_ns_utc: int = 0) -> TrackerState:
-    """Return the state in which nothing taken until now is a measurement any more.
+def void(turn: Turn, because: str, t_ns_utc: int = 0) -> None:
+    """Note that nothing taken until now is a measurement any more.
 
     ``t_ns_utc`` is the RTC's clock now, where it is known better than by its status.
     """
-    before_ns = max(t_ns_utc, 0 if state.rtc is None else state.rtc.t_ns_utc)
-    return replace(state, void_before_ns_utc=before_ns, void_because=because)
+    before_ns = max(t_ns_utc, 0 if turn.rtc is None else turn.rtc.t_ns_utc)
+    turn.state = replace(turn.state, void_before_ns_utc=before_ns, void_because=because)
 
 
-def over(state: TrackerState, name: str, now_ns: int, t_ns_utc: int = 0) -> TrackerState:
-    """Return the state without an alarm; telemetry that it was of stays what it was."""
-    alarm = next((alarm for alarm in state.alarms if alarm.name == name), None)
-    state = without_alarm(state, name, now_ns)
-    if alarm is None or not forbids(alarm, Act.MEASURE):
-        return state
-    return voided(state, RULES[name].because, t_ns_utc)
+def end_alarm(turn: Turn, name: str, t_ns_utc: int = 0) -> None:
+    """End an alarm; telemetry that it was of stays what it was."""
+    alarm = next((alarm for alarm in turn.state.alarms if alarm.name == name), None)
+    turn.calm(name)
+    if alarm is not None and forbids(alarm, Act.MEASURE):
+        void(turn, RULES[name].because, t_ns_utc)
 
 
 def tells_of(state: TrackerState, name: str, when: Taken) -> bool:
@@ -79,14 +101,14 @@ def tells_of(state: TrackerState, name: str, when: Taken) -> bool:
     return alarm is None or not precedes(state, when, alarm.t_ns_utc)
 
 
-def pointed(state: TrackerState, pointing: Pointing | None) -> TrackerState:
-    """Return the state of a telescope that looks there, and remembers its way."""
+def point(turn: Turn, pointing: Pointing | None) -> None:
+    """Note where the telescope looks, and remember its way; None: nobody tells."""
     if pointing is None:
-        return state
-    way, t_ns = state.pointings, 0 if state.rtc is None else state.rtc.t_ns_utc
+        return
+    way, t_ns = turn.state.pointings, 0 if turn.rtc is None else turn.rtc.t_ns_utc
     if not way or way[-1][1].separation_deg(pointing) >= _TURNED_DEG:
         way = (*way, (t_ns, pointing))[-_POINTINGS_KEPT:]
-    return replace(state, pointing=pointing, pointings=way)
+    turn.state = replace(turn.state, pointing=pointing, pointings=way)
 
 
 def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
@@ -98,50 +120,62 @@ def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
     return earlier[-1][1] if earlier else later[0][1]
 
 
-USELESS_SIGMA = np.array([0.1, 0.1, np.deg2rad(0.3), 0.01])
-"""1 σ that says nothing worth keeping, of a window or of α (numeric units)."""
-
-AGEING_SHARE = 0.5
-"""Share of the stale limit from which on α is ageing."""
-
-STALE_AFTER_S = 60.0
-"""Of a running dither without an accepted window. A simulated RTC may be ten times slower than its
-timestamps: a window then takes 20 s."""
-
-CANDIDATE_FOR_S = 60.0
-"""A jump that nothing has confirmed or denied for so long is no longer waited for."""
-
-_ALARM = "estimate-stale"
-
-_WORTHLESS = (Validity.STALE, Validity.INVALID)
-
-Array = NDArray[np.float64]
+def hold(turn: Turn, registration: Registration) -> None:
+    """Take something for what is known of α."""
+    turn.known = registration
 
 
-def aged(state: TrackerState, policy: Policy, now_ns: int) -> TrackerState:
-    """Return the state with σ grown to the present, and what α is then worth."""
-    known = state.registration
+def forget(turn: Turn) -> None:
+    """Know nothing of α any more."""
+    turn.known = None
+
+
+def forget_bias(turn: Turn) -> None:
+    """Forget how far the passive estimate is off."""
+    if turn.known is not None:
+        turn.known = replace(turn.known, bias=None)
+
+
+def unconfirm(turn: Turn) -> None:
+    """Have windows confirm what is known anew."""
+    if turn.known is not None:
+        turn.known = replace(turn.known, n_windows=0)
+
+
+def restore(turn: Turn, known: Registration) -> None:
+    """Take over what was known before a restart of the service."""
+    turn.known = replace(known, n_windows=0, restored_ns_utc=turn.now_ns)
+
+
+def age(turn: Turn) -> None:
+    """Let σ grow to the present, and say what α is then worth."""
+    known = turn.known
     if known is not None:
-        known = _without_old_candidate(known, now_ns)
-        known = replace(known, grown=_growth(state, known, policy, now_ns))
-        standing = _standing(state, known, policy, now_ns)
+        known = _without_old_candidate(known, turn.now_ns)
+        grown = _growth(turn.state, known, turn.policy, turn.now_ns)
+        known = replace(known, grown=grown)
+        standing = _standing(turn.state, known, turn.policy, turn.now_ns)
         if standing.validity in _WORTHLESS:
-            state = with_dither_due(state, standing.reason, now_ns)
-        state = replace(state, registration=replace(known, standing=standing))
-    return _alarmed(state, now_ns)
+            want_window(turn, standing.reason)
+        turn.known = replace(known, standing=standing)
+    text = _why_stale(turn.state, turn.now_ns)
+    if text is None:
+        turn.calm(STALE)
+    else:
+        turn.alarm(STALE, text)
 
 
-def with_dither_due(state: TrackerState, reason: str, now_ns: int) -> TrackerState:
-    """Return the state that wants a dithered window; a wish that stands keeps its beginning."""
-    if state.dither_due_since_ns_utc is not None:
-        return state
-    state = replace(state, dither_due_since_ns_utc=now_ns, dither_due_reason=reason)
-    return logged(state, "dither.due", reason, now_ns)
+def want_window(turn: Turn, reason: str) -> None:
+    """Want a dithered window; a wish that stands keeps its beginning."""
+    if turn.state.dither_due_since_ns_utc is None:
+        due = replace(turn.state, dither_due_since_ns_utc=turn.now_ns, dither_due_reason=reason)
+        turn.state = due
+        turn.log("dither.due", reason)
 
 
-def without_dither_due(state: TrackerState) -> TrackerState:
-    """Return the state whose wish has been fulfilled."""
-    return replace(state, dither_due_since_ns_utc=None, dither_due_reason="")
+def have_window(turn: Turn) -> None:
+    """Note that the wish has been fulfilled."""
+    turn.state = replace(turn.state, dither_due_since_ns_utc=None, dither_due_reason="")
 
 
 def flexure(known: Pointing | None, now: Pointing | None, policy: Policy) -> Array:
@@ -217,14 +251,6 @@ def _without_old_candidate(known: Registration, now_ns: int) -> Registration:
     if candidate is None or now_ns - candidate.held_ns_utc < CANDIDATE_FOR_S * SECOND_NS:
         return known
     return replace(known, candidate=None, doubt="a window was far out, and none has come since")
-
-
-def _alarmed(state: TrackerState, now_ns: int) -> TrackerState:
-    """Raise the alarm while a closed loop runs on an α that is not worth much, or none at all."""
-    text = _why_stale(state, now_ns)
-    if text is None:
-        return without_alarm(state, _ALARM, now_ns)
-    return with_alarm(state, _ALARM, text, now_ns)
 
 
 def _why_stale(state: TrackerState, now_ns: int) -> str | None:

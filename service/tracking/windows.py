@@ -31,32 +31,30 @@ from service.telemetry.lockin import MAX_LAG_FRAMES
 from service.telemetry.passive import PassiveEstimate
 from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
-from service.tracking.acquisition_stages import missed
+from service.tracking.acquisition_stages import count_miss
 from service.tracking.alarms import (
+    DISAGREES,
+    DITHER_LOST,
+    MISALIGNED,
     RULES,
+    SUSPECTED,
     WRONG_ANSWER,
     Act,
     forbidding,
-    logged,
-    with_alarm,
-    without_alarm,
 )
-from service.tracking.dither import DITHER_LOST, found_again
+from service.tracking.dither import found_again
 from service.tracking.estimate import (
-    DISAGREES,
-    SUSPECTED,
     Folded,
     Measured,
-    accepted,
+    accept,
     bias_of,
     brought_forward,
     counted,
     entry_of,
     followed_gains,
     joint_of,
-    remembered,
+    remember,
 )
-from service.tracking.events import WindowFitted
 from service.tracking.jumps import (
     Distance,
     Reading,
@@ -78,155 +76,26 @@ from service.tracking.registration import (
     Watchdog,
 )
 from service.tracking.state import Level, TrackerState
+from service.tracking.turn import Turn
 from service.tracking.validity import (
     USELESS_SIGMA,
     Taken,
-    aged,
+    age,
+    hold,
     pointing_at,
     precedes,
     taken,
     tells_of,
+    want_window,
     why_void,
-    with_dither_due,
 )
+
+Array = NDArray[Any]
 
 TOO_EARLY = (
     "it began before α came into doubt and agrees with what was known then: only one taken since "
     "can tell"
 )
-
-
-def with_window(
-    state: TrackerState, measured: Measured, policy: Policy, now_ns: int
-) -> TrackerState:
-    """Fold a dithered window in, hold it, or have it decide about the one held before."""
-    known = state.registration
-    if known is None:
-        joint = begin_joint(measured.alpha.vector, measured.covariance)
-        folded = Folded(joint=joint, n_windows=1, innovation=0.0)
-        return accepted(state, folded, measured, policy, now_ns)
-    reading = _reading(measured, state)
-    first = window_before(known)
-    if first is not None and pair_surprise(known, reading, policy).far:
-        return _jumped(state, first, measured, policy, now_ns)
-    far = window_surprise(known, reading, policy)
-    if known.doubt and not far.far and precedes(state, measured.when, known.doubted_ns_utc):
-        state = replace(state, windows_refused=state.windows_refused + 1)
-        return logged(state, "window.refused", TOO_EARLY, now_ns)
-    if known.candidate is not None:
-        state = _outlier(state, known.candidate, measured, now_ns)
-    if far.far:
-        return _held(state, measured, far, policy, now_ns)
-    prior = brought_forward(state, known, measured.t_ns_utc, policy, now_ns)
-    folded = Folded(
-        joint=with_dithered(prior, measured.alpha.vector, measured.covariance),
-        n_windows=counted(state, known, prior, policy),
-        innovation=_innovation(prior, measured),
-    )
-    return accepted(state, folded, measured, policy, now_ns)
-
-
-def _held(
-    state: TrackerState, measured: Measured, far: Distance, policy: Policy, now_ns: int
-) -> TrackerState:
-    """Put a window that is far out aside, and doubt α until another one has come."""
-    known, innovation = _known(state), far.innovation
-    text = (
-        f"a window lies {_step(measured, known)} from α (innovation {innovation:.0f}, expected 4, "
-        f"rotation {np.sqrt(far.rotation):.1f} sigma): the next one decides; nothing is made or "
-        "sent meanwhile"
-    )
-    candidate = Candidate(
-        alpha=measured.alpha,
-        covariance=measured.covariance,
-        t_ns_utc=measured.t_ns_utc,
-        held_ns_utc=now_ns,
-        innovation=innovation,
-    )
-    since_ns = max(known.doubted_ns_utc if known.doubt else 0, measured.t_ns_utc)
-    doubted = replace(
-        known, candidate=candidate, doubt="a jump is suspected", doubted_ns_utc=since_ns
-    )
-    state = remembered(
-        replace(state, registration=doubted), entry_of(measured, known, innovation, entered=False)
-    )
-    state = logged(state, "registration.jump-suspected", text, now_ns, Level.WARNING)
-    state = with_dither_due(with_alarm(state, SUSPECTED, text, now_ns), doubted.doubt, now_ns)
-    return aged(state, policy, now_ns)
-
-
-def _outlier(
-    state: TrackerState, candidate: Candidate, measured: Measured, now_ns: int
-) -> TrackerState:
-    """Count the window held before: the one after it has not confirmed it."""
-    known = _known(state)
-    text = (
-        f"the window {_step(candidate, known)} from α was not confirmed: the one after it lies "
-        f"{_step(measured, known)} away"
-    )
-    state = replace(state, windows_outlying=state.windows_outlying + 1)
-    return logged(state, "window.outlier", text, now_ns, Level.WARNING)
-
-
-def _jumped(
-    state: TrackerState, first: Seen, measured: Measured, policy: Policy, now_ns: int
-) -> TrackerState:
-    """Return the state at the new place, which two windows have now seen.
-
-    The first of them is used if it is wholly of the new place.
-    """
-    known = _known(state)
-    prior = brought_forward(state, known, measured.t_ns_utc, policy, now_ns)
-    noise = measured.covariance
-    whole = wholly_after(first, _reading(measured, state), known.alpha.vector, policy)
-    if whole:
-        elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
-        noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
-    joint = widened(prior, noise)
-    if whole:
-        joint = with_dithered(joint, first.alpha.vector, noise)
-    joint = with_dithered(joint, measured.alpha.vector, measured.covariance)
-    state = replace(
-        state,
-        windows_accepted=state.windows_accepted + (whole and known.candidate is not None),
-        registration=replace(known, passive_after_ns_utc=first.t_ns_utc),
-    )
-    folded = Folded(
-        joint=joint,
-        n_windows=2 if whole else 1,
-        innovation=_innovation(prior, measured),
-        jumped=True,
-    )
-    state = accepted(state, folded, measured, policy, now_ns)
-    text = f"jumped by {_step(measured, known)}, as two windows have seen"
-    return logged(state, "registration.jump", text, now_ns, Level.WARNING)
-
-
-def _reading(measured: Measured, state: TrackerState) -> Reading:
-    return Reading(
-        value=measured.alpha.vector,
-        noise=measured.covariance,
-        t_ns_utc=measured.t_ns_utc,
-        pointing=pointing_at(state, measured.t_ns_utc),
-    )
-
-
-def _known(state: TrackerState) -> Registration:
-    if state.registration is None:
-        raise ValueError("no α is known: there is nothing to doubt")
-    return state.registration
-
-
-def _innovation(prior: Joint, measured: Measured) -> float:
-    return dithered_innovation(prior, measured.alpha.vector, measured.covariance)
-
-
-def _step(measured: Measured | Candidate, known: Registration) -> str:
-    step = (measured.alpha.vector - known.alpha.vector) * BOUNDARY_SCALE
-    return f"{step[0]:+.3f}, {step[1]:+.3f} subap, {step[2]:+.3f} deg, {step[3]:+.4f}"
-
-
-Array = NDArray[Any]
 
 CAPTURE_RANGE = np.array([0.8, 0.8, np.deg2rad(2.0), 0.02])
 """Beyond this, one linearised fit with high modes cannot be trusted (numeric units)."""
@@ -246,22 +115,21 @@ MISFIT_WINDOWS = 10
 """So many tell the model error together: the misfit of a faint star's window is mostly chance."""
 
 
-def on_window(
-    state: TrackerState, event: WindowFitted, policy: Policy, now_ns: int
-) -> TrackerState:
+def on_window(turn: Turn, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
     when = taken(event.began_ns_utc, estimate.t_ns_utc)
-    reason = _why_no_window(state, estimate, when, policy)
+    reason = _why_no_window(turn.state, estimate, when, turn.policy)
     if reason is not None:
-        return refuse_window(state, reason, now_ns)
-    if tells_of(state, DITHER_LOST, when):
-        state = found_again(state, now_ns)
-    told = () if isinstance(estimate, RandomEstimate) else (WRONG_ANSWER,)
-    for name in ("columns-misaligned", *told):
-        if tells_of(state, name, when):
-            state = without_alarm(state, name, now_ns)
-    known, random = state.registration, isinstance(estimate, RandomEstimate)
+        refuse_window(turn, reason)
+        return
+    if tells_of(turn.state, DITHER_LOST, when):
+        found_again(turn)
+    random = isinstance(estimate, RandomEstimate)
+    for name in (MISALIGNED, *(() if random else (WRONG_ANSWER,))):
+        if tells_of(turn.state, name, when):
+            turn.calm(name)
+    known = turn.known
     modes, gains, gain_sigma = _gains_of(estimate)
     measured = Measured(
         alpha=estimate.alpha,
@@ -276,10 +144,141 @@ def on_window(
             gain_sigma,
             estimate.t_ns_utc,
         ),
-        floor=_floor(known, estimate, policy),
+        floor=_floor(known, estimate, turn.policy),
         misfit=estimate.misfit,
     )
-    return with_window(state, measured, policy, now_ns)
+    enter(turn, measured)
+
+
+def refuse_window(turn: Turn, reason: str, *, mistold: bool = False) -> None:
+    """Count a window that gave nothing, and say why.
+
+    ``mistold``: because slopes or commands are not what the instrument file says.
+    """
+    _count_refused(turn)
+    count_miss(turn, reason)
+    if reason.startswith("columns misaligned"):
+        turn.alarm(MISALIGNED, reason)
+    if mistold:
+        turn.alarm(WRONG_ANSWER, reason)
+    level = Level.INFO if reason.startswith(EXPECTED) else Level.WARNING
+    turn.log("window.refused", reason, level)
+
+
+def enter(turn: Turn, measured: Measured) -> None:
+    """Fold a dithered window in, hold it, or have it decide about the one held before."""
+    known = turn.known
+    if known is None:
+        joint = begin_joint(measured.alpha.vector, measured.covariance)
+        accept(turn, Folded(joint=joint, n_windows=1, innovation=0.0), measured)
+        return
+    reading = _reading(measured, turn.state)
+    first = window_before(known)
+    if first is not None and pair_surprise(known, reading, turn.policy).far:
+        _jump(turn, known, first, measured)
+        return
+    far = window_surprise(known, reading, turn.policy)
+    if known.doubt and not far.far and precedes(turn.state, measured.when, known.doubted_ns_utc):
+        _count_refused(turn)
+        turn.log("window.refused", TOO_EARLY)
+        return
+    if known.candidate is not None:
+        text = (
+            f"the window {_step(known.candidate, known)} from α was not confirmed: the one after "
+            f"it lies {_step(measured, known)} away"
+        )
+        n_outlying = turn.state.windows_outlying + 1
+        turn.state = replace(turn.state, windows_outlying=n_outlying)
+        turn.warn("window.outlier", text)
+    if far.far:
+        _put_aside(turn, known, measured, far)
+        return
+    prior = brought_forward(turn.state, known, measured.t_ns_utc, turn.policy, turn.now_ns)
+    folded = Folded(
+        joint=with_dithered(prior, measured.alpha.vector, measured.covariance),
+        n_windows=counted(turn.state, known, prior, turn.policy),
+        innovation=_innovation(prior, measured),
+    )
+    accept(turn, folded, measured)
+
+
+def _put_aside(turn: Turn, known: Registration, measured: Measured, far: Distance) -> None:
+    """Put a window that is far out aside, and doubt α until another one has come."""
+    innovation = far.innovation
+    text = (
+        f"a window lies {_step(measured, known)} from α (innovation {innovation:.0f}, expected 4, "
+        f"rotation {np.sqrt(far.rotation):.1f} sigma): the next one decides; nothing is made or "
+        "sent meanwhile"
+    )
+    candidate = Candidate(
+        alpha=measured.alpha,
+        covariance=measured.covariance,
+        t_ns_utc=measured.t_ns_utc,
+        held_ns_utc=turn.now_ns,
+        innovation=innovation,
+    )
+    doubt = "a jump is suspected"
+    hold(turn, replace(_doubted(known, doubt, measured.t_ns_utc), candidate=candidate))
+    remember(turn, entry_of(measured, known, innovation, entered=False))
+    turn.warn("registration.jump-suspected", text)
+    turn.alarm(SUSPECTED, text)
+    want_window(turn, doubt)
+    age(turn)
+
+
+def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> None:
+    """Go to the new place, which two windows have now seen.
+
+    The first of them is used if it is wholly of the new place.
+    """
+    policy = turn.policy
+    prior = brought_forward(turn.state, known, measured.t_ns_utc, policy, turn.now_ns)
+    noise = measured.covariance
+    whole = wholly_after(first, _reading(measured, turn.state), known.alpha.vector, policy)
+    if whole:
+        elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
+        noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
+    joint = widened(prior, noise)
+    if whole:
+        joint = with_dithered(joint, first.alpha.vector, noise)
+    folded = Folded(
+        joint=with_dithered(joint, measured.alpha.vector, measured.covariance),
+        n_windows=2 if whole else 1,
+        innovation=_innovation(prior, measured),
+        jumped=True,
+    )
+    hold(turn, replace(known, passive_after_ns_utc=first.t_ns_utc))
+    both = whole and known.candidate is not None
+    accept(turn, folded, measured, n_accepted=2 if both else 1)
+    turn.warn("registration.jump", f"jumped by {_step(measured, known)}, as two windows have seen")
+
+
+def _count_refused(turn: Turn) -> None:
+    turn.state = replace(turn.state, windows_refused=turn.state.windows_refused + 1)
+
+
+def _doubted(known: Registration, doubt: str, since_ns_utc: int) -> Registration:
+    """Return what is known in doubt, not since earlier than it already is."""
+    since_ns = max(known.doubted_ns_utc if known.doubt else 0, since_ns_utc)
+    return replace(known, doubt=doubt, doubted_ns_utc=since_ns)
+
+
+def _reading(measured: Measured, state: TrackerState) -> Reading:
+    return Reading(
+        value=measured.alpha.vector,
+        noise=measured.covariance,
+        t_ns_utc=measured.t_ns_utc,
+        pointing=pointing_at(state, measured.t_ns_utc),
+    )
+
+
+def _innovation(prior: Joint, measured: Measured) -> float:
+    return dithered_innovation(prior, measured.alpha.vector, measured.covariance)
+
+
+def _step(measured: Measured | Candidate, known: Registration) -> str:
+    step = (measured.alpha.vector - known.alpha.vector) * BOUNDARY_SCALE
+    return f"{step[0]:+.3f}, {step[1]:+.3f} subap, {step[2]:+.3f} deg, {step[3]:+.4f}"
 
 
 def _floor(known: Registration | None, estimate: DitheredEstimate, policy: Policy) -> Array:
@@ -343,67 +342,60 @@ def why_no_measurement(state: TrackerState, when: Taken) -> str | None:
     return f"{RULES[alarm.name].because}: its telemetry is no measurement"
 
 
-def refuse_window(
-    state: TrackerState, reason: str, now_ns: int, *, mistold: bool = False
-) -> TrackerState:
-    """Count a window that gave nothing, and say why.
-
-    ``mistold``: because slopes or commands are not what the instrument file says.
-    """
-    state = missed(replace(state, windows_refused=state.windows_refused + 1), reason)
-    if reason.startswith("columns misaligned"):
-        state = with_alarm(state, "columns-misaligned", reason, now_ns)
-    if mistold:
-        state = with_alarm(state, WRONG_ANSWER, reason, now_ns)
-    level = Level.INFO if reason.startswith(EXPECTED) else Level.WARNING
-    return logged(state, "window.refused", reason, now_ns, level)
-
-
-def on_watchdog(
-    state: TrackerState, event: ev.Watched, policy: Policy, now_ns: int
-) -> TrackerState:
+def on_watchdog(turn: Turn, event: ev.Watched) -> None:
     """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
-    reason = _why_no_look(state, event) or _why_known_already(state, event)
+    reason = _why_no_look(turn.state, event) or _why_known_already(turn.state, event)
     if reason is not None:
-        return replace(state, unwatched=f"a look was not used: {reason}")
-    known = state.registration
+        cannot_watch(turn, f"a look was not used: {reason}")
+        return
+    known, estimate = turn.known, event.estimate
     if known is None:
-        return _alone(state, event, policy)
-    excess = event.estimate.bias_excess
-    known = _expecting(known, excess)
-    prior = allowing(brought_forward(state, known, event.t_ns_utc, policy, now_ns), excess)
+        _show_alone(turn, event)
+        return
+    known = _expecting(known, estimate.bias_excess)
+    prior = allowing(
+        brought_forward(turn.state, known, event.t_ns_utc, turn.policy, turn.now_ns),
+        estimate.bias_excess,
+    )
     if _mixed(known):
         text = "not used: its telemetry may be from both sides of a jump"
-        bias = bias_of(joint_of(known), event.t_ns_utc, _loop(state, known))
-        state = replace(state, registration=replace(known, bias=bias))
-        return _shown(state, event, _reading_sigma(event.estimate, prior), prior.bias, text)
-    measured = event.estimate.alpha.vector
+        bias = bias_of(joint_of(known), event.t_ns_utc, _loop(turn.state, known))
+        hold(turn, replace(known, bias=bias))
+        _show(turn, event, _reading_sigma(estimate, prior), prior.bias, text)
+        return
+    measured = estimate.alpha.vector
     reading = Reading(
         value=measured,
-        noise=event.estimate.covariance,
+        noise=estimate.covariance,
         t_ns_utc=event.t_ns_utc,
-        pointing=pointing_at(state, event.t_ns_utc),
+        pointing=pointing_at(turn.state, event.t_ns_utc),
     )
-    far = look_surprise(known, joint_of(known), reading, policy)
+    far = look_surprise(known, joint_of(known), reading, turn.policy)
     if far > JUMP_THRESHOLD:
-        return _barking(state, event, prior, far, policy, now_ns)
-    innovation = passive_innovation(prior, measured, event.estimate.covariance)
-    joint = with_passive(prior, measured, event.estimate.covariance)
-    registration = _after(state, known, joint, event, now_ns)
-    state = aged(replace(state, registration=registration), policy, now_ns)
-    sigma = _reading_sigma(event.estimate, prior)
+        _doubt_by_look(turn, known, event, prior, far)
+        return
+    joint = with_passive(prior, measured, estimate.covariance)
+    registration = _after_look(turn, known, joint, event)
+    hold(turn, registration)
+    age(turn)
+    sigma = _reading_sigma(estimate, prior)
     entry = HistoryEntry(
         t_ns_utc=event.t_ns_utc,
         measured=Misregistration.from_vector(measured - joint.bias),
         measured_sigma=sigma,
         filtered=registration.alpha,
         filtered_sigma=registration.sigma,
-        innovation=innovation,
-        misfit=event.estimate.misfit,
+        innovation=passive_innovation(prior, measured, estimate.covariance),
+        misfit=estimate.misfit,
         source=Source.PASSIVE,
     )
-    text = "agrees with α and with what is known of its own bias"
-    return _shown(remembered(state, entry), event, sigma, joint.bias, text)
+    remember(turn, entry)
+    _show(turn, event, sigma, joint.bias, "agrees with α and with what is known of its own bias")
+
+
+def cannot_watch(turn: Turn, why: str) -> None:
+    """Note why ordinary telemetry says nothing of α now."""
+    turn.state = replace(turn.state, unwatched=why)
 
 
 def fit_begins_at(state: TrackerState) -> Misregistration | None:
@@ -433,17 +425,18 @@ def _why_known_already(state: TrackerState, event: ev.Watched) -> str | None:
     return "a dithered window taken since has been fitted before it"
 
 
-def _alone(state: TrackerState, event: ev.Watched, policy: Policy) -> TrackerState:
+def _show_alone(turn: Turn, event: ev.Watched) -> None:
     """Show a look while α is not known: it is all there is, and no more than it says it is."""
-    step = event.estimate.alpha.vector - policy.start.vector
+    step = event.estimate.alpha.vector - turn.policy.start.vector
     if np.any(np.abs(step) > CAPTURE_RANGE):
         text = (
             f"it cannot tell: {event.estimate.alpha.to_boundary()} is too far from where its fit "
             "begins, the nominal rotation; let the service acquire, or dither"
         )
-        return _shown(state, event, np.full(4, np.inf), np.zeros(4), text)
+        _show(turn, event, np.full(4, np.inf), np.zeros(4), text)
+        return
     text = "no dithered estimate to compare with: nothing is made from this reading alone"
-    return _shown(state, event, event.estimate.sigma, np.zeros(4), text)
+    _show(turn, event, event.estimate.sigma, np.zeros(4), text)
 
 
 def _expecting(known: Registration, excess: Array) -> Registration:
@@ -474,47 +467,37 @@ def _mixed(known: Registration) -> bool:
     return known.candidate is not None or (jumped_ns_utc > 0 and began_ns_utc < jumped_ns_utc)
 
 
-def _barking(
-    state: TrackerState,
-    event: ev.Watched,
-    prior: Joint,
-    far: float,
-    policy: Policy,
-    now_ns: int,
-) -> TrackerState:
+def _doubt_by_look(
+    turn: Turn, known: Registration, event: ev.Watched, prior: Joint, far: float
+) -> None:
     """Forget the bias and doubt α: the wind has changed or the mirror has moved."""
-    known = state.registration
-    if known is None:
-        raise ValueError("no α is known: there is nothing to doubt")
     text = (
         "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
         "dithered window must tell which"
     )
+    known = turn.known or known
     gone = forgotten(prior, event.estimate.bias_excess)
-    registration = _after(state, known, gone, event, now_ns)
-    bias = bias_of(gone, event.t_ns_utc, _loop(state, known))
-    since_ns = max(known.doubted_ns_utc if known.doubt else 0, event.t_ns_utc)
-    registration = replace(registration, doubt=text, doubted_ns_utc=since_ns, bias=bias)
-    state = replace(state, registration=registration)
-    detail = f"{text} (innovation {far:.0f}, expected 4)"
-    state = logged(state, "registration.passive-jump", detail, now_ns, Level.WARNING)
-    state = with_dither_due(with_alarm(state, DISAGREES, text, now_ns), text, now_ns)
-    state = aged(state, policy, now_ns)
-    return _shown(state, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
+    after = _after_look(turn, known, gone, event)
+    bias = bias_of(gone, event.t_ns_utc, _loop(turn.state, known))
+    hold(turn, replace(_doubted(after, text, event.t_ns_utc), bias=bias))
+    turn.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
+    turn.alarm(DISAGREES, text)
+    want_window(turn, text)
+    age(turn)
+    _show(turn, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
 
 
-def _after(
-    state: TrackerState, known: Registration, joint: Joint, event: ev.Watched, now_ns: int
-) -> Registration:
+def _after_look(turn: Turn, known: Registration, joint: Joint, event: ev.Watched) -> Registration:
     """Return the registration as the filter has it after a look."""
+    loop = _loop(turn.state, known)
     return replace(
         known,
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
         t_ns_utc=max(event.t_ns_utc, known.t_ns_utc),
-        arrived_ns_utc=now_ns,
-        bias=bias_of(joint, event.t_ns_utc, _loop(state, known), sum_of(known, joint_of(known))),
-        pointing=pointing_at(state, event.t_ns_utc),
+        arrived_ns_utc=turn.now_ns,
+        bias=bias_of(joint, event.t_ns_utc, loop, sum_of(known, joint_of(known))),
+        pointing=pointing_at(turn.state, event.t_ns_utc),
     )
 
 
@@ -523,15 +506,15 @@ def _reading_sigma(estimate: PassiveEstimate, prior: Joint) -> Array:
     return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[4:])
 
 
-def _shown(
-    state: TrackerState,
+def _show(
+    turn: Turn,
     event: ev.Watched,
     sigma: Array,
     bias: Array,
     text: str,
     *,
     consistent: bool = True,
-) -> TrackerState:
+) -> None:
     watchdog = Watchdog(
         alpha=event.estimate.alpha,
         sigma=sigma,
@@ -541,4 +524,4 @@ def _shown(
         text=text,
         bias=bias,
     )
-    return replace(state, watchdog=watchdog, unwatched="")
+    turn.state = replace(turn.state, watchdog=watchdog, unwatched="")

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from service.control.expected_gain import explained_by_noise
 from service.model.misregistration import BOUNDARY_SCALE
-from service.tracking.alarms import logged
 from service.tracking.events import Event, Reject
 from service.tracking.loop import RtcView
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import Assessment, MatrixState, ModeLimit, ReconstructorRecord
 from service.tracking.registration import Registration
-from service.tracking.state import Level, TrackerState
+from service.tracking.state import TrackerState
+from service.tracking.turn import Turn
 
 CALMING_S = 60.0
 """After an update the thresholds are doubled, and come down to their own over this time."""
@@ -194,49 +194,46 @@ def _comfortable(state: TrackerState) -> bool:
     return 1.0 - margin.worst_pole_radius >= COMFORT * (1.0 - margin.bound)
 
 
-def with_limit(
-    state: TrackerState, record: ReconstructorRecord, asked: int, why_fewer: str, now_ns: int
-) -> TrackerState:
+def note_limit(turn: Turn, record: ReconstructorRecord, asked: int, why_fewer: str) -> None:
     """Note what a reconstructor asked to have ``asked`` modes says of how many are possible."""
-    n_now = state.rtc.n_controlled if state.rtc is not None else record.n_modes
+    n_now = turn.rtc.n_controlled if turn.rtc is not None else record.n_modes
     if record.state is MatrixState.REFUSED:
-        if asked <= n_now:
-            return state
-        reason = record.gate.reason if record.gate is not None else record.reason
-        return limited(state, n_now, reason, now_ns)
+        if asked > n_now:
+            reason = record.gate.reason if record.gate is not None else record.reason
+            limit_modes(turn, n_now, reason)
+        return
     if record.n_modes < asked:
-        state = limited(state, record.n_modes, why_fewer, now_ns)
+        limit_modes(turn, record.n_modes, why_fewer)
+    text = f"{record.id} has {record.n_modes} modes, {n_now} are controlled"
     if record.n_modes < n_now:
-        text = f"{record.id} has {record.n_modes} modes, {n_now} are controlled: {why_fewer}"
-        return logged(state, "modes.lowered", text, now_ns, Level.WARNING)
+        turn.warn("modes.lowered", f"{text}: {why_fewer}")
+        return
     if record.n_modes > n_now:
-        text = f"{record.id} has {record.n_modes} modes, {n_now} are controlled"
-        state = logged(state, "modes.raised", text, now_ns)
-    limit = state.mode_limit
+        turn.log("modes.raised", text)
+    limit = turn.state.mode_limit
     if limit is not None and record.n_modes > limit.n_modes:
         # kept: a limit found again soon must be waited out longer
-        state = replace(state, mode_limit=replace(limit, n_modes=record.n_modes))
-    return state
+        turn.state = replace(turn.state, mode_limit=replace(limit, n_modes=record.n_modes))
 
 
-def declined(before: TrackerState, state: TrackerState, event: Event, now_ns: int) -> TrackerState:
+def note_declined(turn: Turn) -> None:
     """Note that a reconstructor which had passed the gate was declined before it came into use.
 
     If it has more modes than are controlled, that is what it was made for: no more are tried for a
     while, longer each time. An acquisition counts its own failures.
     """
-    if state.reconstructors is before.reconstructors or state.acquisition.under_way:
-        return state
-    rtc = state.rtc or before.rtc
+    before, records = turn.before, turn.state.reconstructors
+    if records is before.reconstructors or turn.acquisition.under_way:
+        return
+    rtc = turn.rtc or before.rtc
     if rtc is None or rtc.n_controlled == 0:
-        return state
+        return
     earlier = {record.id: record.state for record in before.reconstructors}
-    for record in state.reconstructors:
-        wait_s = _wait_after(record, earlier.get(record.id), event)
+    for record in records:
+        wait_s = _wait_after(record, earlier.get(record.id), turn.event)
         if wait_s is not None and record.n_modes > rtc.n_controlled:
             reason = f"{record.id} was {record.state}: {record.reason}"
-            state = limited(state, rtc.n_controlled, reason, now_ns, wait_s)
-    return state
+            limit_modes(turn, rtc.n_controlled, reason, wait_s)
 
 
 def _wait_after(
@@ -252,15 +249,9 @@ def _wait_after(
     return None
 
 
-def limited(
-    state: TrackerState,
-    n_modes: int,
-    reason: str,
-    now_ns: int,
-    first_wait_s: float = FIRST_WAIT_S,
-) -> TrackerState:
+def limit_modes(turn: Turn, n_modes: int, reason: str, first_wait_s: float = FIRST_WAIT_S) -> None:
     """Try no more than these for a while, longer each time that it is found again."""
-    before, wait_s = state.mode_limit, first_wait_s
+    before, wait_s, now_ns = turn.state.mode_limit, first_wait_s, turn.now_ns
     if before is not None and now_ns - before.since_ns_utc < FORGIVEN_AFTER_S * SECOND_NS:
         left_s = (before.until_ns_utc - now_ns) / SECOND_NS
         wait_s = max(first_wait_s, min(2.0 * before.wait_s, LONGEST_WAIT_S), left_s)
@@ -271,5 +262,5 @@ def limited(
         wait_s=wait_s,
         reason=reason,
     )
-    text = f"no more than {n_modes} modes for {wait_s:.0f} s: {reason}"
-    return logged(replace(state, mode_limit=limit), "modes.limited", text, now_ns)
+    turn.state = replace(turn.state, mode_limit=limit)
+    turn.log("modes.limited", f"no more than {n_modes} modes for {wait_s:.0f} s: {reason}")

@@ -24,12 +24,12 @@ from service.errors import PyrcalError
 from service.model.misregistration import Misregistration
 from service.tracker import step
 from service.tracking.activity import under_way
-from service.tracking.alarms import new_lines
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.reconstructors import restored
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Mode, TrackerState
+from service.tracking.turn import new_lines
 from studies.campaign.golden_codec import Json, decoded, encoded, renewed
 
 FOLDER = Path("tests/data/golden")

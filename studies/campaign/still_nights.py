@@ -24,9 +24,9 @@ from typing_extensions import override
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.tracking.alarms import new_lines
 from service.tracking.events import Event
 from service.tracking.state import Mode, TrackerState
+from service.tracking.turn import new_lines
 from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Latencies, Observatory
 

@@ -10,13 +10,13 @@ from service.errors import CommandError
 from service.telemetry.windows import WindowRefused
 from service.tracker import step
 from service.tracking import events as ev
-from service.tracking.alarms import LOG_LENGTH
 from service.tracking.dither_plan import total_m
 from service.tracking.estimate import HISTORY_LENGTH
 from service.tracking.measuring import MEASUREMENTS_KEPT
 from service.tracking.products import MatrixState, MeasurementRecord, MeasurePattern, MeasureState
 from service.tracking.reconstructors import RECONSTRUCTORS_KEPT
 from service.tracking.state import Mode, TrackerState
+from service.tracking.turn import LOG_LENGTH
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,

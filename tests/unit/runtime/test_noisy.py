@@ -14,9 +14,8 @@ from service.runtime.estimates import NoisySums
 from service.telemetry.frames import FrameBlock
 from service.telemetry.random_dither import RandomDither, RandomPlan, accumulate
 from service.tracking import events as ev
-from service.tracking.alarms import with_alarm
 from service.tracking.products import NoisyRecord, NoisyState
-from service.tracking.state import TrackerState
+from service.tracking.state import Alarm, TrackerState
 from service.worker import OpticsWorker
 from tests.unit.runtime.small import COMPUTE, small_instrument
 from tests.unit.tracking.situations import rtc
@@ -26,6 +25,7 @@ ALPHA = Misregistration(
 )
 MODES = tuple(range(0, 60, 2))
 TOTAL_M = 5e-9
+DIVERGING = Alarm(name="loop-diverging", since_ns_utc=0, text="it does")
 N_FRAMES = 1000
 RUNNING = NoisyRecord(
     id="noisy-1",
@@ -130,7 +130,7 @@ async def test_windows_of_another_dither_or_of_a_loop_out_of_hand_do_not_count(d
     desk.take(other, STATE)
     (window,) = windows(workers, n=1)
     desk.take(window, replace(STATE, noisy=()))
-    desk.take(window, with_alarm(STATE, "loop-diverging", "it does", 0))
+    desk.take(window, replace(STATE, alarms=(DIVERGING,)))
     with pytest.raises(CommandError, match="no window of its dither was whole"):
         await desk.finish(RUNNING, STATE)
 

@@ -14,6 +14,7 @@ from service.tracking.policy import Policy
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import commanded_gains
 from service.tracking.state import Mode, TrackerState
+from service.tracking.turn import Turn
 
 SECOND = 1_000_000_000
 START_NS = 1_800_000_000 * SECOND
@@ -116,6 +117,13 @@ def estimate(alpha=ALPHA, *, t_ns=START_NS, session="s1", **changes):
 def moved(alpha=ALPHA, **by):
     """A registration some way from another, in the numeric units of its fields."""
     return replace(alpha, **{name: getattr(alpha, name) + step for name, step in by.items()})
+
+
+def turned(state, act, *args, now_ns=START_NS, **kwargs):
+    """The state after something was done to it while an event was worked out."""
+    turn = Turn(state, ev.Tick(), POLICY, now_ns)
+    act(turn, *args, **kwargs)
+    return turn.state
 
 
 class Story:

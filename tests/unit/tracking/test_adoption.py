@@ -6,7 +6,7 @@ import pytest
 
 from service.runtime.translate import rtc_view
 from service.tracking import events as ev
-from service.tracking.dither import OVER_BUDGET
+from service.tracking.alarms import OVER_BUDGET
 from service.tracking.dither_plan import plan_dither, why_unusable
 from service.wire import (
     DitherAction,

@@ -1,7 +1,20 @@
-from service.tracking.alarms import LOG_LENGTH, counted, logged, with_alarm, without_alarm
 from service.tracking.state import Level, TrackerState
+from service.tracking.turn import LOG_LENGTH, Turn, logged, tell_bursts
+from tests.unit.tracking.situations import turned
 
 STATE = TrackerState(system="flao")
+
+
+def counted(state, now_ns):
+    return turned(state, tell_bursts, now_ns=now_ns)
+
+
+def with_alarm(state, name, text, now_ns):
+    return turned(state, Turn.alarm, name, text, now_ns=now_ns)
+
+
+def without_alarm(state, name, now_ns):
+    return turned(state, Turn.calm, name, now_ns=now_ns)
 
 
 SECOND_NS = 10**9

@@ -6,15 +6,23 @@ from service.tracking.reconstructors import (
     RECONSTRUCTORS_KEPT,
     RETURNS_KEPT,
     UNSENT_KEPT,
+    change_state,
+    keep,
     restored,
-    with_in_use,
-    with_record,
-    with_state,
+    use,
 )
 from service.tracking.state import TrackerState
-from tests.unit.tracking.situations import foreign, record
+from tests.unit.tracking.situations import foreign, record, turned
 
 STATE = TrackerState(system="flao")
+
+
+def with_record(state, made):
+    return turned(state, keep, made)
+
+
+def with_in_use(state, matrix_id):
+    return turned(state, use, matrix_id)
 
 
 @pytest.mark.parametrize(
@@ -98,4 +106,4 @@ def test_a_restarted_service_still_knows_the_way_back_after_a_flood():
 
 def test_a_reconstructor_nobody_knows_is_named():
     with pytest.raises(UnknownIdError, match="no reconstructor cm-9"):
-        with_state(STATE, "cm-9", MatrixState.FAILED, "")
+        turned(STATE, change_state, "cm-9", MatrixState.FAILED, "")

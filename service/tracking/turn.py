@@ -1,0 +1,188 @@
+"""One event being worked out, and the log and the alarms it may add to."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+from service.tracking.alarms import Act, forbidding
+from service.tracking.events import Effect, Event
+from service.tracking.loop import DitherView, RtcView
+from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.registration import Registration
+from service.tracking.stages import Acquisition, Dithering
+from service.tracking.state import Alarm, Level, LogEntry, Retries, TrackerState
+
+LOG_LENGTH = 500
+
+BURST_NS = 60 * SECOND_NS
+"""A line that comes again within this is counted, not told."""
+
+REPEATING = frozenset(
+    {
+        "acknowledgement.unknown",
+        "dither.lost",
+        "dither.unusable",
+        "job.failed",
+        "measurement.ignored",
+        "message.malformed",
+        "reconstructor.not-offered",
+        "watchdog.failed",
+        "window.outlier",
+        "window.refused",
+    }
+)
+"""Lines that say the same though their numbers differ: what becomes of telemetry, and of deeds that
+are tried again."""
+
+LOOKED_BACK = 30
+"""So many lines back the beginning of a burst is looked for."""
+
+_NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
+
+
+class Turn:
+    """One event being worked out: the state as it becomes, and what is to be done about it.
+
+    It lasts as long as ``service.tracker.step``; before and after it states are values.
+    """
+
+    __slots__ = ("before", "effects", "event", "now_ns", "policy", "state")
+
+    def __init__(self, state: TrackerState, event: Event, policy: Policy, now_ns: int) -> None:
+        self.before = state
+        """As nobody had seen the event yet."""
+
+        self.state = state
+        self.event = event
+        self.policy = policy
+        self.now_ns = now_ns
+        self.effects: list[Effect] = []
+
+    @property
+    def rtc(self) -> RtcView | None:
+        """The RTC by its last status; None: none is there."""
+        return self.state.rtc
+
+    @property
+    def known(self) -> Registration | None:
+        """What is known of α; None: nothing."""
+        return self.state.registration
+
+    @known.setter
+    def known(self, registration: Registration | None) -> None:
+        self.state = replace(self.state, registration=registration)
+
+    @property
+    def dither(self) -> DitherView | None:
+        """The dither that was asked for or runs; None: none."""
+        return self.state.dither
+
+    @dither.setter
+    def dither(self, dither: DitherView | None) -> None:
+        self.state = replace(self.state, dither=dither)
+
+    @property
+    def dithering(self) -> Dithering:
+        """What the dither policy remembers."""
+        return self.state.dithering
+
+    @dithering.setter
+    def dithering(self, dithering: Dithering) -> None:
+        self.state = replace(self.state, dithering=dithering)
+
+    @property
+    def acquisition(self) -> Acquisition:
+        """How far finding α from nothing has come."""
+        return self.state.acquisition
+
+    @acquisition.setter
+    def acquisition(self, acquisition: Acquisition) -> None:
+        self.state = replace(self.state, acquisition=acquisition)
+
+    def ask(self, effect: Effect) -> None:
+        """Have something done."""
+        self.effects.append(effect)
+
+    def forbidden(self, act: Act) -> Alarm | None:
+        """Return an alarm that forbids this now, or None."""
+        return forbidding(self.state, act)
+
+    def put_off(self, *, dither_s: float = 0.0, make_s: float = 0.0) -> None:
+        """Ask for no dither, make no reconstructor for so long; 0: that one is not put off."""
+        retries = self.state.retries.later(
+            dither_ns_utc=self.now_ns + round(dither_s * SECOND_NS) if dither_s else 0,
+            make_ns_utc=self.now_ns + round(make_s * SECOND_NS) if make_s else 0,
+        )
+        self.state = replace(self.state, retries=retries)
+
+    def retry_all(self) -> None:
+        """Put nothing off any more."""
+        self.state = replace(self.state, retries=Retries())
+
+    def log(self, name: str, text: str, level: Level = Level.INFO) -> None:
+        """Add a line to the log; one that repeats is counted instead."""
+        self.state = logged(self.state, name, text, self.now_ns, level)
+
+    def warn(self, name: str, text: str) -> None:
+        """Add a warning to the log."""
+        self.log(name, text, Level.WARNING)
+
+    def alarm(self, name: str, text: str) -> None:
+        """Raise an alarm; one already raised keeps its beginning."""
+        before = next((alarm for alarm in self.state.alarms if alarm.name == name), None)
+        t_ns = 0 if self.rtc is None else self.rtc.t_ns_utc
+        first = before or Alarm(name=name, since_ns_utc=self.now_ns, text=text, t_ns_utc=t_ns)
+        others = tuple(alarm for alarm in self.state.alarms if alarm.name != name)
+        raised = replace(first, text=text, seen_ns_utc=self.now_ns)
+        self.state = replace(self.state, alarms=(*others, raised))
+        if before is None:
+            self.log(name, text, Level.ALARM)
+
+    def calm(self, name: str) -> None:
+        """End an alarm, if it is raised."""
+        others = tuple(alarm for alarm in self.state.alarms if alarm.name != name)
+        if len(others) < len(self.state.alarms):
+            self.state = replace(self.state, alarms=others)
+            self.log(name, f"{name}: over")
+
+
+def logged(
+    state: TrackerState, name: str, text: str, now_ns: int, level: Level = Level.INFO
+) -> TrackerState:
+    """Return the state with one more line in its log; one that repeats is counted instead."""
+    entry = LogEntry(t_ns_utc=now_ns, level=level, name=name, text=text)
+    for back, before in enumerate(reversed(state.log[-LOOKED_BACK:]), start=1):
+        # the very last line may be any; what lies between makes a story of two equal ones
+        if (back == 1 or name in REPEATING) and _same(before, entry):
+            log = list(state.log)
+            log[-back] = replace(before, times=before.times + 1, last_ns_utc=now_ns)
+            return replace(state, log=tuple(log))
+    return replace(state, log=(*state.log, entry)[-LOG_LENGTH:])
+
+
+def _same(before: LogEntry, entry: LogEntry) -> bool:
+    if before.name != entry.name or entry.t_ns_utc - before.t_ns_utc >= BURST_NS:
+        return False
+    if entry.name not in REPEATING:
+        return before.text == entry.text
+    return _NUMBERS.sub("", before.text) == _NUMBERS.sub("", entry.text)
+
+
+def tell_bursts(turn: Turn) -> None:
+    """Add a line for each burst that is over, which says how often it was."""
+    for entry in turn.state.log:
+        if entry.times > 1 and turn.now_ns - entry.t_ns_utc >= BURST_NS:
+            lasted_s = (entry.last_ns_utc - entry.t_ns_utc) / SECOND_NS
+            text = f"{entry.text} ({entry.times} times in {lasted_s:.0f} s)"
+            told = replace(entry, t_ns_utc=turn.now_ns, text=text, times=1)
+            log = (replace(e, times=1) if e is entry else e for e in turn.state.log)
+            turn.state = replace(turn.state, log=(*log, told)[-LOG_LENGTH:])
+
+
+def new_lines(before: TrackerState, after: TrackerState) -> list[LogEntry]:
+    """Return the lines that were added; one that was only counted is not among them."""
+    if after.log is before.log:
+        return []
+    known = {entry.line for entry in before.log}
+    return [entry for entry in after.log if entry.line not in known]

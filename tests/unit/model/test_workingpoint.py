@@ -84,6 +84,7 @@ def shift_derivative_error(n_nodes):
     return np.linalg.norm(model.derivatives(ALIGNED)[0] - numeric) / np.linalg.norm(numeric)
 
 
+@pytest.mark.long
 def test_the_derivatives_follow_the_matrix_at_the_working_point_too():
     # the halo's finer structure needs more nodes than the flat response, but only those
     coarse, fine = (shift_derivative_error(n_nodes) for n_nodes in (3, 6))

@@ -64,7 +64,7 @@ def still():
     )
 
 
-@pytest.mark.parametrize("strength", [0.4, 2.0])
+@pytest.mark.parametrize("strength", [pytest.param(0.4, marks=pytest.mark.long), 2.0])
 def test_the_residual_is_found_from_the_gains_it_leaves(bench, strength):
     sky = on_sky(strength)
     window = dithered_window(sky, ALPHA, noise=1e-6)

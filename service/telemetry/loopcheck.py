@@ -443,25 +443,24 @@ def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
     A constant is free for every mode, and leaves with the means.
     """
     taps = np.arange(1, n_taps + 1)
-    target, before = commands[at], commands[at - 1]
-    steps = target - before
-    inputs = np.stack([before, *(seen[at - tap] for tap in taps)]).transpose(2, 1, 0)
-    inputs = inputs - inputs.mean(axis=1, keepdims=True)
-    scale = np.linalg.norm(inputs, axis=1)
+    moved, answered = np.ascontiguousarray(commands.T), np.ascontiguousarray(seen.T)
+    target, before = moved[:, at], moved[:, at - 1]
+    inputs = np.stack([before, *(answered[:, at - tap] for tap in taps)], axis=1)
+    inputs -= inputs.mean(axis=2, keepdims=True)
+    scale = np.sqrt(np.einsum("mkn,mkn->mk", inputs, inputs))
     scale[scale == 0.0] = 1.0
-    inputs /= scale[:, None]
-    wanted = (target - target.mean(axis=0)).T[:, :, None]
-    transposed = inputs.transpose(0, 2, 1)
-    inverse = np.linalg.pinv(transposed @ inputs, hermitian=True)
-    weights = inverse @ (transposed @ wanted)
-    left = np.sum((wanted - inputs @ weights) ** 2, axis=(1, 2))
+    inputs /= scale[:, :, None]
+    wanted = (target - target.mean(axis=1, keepdims=True))[:, :, None]
+    inverse = np.linalg.pinv(inputs @ inputs.transpose(0, 2, 1), hermitian=True)
+    weights = inverse @ (inputs @ wanted)
+    missed = wanted - inputs.transpose(0, 2, 1) @ weights
+    left, steps = np.sum(missed**2, axis=(1, 2)), target - before
     weights = weights[:, :, 0] / scale
     gain = -weights[:, 1:].sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         late = -(weights[:, 1:] @ taps) / gain
-    moves = np.std(steps, axis=0) >= _STILL_LAW_M
     return _Fits(
-        clear=moves & (left <= EXPLAINED * np.sum(steps**2, axis=0)),
+        clear=(steps.std(axis=1) >= _STILL_LAW_M) & (left <= EXPLAINED * np.sum(steps**2, axis=1)),
         leak=weights[:, 0],
         leak_sigma=np.sqrt(inverse[:, 0, 0] * left / len(at)) / scale[:, 0],
         gain=gain,

@@ -333,3 +333,10 @@ def test_a_layout_without_symmetry_has_an_interaction_matrix_too():
     instrument = small_instrument(layout)
     model = InteractionModel(instrument, karhunen_loeve_basis(instrument))
     assert np.linalg.cond(model.interaction_matrix(SOMEWHERE)) < 20
+
+
+def test_a_model_that_was_told_to_forget_finds_the_same_matrix():
+    model = InteractionModel(small_instrument(), small_basis())
+    before = model.interaction_matrix(SOMEWHERE)
+    model.forget()
+    np.testing.assert_array_equal(model.interaction_matrix(SOMEWHERE), before)

@@ -23,7 +23,7 @@ LEAP_S: Final = 10.0
 """Of frames: a longer leap of the sequence is believed only when more batches confirm it."""
 
 ROOM: Final = 512
-"""Frames there is memory for at first: only a reader that falls behind needs more."""
+"""Frames there is memory for while the reader keeps up; one that falls behind needs more."""
 
 CONFIRMATIONS: Final = 2
 """Batches that must go on where a leap has led."""
@@ -56,7 +56,8 @@ class FrameRing:
 
     The reader's cursor and the head (one past the newest frame) bound what is undelivered.
     A place between them is held, missing (it may still come) or void (it came, with a number
-    that is not finite). Numbers are kept modulo the room, which grows to the capacity.
+    that is not finite). Numbers are kept modulo the room, which grows up to the capacity
+    and is given back when the reader has caught up.
     """
 
     def __init__(self, header: FrameHeader, capacity: int, counts: FrameCounts) -> None:
@@ -77,10 +78,8 @@ class FrameRing:
         self._counts = counts
         self._capacity = capacity
         self._cursor = self._head = header.seq0
-        self._room = min(capacity, ROOM)
-        self._slopes = np.empty((self._room, header.n_slopes), np.float32)
-        self._commands = np.empty((self._room, header.n_modes), np.float32)
-        self._dither = np.empty((self._room, header.n_modes), np.float32)
+        self._least_room = min(capacity, ROOM)
+        self._allocate(self._least_room)
         self._state = np.zeros(capacity, np.int8)
         self._seq = np.full(capacity, -1, np.int64)
         self._t_ns = np.zeros(capacity, np.int64)
@@ -174,6 +173,8 @@ class FrameRing:
             if self._state[slots[start]] == HELD
         ]
         self._cursor += len(slots)
+        if self._cursor == self._head and self._room > self._least_room:
+            self._allocate(self._least_room)
         return blocks
 
     def due(self, now_s: float, patience_s: float) -> bool:
@@ -201,17 +202,22 @@ class FrameRing:
         self._noticed_s[slots] = now_s
         self._head = head
 
+    def _allocate(self, room: int) -> None:
+        """Take memory for the numbers of so many frames, in which there are none yet."""
+        self._room = room
+        self._slopes = np.empty((room, self.n_slopes), np.float32)
+        self._commands = np.empty((room, self.n_modes), np.float32)
+        self._dither = np.empty((room, self.n_modes), np.float32)
+
     def _make_room(self, cursor: int, head: int) -> None:
-        """Take memory for the numbers of all places from the cursor to the head."""
+        """Have memory for the numbers of all places from the cursor to the head."""
         if head - cursor <= self._room:
             return
         kept = np.arange(cursor, self._head)
-        before, self._room = kept % self._room, min(self._capacity, 2 * (head - cursor))
-        for name in ("_slopes", "_commands", "_dither"):
-            old = getattr(self, name)
-            new = np.empty((self._room, old.shape[1]), np.float32)
-            new[kept % self._room] = old[before]
-            setattr(self, name, new)
+        before, old = kept % self._room, (self._slopes, self._commands, self._dither)
+        self._allocate(min(self._capacity, 2 * (head - cursor)))
+        for new, numbers in zip((self._slopes, self._commands, self._dither), old, strict=True):
+            new[kept % self._room] = numbers[before]
 
     def _fill(self, batch: FrameBatch, rows: NDArray[np.intp], slots: NDArray[np.int64]) -> None:
         header = batch.header

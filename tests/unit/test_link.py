@@ -8,6 +8,7 @@ from service.link.endpoint import Endpoint
 from service.link.events import EventQueue
 from service.link.intake import Intake
 from service.link.matrices import OFFERS, MeasuredIntake, Offer, Outbox
+from service.link.ring import ROOM
 from service.link.rivals import Order, SessionWatch
 from service.tracking import events as ev
 from service.wire import (
@@ -528,3 +529,18 @@ def test_a_measured_matrix_for_another_system_or_under_another_name_is_refused()
         intake.take("ao/v1/other/im/m1/chunk/0", b"1234")
     with pytest.raises(WireError, match="chunk 0 has 0 bytes"):
         intake.take(keys.measured_chunk("m2", 0), b"")
+
+
+def test_memory_for_frames_grows_with_what_waits_and_is_given_back(clock):
+    """Five seconds of a thousand frames each wait, then nobody is behind any more."""
+    intake = Intake(Endpoint(system="bench", ring_seconds=5.0), clock)
+    send(intake, 0)
+    ring = intake._ring
+    assert len(ring._slopes) == ROOM
+    for k in range(1, 500):
+        send(intake, 10 * k)
+    assert len(ring._slopes) == 5000
+    assert sum(block.n_frames for block in intake.drain()) == 5000
+    assert len(ring._slopes) == ROOM
+    send(intake, 5000)
+    assert [block.first_seq for block in intake.drain()] == [5000]

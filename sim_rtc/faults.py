@@ -7,7 +7,6 @@ reconstructors in :mod:`sim_rtc.link.intake`.
 
 from __future__ import annotations
 
-import argparse
 import textwrap
 import threading
 import time
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.wire import Command, FrameHeader, Loop, LoopRequest, Reply, encode_frames
+from sim_rtc.arguments import refusal
 from sim_rtc.computer.telemetry import FrameClock, Pace, new_session
 
 _log = structlog.get_logger("sim_rtc")
@@ -168,7 +168,7 @@ def read_fault(text: str) -> Fault:
     """
     name, _, rest = text.partition("@")
     if name not in FORMS:
-        raise _refusal(text, f"KIND@T[:ARGUMENTS] with KIND one of {', '.join(FORMS)}")
+        raise refusal(text, f"KIND@T[:ARGUMENTS] with KIND one of {', '.join(FORMS)}")
     kind = FaultKind(name)
     form = FORMS[kind][0]
     expected = f"{kind}@T[:{','.join(a.name for a in form)}], T >= 0 seconds"
@@ -177,13 +177,13 @@ def read_fault(text: str) -> Fault:
         time_s = float(time_text)
         given = [float(part) for part in arguments.split(",")] if arguments else []
     except ValueError:
-        raise _refusal(text, expected) from None
+        raise refusal(text, expected) from None
     if not 0.0 <= time_s < _FOREVER or len(given) > len(form):
-        raise _refusal(text, expected)
+        raise refusal(text, expected)
     values = (*given, *(argument.default for argument in form[len(given) :]))
     for value, argument in zip(values, form, strict=True):
         if not argument.low <= value <= argument.high:
-            raise _refusal(text, f"{argument.name} from {argument.low:g} to {argument.high:g}")
+            raise refusal(text, f"{argument.name} from {argument.low:g} to {argument.high:g}")
     return Fault(kind=kind, time_s=time_s, values=values)
 
 
@@ -199,10 +199,6 @@ def manual() -> str:
         head = f"    {kind + ' ' + arguments:<35}"
         lines += textwrap.wrap(text, 96, initial_indent=head, subsequent_indent=" " * 39)
     return "\n".join(lines) + "\n"
-
-
-def _refusal(text: str, expected: str) -> argparse.ArgumentTypeError:
-    return argparse.ArgumentTypeError(f"found {text!r}; expected {expected}")
 
 
 _NEVER_FRAMES = 2**40

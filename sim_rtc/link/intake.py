@@ -16,7 +16,6 @@ from service.wire import (
     CHUNK_LIMIT,
     Acknowledgement,
     AckState,
-    Encodings,
     Keys,
     Manifest,
     Role,
@@ -28,6 +27,7 @@ from sim_rtc.computer.reconstructors import Outcome, Staging, Verdict
 from sim_rtc.computer.telemetry import Reconstructor
 from sim_rtc.faults import Fault, FaultKind, FaultPlan
 from sim_rtc.link.record import Kind, Recorder
+from sim_rtc.link.replies import acknowledge
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -239,10 +239,4 @@ class Intake:
         data = encode_acknowledgement(message)
         if self._recorder is not None:
             self._recorder.put(Kind.ACKNOWLEDGEMENT, data)
-        self._session.put(
-            self._keys.acknowledgement,
-            data,
-            encoding=Encodings.ACKNOWLEDGEMENT,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.DATA_HIGH,
-        )
+        acknowledge(self._session, self._keys, data)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Final
 
 import structlog
@@ -22,7 +22,6 @@ from service.wire import (
     Acknowledgement,
     AckState,
     CommandKind,
-    Encodings,
     Keys,
     Reply,
     Status,
@@ -30,10 +29,10 @@ from service.wire import (
     decode_manifest,
     decode_status,
     encode_acknowledgement,
-    encode_reply,
 )
 from sim_rtc.link.link import Token, client_config, frames_publisher, status_publisher
 from sim_rtc.link.record import Kind, Message, Recording
+from sim_rtc.link.replies import acknowledge, answer_applied, answer_commands
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -67,9 +66,8 @@ class Replay:
         if session is None:
             return
         with session:
-            for kind in CommandKind:
-                session.declare_queryable(self._keys.command(kind), self._refusing(kind))
-            session.declare_queryable(self._keys.applied, self._answer_applied)
+            answer_commands(session, self._keys, _refuse)
+            answer_applied(session, self._keys, self._applied)
             session.declare_subscriber(self._keys.all_commits, self._on_commit)
             zenoh.ext.declare_advanced_subscriber(
                 session,
@@ -112,7 +110,7 @@ class Replay:
                         self._status = decode_status(message.payload)
                         status.put(message.payload)
                     case Kind.ACKNOWLEDGEMENT:
-                        self._acknowledge(session, message.payload)
+                        acknowledge(session, self._keys, message.payload)
                     case Kind.LIVELINESS:
                         token.show(visible=message.payload != b"\x00")
                     case Kind.MATRIX:
@@ -131,31 +129,14 @@ class Replay:
                 return
             yield message
 
-    def _refusing(self, kind: CommandKind) -> Callable[[zenoh.Query], None]:
-        def answer(query: zenoh.Query) -> None:
-            with query:
-                data = b"" if query.payload is None else query.payload.to_bytes()
-                reply = Reply(id=command_id(data), accepted=False, reason=REFUSAL, start_seq=None)
-                query.reply(self._keys.command(kind), encode_reply(reply), encoding=Encodings.REPLY)
-
-        return answer
-
-    def _answer_applied(self, query: zenoh.Query) -> None:
-        with query:
-            matrix, wanted = self._matrix, query.parameters.get("chunk")
-            if matrix is None:
-                query.reply_err("missing: no matrix has been played yet")
-                return
-            if wanted is None:
-                query.reply(self._keys.applied, matrix.attachment, encoding=Encodings.COMMIT)
-                return
-            layout = decode_manifest(matrix.attachment).layout
-            if not wanted.isdecimal() or int(wanted) >= layout.n_chunks:
-                query.reply_err(f"range: chunk {wanted}, expected 0 to {layout.n_chunks - 1}")
-                return
-            start = int(wanted) * layout.chunk_bytes
-            part = matrix.payload[start : start + layout.chunk_bytes]
-            query.reply(self._keys.applied, part, encoding=Encodings.BYTES)
+    def _applied(self) -> tuple[bytes, list[bytes]] | None:
+        """Return manifest and chunks of the matrix that was played last."""
+        matrix = self._matrix
+        if matrix is None:
+            return None
+        size = decode_manifest(matrix.attachment).layout.chunk_bytes
+        starts = range(0, len(matrix.payload), size)
+        return matrix.attachment, [matrix.payload[start : start + size] for start in starts]
 
     def _on_commit(self, sample: zenoh.Sample) -> None:
         try:
@@ -177,13 +158,8 @@ class Replay:
                 reason=REFUSAL,
                 frame_seq=None,
             )
-            self._acknowledge(session, encode_acknowledgement(refused))
+            acknowledge(session, self._keys, encode_acknowledgement(refused))
 
-    def _acknowledge(self, session: zenoh.Session, data: bytes) -> None:
-        session.put(
-            self._keys.acknowledgement,
-            data,
-            encoding=Encodings.ACKNOWLEDGEMENT,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.DATA_HIGH,
-        )
+
+def _refuse(_kind: CommandKind, data: bytes) -> Reply:
+    return Reply(id=command_id(data), accepted=False, reason=REFUSAL, start_seq=None)

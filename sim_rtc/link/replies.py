@@ -39,53 +39,82 @@ class Replies:
     def __init__(self, keys: Keys, computer: RealTimeComputer) -> None:
         self._keys = keys
         self._computer = computer
-        self._desk = ReplyCache(computer.execute)
+        self._cache = ReplyCache(computer.execute)
 
     def declare(self, session: zenoh.Session) -> None:
         """Let the session answer from now on."""
-        for kind in CommandKind:
-            session.declare_queryable(self._keys.command(kind), self._answering(kind))
-        session.declare_queryable(self._keys.applied, self._answer_applied)
+        answer_commands(session, self._keys, self._reply)
+        answer_applied(session, self._keys, self._applied)
 
-    def _answering(self, kind: CommandKind) -> Callable[[zenoh.Query], None]:
+    def _reply(self, kind: CommandKind, data: bytes) -> Reply:
+        try:
+            reply = self._cache.handle(decode_command(kind, data), time.monotonic())
+        except WireError as error:
+            reply = Reply(id=command_id(data), accepted=False, reason=str(error), start_seq=None)
+        _log.info(
+            "command",
+            kind=str(kind),
+            id=reply.id,
+            accepted=reply.accepted,
+            reason=reply.reason,
+        )
+        return reply
+
+    def _applied(self) -> tuple[bytes, list[bytes]]:
+        active = self._computer.snapshot().reconstructor
+        chunks = split(active.matrix, active.manifest.layout.chunk_bytes)
+        return encode_manifest(active.manifest), chunks
+
+
+def answer_commands(
+    session: zenoh.Session, keys: Keys, reply: Callable[[CommandKind, bytes], Reply]
+) -> None:
+    """Let a session answer commands of every kind with what ``reply`` makes of them."""
+
+    def answering(kind: CommandKind) -> Callable[[zenoh.Query], None]:
         def answer(query: zenoh.Query) -> None:
             with query:
                 data = b"" if query.payload is None else query.payload.to_bytes()
-                try:
-                    reply = self._desk.handle(decode_command(kind, data), time.monotonic())
-                except WireError as error:
-                    reply = Reply(
-                        id=command_id(data), accepted=False, reason=str(error), start_seq=None
-                    )
-                _log.info(
-                    "command",
-                    kind=str(kind),
-                    id=reply.id,
-                    accepted=reply.accepted,
-                    reason=reply.reason,
-                )
-                query.reply(
-                    self._keys.command(kind),
-                    encode_reply(reply),
-                    encoding=Encodings.REPLY,
-                )
+                said = encode_reply(reply(kind, data))
+                query.reply(keys.command(kind), said, encoding=Encodings.REPLY)
 
         return answer
 
-    def _answer_applied(self, query: zenoh.Query) -> None:
+    for kind in CommandKind:
+        session.declare_queryable(keys.command(kind), answering(kind))
+
+
+def answer_applied(
+    session: zenoh.Session, keys: Keys, applied: Callable[[], tuple[bytes, list[bytes]] | None]
+) -> None:
+    """Let a session tell the matrix in use: the manifest, or a chunk that is asked for."""
+
+    def answer(query: zenoh.Query) -> None:
         with query:
-            active = self._computer.snapshot().reconstructor
-            wanted = query.parameters.get("chunk")
+            found, wanted = applied(), query.parameters.get("chunk")
+            if found is None:
+                query.reply_err("missing: no matrix has been played yet")
+                return
+            manifest, chunks = found
             if wanted is None:
-                query.reply(
-                    self._keys.applied, encode_manifest(active.manifest), encoding=Encodings.COMMIT
-                )
-                return
-            chunks = split(active.matrix, active.manifest.layout.chunk_bytes)
-            if not wanted.isdecimal() or int(wanted) >= len(chunks):
+                query.reply(keys.applied, manifest, encoding=Encodings.COMMIT)
+            elif wanted.isdecimal() and int(wanted) < len(chunks):
+                query.reply(keys.applied, chunks[int(wanted)], encoding=Encodings.BYTES)
+            else:
                 query.reply_err(f"range: chunk {wanted}, expected 0 to {len(chunks) - 1}")
-                return
-            query.reply(self._keys.applied, chunks[int(wanted)], encoding=Encodings.BYTES)
+
+    session.declare_queryable(keys.applied, answer)
+
+
+def acknowledge(session: zenoh.Session, keys: Keys, data: bytes) -> None:
+    """Send an acknowledgement."""
+    session.put(
+        keys.acknowledgement,
+        data,
+        encoding=Encodings.ACKNOWLEDGEMENT,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        priority=zenoh.Priority.DATA_HIGH,
+    )
 
 
 _REMEMBERED_S = 600.0

@@ -13,7 +13,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TypedDict, Unpack
+from typing import Self, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -281,22 +281,33 @@ class PhaseFeed(Feed):
         )
 
 
-class Ahead:
-    """Blocks computed ahead in a thread of their own; two at most, then the thread waits."""
+class Background(ABC):
+    """Work in a thread of its own while a ``with`` block lasts."""
 
-    def __init__(self, blocks: Iterator[Block]) -> None:
-        self._blocks = blocks
-        self._queue: queue.Queue[Block | BaseException] = queue.Queue(_AHEAD_BLOCKS)
+    def __init__(self, name: str) -> None:
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="open-loop", daemon=True)
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
 
-    def __enter__(self) -> Ahead:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stopped.set()
         self._thread.join()
+
+    @abstractmethod
+    def _work(self) -> None:
+        """Work until ``_stopped`` is set."""
+
+
+class Ahead(Background):
+    """Blocks computed ahead; two at most, then the thread waits."""
+
+    def __init__(self, blocks: Iterator[Block]) -> None:
+        super().__init__("open-loop")
+        self._blocks = blocks
+        self._queue: queue.Queue[Block | BaseException] = queue.Queue(_AHEAD_BLOCKS)
 
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks until the ``with`` block ends; re-raise what stopped the thread."""
@@ -309,6 +320,7 @@ class Ahead:
                 raise item
             yield item
 
+    @override
     def _work(self) -> None:
         try:
             for block in self._blocks:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import queue
-import threading
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Self
 
 import structlog
 import zenoh
+from typing_extensions import override
 
 from service.errors import WireError
 from service.wire import (
@@ -23,6 +23,7 @@ from service.wire import (
     encode_acknowledgement,
 )
 from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.feed import Background
 from sim_rtc.computer.reconstructors import Outcome, Staging, Verdict
 from sim_rtc.computer.telemetry import Reconstructor
 from sim_rtc.faults import Fault, FaultKind, FaultPlan
@@ -40,7 +41,7 @@ _MOST_EVENTS: Final = 256
 Event = Callable[[], None]
 
 
-class Intake:
+class Intake(Background):
     """Looks after reconstructors in a thread of its own while its ``with`` block lasts."""
 
     def __init__(
@@ -52,22 +53,21 @@ class Intake:
         plan: FaultPlan | None = None,
         recorder: Recorder | None = None,
     ) -> None:
+        super().__init__("reconstructors")
         self._session = session
         self._keys = keys
         self._computer = computer
         self._staging = Staging(computer.terms, limit_bytes=computer.largest_matrix_bytes)
         self._events: queue.Queue[Event] = queue.Queue(_MOST_EVENTS)
-        self._stopped = threading.Event()
         self._rtc_session = computer.snapshot().session
         self._asked_current = False
         self._plan = plan or FaultPlan()
         self._recorder = recorder
         self._refused: dict[Fault, int] = {}
         self._late: list[tuple[float, Reconstructor]] = []
-        self._thread = threading.Thread(target=self._run, name="reconstructors", daemon=True)
 
-    def __enter__(self) -> Intake:
-        self._thread.start()
+    @override
+    def __enter__(self) -> Self:
         self._declared = (
             self._session.declare_subscriber(self._keys.all_chunks, self._on_chunk),
             self._session.declare_subscriber(self._keys.all_commits, self._on_commit),
@@ -75,11 +75,7 @@ class Intake:
                 self._keys.alive(Role.SERVICE), self._on_service, history=True
             ),
         )
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._thread.join()
+        return super().__enter__()
 
     def _on_chunk(self, sample: zenoh.Sample) -> None:
         if len(sample.payload) > CHUNK_LIMIT:
@@ -101,7 +97,8 @@ class Intake:
         except queue.Full:
             _log.warning("reconstructor.overflow", waiting=_MOST_EVENTS)
 
-    def _run(self) -> None:
+    @override
+    def _work(self) -> None:
         while not self._stopped.is_set():
             try:
                 event = self._events.get(timeout=_POLL_S)

@@ -19,9 +19,11 @@ import numpy as np
 import structlog
 import zenoh
 import zenoh.ext
+from typing_extensions import override
 
 from service.wire import Encodings, Keys, Role, encode_manifest, encode_status, split
 from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.feed import Background
 from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of, status_of
 from sim_rtc.faults import FaultPlan, WireFaults
 from sim_rtc.link.intake import Intake
@@ -61,7 +63,7 @@ class _Outgoing:
     """Loop time."""
 
 
-class Link:
+class Link(Background):
     """Connects a computer to the service for as long as the ``with`` block lasts."""
 
     def __init__(
@@ -76,6 +78,7 @@ class Link:
         elevation: Elevation | None = None,
         rehearsal: Rehearsal | None = None,
     ) -> None:
+        super().__init__("link")
         rehearsal = rehearsal or Rehearsal(plan=FaultPlan())
         self._plan = rehearsal.plan
         self._recorder = rehearsal.recorder
@@ -92,19 +95,14 @@ class Link:
         self._keys = Keys(computer.identity.system)
         self._backlog: deque[_Outgoing] = deque()
         self._ready = threading.Condition()
-        self._stopped = threading.Event()
         self._dropped = 0
-        self._thread = threading.Thread(target=self._run, name="link", daemon=True)
 
-    def __enter__(self) -> Link:
-        self._thread.start()
-        return self
-
+    @override
     def __exit__(self, *_: object) -> None:
         self._stopped.set()
         with self._ready:
             self._ready.notify()
-        self._thread.join()
+        super().__exit__()
 
     @property
     def n_dropped_frames(self) -> int:
@@ -134,7 +132,8 @@ class Link:
         finally:
             self._absent.clear()
 
-    def _run(self) -> None:
+    @override
+    def _work(self) -> None:
         replies = Replies(self._keys, self._computer)
         while (session := self._open()) is not None:
             self._speak(session, replies)

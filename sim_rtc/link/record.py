@@ -33,8 +33,10 @@ from typing import Any, Final, Self
 import h5py
 import numpy as np
 import structlog
+from typing_extensions import override
 
 from service.errors import ConfigurationError
+from sim_rtc.computer.feed import Background
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -83,24 +85,23 @@ class Message:
     attachment: bytes = b""
 
 
-class Recorder:
-    """Writes messages in a thread of its own during its ``with`` block; ``put`` never waits."""
+class Recorder(Background):
+    """Writes messages while its ``with`` block lasts; ``put`` never waits."""
 
     def __init__(self, path: Path, *, system: str, backlog_bytes: int = BACKLOG_BYTES) -> None:
+        super().__init__("recorder")
         self._path = path
         self._system = system
         self._backlog_bytes = backlog_bytes
         self._waiting: deque[Message] = deque()
         self._waiting_bytes = 0
         self._lock = threading.Lock()
-        self._stopped = threading.Event()
         self._broken = False
         self._start_s = time.monotonic()
         self.n_dropped = 0
         """Messages that were not written."""
 
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
-
+    @override
     def __enter__(self) -> Self:
         """Create the file.
 
@@ -121,13 +122,12 @@ class Recorder:
         self._rows = _growing(self._file, "messages", _ROW, _ROWS_CHUNK)
         self._dropped = self._file.create_dataset("dropped", data=np.zeros(1, np.int64))
         self._file.swmr_mode = True
-        self._thread.start()
-        return self
+        return super().__enter__()
 
+    @override
     def __exit__(self, *_: object) -> None:
         """Write what waits and close the file."""
-        self._stopped.set()
-        self._thread.join()
+        super().__exit__()
         self._file.close()
         _log.info("record.end", file=str(self._path), dropped=self.n_dropped)
 
@@ -143,7 +143,8 @@ class Recorder:
             self._waiting.append(message)
             self._waiting_bytes += size
 
-    def _run(self) -> None:
+    @override
+    def _work(self) -> None:
         try:
             while not self._stopped.wait(FLUSH_S):
                 self._write()

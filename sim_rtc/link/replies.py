@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 import structlog
 import zenoh
+from typing_extensions import override
 
 from service.errors import WireError
 from service.wire import (
@@ -28,6 +29,7 @@ from service.wire import (
     split,
 )
 from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.feed import Background
 from sim_rtc.computer.measure import Measured, product
 
 _log = structlog.get_logger("sim_rtc")
@@ -156,29 +158,21 @@ class ReplyCache:
 _POLL_S: Final = 0.05
 
 
-class MeasuredPublisher:
-    """Solves and sends what was measured, in a thread of its own while its ``with`` block lasts.
+class MeasuredPublisher(Background):
+    """Solves and sends what was measured.
 
     Solving takes up to half a second and sending waits for the network: telemetry must not wait
     with it.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, computer: RealTimeComputer) -> None:
+        super().__init__("measured")
         self._session = session
         self._keys = keys
         self._computer = computer
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="measured", daemon=True)
 
-    def __enter__(self) -> MeasuredPublisher:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._thread.join()
-
-    def _run(self) -> None:
+    @override
+    def _work(self) -> None:
         while not self._stopped.wait(_POLL_S):
             for measured in self._computer.take_measured():
                 self._send(measured)

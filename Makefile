@@ -27,7 +27,7 @@ test: $(STAMP) ## all that a change needs, what is known soonest first; ARGS go 
 	@$(PY) -m pytest -n 2 -m 'not long and not slow' $(ARGS)
 
 test-long: $(STAMP) ## the other tests: what takes minutes of real time
-	@$(PY) -m pytest -n 2 -m 'long and not slow' $(ARGS)
+	@$(PY) -m pytest -n 3 -m 'long and not slow' $(ARGS)  # they wait more than they work
 
 check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff check .

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Coroutine, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -209,12 +209,16 @@ class Supervisor:
         blocks = tuple(self._bridge.drain())
         for block in blocks:
             self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
-        with self._surviving("telemetry", self._engine.begin_anew):
+        with self._surviving("telemetry"):
             self._engine.feed(blocks)
 
     @contextlib.contextmanager
-    def _surviving(self, what: str, mend: Callable[[], None] | None = None) -> Iterator[None]:
-        """Go on after a fault that nobody foresaw: it is on record, and costs what was at hand."""
+    def _surviving(self, what: str) -> Iterator[None]:
+        """Go on after a fault that nobody foresaw: it is on record, and costs what was gathered.
+
+        The estimators begin anew before anything is posted: each event leads them on, so that what
+        broke one would break the report of it as well.
+        """
         try:
             yield
         except Exception as error:  # noqa: BLE001 - a bug must not end the service
@@ -222,9 +226,8 @@ class Supervisor:
             if text != self._broken:  # its traceback once, not with every batch of frames
                 self._log.exception("internal.error", text=text)
             self._broken = text
+            self._engine.begin_anew()
             self._note("internal.error", text, Level.ALARM)
-            if mend is not None:
-                mend()
 
     def fit(self, window: Spectra | Correlated) -> None:
         """Put a window where the worker finds it."""

@@ -32,8 +32,8 @@ REPEATING = frozenset(
         "window.refused",
     }
 )
-"""Lines that say the same though their numbers differ: what becomes of telemetry, and of deeds that
-are tried again."""
+"""Lines that say the same though their numbers differ: what becomes of telemetry, and of actions
+that are tried again."""
 
 LOOKED_BACK = 30
 """So many lines back the beginning of a burst is looked for."""

@@ -15,6 +15,7 @@ from service.archive import Archive
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
+from service.runtime.engine import followed
 from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
 from service.runtime.workers import WorkerPool
@@ -268,6 +269,22 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
         assert "an inhomogeneous shape" in entry.text
         assert "telemetry was dropped" in entry.text
         assert supervisor._engine.streams.rtc is not None
+        assert supervisor.snapshot().ready
+
+
+async def test_estimators_that_break_whatever_is_posted_begin_anew(supervisor, monkeypatch):
+    def broken(streams, state, policy):
+        if streams.heard_ns_utc == 1:
+            raise ValueError("samples of two matrices")
+        return followed(streams, state, policy)
+
+    async with running(supervisor):
+        monkeypatch.setattr("service.runtime.engine.followed", broken)
+        supervisor._engine.streams = replace(supervisor._engine.streams, heard_ns_utc=1)
+        await until(lambda: supervisor._engine.streams.heard_ns_utc != 1)
+        entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
+        assert "a tick was dropped" in entry.text
+        assert "samples of two matrices" in entry.text
         assert supervisor.snapshot().ready
 
 

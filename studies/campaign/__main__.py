@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import multiprocessing
 import os
 import sys
@@ -25,22 +24,21 @@ from service.config.policy import floor_of
 from studies.campaign.night import play
 from studies.campaign.plan import Estimator, Night, without_dither
 from studies.campaign.plots import plot
-from studies.campaign.summary import Row, table
+from studies.campaign.rows import Row, RowFile, range_of, tell
+from studies.campaign.summary import table
 from studies.campaign.trouble import Trouble
 
 
 def main() -> int:
     """Run what is missing, then print the table."""
     given = _parser().parse_args()
-    rows = _read(given.output)
-    done = {_key(row) for row in rows}
+    file = RowFile(given.output)
+    done = {_key(row) for row in file.rows}
     nights = [night for night in _nights(given) if _key(asdict(night)) not in done]
     started = time.monotonic()
-    with _executor(given.workers) as executor, given.output.open("a") as file:
+    with _executor(given.workers) as executor:
         for k, new in enumerate(_played(executor, nights, given.keep), start=1):
-            rows += new
-            file.writelines(json.dumps(row) + "\n" for row in new)
-            file.flush()
+            file.add(*new)
             left_s = (time.monotonic() - started) / k * (len(nights) - k)
             sys.stderr.write(f"\r{k} of {len(nights)} nights, {left_s / 60:.0f} min left   ")
     sys.stderr.write("\n")
@@ -48,13 +46,10 @@ def main() -> int:
     if given.working_point_modes is not None:
         environment["PYRCAL_COMPUTE__WORKING_POINT_MODES"] = str(given.working_point_modes)
     floor = floor_of(load_settings(None, environment))
-    text = table(rows, floor, pooled=given.winds_in_turn is not None)
-    sys.stdout.write(text)
-    if given.table is not None:
-        command = "pyrcal campaign " + " ".join(sys.argv[1:])
-        given.table.write_text(f"Made by `{command}`.\n\n{text}")
+    text = table(file.rows, floor, pooled=given.winds_in_turn is not None)
+    tell(text, given.table, "pyrcal campaign")
     if given.plot is not None:
-        plot(given.plot, rows, floor)
+        plot(given.plot, file.rows, floor)
     return 0
 
 
@@ -66,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", type=Path, default=Path("campaign.jsonl"), help="rows, resumed")
     parser.add_argument("--table", type=Path, metavar="FILE.md")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="needs the extra 'plots'")
-    parser.add_argument("--seeds", type=_range, default=range(2), metavar="FIRST:END")
+    parser.add_argument("--seeds", type=range_of, default=range(2), metavar="FIRST:END")
     parser.add_argument("--magnitudes", type=_floats, default=(10.0,), metavar="R,R...")
     parser.add_argument("--winds", type=_floats, default=(12.0,), metavar="M_S,M_S...")
     parser.add_argument(
@@ -141,20 +136,9 @@ def _played(executor: Executor, nights: Iterable[Night], keep: Path | None) -> I
         yield finished.result()
 
 
-def _read(path: Path) -> list[Row]:
-    if not path.exists():
-        return []
-    return [json.loads(text) for text in path.read_text().splitlines()]
-
-
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:
     values = (row[name] for name in asdict(Night()))
     return tuple(tuple(value) if isinstance(value, list) else value for value in values)
-
-
-def _range(text: str) -> range:
-    first, end = text.split(":")
-    return range(int(first), int(end))
 
 
 def _floats(text: str) -> tuple[float, ...]:

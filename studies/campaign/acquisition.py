@@ -9,7 +9,6 @@ on the matrix of a perfect registration, and nobody tells the service anything.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -32,6 +31,7 @@ from service.tracking.state import Mode
 from service.worker import Compute, OpticsWorker
 from studies.campaign.acquisition_table import table
 from studies.campaign.observatory import Observatory
+from studies.campaign.rows import Row, RowFile, range_of, tell
 from studies.campaign.system_nights import GAINS
 
 RANGE = np.array([1.5, 1.5, 6.0, 0.05])
@@ -43,8 +43,6 @@ _HOLDS_S = 4.0
 """For so long the loop must hold: one that has slipped is found out and opened in three."""
 
 _OVER = (AcquisitionStage.TRACKING, AcquisitionStage.FAILED, AcquisitionStage.ABORTED)
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,21 +160,16 @@ def _bench(instrument: str, sampling: int) -> OpticsWorker:
 def main() -> int:
     """Run what is missing, then print the table."""
     given = _parser().parse_args()
-    rows = _read(given.output)
-    done = {_key(row) for row in rows}
-    with given.output.open("a") as file:
-        for start in _starts(given):
-            if _key(asdict(start)) in done:
-                continue
-            rows.append(play(start))
-            file.write(json.dumps(rows[-1]) + "\n")
-            file.flush()
-            sys.stderr.write(f"{start.seed}: {rows[-1]['text']}\n")
-    text = table(rows)
-    sys.stdout.write(text)
-    if given.table is not None:
-        command = "python -m studies.campaign.acquisition " + " ".join(sys.argv[1:])
-        given.table.write_text(f"Made by `{command}`.\n\n{text}")
+    file = RowFile(given.output)
+    done = {_key(row) for row in file.rows}
+    for start in _starts(given):
+        if _key(asdict(start)) in done:
+            continue
+        row = play(start)
+        file.add(row)
+        sys.stderr.write(f"{start.seed}: {row['text']}\n")
+    text = table(file.rows)
+    tell(text, given.table, "python -m studies.campaign.acquisition")
     return 0
 
 
@@ -192,7 +185,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--instrument", default="flao-lbt", metavar="NAME|FILE")
     parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
     parser.add_argument("--truth", default="ideal", metavar="NAME")
-    parser.add_argument("--starts", type=_range, default=range(2), metavar="FIRST:END")
+    parser.add_argument("--starts", type=range_of, default=range(2), metavar="FIRST:END")
     parser.add_argument("--mag", type=float, default=10.0)
     parser.add_argument("--gain", type=float, help="default: 0.4 linear, 0.6 diffractive")
     parser.add_argument("--n-controlled", type=int, default=400)
@@ -218,19 +211,8 @@ def _starts(given: argparse.Namespace) -> Iterator[Start]:
         )
 
 
-def _read(path: Path) -> list[Row]:
-    if not path.exists():
-        return []
-    return [json.loads(text) for text in path.read_text().splitlines()]
-
-
 def _key(row: Row) -> tuple[Any, ...]:
     return tuple(row[name] for name in asdict(Start()))
-
-
-def _range(text: str) -> range:
-    first, end = text.split(":")
-    return range(int(first), int(end))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-Row = dict[str, Any]
+from studies.campaign.rows import Row
 
 WRONG = np.array([0.1, 0.1, 0.1, 0.005])
 """An α further off than this is wrong (boundary units): what a loop needs, and ten times the

@@ -8,13 +8,11 @@ first matrix is the RTC's own and its loop is healthy; every matrix sent would b
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -29,9 +27,8 @@ from service.tracking.state import Mode
 from service.wire import LoopRequest, Status
 from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Observatory
+from studies.campaign.rows import Row, RowFile
 from studies.campaign.strange_rtc import Dialect, StrangeDome, StrangeLink
-
-Row = dict[str, Any]
 
 GAINS = {"linear": 0.4, "diffractive": 0.6}
 NAMING = ("matrix-mismatch", "response-mismatch", "loop-law", "command-unit", "commands-off-loop")
@@ -218,20 +215,16 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=Path("mistold.jsonl"))
     parser.add_argument("--table", type=Path, metavar="FILE.md")
     given = parser.parse_args()
-    rows: list[Row] = []
-    if given.output.exists():
-        rows = [json.loads(line) for line in given.output.read_text().splitlines()]
+    file = RowFile(given.output)
     key = (Path(given.instrument).stem, given.plant)
-    done = {row["case"] for row in rows if (row["instrument"], row["plant"]) == key}
-    with given.output.open("a") as file:
-        for case in CASES:
-            if case.name in done or case.name not in given.cases.split(","):
-                continue
-            rows.append(play(case, given))
-            file.write(json.dumps(rows[-1]) + "\n")
-            file.flush()
-            sys.stderr.write(table(rows[-1:]).splitlines()[-1] + "\n")
-    text = table(rows)
+    done = {row["case"] for row in file.rows if (row["instrument"], row["plant"]) == key}
+    for case in CASES:
+        if case.name in done or case.name not in given.cases.split(","):
+            continue
+        row = play(case, given)
+        file.add(row)
+        sys.stderr.write(table([row]).splitlines()[-1] + "\n")
+    text = table(file.rows)
     sys.stdout.write(text)
     if given.table is not None:
         given.table.write_text(text)

@@ -16,7 +16,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -31,29 +30,23 @@ from sim_rtc.computer.feed import Ahead
 from sim_rtc.options import parse_options
 from studies.campaign.passive_table import table
 from studies.campaign.passive_watch import PassiveNight, Watch
+from studies.campaign.rows import Row, RowFile
 
 REGISTERED_TO = np.array([0.005, 0.005, np.deg2rad(0.01), 3e-4])
 """1 σ of the α that the loop's reconstructor was made for, about the true one (numeric units)."""
-
-Row = dict[str, Any]
 
 
 def main() -> int:
     """Play what is missing, then print the table."""
     given = _arguments()
-    rows = []
-    if given.output.exists():
-        rows = [json.loads(line) for line in given.output.read_text().splitlines()]
-    done = {json.dumps(row["night"], sort_keys=True) for row in rows}
-    with given.output.open("a") as file, threadpool_limits(1):
+    file = RowFile(given.output)
+    done = {json.dumps(row["night"], sort_keys=True) for row in file.rows}
+    with threadpool_limits(1):
         for night in _nights(given):
             if json.dumps(asdict(night), sort_keys=True) in done:
                 continue
-            new = play(night)
-            rows += new
-            file.writelines(json.dumps(row) + "\n" for row in new)
-            file.flush()
-    sys.stdout.write(table(rows))
+            file.add(*play(night))
+    sys.stdout.write(table(file.rows))
     return 0
 
 

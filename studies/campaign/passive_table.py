@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any
 
 import numpy as np
 
-Row = dict[str, Any]
+from studies.campaign.rows import Row
 
 UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
 """Printed in % of a subaperture, thousandths of a degree, %."""

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from studies.campaign.summary import Row, distances, model_errors
+from studies.campaign.rows import Row
+from studies.campaign.summary import distances, model_errors
 
 LABELS = ("shift x, subap", "shift y, subap", "rotation, deg", "magnification")
 

@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
@@ -29,8 +27,7 @@ from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import new_lines
 from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Latencies, Observatory
-
-Row = dict[str, Any]
+from studies.campaign.rows import Row, RowFile
 
 SMALL = "tests/system/small.toml"
 PLANTS = {
@@ -144,18 +141,12 @@ def main() -> int:
     """Run what is missing, then print the table."""
     given = _parser().parse_args()
     given.output.parent.mkdir(parents=True, exist_ok=True)
-    rows: list[Row] = []
-    if given.output.exists():
-        rows = [json.loads(line) for line in given.output.read_text().splitlines()]
-    done = {(r["plant"], r["sky"], r["worker"], r["seed"], r["seconds"]) for r in rows}
-    with given.output.open("a") as file:
-        for plant, sky, worker in itertools.product(given.plants, SKIES, WORKERS):
-            if (plant, sky, worker, given.seed, given.seconds) in done:
-                continue
-            rows.append(play(plant, sky, worker, given.seed, given.seconds))
-            file.write(json.dumps(rows[-1]) + "\n")
-            file.flush()
-    sys.stdout.write(table(rows))
+    file = RowFile(given.output)
+    done = {(r["plant"], r["sky"], r["worker"], r["seed"], r["seconds"]) for r in file.rows}
+    for plant, sky, worker in itertools.product(given.plants, SKIES, WORKERS):
+        if (plant, sky, worker, given.seed, given.seconds) not in done:
+            file.add(play(plant, sky, worker, given.seed, given.seconds))
+    sys.stdout.write(table(file.rows))
     return 0
 
 

@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -34,9 +33,8 @@ from service.wire import Acknowledgement, Loop, LoopRequest
 from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Latencies, Observatory
 from studies.campaign.observatory_dome import Moment
+from studies.campaign.rows import Row, RowFile, range_of, tell
 from studies.campaign.strange_rtc import DIALECTS, Mischief, StrangeDome, StrangeLink
-
-Row = dict[str, Any]
 
 LIMIT_NM, LIMIT_S = 1000.0, 1.0
 """A loop beyond the first for longer than the second is not held any more."""
@@ -305,21 +303,14 @@ def table(rows: Sequence[Row]) -> str:
 def main() -> int:
     """Run what is missing, then print the table; 1 if the service has done harm."""
     given = _parser().parse_args()
-    rows = _read(given.output)
-    done = {row["seed"] for row in rows}
-    with given.output.open("a") as file:
-        for seed in given.seeds:
-            if seed in done:
-                continue
-            rows.append(play(seed, given.instrument, given.seconds))
-            file.write(json.dumps(rows[-1]) + "\n")
-            file.flush()
-    text = table(rows)
-    sys.stdout.write(text)
-    if given.table is not None:
-        command = "python -m studies.campaign.strange_nights " + " ".join(sys.argv[1:])
-        given.table.write_text(f"Made by `{command}`.\n\n{text}")
-    return int(any(row["blamed"] for row in rows))
+    file = RowFile(given.output)
+    done = {row["seed"] for row in file.rows}
+    for seed in given.seeds:
+        if seed not in done:
+            file.add(play(seed, given.instrument, given.seconds))
+    text = table(file.rows)
+    tell(text, given.table, "python -m studies.campaign.strange_nights")
+    return int(any(row["blamed"] for row in file.rows))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -330,18 +321,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", type=Path, default=Path("strange.jsonl"), help="rows, resumed")
     parser.add_argument("--table", type=Path, metavar="FILE.md")
     parser.add_argument("--instrument", default="tests/system/small.toml", metavar="NAME|FILE")
-    parser.add_argument("--seeds", type=_range, default=range(4), metavar="FIRST:END")
+    parser.add_argument("--seeds", type=range_of, default=range(4), metavar="FIRST:END")
     parser.add_argument("--seconds", type=float, default=40.0, help="of each night")
     return parser
-
-
-def _read(path: Path) -> list[Row]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def _range(text: str) -> range:
-    first, end = text.split(":")
-    return range(int(first), int(end))
 
 
 if __name__ == "__main__":

@@ -11,9 +11,9 @@ from scipy.stats import chi2
 
 from service.telemetry.estimate import model_error
 from studies.campaign.plan import Estimator
+from studies.campaign.rows import Row
 
 Array = NDArray[np.float64]
-Row = dict[str, Any]
 
 GROUPED_BY = (
     "plant", "truth", "estimator", "trouble", "magnitude", "profile", "wind_m_s", "gain",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +10,7 @@ from service.tracking.products import MatrixState
 from studies.campaign.observatory import Observatory
 from studies.campaign.observatory_checks import Outcome, Publication
 from studies.campaign.observatory_dome import START_NS, Moment
+from studies.campaign.rows import Row
 
 GOOD = np.array([0.02, 0.02, 0.02, 0.001])
 """An α this near the truth is a good one: two floors of the shift (boundary units)."""
@@ -29,7 +28,6 @@ FLAGS = ("registration.jump-suspected", "registration.jump", "registration.passi
 """Log entries that say that the mirror has jumped, or may have."""
 
 Array = NDArray[np.float64]
-Row = dict[str, Any]
 
 
 def row_of(night: Observatory, jump_times_s: tuple[float, ...]) -> Row:

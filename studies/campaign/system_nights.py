@@ -27,8 +27,9 @@ from service.wire import DitherRequest
 from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Observatory
 from studies.campaign.observatory_dome import replayed
+from studies.campaign.rows import Row, RowFile, range_of, tell
 from studies.campaign.system_cases import Case, Plan
-from studies.campaign.system_measures import Row, row_of, wavefront_rms_nm
+from studies.campaign.system_measures import row_of, wavefront_rms_nm
 from studies.campaign.system_table import table
 
 GAINS = {"linear": 0.4, "diffractive": 0.6}
@@ -38,23 +39,17 @@ GAINS = {"linear": 0.4, "diffractive": 0.6}
 def main() -> int:
     """Run what is missing, then print the table."""
     given = _parser().parse_args()
-    rows = _read(given.output)
-    done = {_key(row) for row in rows}
+    file = RowFile(given.output)
+    done = {_key(row) for row in file.rows}
     plans = [plan for plan in _plans(given) if _key(asdict(plan)) not in done]
     started = time.monotonic()
-    with given.output.open("a") as file:
-        for k, row in enumerate(_played(plans, given.workers), start=1):
-            rows.append(row)
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-            spent_min = (time.monotonic() - started) / 60.0
-            sys.stderr.write(f"\r{k} of {len(plans)} nights in {spent_min:.0f} min   ")
+    for k, row in enumerate(_played(plans, given.workers), start=1):
+        file.add(row)
+        spent_min = (time.monotonic() - started) / 60.0
+        sys.stderr.write(f"\r{k} of {len(plans)} nights in {spent_min:.0f} min   ")
     sys.stderr.write("\n")
-    text = table(rows)
-    sys.stdout.write(text)
-    if given.table is not None:
-        command = "python -m studies.campaign.system_nights " + " ".join(sys.argv[1:])
-        given.table.write_text(f"Made by `{command}`.\n\n{text}")
+    text = table(file.rows)
+    tell(text, given.table, "python -m studies.campaign.system_nights")
     return 0
 
 
@@ -105,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--cases", type=_words, default=("drift",), metavar="NAME,NAME...", help=", ".join(Case)
     )
-    parser.add_argument("--seeds", type=_range, default=range(2), metavar="FIRST:END")
+    parser.add_argument("--seeds", type=range_of, default=range(2), metavar="FIRST:END")
     parser.add_argument("--magnitudes", type=_floats, default=(10.0,), metavar="R,R...")
     parser.add_argument("--truths", type=_words, default=("ideal",), metavar="NAME,NAME...")
     parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
@@ -154,19 +149,8 @@ def _played(plans: Iterable[Plan], workers: int) -> Iterator[Row]:
             yield finished.result()
 
 
-def _read(path: Path) -> list[Row]:
-    if not path.exists():
-        return []
-    return [json.loads(text) for text in path.read_text().splitlines()]
-
-
 def _key(row: dict[str, Any]) -> str:
     return json.dumps([row[name] for name in asdict(Plan(case=Case.DRIFT))])
-
-
-def _range(text: str) -> range:
-    first, end = text.split(":")
-    return range(int(first), int(end))
 
 
 def _floats(text: str) -> tuple[float, ...]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.campaign.system_measures import Row
+from studies.campaign.rows import Row
 
 UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
 """Printed in % of a subaperture, thousandths of a degree, %."""

@@ -59,8 +59,9 @@ def test_a_slow_worker_gets_longer_windows_and_is_named(night):
         worker, before = worker_of(service), night.state
         deadline = Deadline(70.0)
         try:
-            while "worker-behind" not in night.alarms:
-                assert not deadline.passed, night.state["pace"]
+            # what its first joined window is like shows when it is fitted, after the alarm perhaps
+            while "worker-behind" not in night.alarms or night.state["pace"]["window_s"] <= 2.0:
+                assert not deadline.passed, (night.state["pace"], night.alarms)
                 os.kill(worker, signal.SIGSTOP)
                 time.sleep(4.7)
                 os.kill(worker, signal.SIGCONT)
@@ -72,6 +73,5 @@ def test_a_slow_worker_gets_longer_windows_and_is_named(night):
         assert "the machine is loaded" in night.alarms["worker-behind"]
         assert after["windows_accepted"] > before["windows_accepted"]
         assert after["windows_refused"] == before["windows_refused"]
-        assert after["pace"]["window_s"] > 2.0
         assert night.metrics["pyrcal_windows_late"] >= 3
         wait_for(lambda: "worker-behind" not in night.alarms, 90.0, "the alarm is over")

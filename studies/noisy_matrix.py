@@ -33,7 +33,7 @@ from service.telemetry.random_dither import (
 )
 from service.telemetry.windows import WindowRefused
 from service.tracking.products import NoisyRecord, NoisyState
-from service.wire import DitherAction, DitherKind, DitherRequest
+from service.wire import DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.computer import RealTimeComputer
@@ -145,7 +145,6 @@ def _started(given: argparse.Namespace, computer: RealTimeComputer, rate_hz: flo
     reply = computer.execute(
         DitherRequest(
             id="study",
-            action=DitherAction.START,
             kind=DitherKind.BINARY,
             modes=modes,
             amplitude_m=amplitude_m,

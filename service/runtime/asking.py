@@ -14,9 +14,9 @@ from service.tracking.loop import CommandState
 from service.tracking.products import MeasureState
 from service.tracking.state import TrackerState
 from service.wire import (
-    DitherAction,
     DitherKind,
     DitherRequest,
+    DitherStop,
     Loop,
     LoopRequest,
     RampRequest,
@@ -87,7 +87,6 @@ async def _dither(bridge: RtcPort, question: ev.AskDither) -> Event:
     reply = await bridge.command(
         DitherRequest(
             id=dither.id,
-            action=DitherAction.START,
             kind=DitherKind(dither.kind.value),
             modes=dither.modes,
             amplitude_m=dither.amplitude_m,
@@ -102,7 +101,7 @@ async def _dither(bridge: RtcPort, question: ev.AskDither) -> Event:
 
 
 async def _no_dither(bridge: RtcPort, command: str) -> None:
-    reply = await bridge.command(DitherRequest(id=command, action=DitherAction.STOP))
+    reply = await bridge.command(DitherStop(id=command))
     if not reply.accepted:
         raise CommandError(f"the RTC did not stop the dither: {reply.reason}")
 

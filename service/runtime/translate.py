@@ -75,17 +75,15 @@ def _pointing(status: PointingStatus | None) -> Pointing | None:
     return Pointing(elevation_deg=status.elevation_deg, azimuth_deg=status.azimuth_deg)
 
 
-def _running(status: DitherStatus) -> DitherView | None:
+def _running(status: DitherStatus) -> DitherView:
     """Return the dither that runs."""
     request = status.request
-    if request.modes is None or request.amplitude_m is None or request.kind is None:
-        return None
     return DitherView(
         id=request.id,
         modes=request.modes,
         amplitude_m=request.amplitude_m,
         frequency_hz=request.frequency_hz or (),
-        duration_s=request.duration_s or 0.0,
+        duration_s=request.duration_s,
         start_seq=status.start_seq,
         asked_ns_utc=0,
         kind=DitherKind(request.kind.value),

@@ -10,9 +10,9 @@ from service.wire.codec import MESSAGE_LIMIT, TEXT_LIMIT, VERSION
 from service.wire.commands import (
     Command,
     CommandKind,
-    DitherAction,
     DitherKind,
     DitherRequest,
+    DitherStop,
     Loop,
     LoopRequest,
     MeasureRequest,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
 from typing import Annotated, Any, Final
@@ -18,6 +18,7 @@ from service.wire.codec import (
     above,
     applicable,
     checked,
+    get,
     integer,
     number,
     of_this_version,
@@ -54,13 +55,6 @@ class Loop(StrEnum):
     """Closed, with the gain of some controlled modes at 0."""
 
 
-class DitherAction(StrEnum):
-    """What to do with the dither."""
-
-    START = "start"
-    STOP = "stop"
-
-
 class DitherKind(StrEnum):
     """Shape of the dither in time."""
 
@@ -85,25 +79,31 @@ class Pattern(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherRequest:
-    """Start or stop a dither; stopping needs nothing but the id and always succeeds."""
+    """Start a dither."""
 
     id: Id
     """Of the command: repeated with the same id it is carried out once."""
 
-    action: DitherAction
-    kind: DitherKind | None = None
-    modes: tuple[Count, ...] | None = None
+    kind: DitherKind
+    modes: tuple[Count, ...]
     """0-based basis indices."""
 
-    amplitude_m: tuple[Positive, ...] | None = None
+    amplitude_m: tuple[Positive, ...]
     """RMS of each mode, metres OPD."""
 
     frequency_hz: tuple[Positive, ...] | None = None
     """Of each mode, below half the frame rate; None: binary."""
 
-    duration_s: _Duration | None = None
+    duration_s: _Duration
     seed: Count | None = None
     """Of the binary sequence; None: sine."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DitherStop:
+    """Stop the dither, whichever plays; this always succeeds."""
+
+    id: Id
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,7 +165,7 @@ class RampRequest:
     """Frames each gain is tried for, settling included."""
 
 
-Command = DitherRequest | LoopRequest | MeasureRequest | RampRequest
+Command = DitherRequest | DitherStop | LoopRequest | MeasureRequest | RampRequest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,17 +183,19 @@ class Reply:
     """First frame whose exposure contains what was asked for; None where that means nothing."""
 
 
-_RECORDS: dict[CommandKind, type[Command]] = {
-    CommandKind.DITHER: DitherRequest,
-    CommandKind.LOOP: LoopRequest,
-    CommandKind.MEASURE: MeasureRequest,
-    CommandKind.RAMP: RampRequest,
+_KINDS: dict[type[Command], CommandKind] = {
+    DitherRequest: CommandKind.DITHER,
+    DitherStop: CommandKind.DITHER,
+    LoopRequest: CommandKind.LOOP,
+    MeasureRequest: CommandKind.MEASURE,
+    RampRequest: CommandKind.RAMP,
 }
+_START, _STOP = "start", "stop"
 
 
 def command_kind(command: Command) -> CommandKind:
     """Return which key a command goes to."""
-    return next(kind for kind, record in _RECORDS.items() if isinstance(command, record))
+    return _KINDS[type(command)]
 
 
 def command_id(data: bytes) -> str | None:
@@ -212,7 +214,10 @@ def encode_command(command: Command) -> bytes:
     WireError
         If the record breaks the contract.
     """
-    return checked(pack(command), lambda data: decode_command(command_kind(command), data))
+    data = pack(command)
+    if isinstance(command, DitherRequest | DitherStop):
+        data = pack(command, action=_START if isinstance(command, DitherRequest) else _STOP)
+    return checked(data, lambda data: decode_command(command_kind(command), data))
 
 
 def decode_command(kind: CommandKind, data: bytes) -> Command:
@@ -228,8 +233,10 @@ def decode_command(kind: CommandKind, data: bytes) -> Command:
     where = f"a {kind} command"
     values = of_this_version(unpack(data, where), where)
     if kind is CommandKind.DITHER:
-        return read_dither(values, where)
-    command = read(values, _RECORDS[kind], where)
+        stops = values.get("action") == _STOP
+        return read(values, DitherStop, where) if stops else read_dither(values, where)
+    record = next(record for record, of_kind in _KINDS.items() if of_kind is kind)
+    command = read(values, record, where)
     if isinstance(command, MeasureRequest):
         sine = command.pattern is Pattern.SINE
         applicable(command, where, n_average=not sine, frequency_hz=sine, duration_s=sine)
@@ -240,22 +247,17 @@ def decode_command(kind: CommandKind, data: bytes) -> Command:
 
 
 def read_dither(values: dict[str, Any], where: str) -> DitherRequest:
-    """Return the dither request a map holds.
+    """Return the dither that a map asks for.
 
     Raises
     ------
     WireError
         If a key is missing or out of range.
     """
-    if values.get("action") == DitherAction.STOP:
-        needed = {"id", "action"}
-        values = {f.name: None for f in fields(DitherRequest) if f.name not in needed} | {
-            key: values[key] for key in needed & values.keys()
-        }
-        return read(values, DitherRequest, where)
+    if get(values, "action", where) != _START:
+        raise refusal("action", values["action"], f"{_START} or {_STOP}", where)
     command = read(values, DitherRequest, where)
     sine = command.kind is DitherKind.SINE
-    applicable(command, where, kind=True, modes=True, amplitude_m=True, duration_s=True)
     applicable(command, where, frequency_hz=sine, seed=not sine)
     _check_modes(command, where)
     return command
@@ -263,7 +265,7 @@ def read_dither(values: dict[str, Any], where: str) -> DitherRequest:
 
 def _check_modes(command: DitherRequest | MeasureRequest, where: str) -> None:
     """Refuse modes that are none or twice the same, and what is not one for each of them."""
-    modes = command.modes or ()
+    modes = command.modes
     if not modes or len(set(modes)) != len(modes):
         raise refusal("modes", modes, "at least one mode, none twice", where)
     for key in ("amplitude_m", "frequency_hz"):

@@ -215,7 +215,7 @@ def encode_status(status: Status) -> bytes:
     playing = status.dither
     dither = None
     if playing is not None:
-        dither = {**asdict(playing.request), "start_seq": playing.start_seq}
+        dither = {**asdict(playing.request), "action": "start", "start_seq": playing.start_seq}
     pointing = None if status.pointing is None else asdict(status.pointing)
     return checked(pack(status, dither=dither, pointing=pointing), decode_status)
 

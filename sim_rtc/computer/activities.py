@@ -174,7 +174,7 @@ class Dither:
         self.start_seq = start_seq
         self._n_modes = n_modes
         self._frame_rate_hz = frame_rate_hz
-        self.stop_seq = start_seq + max(1, round((request.duration_s or 0.0) * frame_rate_hz))
+        self.stop_seq = start_seq + max(1, round(request.duration_s * frame_rate_hz))
         """First frame without it."""
         self._modes = np.array(request.modes, dtype=np.intp)
         self._amplitude_m = np.array(request.amplitude_m)
@@ -207,16 +207,16 @@ def refusal(
     request: DitherRequest, limits: DitherLimits, *, n_modes: int, frame_rate_hz: float
 ) -> str:
     """Return why a dither cannot be played, in the wire's words; empty: it can."""
-    modes, amplitude_m = request.modes or (), request.amplitude_m or ()
-    if max(modes, default=0) >= n_modes:
+    modes, amplitude_m = request.modes, request.amplitude_m
+    if max(modes) >= n_modes:
         return f"range: mode {max(modes)}, expected 0 to {n_modes - 1}"
     if len(modes) > limits.most_modes:
         return f"range: {len(modes)} modes, expected at most {limits.most_modes}"
-    if max(amplitude_m, default=0.0) > limits.largest_m:
+    if max(amplitude_m) > limits.largest_m:
         return f"range: amplitude_m {max(amplitude_m):.3g}, expected at most {limits.largest_m:.3g}"
     highest = max(request.frequency_hz or (), default=0.0)
     if highest >= frame_rate_hz / 2:
         return f"range: frequency_hz {highest:g}, expected below {frame_rate_hz / 2:g}"
-    if (request.duration_s or 0.0) > limits.longest_s:
+    if request.duration_s > limits.longest_s:
         return f"range: duration_s {request.duration_s:g}, expected at most {limits.longest_s:g}"
     return ""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from service.wire import (
     Command,
-    DitherAction,
     DitherRequest,
+    DitherStop,
     Loop,
     LoopRequest,
     MeasureRequest,
@@ -210,7 +210,7 @@ class RealTimeComputer:
     def execute(self, command: Command) -> Reply:
         """Carry out a command, or say why not."""
         match command:
-            case DitherRequest(action=DitherAction.STOP):
+            case DitherStop():
                 return self._stop_dither(command)
             case DitherRequest():
                 return self._start_dither(command)
@@ -298,7 +298,7 @@ class RealTimeComputer:
             self._activities.begin_dither(request, start_seq)
         return accepted(request.id, start_seq)
 
-    def _stop_dither(self, request: DitherRequest) -> Reply:
+    def _stop_dither(self, request: DitherStop) -> Reply:
         with self._lock:
             self._activities.end_dither()
             return accepted(request.id, self._seq)

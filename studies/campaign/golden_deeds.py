@@ -10,7 +10,7 @@ from service.tracking.loop import Pointing
 from service.tracking.products import MatrixState, MeasurePattern
 from service.tracking.state import Mode
 from service.wire import Command as Order
-from service.wire import DitherAction, DitherKind, DitherRequest
+from service.wire import DitherKind, DitherRequest
 from studies.campaign.golden_night import GoldenNight
 from studies.campaign.strange_rtc import Mischief
 
@@ -193,7 +193,6 @@ def dither(name: str) -> DitherRequest:
     """Return a dither that somebody else asks for."""
     return DitherRequest(
         id=name,
-        action=DitherAction.START,
         kind=DitherKind.SINE,
         modes=(60, 65),
         amplitude_m=(5e-9, 5e-9),

@@ -24,7 +24,7 @@ from service.tracking.products import (
     NoisyState,
 )
 from service.tracking.state import Mode, TrackerState
-from service.wire import Acknowledgement, DitherAction, DitherRequest, Reply
+from service.wire import Acknowledgement, DitherRequest, Reply
 from service.wire import Command as Order
 from service.worker import OpticsWorker
 from studies.campaign.golden import Entry, Teller
@@ -100,8 +100,7 @@ class GoldenDome(StrangeDome):
         if isinstance(command, self.refused):
             reason = "busy: it is told to refuse"
             return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
-        starts = isinstance(command, DitherRequest) and command.action is DitherAction.START
-        if self.deaf and starts:
+        if self.deaf and isinstance(command, DitherRequest):
             return Reply(id=command.id, accepted=True, reason="", start_seq=self.frame + 50)
         return super().order(command)
 

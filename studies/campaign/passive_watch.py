@@ -26,7 +26,7 @@ from service.telemetry.kalman import (
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.passive import Passive, accumulate
 from service.telemetry.windows import WindowRefused
-from service.wire import DitherAction, DitherKind, DitherRequest
+from service.wire import DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.computer import RealTimeComputer
@@ -131,7 +131,6 @@ class Watch:
         reply = computer.execute(
             DitherRequest(
                 id=f"teach-{self._night.seed}",
-                action=DitherAction.START,
                 kind=DitherKind.SINE,
                 modes=DITHERED,
                 amplitude_m=(AMPLITUDE_M,) * len(DITHERED),

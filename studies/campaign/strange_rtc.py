@@ -186,11 +186,9 @@ class StrangeDome(Dome):
         """Tell the RTC something and return its answer."""
         if Mischief.STRONG_DITHER in self.mischief and isinstance(command, DitherRequest):
             self._asked[command.id] = command
-            amplitudes = command.amplitude_m
-            if amplitudes is not None:
-                most_m = self.computer.snapshot().limits.largest_m
-                strong = tuple(min(STRONG * a, most_m) for a in amplitudes)
-                command = replace(command, amplitude_m=strong)
+            most_m = self.computer.snapshot().limits.largest_m
+            strong = tuple(min(STRONG * a, most_m) for a in command.amplitude_m)
+            command = replace(command, amplitude_m=strong)
         return super().order(command)
 
     @override

@@ -15,7 +15,7 @@ from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.passive import Passive
 from service.telemetry.random_dither import Correlated, RandomDither, RandomPlan
 from service.telemetry.windows import WindowRefused
-from service.wire import DitherAction, DitherKind, DitherRequest
+from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch
@@ -112,7 +112,6 @@ def start_dither(night: Night, computer: RealTimeComputer, rate_hz: float) -> Pl
         reply = computer.execute(
             DitherRequest(
                 id="campaign",
-                action=DitherAction.START,
                 kind=DitherKind.SINE if sine else DitherKind.BINARY,
                 modes=told(night.trouble, night.dithered),
                 amplitude_m=amplitude_m,

@@ -22,7 +22,6 @@ from service.wire import (
     Acknowledgement,
     AckState,
     AlarmMessage,
-    DitherAction,
     DitherKind,
     DitherRequest,
     Keys,
@@ -675,7 +674,6 @@ def test_a_measured_matrix_with_a_wrong_checksum_is_refused_and_the_next_one_tak
 async def test_a_command_is_answered_and_carried_out(bridge, rtc):
     request = DitherRequest(
         id="d-1",
-        action=DitherAction.START,
         kind=DitherKind.SINE,
         modes=(3, 2),
         amplitude_m=(5e-9, 5e-9),

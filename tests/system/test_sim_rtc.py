@@ -19,9 +19,9 @@ import zenoh
 from benchmarks.plant import measure_linear
 from service.wire import (
     CommandKind,
-    DitherAction,
     DitherKind,
     DitherRequest,
+    DitherStop,
     Keys,
     LoopRequest,
     Manifest,
@@ -286,7 +286,6 @@ def test_commands_obey_the_integrator_equation_of_the_wire(rtc):
 def test_a_sine_dither_appears_as_announced_and_stays_out_of_the_integrator(rtc):
     request = DitherRequest(
         id="sine-1",
-        action=DitherAction.START,
         kind=DitherKind.SINE,
         modes=(501, 450),
         amplitude_m=(5e-9, 3e-9),
@@ -317,12 +316,9 @@ def test_a_sine_dither_appears_as_announced_and_stays_out_of_the_integrator(rtc)
 
 
 def test_a_second_dither_is_refused_until_the_first_is_stopped(rtc):
-    def request(name, action=DitherAction.START):
-        if action is DitherAction.STOP:
-            return DitherRequest(id=name, action=action)
+    def request(name):
         return DitherRequest(
             id=name,
-            action=action,
             kind=DitherKind.BINARY,
             modes=(500,),
             amplitude_m=(4e-9,),
@@ -336,7 +332,7 @@ def test_a_second_dither_is_refused_until_the_first_is_stopped(rtc):
     (batch, *_) = rtc.frames(first.start_seq, first.start_seq + 10)
     np.testing.assert_allclose(np.abs(batch.dither_m[:, 500]), 4e-9, rtol=1e-6)
     assert rtc.next_status().dither.start_seq == first.start_seq
-    assert rtc.command(CommandKind.DITHER, request("stop-1", DitherAction.STOP)).accepted
+    assert rtc.command(CommandKind.DITHER, DitherStop(id="stop-1")).accepted
     assert rtc.next_status().dither is None
 
 
@@ -360,7 +356,6 @@ def test_a_second_dither_is_refused_until_the_first_is_stopped(rtc):
             CommandKind.DITHER,
             DitherRequest(
                 id="far",
-                action=DitherAction.START,
                 kind=DitherKind.SINE,
                 modes=(600,),
                 amplitude_m=(1e-9,),

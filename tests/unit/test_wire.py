@@ -13,10 +13,10 @@ from service.wire import (
     AckState,
     ChunkAssembler,
     CommandKind,
-    DitherAction,
     DitherKind,
     DitherRequest,
     DitherStatus,
+    DitherStop,
     FrameHeader,
     Keys,
     Loop,
@@ -73,7 +73,6 @@ ROWS = np.arange(14, dtype=np.float32).reshape(2, 7)
 
 DITHER = DitherRequest(
     id="d-1",
-    action=DitherAction.START,
     kind=DitherKind.SINE,
     modes=(501, 450),
     amplitude_m=(5e-9, 4e-9),
@@ -355,10 +354,9 @@ def test_a_reply_may_lack_the_id_it_could_not_read():
     "command",
     [
         DITHER,
-        DitherRequest(id="d-2", action=DitherAction.STOP),
+        DitherStop(id="d-2"),
         DitherRequest(
             id="d-3",
-            action=DitherAction.START,
             kind=DitherKind.BINARY,
             modes=(3,),
             amplitude_m=(1e-9,),
@@ -390,7 +388,7 @@ def test_commands_arrive_as_they_were_meant(command):
 def test_stopping_a_dither_needs_nothing_but_the_id():
     data = msgpack.packb({"v": 1, "id": "d-9", "action": "stop"})
     command = decode_command(CommandKind.DITHER, data)
-    assert command == DitherRequest(id="d-9", action=DitherAction.STOP)
+    assert command == DitherStop(id="d-9")
 
 
 @pytest.mark.parametrize(

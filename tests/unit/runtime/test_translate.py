@@ -9,7 +9,6 @@ from service.tracking.state import Mode
 from service.wire import (
     Acknowledgement,
     AckState,
-    DitherAction,
     DitherKind,
     DitherRequest,
     DitherStatus,
@@ -62,7 +61,6 @@ def test_where_the_telescope_looks_is_taken_over_when_the_rtc_knows():
 def test_a_running_dither_is_known_by_its_id():
     request = DitherRequest(
         id="dither-5",
-        action=DitherAction.START,
         kind=DitherKind.SINE,
         modes=(1,),
         amplitude_m=(1e-9,),
@@ -76,7 +74,6 @@ def test_a_running_dither_is_known_by_its_id():
 def test_a_random_dither_is_known_by_its_seed():
     request = DitherRequest(
         id="dither-6",
-        action=DitherAction.START,
         kind=DitherKind.BINARY,
         modes=(1, 4),
         amplitude_m=(1e-9, 2e-9),

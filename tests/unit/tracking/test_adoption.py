@@ -9,7 +9,6 @@ from service.tracking import events as ev
 from service.tracking.alarms import OVER_BUDGET
 from service.tracking.dither_plan import plan_dither, why_unusable
 from service.wire import (
-    DitherAction,
     DitherKind,
     DitherRequest,
     DitherStatus,
@@ -113,7 +112,6 @@ def test_one_over_budget_from_before_a_restart_is_stopped_and_read_only_where_it
 def test_only_a_sine_of_the_status_can_be_demodulated(kind, frequency_hz, seed):
     request = DitherRequest(
         id="d-1",
-        action=DitherAction.START,
         kind=kind,
         modes=(501, 520),
         amplitude_m=(5e-9, 4e-9),

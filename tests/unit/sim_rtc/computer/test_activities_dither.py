@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from service.wire import DitherAction, DitherKind, DitherRequest
+from service.wire import DitherKind, DitherRequest
 from sim_rtc.computer.activities import Dither, refusal
 from sim_rtc.computer.telemetry import DitherLimits
 
@@ -9,7 +9,6 @@ from sim_rtc.computer.telemetry import DitherLimits
 def request(**changes):
     values = {
         "id": "d",
-        "action": DitherAction.START,
         "kind": DitherKind.SINE,
         "modes": (3, 1),
         "amplitude_m": (5e-9, 2e-9),

@@ -5,7 +5,6 @@ import pytest
 
 from service.model.misregistration import Misregistration
 from service.wire import (
-    DitherAction,
     DitherKind,
     DitherRequest,
     Loop,
@@ -90,7 +89,6 @@ def loop_request(name, **changes):
 def dither_request(name):
     return DitherRequest(
         id=name,
-        action=DitherAction.START,
         kind=DitherKind.SINE,
         modes=(3,),
         amplitude_m=(1e-9,),

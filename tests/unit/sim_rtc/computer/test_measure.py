@@ -8,9 +8,9 @@ import pytest
 
 from service.model.misregistration import Misregistration
 from service.wire import (
-    DitherAction,
     DitherKind,
     DitherRequest,
+    DitherStop,
     Loop,
     LoopRequest,
     Manifest,
@@ -125,10 +125,9 @@ def sines(duration_s=2.0, modes=ALL, frequency_hz=None):
     )
 
 
-def dither(action=DitherAction.START):
+def dither():
     return DitherRequest(
-        id=f"d-{action}",
-        action=action,
+        id="d-start",
         kind=DitherKind.SINE,
         modes=(5,),
         amplitude_m=(1e-9,),
@@ -313,7 +312,7 @@ def test_one_thing_at_a_time():
     assert computer.execute(dither()).accepted
     assert computer.execute(push_pull()).reason.startswith("busy: dither d-start is on until frame")
     assert computer.snapshot().loop is Loop.CLOSED, "a refused command changes nothing"
-    assert computer.execute(dither(DitherAction.STOP)).accepted
+    assert computer.execute(DitherStop(id="d-stop")).accepted
     assert computer.execute(push_pull()).accepted
     assert computer.execute(push_pull("im-2")).reason.startswith("busy: matrix im-1")
     assert computer.execute(dither()).reason.startswith("busy: matrix im-1 is being measured")

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from service.files.product import instrument_sha256
 from service.model import instrument as model_code
 from service.model.instrument import BasisKind, Instrument, Mirror
-from service.model.mirror import mirror_surface
-from service.model.modes import Basis, ModalBasis, modal_basis
+from service.model.modes import Basis, ModalBasis, mirror_surface, modal_basis
 
 Arrays = Mapping[str, NDArray[Any]]
 

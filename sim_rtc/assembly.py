@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument, KarhunenLoeve, TabulatedModes
-from service.model.mirror import mirror_surface
-from service.model.modes import ModalBasis, analytic_basis
+from service.model.modes import ModalBasis, analytic_basis, mirror_surface
 from service.model.slopes import Normalisation, Orientation, SlopeOrder
 from service.prepared import Prepared, usual_folder
 from sim_rtc.computer.computer import RealTimeComputer

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
+from service.control.expected_gain import noise_of_counts
 from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, LoopSettings, judge
-from service.control.noise import noise_of_counts
 from service.control.reconstructor import Method, Prior, Recipe, reconstruct
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.control.noise import noise_of_counts
+from service.control.expected_gain import noise_of_counts
 from service.fit.light import CannotTell, find_pupil, measured_illumination
 from service.model.interaction import InteractionModel, valid_subapertures
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration

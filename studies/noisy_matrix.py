@@ -23,6 +23,7 @@ from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.estimates import finished, work_out
 from service.telemetry import random_dither
+from service.telemetry.frames import WindowRefused
 from service.telemetry.random_dither import (
     Correlated,
     RandomDither,
@@ -31,7 +32,6 @@ from service.telemetry.random_dither import (
     joined,
     noisy_matrix,
 )
-from service.telemetry.windows import WindowRefused
 from service.tracking.products import NoisyRecord, NoisyState
 from service.wire import DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker

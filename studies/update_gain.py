@@ -18,8 +18,14 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.control.expected_gain import ExpectedGain, Sky, Timing, beyond_m2, expected_gain
-from service.control.noise import noise_of_star
+from service.control.expected_gain import (
+    ExpectedGain,
+    Sky,
+    Timing,
+    beyond_m2,
+    expected_gain,
+    noise_of_star,
+)
 from service.control.reconstructor import invert
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration

@@ -21,7 +21,7 @@ from service.config import load_instrument
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.model.modes import karhunen_loeve_basis
-from service.model.workingpoint import working_point
+from service.model.turbulence import working_point
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.diffractive import DiffractiveOptics
 from studies.optical_gain import PROBE_M, closed_loop, telescope_of

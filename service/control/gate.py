@@ -305,15 +305,6 @@ def pole_radius(
     return np.asarray(np.abs(np.linalg.eigvals(companion)).max(axis=-1))
 
 
-def integrator_limit(eigenvalue_argument_rad: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the largest stable ``gain |λ|`` for two frames of delay and no leak.
-
-    ``2 sin((π/2 - |arg λ|) / 3)``; negative where no gain is stable. The closed form of
-    ``pole_radius`` < 1, kept as its check and for explaining a refusal.
-    """
-    return np.asarray(2.0 * np.sin((np.pi / 2 - np.abs(eigenvalue_argument_rad)) / 3.0))
-
-
 LIMIT_M = 195e-9
 """Largest motion of an outer actuator per unit of slope noise that a loop without leak bears."""
 

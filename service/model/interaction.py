@@ -23,7 +23,7 @@ from service.model.modes import Basis
 from service.model.pupil import Illumination, annular_pupil, instrument_pupil
 from service.model.pyramid import Mapper, Nodes, PyramidOptics, Response, enough_modulation_points
 from service.model.slopes import Normalisation, rtc_mask, to_rtc, turned_mask
-from service.model.workingpoint import Halo
+from service.model.turbulence import Halo
 
 Array = NDArray[Any]
 Value = TypeVar("Value")

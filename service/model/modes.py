@@ -1,20 +1,18 @@
-"""The modes of a mirror: Karhunen-Loeve modes in the space it can reach, or its user's own."""
+"""The modes of a mirror, Karhunen-Loeve or its user's own, and its surface between actuators."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import BasisKind, Instrument, Mirror, TabulatedModes
-from service.model.mirror import Surface, mirror_surface
+from service.model.instrument import BasisKind, Influence, Instrument, Mirror, TabulatedModes
 from service.model.pupil import PupilGrid, instrument_pupil
-from service.model.tabulated import tabulated_basis
+from service.model.tabulated import TabulatedBasis, tabulated_basis
 from service.model.turbulence import (
     expected_variance,
     piston_free,
@@ -22,45 +20,117 @@ from service.model.turbulence import (
 )
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThinPlate:
+    """Thin-plate-spline interpolant through the actuators: 1 at its own, 0 at all others.
+
+    It is the shape of least bending energy, which a position-controlled thin shell takes. The
+    weights must stay in float64: rounded to float32 they alone change D by 1e-3.
+    """
+
+    positions: Array
+    """``(n_actuators, 2)`` x and y, in the units of the points to be evaluated."""
+
+    def coefficients(self, strokes: Array) -> Array:
+        """Solve the spline system for these strokes."""
+        n = len(self.positions)
+        affine = np.column_stack([np.ones(n), self.positions])
+        system = np.zeros((n + 3, n + 3))
+        system[:n, :n] = _bending_kernel(*_offsets(self.positions, self.positions))
+        system[:n, n:] = affine
+        system[n:, :n] = affine.T
+        padded = np.vstack([strokes, np.zeros((3, strokes.shape[1]))])
+        return np.asarray(scipy.linalg.lu_solve(scipy.linalg.lu_factor(system), padded))
+
+    def basis(self, points: Array) -> Array:
+        """Evaluate r² log r about each actuator, then 1, x, y."""
+        n = len(self.positions)
+        out = np.empty((len(points), n + 3))
+        out[:, :n] = _bending_kernel(*_offsets(points, self.positions))
+        out[:, n] = 1.0
+        out[:, n + 1 :] = points
+        return out
+
+    def slope(self, points: Array, direction: Array) -> Array:
+        """Differentiate the basis along ``direction``."""
+        n = len(self.positions)
+        dx, dy = _offsets(points, self.positions)
+        along = dx * direction[:, :1] + dy * direction[:, 1:]
+        out = np.empty((len(points), n + 3))
+        out[:, :n] = (_log_squared(dx, dy) + 1.0) * along
+        out[:, n] = 0.0
+        out[:, n + 1 :] = direction
+        return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaussian:
+    """Gaussian influence functions, ``coupling ** (r / pitch)²``."""
+
+    positions: Array
+    """``(n_actuators, 2)`` x and y."""
+
+    pitch: float
+    """In the units of ``positions``."""
+
+    coupling: float
+    """Height at one pitch, 0..1."""
+
+    def coefficients(self, strokes: Array) -> Array:
+        """Each actuator is its own basis function."""
+        return np.asarray(strokes, dtype=np.float64)
+
+    def basis(self, points: Array) -> Array:
+        """Evaluate the Gaussians."""
+        dx, dy = _offsets(points, self.positions)
+        return np.asarray(np.exp(np.log(self.coupling) / self.pitch**2 * (dx**2 + dy**2)))
+
+    def slope(self, points: Array, direction: Array) -> Array:
+        """Differentiate the Gaussians along ``direction``."""
+        dx, dy = _offsets(points, self.positions)
+        rate = 2.0 * np.log(self.coupling) / self.pitch**2
+        along = dx * direction[:, :1] + dy * direction[:, 1:]
+        return np.asarray(rate * along * self.basis(points))
+
+
+Surface = ThinPlate | Gaussian
+"""Influence functions as combinations of functions that can be evaluated anywhere."""
+
+
+def mirror_surface(mirror: Mirror, subaperture_m: float) -> Surface:
+    """Return the surface of this mirror in coordinates of subapertures."""
+    positions = mirror.positions_m / subaperture_m
+    match mirror.influence:
+        case Influence.THIN_PLATE:
+            return ThinPlate(positions)
+        case Influence.GAUSSIAN:
+            return Gaussian(positions, mirror.pitch_m / subaperture_m, mirror.coupling)
+
+
+def _offsets(points: Array, centres: Array) -> tuple[Array, Array]:
+    """Return x and y of every point relative to every centre, ``(n_points, n_centres)``."""
+    return points[:, :1] - centres[:, 0], points[:, 1:] - centres[:, 1]
+
+
+def _log_squared(dx: Array, dy: Array) -> Array:
+    """Return 2 log r, with 0 at r = 0 where it is always multiplied by a zero."""
+    squared = dx**2 + dy**2
+    return np.asarray(np.log(squared, out=np.zeros_like(squared), where=squared > 0.0))
+
+
+def _bending_kernel(dx: Array, dy: Array) -> Array:
+    """Return r² log r."""
+    return np.asarray(0.5 * (dx**2 + dy**2) * _log_squared(dx, dy))
+
+
 Indices = Sequence[int] | NDArray[np.integer]
 
 _NORM_SAMPLING = 4
 _PISTON_RATIO = 1e-9
 _DEGENERATE = 1e-3
 """The square grid splits pairs that the mirror's symmetry makes equal by less than this."""
-
-
-class Basis(Protocol):
-    """Shapes of the mirror that can be evaluated wherever a registration puts them.
-
-    Points are ``(n_points, 2)``, x and y in subapertures, in the mirror's nominal place.
-    """
-
-    @property
-    def n_modes(self) -> int:
-        """Modes of the basis."""
-
-    @property
-    def variance_m2(self) -> Array:
-        """``(n_modes,)`` expected variance of each mode under the turbulence, metres² OPD."""
-
-    def render(self, points: Array) -> Array:
-        """Return the modes ``(n_points, n_modes)``."""
-
-    def render_slope(self, points: Array, direction: Array) -> Array:
-        """Return the derivative of the modes along ``direction``, ``(n_points, n_modes)``."""
-
-    def known(self, points: Array) -> NDArray[np.bool_]:
-        """Return whether the surface is known at every point, ``(n_points,)``."""
-
-    def subset(self, indices: Indices) -> Self:
-        """Return a basis of these modes only, in this order."""
-
-    def combined(self, weights: Array) -> Self:
-        """Return a basis of combinations of the modes, ``weights`` ``(n_modes, n_combined)``."""
-
-    def mirrored(self) -> Self:
-        """Return the same modes of the mirror seen from its other side: y runs backwards."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -125,9 +195,9 @@ class ModalBasis:
             variance_m2=self.variance_m2 @ weights**2,
         )
 
-    def mirrored(self) -> ModalBasis:
-        """Return the same modes of the mirror seen from its other side: y runs backwards."""
-        return replace(self, y_sign=-self.y_sign)
+
+Basis = ModalBasis | TabulatedBasis
+"""Shapes of the mirror that can be evaluated wherever a registration puts them."""
 
 
 def modal_basis(instrument: Instrument) -> Basis:

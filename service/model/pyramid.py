@@ -17,7 +17,7 @@ from service.errors import ModelError
 from service.model.instrument import Pyramid
 from service.model.pupil import PupilGrid
 from service.model.slopes import Normalisation
-from service.model.workingpoint import Halo
+from service.model.turbulence import Halo
 
 Array = NDArray[Any]
 

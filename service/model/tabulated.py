@@ -98,10 +98,6 @@ class TabulatedBasis:
         """Return a basis of combinations of the modes, ``weights`` ``(n_modes, n_combined)``."""
         return replace(self, coefficients=self.coefficients @ weights)
 
-    def mirrored(self) -> TabulatedBasis:
-        """Return the same modes of the mirror seen from its other side."""
-        return replace(self, y_sign=-self.y_sign)
-
     def _place(self, points: Array) -> Array:
         """Return where points lie in the table, ``(n_points, 2)``: row and column."""
         centre = (np.array(self.surface_known.shape) - 1) / 2

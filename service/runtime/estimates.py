@@ -17,11 +17,10 @@ from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
 from service.telemetry import lockin, random_dither
-from service.telemetry.frames import Loop
+from service.telemetry.frames import Loop, Telemetry, WindowRefused
 from service.telemetry.lockin import Spectra
 from service.telemetry.passive import Passive
 from service.telemetry.random_dither import Correlated, RandomEstimate, noisy_matrix
-from service.telemetry.windows import Telemetry, WindowRefused
 from service.tracking import events as ev
 from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
 from service.tracking.events import Event

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.runtime.loops import terms_of
 from service.telemetry import lockin, loopcheck, passive, random_dither
-from service.telemetry.frames import FrameBlock, Loop
+from service.telemetry.frames import FrameBlock, Loop, WindowRefused
 from service.telemetry.health import (
     EdgeHealth,
     EdgeWatch,
@@ -25,7 +25,6 @@ from service.telemetry.loopcheck import LoopCheck, LoopLaw, Obedience
 from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, measured
 from service.telemetry.random_dither import Correlated, RandomDither
-from service.telemetry.windows import WindowRefused
 from service.tracking.dither_plan import SETTLING_S, asked_of, lock_in_plan, random_plan
 from service.tracking.loop import DitherKind, DitherView, RtcView, same_rate
 from service.worker import Description

@@ -20,9 +20,17 @@ from service.errors import ModelError
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import DitheredEstimate
-from service.telemetry.frames import FrameBlock, Loop, joined_frames
-from service.telemetry.windows import CHUNK_FRAMES, Telemetry, Window, WindowCutter, WindowPlan
-from service.telemetry.windows import WindowRefused as WindowRefused
+from service.telemetry.frames import (
+    CHUNK_FRAMES,
+    FrameBlock,
+    Loop,
+    Telemetry,
+    Window,
+    WindowCutter,
+    WindowPlan,
+    joined_frames,
+)
+from service.telemetry.frames import WindowRefused as WindowRefused
 
 Array = NDArray[Any]
 
@@ -315,27 +323,18 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> Wi
     )
 
 
-def closed_loop_response(
-    dither: Array, matrix: Array, loop: Loop, frequency_hz: float, gain: complex
-) -> Array:
-    """Return the total command ``(n_modes,)`` that a dither of this complex amplitude leads to.
-
-    ``Z = [I + g R D γ e^{-iwd} / (1 - leak e^{-iw})]^{-1} U``, solved in the controlled modes.
-    """
-    coupling = loop.reconstructor @ matrix
-    found = _responses(dither[None], coupling, loop, (frequency_hz,), np.array([gain]))
-    return np.asarray(found[0])
-
-
 def _instrument(spectra: Spectra, coupling: Array, loop: Loop, gains: Array) -> Array:
     """Return ``(n_lines, n_modes)`` the command each line's dither alone would cause."""
-    return _responses(spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains)
+    return closed_loop_responses(spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains)
 
 
-def _responses(
+def closed_loop_responses(
     dither: Array, coupling: Array, loop: Loop, frequencies_hz: tuple[float, ...], gains: Array
 ) -> Array:
-    """Return ``closed_loop_response`` of every line from R D ``(n_controlled, n_modes)``.
+    """Return the total commands ``(n_lines, n_modes)`` that dithers of these amplitudes lead to.
+
+    ``Z = [I + g R D γ e^{-iwd} / (1 - leak e^{-iw})]^{-1} U``, solved in the controlled modes;
+    ``coupling`` is R D ``(n_controlled, n_modes)``, ``gains`` ``(n_lines,)`` the sensor's.
 
     The instrument need not be better known than D: single precision is enough, and so is the
     series ``1 - F + F^2 - ...`` where it converges, as it does above a sixth of the frame rate.

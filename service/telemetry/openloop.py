@@ -19,9 +19,8 @@ from service.fit import solver
 from service.fit.solver import LONGEST_STEP, Columns
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import Loop
+from service.telemetry.frames import Loop, WindowRefused
 from service.telemetry.lockin import MAX_LAG_FRAMES, Spectra, WindowEstimate, fit_window
-from service.telemetry.windows import WindowRefused
 
 Array = NDArray[Any]
 

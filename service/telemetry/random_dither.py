@@ -20,9 +20,9 @@ from service.fit.solver import Columns, Projection
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import DitheredEstimate
-from service.telemetry.frames import FrameBlock
-from service.telemetry.windows import (
+from service.telemetry.frames import (
     CHUNK_FRAMES,
+    FrameBlock,
     Telemetry,
     Window,
     WindowCutter,

@@ -12,9 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.dither import information
-from service.control.expected_gain import ExpectedGain, Sky, Timing, beyond_m2, expected_gain
+from service.control.expected_gain import (
+    ExpectedGain,
+    Sky,
+    Timing,
+    beyond_m2,
+    expected_gain,
+    noise_of_star,
+)
 from service.control.gate import GateVerdict, LoopSettings, judge
-from service.control.noise import noise_of_star
 from service.control.reconstructor import Method, Prior, Recipe, reconstruct
 from service.fit.dialect import LIKELY, Dialect, of_answer, of_reconstructor
 from service.fit.light import far_starts
@@ -23,15 +29,14 @@ from service.fit.reference import oriented
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.workingpoint import Halo
+from service.model.turbulence import Halo
 from service.prepared import Prepared
 from service.telemetry import passive
 from service.telemetry.estimate import DitheredEstimate
-from service.telemetry.frames import Loop
+from service.telemetry.frames import Loop, WindowRefused
 from service.telemetry.lockin import Spectra, WindowEstimate, fit_window
 from service.telemetry.openloop import NOT_FOUND, FarEstimate, FarSearch, find
 from service.telemetry.random_dither import Correlated, RandomEstimate, fit_random
-from service.telemetry.windows import WindowRefused
 from service.worker.records import (
     Compute,
     Description,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.workingpoint import Halo, working_point
+from service.model.turbulence import Halo, working_point
 
 Array = NDArray[np.float64]
 

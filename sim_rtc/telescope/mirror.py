@@ -18,7 +18,7 @@ from scipy.special import k0
 
 from service.errors import ConfigurationError
 from service.model.instrument import Influence, Mirror
-from service.model.mirror import mirror_surface
+from service.model.modes import mirror_surface
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

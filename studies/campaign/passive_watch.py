@@ -14,6 +14,7 @@ from service.config.policy import policy_of
 from service.model.misregistration import Misregistration
 from service.runtime.streams import PASSIVE_MEMORY_S
 from service.telemetry import lockin
+from service.telemetry.frames import WindowRefused
 from service.telemetry.kalman import (
     Drift,
     Joint,
@@ -25,7 +26,6 @@ from service.telemetry.kalman import (
 )
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.passive import Passive, accumulate
-from service.telemetry.windows import WindowRefused
 from service.wire import DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope

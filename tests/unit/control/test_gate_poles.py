@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.gate import integrator_limit, pole_radius
+from service.control.gate import pole_radius
+
+
+def integrator_limit(eigenvalue_argument_rad):
+    """Return the largest stable ``gain |λ|`` for two frames of delay and no leak.
+
+    ``2 sin((π/2 - |arg λ|) / 3)``; negative where no gain is stable.
+    """
+    return 2.0 * np.sin((np.pi / 2 - np.abs(eigenvalue_argument_rad)) / 3.0)
 
 
 def test_an_integrator_of_two_frames_loses_stability_at_a_gain_of_one():

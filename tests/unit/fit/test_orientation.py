@@ -44,7 +44,7 @@ def test_exchanged_components_come_out():
 
 
 def test_a_mirror_seen_from_behind_is_a_flip():
-    found = fit(matrix(basis=small_basis().mirrored()), UNKNOWN)
+    found = fit(matrix(basis=replace(small_basis(), y_sign=-1.0)), UNKNOWN)
     axes = found.orientation
     assert axes.flip_x + axes.flip_y + axes.swap_xy == 1
     assert found.accepted

@@ -9,7 +9,7 @@ import pytest
 from service.control.gate import judge
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.workingpoint import working_point
+from service.model.turbulence import working_point
 from service.telemetry.frames import Loop
 from service.worker import OpticsWorker, sensor
 from service.worker.sensor import FOLLOWED, STRENGTHS

@@ -13,10 +13,9 @@ from service.runtime.streams import (
     with_matrix,
     with_rtc,
 )
-from service.telemetry.frames import FrameBlock
+from service.telemetry.frames import FrameBlock, WindowRefused
 from service.telemetry.health import LOW_MODES, Actuators
 from service.telemetry.lockin import Spectra
-from service.telemetry.windows import WindowRefused
 from service.tracking import events as ev
 from service.tracking.loop import DitherView
 from service.tracking.state import TrackerState

@@ -10,6 +10,7 @@ import pytest
 from service.errors import ModelError
 from service.model.interaction import Linearisation
 from service.telemetry import random_dither
+from service.telemetry.frames import WindowRefused
 from service.telemetry.random_dither import (
     Correlated,
     RandomDither,
@@ -20,7 +21,6 @@ from service.telemetry.random_dither import (
     joined,
     noisy_matrix,
 )
-from service.telemetry.windows import WindowRefused
 from tests.numerics import (
     N_MODES,
     SOMEWHERE,

@@ -5,8 +5,8 @@ import pytest
 
 from service.model.instrument import Stop
 from service.model.interaction import InteractionModel
-from service.model.mirror import ThinPlate
 from service.model.misregistration import Misregistration
+from service.model.modes import ThinPlate
 from service.model.pupil import instrument_pupil
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.linear import LinearPlant, optical_gain

@@ -8,7 +8,7 @@ from service.config import load_instrument
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.workingpoint import Halo, working_point
+from service.model.turbulence import Halo, working_point
 from tests.numerics import small_basis, small_instrument, small_model
 
 ALIGNED = Misregistration()

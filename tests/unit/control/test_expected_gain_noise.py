@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.noise import Camera, noise_of_counts, noise_of_star
+from service.control.expected_gain import Camera, noise_of_counts, noise_of_star
 from service.errors import ModelError
 from service.model.interaction import reference_slopes
 from tests.numerics import small_instrument

@@ -7,7 +7,7 @@ import pytest
 
 from service.config.mirrors import rings
 from service.model.instrument import Influence, Mirror
-from service.model.mirror import Gaussian, ThinPlate, mirror_surface
+from service.model.modes import Gaussian, ThinPlate, mirror_surface
 
 POSITIONS = rings(1, 4, 1.1)
 

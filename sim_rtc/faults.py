@@ -2,7 +2,7 @@
 
 ``KIND@T[:ARGUMENTS]`` begins a fault at T seconds of loop time. The plan only knows what is to
 happen when; those of the computer and of telemetry on its way are carried out here, those of
-reconstructors in :mod:`sim_rtc.link.intake`.
+reconstructors in :mod:`sim_rtc.link.matrices`.
 """
 
 from __future__ import annotations

@@ -32,7 +32,8 @@ class Activities:
         self._dither: Dither | None = None
         self._measurement: Measurement | None = None
         self._closes_again = False
-        self._ended: deque[Measured] = deque(maxlen=_MOST_ENDED)
+        self.ended: deque[Measured] = deque(maxlen=_MOST_ENDED)
+        """Measurements that have ended, for whoever sends them."""
         self._tuning: Tuning | None = None
         self.late_dither_frames = 0
         """After the announced frame, that dithers to come really begin."""
@@ -119,7 +120,7 @@ class Activities:
             ended = Measured(
                 measurement=measurement, session=session, n_slopes=self._n_slopes, failure=failure
             )
-            self._ended.append(ended)
+            self.ended.append(ended)
 
     def commands(self, seq0: int, n_frames: int) -> Array32 | None:
         """Return what is added to the commands of the batch ``(n_frames, n_modes)``, metres."""
@@ -148,12 +149,6 @@ class Activities:
             if tuning.done:
                 self._tuning = None
         return settings
-
-    def take_measured(self) -> list[Measured]:
-        """Return the measurements that have ended since the last call."""
-        ended = list(self._ended)
-        self._ended.clear()
-        return ended
 
 
 class Dither:

@@ -163,6 +163,11 @@ class RealTimeComputer:
         with self._lock:
             self._activities.late_dither_frames = n_frames
 
+    @property
+    def has_news(self) -> bool:
+        """Whether a matrix has been swapped in or measured that nobody has taken note of."""
+        return bool(self._swaps or self._activities.ended)
+
     def take_swaps(self) -> list[tuple[str, int]]:
         """Return ids and first frames of the matrices swapped in since the last call."""
         with self._lock:
@@ -173,13 +178,16 @@ class RealTimeComputer:
     def take_measured(self) -> list[Measured]:
         """Return the measurements that have ended since the last call."""
         with self._lock:
-            return self._activities.take_measured()
+            ended = list(self._activities.ended)
+            self._activities.ended.clear()
+        return ended
 
     def terms(self) -> Terms:
         """Return what a new reconstructor must fit at present."""
         with self._lock:
             rows = {self._settings.n_controlled_next: None, len(self._active.matrix): None}
         return Terms(
+            session=self._session,
             n_slopes=self._n_slopes,
             n_controlled=tuple(rows),
             basis_id=self.identity.basis_id,

@@ -147,7 +147,9 @@ class ModalLoop:
         """Return how many of the first modes may move: nothing corrects those beyond the loop."""
         if self._drive is not None:
             return int(added.applied.shape[1])
-        beyond = added.applied.any(axis=0) | self._decided.any(axis=0)
+        beyond = self._decided.any(axis=0)
+        if added.something:
+            beyond |= added.applied.any(axis=0)
         return max(n_controlled, int(np.flatnonzero(beyond)[-1]) + 1 if beyond.any() else 0)
 
     def run_frames(
@@ -231,6 +233,9 @@ class _Added:
     dither: Array32 | None
     """``(n_frames, n_modes)``."""
 
+    something: bool
+    """Whether anything is added at all."""
+
     @classmethod
     def of(
         cls, dither_m: Array32 | None, played_m: Array32 | None, shape: tuple[int, int]
@@ -239,4 +244,8 @@ class _Added:
         for part in (dither_m, played_m):
             if part is not None:
                 applied += part
-        return cls(applied=applied, dither=None if dither_m is None else dither_m.copy())
+        return cls(
+            applied=applied,
+            dither=None if dither_m is None else dither_m.copy(),
+            something=dither_m is not None or played_m is not None,
+        )

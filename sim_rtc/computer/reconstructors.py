@@ -20,7 +20,14 @@ from service.errors import WireError
 from service.model.instrument import BasisKind, Instrument
 from service.model.interaction import InteractionModel
 from service.model.modes import ModalBasis
-from service.wire import CHUNK_LIMIT, AckState, ChunkAssembler, Manifest, layout_of
+from service.wire import (
+    CHUNK_LIMIT,
+    Acknowledgement,
+    AckState,
+    ChunkAssembler,
+    Manifest,
+    layout_of,
+)
 from sim_rtc.computer.telemetry import Identity, Reconstructor
 
 Array32 = NDArray[np.float32]
@@ -39,6 +46,7 @@ _SMALLEST_SINGULAR_RATIO = 1e-3
 class Terms:
     """What a reconstructor must fit."""
 
+    session: str
     n_slopes: int
     n_controlled: tuple[int, ...]
     """Numbers of rows the loop takes: the present one, and the one a command has asked for."""
@@ -64,17 +72,6 @@ class Terms:
         return ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
-    """What the RTC says of one reconstructor; becomes an acknowledgement."""
-
-    id: str
-    sha256: str
-    state: AckState
-    reason: str = ""
-    frame_seq: int | None = None
-
-
 @dataclass(slots=True, kw_only=True)
 class _Collection:
     """Parts of one matrix, and its manifest once it has come."""
@@ -89,8 +86,8 @@ class _Collection:
 class Outcome:
     """What is to be done after something has arrived or time has passed."""
 
-    verdicts: list[Verdict] = field(default_factory=list)
-    """To be acknowledged, in order."""
+    said: list[Acknowledgement] = field(default_factory=list)
+    """To be sent, in order."""
 
     staged: list[Reconstructor] = field(default_factory=list)
     """To be handed to the loop."""
@@ -106,11 +103,11 @@ class Staging:
         self._terms = terms
         self._limit_bytes = limit_bytes
         self._collected: OrderedDict[str, _Collection] = OrderedDict()
-        self._verdicts: OrderedDict[str, Verdict] = OrderedDict()
+        self._said: OrderedDict[str, Acknowledgement] = OrderedDict()
 
     def chunk(self, matrix_id: str, index: int, data: bytes) -> Outcome:
         """Take one part; one that cannot be right is dropped and asked for again in time."""
-        if matrix_id in self._verdicts:
+        if matrix_id in self._said:
             return Outcome()
         with suppress(WireError):
             self._collection(matrix_id).parts.add(index, data)
@@ -118,7 +115,7 @@ class Staging:
 
     def commit(self, manifest: Manifest, now_s: float) -> Outcome:
         """Take a manifest: the order to stage and swap."""
-        known = self._verdicts.get(manifest.id)
+        known = self._said.get(manifest.id)
         if known is not None:
             return self._repeated(manifest, known)
         collection = self._collection(manifest.id)
@@ -143,15 +140,15 @@ class Staging:
             missing = collection.parts.missing()
             if collection.asked:
                 reason = f"missing: chunks {list(missing[:8])}, {len(missing)} in all"
-                outcome.verdicts += self._reject(matrix_id, reason).verdicts
+                outcome.said += self._reject(matrix_id, reason).said
             else:
                 collection.asked, collection.deadline_s = True, now_s + _WAIT_S
                 outcome.missing.append((matrix_id, missing))
         return outcome
 
-    def applied(self, matrix_id: str, frame_seq: int) -> Verdict | None:
-        """Note that the loop has swapped; return what to acknowledge, None if it was voided."""
-        staged = self._verdicts.get(matrix_id)
+    def applied(self, matrix_id: str, frame_seq: int) -> Acknowledgement | None:
+        """Note that the loop has swapped; return what to say of it, None if it was voided."""
+        staged = self._said.get(matrix_id)
         if staged is None:
             return None
         return self._remember(replace(staged, state=AckState.APPLIED, frame_seq=frame_seq))
@@ -159,9 +156,9 @@ class Staging:
     def void(self) -> None:
         """Forget what has not been applied: a new session begins."""
         self._collected.clear()
-        for matrix_id, verdict in list(self._verdicts.items()):
-            if verdict.state is AckState.STAGED:
-                del self._verdicts[matrix_id]
+        for matrix_id, said in list(self._said.items()):
+            if said.state is AckState.STAGED:
+                del self._said[matrix_id]
 
     def _collection(self, matrix_id: str) -> _Collection:
         if matrix_id not in self._collected:
@@ -181,9 +178,8 @@ class Staging:
             return self._reject(matrix_id, str(error))
         manifest = collection.manifest
         del self._collected[matrix_id]
-        staged = Verdict(id=matrix_id, sha256=manifest.layout.sha256, state=AckState.STAGED)
         return Outcome(
-            verdicts=[self._remember(staged)],
+            said=[self._remember(self.answer(manifest, AckState.STAGED))],
             staged=[Reconstructor(manifest=manifest, matrix=matrix)],
         )
 
@@ -191,33 +187,33 @@ class Staging:
         manifest = self._collected.pop(matrix_id).manifest
         if manifest is None:
             return Outcome()
-        verdict = Verdict(
-            id=matrix_id, sha256=manifest.layout.sha256, state=AckState.REJECTED, reason=reason
-        )
-        return Outcome(verdicts=[self._remember(verdict)])
+        return Outcome(said=[self._remember(self.answer(manifest, AckState.REJECTED, reason))])
 
-    def _repeated(self, manifest: Manifest, known: Verdict) -> Outcome:
-        """Repeat the verdict on the same matrix; an id that is used again is refused."""
+    def _repeated(self, manifest: Manifest, known: Acknowledgement) -> Outcome:
+        """Say the same of the same matrix again; an id that is used for another is refused."""
         if manifest.layout.sha256 == known.sha256:
-            return Outcome(verdicts=[known])
+            return Outcome(said=[replace(known, session=self._terms().session)])
         reason = f"id: {manifest.id} was used with sha256 {known.sha256}, expected a new id"
-        return Outcome(
-            verdicts=[
-                Verdict(
-                    id=manifest.id,
-                    sha256=manifest.layout.sha256,
-                    state=AckState.REJECTED,
-                    reason=reason,
-                )
-            ]
+        return Outcome(said=[self.answer(manifest, AckState.REJECTED, reason)])
+
+    def answer(self, manifest: Manifest, state: AckState, reason: str = "") -> Acknowledgement:
+        """Return what is said of a matrix in the present session."""
+        return Acknowledgement(
+            session=self._terms().session,
+            id=manifest.id,
+            sha256=manifest.layout.sha256,
+            state=state,
+            reason=reason,
+            frame_seq=None,
         )
 
-    def _remember(self, verdict: Verdict) -> Verdict:
-        self._verdicts[verdict.id] = verdict
-        self._verdicts.move_to_end(verdict.id)
-        if len(self._verdicts) > _MOST_REMEMBERED:
-            self._verdicts.popitem(last=False)
-        return verdict
+    def _remember(self, said: Acknowledgement) -> Acknowledgement:
+        if said.id is not None:
+            self._said[said.id] = said
+            self._said.move_to_end(said.id)
+        if len(self._said) > _MOST_REMEMBERED:
+            self._said.popitem(last=False)
+        return said
 
 
 def truncated_inverse(interaction: Array32) -> Array32:

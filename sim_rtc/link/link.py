@@ -26,9 +26,9 @@ from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import Background
 from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of, status_of
 from sim_rtc.faults import FaultPlan, WireFaults
-from sim_rtc.link.intake import Intake
+from sim_rtc.link.matrices import Matrices
 from sim_rtc.link.record import Kind, Recorder
-from sim_rtc.link.replies import MeasuredPublisher, Replies
+from sim_rtc.link.replies import Replies
 from sim_rtc.telescope.detector import Detector
 from sim_rtc.telescope.scene import Elevation
 
@@ -146,18 +146,17 @@ class Link(Background):
                 # What has waited for a service is old: it would only arrive as a burst.
                 self._backlog.clear()
             with (
-                Intake(
+                Matrices(
                     session,
                     self._keys,
                     self._computer,
                     plan=self._plan,
                     recorder=self._recorder,
-                ),
-                MeasuredPublisher(session, self._keys, self._computer),
+                ) as matrices,
                 Token(session, self._keys, self._recorder) as token,
             ):
                 _log.info("link.open", endpoint=self._endpoint, system=self._keys.system)
-                self._publish(session, token)
+                self._publish(session, token, matrices)
 
     def _open(self) -> zenoh.Session | None:
         """Open the session, waiting for the service's router for as long as it takes."""
@@ -172,7 +171,7 @@ class Link(Background):
                 self._stopped.wait(RETRY_S)
         return None
 
-    def _publish(self, session: zenoh.Session, token: Token) -> None:
+    def _publish(self, session: zenoh.Session, token: Token, matrices: Matrices) -> None:
         rate_hz = 1e9 / self._clock.dt_ns
         frames = frames_publisher(session, self._keys, rate_hz / self._batch_frames)
         status = status_publisher(session, self._keys)
@@ -188,6 +187,8 @@ class Link(Background):
                 for payload, attachment in self._faults.messages(header, rows, outgoing.time_s):
                     frames.put(payload, attachment=attachment)
                     self._record(Kind.FRAMES, payload, attachment)
+            if self._computer.has_news:
+                matrices.look()
             token.show(visible=not self._absent.is_set())
             now_s = time.monotonic()
             if now_s >= next_status_s and not self._absent.is_set():

@@ -1,4 +1,4 @@
-"""What the RTC answers when it is asked, and the matrices that it was asked to measure.
+"""What the RTC answers when it is asked.
 
 A command is carried out once, however often it is sent.
 """
@@ -8,11 +8,10 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import structlog
 import zenoh
-from typing_extensions import override
 
 from service.errors import WireError
 from service.wire import (
@@ -24,13 +23,10 @@ from service.wire import (
     command_id,
     decode_command,
     encode_manifest,
-    encode_measured_manifest,
     encode_reply,
     split,
 )
 from sim_rtc.computer.computer import RealTimeComputer
-from sim_rtc.computer.feed import Background
-from sim_rtc.computer.measure import Measured, product
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -153,53 +149,3 @@ class ReplyCache:
                 return known.reply
         reason = f"id: {command.id} was used for another command, expected a new id"
         return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
-
-
-_POLL_S: Final = 0.05
-
-
-class MeasuredPublisher(Background):
-    """Solves and sends what was measured.
-
-    Solving takes up to half a second and sending waits for the network: telemetry must not wait
-    with it.
-    """
-
-    def __init__(self, session: zenoh.Session, keys: Keys, computer: RealTimeComputer) -> None:
-        super().__init__("measured")
-        self._session = session
-        self._keys = keys
-        self._computer = computer
-
-    @override
-    def _work(self) -> None:
-        while not self._stopped.wait(_POLL_S):
-            for measured in self._computer.take_measured():
-                self._send(measured)
-
-    def _send(self, measured: Measured) -> None:
-        """Send a matrix in parts, then its manifest, or why there is none."""
-        manifest, matrix = product(measured, self._computer.identity, time.time_ns())
-        parts = [] if matrix is None else split(matrix, manifest.layout.chunk_bytes)
-        for index, part in enumerate(parts):
-            self._session.put(
-                self._keys.measured_chunk(manifest.id, index),
-                part,
-                encoding=Encodings.BYTES,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.DATA_LOW,
-            )
-        self._session.put(
-            self._keys.measured_commit(manifest.id),
-            encode_measured_manifest(manifest),
-            encoding=Encodings.MEASURED_COMMIT,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.DATA_HIGH,
-        )
-        _log.info(
-            "matrix.measured",
-            id=manifest.id,
-            pattern=str(manifest.pattern),
-            shape=manifest.layout.shape,
-            reason=manifest.reason or "",
-        )

@@ -16,7 +16,7 @@ from service.errors import PyrcalError, UnknownIdError, WorkerError
 from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
 from service.worker import Done, OpticsWorker
-from sim_rtc.computer.reconstructors import Outcome, Staging, Verdict
+from sim_rtc.computer.reconstructors import Outcome, Staging
 from studies.campaign.observatory_dome import Dome
 
 P = ParamSpec("P")
@@ -60,8 +60,8 @@ class ShortLink:
 
     def swapped(self) -> list[Acknowledgement]:
         """Return what the RTC says of the matrices it has begun to use."""
-        verdicts = [self._staging.applied(*swap) for swap in self._dome.computer.take_swaps()]
-        return [self._told(verdict) for verdict in verdicts if verdict is not None]
+        said = [self._staging.applied(*swap) for swap in self._dome.computer.take_swaps()]
+        return [self._told(one) for one in said if one is not None]
 
     def void(self) -> None:
         """Forget what was on its way: the RTC has restarted."""
@@ -71,17 +71,11 @@ class ShortLink:
     def _carry_out(self, outcome: Outcome) -> list[Acknowledgement]:
         for reconstructor in outcome.staged:
             self._dome.stage(reconstructor)
-        return [self._told(verdict) for verdict in outcome.verdicts]
+        return [self._told(one) for one in outcome.said]
 
-    def _told(self, verdict: Verdict) -> Acknowledgement:
-        return Acknowledgement(
-            session=self._dome.computer.snapshot().session,
-            id=verdict.id,
-            sha256=verdict.sha256,
-            state=verdict.state,
-            reason=verdict.reason,
-            frame_seq=verdict.frame_seq,
-        )
+    def _told(self, said: Acknowledgement) -> Acknowledgement:
+        """Return what is heard of it."""
+        return said
 
 
 class OwnHands:

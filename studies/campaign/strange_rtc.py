@@ -27,7 +27,6 @@ from service.wire import (
     Status,
     layout_of,
 )
-from sim_rtc.computer.reconstructors import Verdict
 from sim_rtc.computer.telemetry import Reconstructor
 from studies.campaign.observatory_dome import Dome
 from studies.campaign.observatory_link import ShortLink
@@ -237,8 +236,6 @@ class StrangeLink(ShortLink):
         return self._strange.applied()
 
     @override
-    def _told(self, verdict: Verdict) -> Acknowledgement:
-        told = super()._told(verdict)
-        if Mischief.OTHER_SHA in self._strange.mischief:
-            return replace(told, sha256="0" * 64)
-        return told
+    def _told(self, said: Acknowledgement) -> Acknowledgement:
+        other = Mischief.OTHER_SHA in self._strange.mischief
+        return replace(said, sha256="0" * 64) if other else said

@@ -7,7 +7,12 @@ from service.wire import AckState, Manifest, layout_of, split
 from sim_rtc.computer.reconstructors import Staging, Terms, truncated_inverse
 
 TERMS = Terms(
-    n_slopes=12, n_controlled=(8, 6), basis_id="basis", config_id="sensor", system="small"
+    session="s1",
+    n_slopes=12,
+    n_controlled=(8, 6),
+    basis_id="basis",
+    config_id="sensor",
+    system="small",
 )
 MATRIX = np.random.default_rng(1).standard_normal((6, 12)).astype(np.float32)
 CHUNK_BYTES = 100
@@ -47,22 +52,22 @@ def send(staging, matrix=MATRIX, leave_out=(), matrix_id="m1"):
 
 
 def states(outcome):
-    return [verdict.state for verdict in outcome.verdicts]
+    return [verdict.state for verdict in outcome.said]
 
 
 @pytest.mark.parametrize("commit_first", [True, False])
 def test_a_whole_matrix_is_staged_in_whatever_order_it_comes(staging, commit_first):
     if commit_first:
-        assert staging.commit(manifest(), 0.0).verdicts == []
+        assert staging.commit(manifest(), 0.0).said == []
         outcome = send(staging)
     else:
-        assert send(staging).verdicts == []
+        assert send(staging).said == []
         outcome = staging.commit(manifest(), 0.0)
     assert states(outcome) == [AckState.STAGED]
     np.testing.assert_array_equal(outcome.staged[0].matrix, MATRIX)
     applied = staging.applied("m1", 1230)
     assert (applied.state, applied.frame_seq) == (AckState.APPLIED, 1230)
-    assert staging.commit(manifest(), 5.0).verdicts == [applied]
+    assert staging.commit(manifest(), 5.0).said == [applied]
 
 
 def test_missing_chunks_are_asked_for_after_two_seconds_and_given_up_after_four(staging):
@@ -73,7 +78,7 @@ def test_missing_chunks_are_asked_for_after_two_seconds_and_given_up_after_four(
     assert staging.poll(13.9).missing == []
     outcome = staging.poll(14.0)
     assert states(outcome) == [AckState.REJECTED]
-    assert outcome.verdicts[0].reason == "missing: chunks [1], 1 in all"
+    assert outcome.said[0].reason == "missing: chunks [1], 1 in all"
 
 
 def test_an_asked_for_chunk_completes_the_matrix(staging):
@@ -82,7 +87,7 @@ def test_an_asked_for_chunk_completes_the_matrix(staging):
     staging.poll(12.0)
     outcome = staging.chunk("m1", 1, split(MATRIX, CHUNK_BYTES)[1])
     assert states(outcome) == [AckState.STAGED]
-    assert staging.poll(20.0).verdicts == []
+    assert staging.poll(20.0).said == []
 
 
 def test_a_chunk_of_the_wrong_length_is_asked_for_again(staging):
@@ -107,15 +112,15 @@ def test_a_chunk_of_the_wrong_length_is_asked_for_again(staging):
 def test_what_does_not_fit_is_rejected_at_once(staging, changes, reason):
     outcome = staging.commit(manifest(**changes), 0.0)
     assert states(outcome) == [AckState.REJECTED]
-    assert outcome.verdicts[0].reason == reason
-    assert send(staging).verdicts == []
+    assert outcome.said[0].reason == reason
+    assert send(staging).said == []
 
 
 def test_other_bytes_than_announced_are_rejected(staging):
     staging.commit(manifest(), 0.0)
     outcome = send(staging, 2 * MATRIX)
     assert states(outcome) == [AckState.REJECTED]
-    assert "sha256" in outcome.verdicts[0].reason
+    assert "sha256" in outcome.said[0].reason
 
 
 def test_an_id_is_never_used_again_for_another_matrix(staging):
@@ -123,7 +128,7 @@ def test_an_id_is_never_used_again_for_another_matrix(staging):
     staging.commit(manifest(), 0.0)
     outcome = staging.commit(manifest(2 * MATRIX), 1.0)
     assert states(outcome) == [AckState.REJECTED]
-    assert outcome.verdicts[0].reason.startswith("id: m1 was used with sha256")
+    assert outcome.said[0].reason.startswith("id: m1 was used with sha256")
     assert states(staging.commit(manifest(), 2.0)) == [AckState.STAGED]
 
 
@@ -132,7 +137,7 @@ def test_a_new_session_voids_what_is_not_applied(staging):
     staging.commit(manifest(), 0.0)
     staging.void()
     assert staging.applied("m1", 10) is None
-    assert staging.commit(manifest(), 1.0).verdicts == []
+    assert staging.commit(manifest(), 1.0).said == []
 
 
 def test_only_a_few_matrices_are_collected_at_a_time(staging):

@@ -1,4 +1,4 @@
-"""Reconstructors from the wire into the loop, and the acknowledgements back."""
+"""Matrices on the wire: reconstructors into the loop, acknowledgements and measured ones out."""
 
 from __future__ import annotations
 
@@ -16,15 +16,19 @@ from service.wire import (
     CHUNK_LIMIT,
     Acknowledgement,
     AckState,
+    Encodings,
     Keys,
     Manifest,
     Role,
     decode_manifest,
     encode_acknowledgement,
+    encode_measured_manifest,
+    split,
 )
 from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import Background
-from sim_rtc.computer.reconstructors import Outcome, Staging, Verdict
+from sim_rtc.computer.measure import Measured, product
+from sim_rtc.computer.reconstructors import Outcome, Staging
 from sim_rtc.computer.telemetry import Reconstructor
 from sim_rtc.faults import Fault, FaultKind, FaultPlan
 from sim_rtc.link.record import Kind, Recorder
@@ -32,7 +36,7 @@ from sim_rtc.link.replies import acknowledge
 
 _log = structlog.get_logger("sim_rtc")
 
-_POLL_S: Final = 0.05
+_POLL_S: Final = 0.2
 _QUERY_TIMEOUT_S: Final = 2.0
 _MOST_EVENTS: Final = 256
 """Events that wait for the thread; a burst beyond it is dropped, its chunks are asked for again."""
@@ -41,8 +45,12 @@ _MOST_EVENTS: Final = 256
 Event = Callable[[], None]
 
 
-class Intake(Background):
-    """Looks after reconstructors in a thread of its own while its ``with`` block lasts."""
+class Matrices(Background):
+    """Looks after matrices in a thread of its own while its ``with`` block lasts.
+
+    Asking for a matrix, solving one and sending it wait for the network or take up to half a
+    second: telemetry must not wait with them.
+    """
 
     def __init__(
         self,
@@ -53,7 +61,7 @@ class Intake(Background):
         plan: FaultPlan | None = None,
         recorder: Recorder | None = None,
     ) -> None:
-        super().__init__("reconstructors")
+        super().__init__("matrices")
         self._session = session
         self._keys = keys
         self._computer = computer
@@ -87,6 +95,10 @@ class Intake(Background):
         key, data = str(sample.key_expr), sample.payload.to_bytes()
         self._enqueue(lambda: self._commit(key, data))
 
+    def look(self) -> None:
+        """Have swaps acknowledged and measured matrices sent now."""
+        self._enqueue(self._report)
+
     def _on_service(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
             self._enqueue(self._ask_current)
@@ -109,10 +121,15 @@ class Intake(Background):
                 event()
             self._carry_out(self._staging.poll(time.monotonic()))
             self._swap_late()
-            for matrix_id, seq in self._computer.take_swaps():
-                verdict = self._staging.applied(matrix_id, seq)
-                if verdict is not None:
-                    self._acknowledge(verdict)
+
+    def _report(self) -> None:
+        """Say what the loop has done since the last time."""
+        for matrix_id, seq in self._computer.take_swaps():
+            said = self._staging.applied(matrix_id, seq)
+            if said is not None:
+                self._acknowledge(said)
+        for measured in self._computer.take_measured():
+            self._send(measured)
 
     def _follow_session(self) -> None:
         """Void what was on its way when the computer has started a new session."""
@@ -144,10 +161,7 @@ class Intake(Background):
             return
         if self._refuses():
             reason = "range: refused as a fault asked for"
-            sha256 = manifest.layout.sha256
-            self._acknowledge(
-                Verdict(id=manifest.id, sha256=sha256, state=AckState.REJECTED, reason=reason)
-            )
+            self._acknowledge(self._staging.answer(manifest, AckState.REJECTED, reason))
             return
         self._carry_out(self._staging.commit(manifest, time.monotonic()))
 
@@ -201,8 +215,8 @@ class Intake(Background):
         return None
 
     def _carry_out(self, outcome: Outcome) -> None:
-        for verdict in outcome.verdicts:
-            self._acknowledge(verdict)
+        for said in outcome.said:
+            self._acknowledge(said)
         for reconstructor in outcome.staged:
             late = self._plan.active(FaultKind.LATE_SWAP)
             if late is None:
@@ -216,24 +230,43 @@ class Intake(Background):
         while self._late and self._late[0][0] <= self._plan.now_s:
             self._computer.stage(self._late.pop(0)[1])
 
-    def _acknowledge(self, verdict: Verdict) -> None:
+    def _acknowledge(self, said: Acknowledgement) -> None:
         _log.info(
-            "reconstructor." + verdict.state,
-            id=verdict.id,
-            reason=verdict.reason,
-            frame_seq=verdict.frame_seq,
-        )
-        message = Acknowledgement(
-            session=self._rtc_session,
-            id=verdict.id,
-            sha256=verdict.sha256,
-            state=verdict.state,
-            reason=verdict.reason,
-            frame_seq=verdict.frame_seq,
+            "reconstructor." + said.state,
+            id=said.id,
+            reason=said.reason,
+            frame_seq=said.frame_seq,
         )
         if self._plan.active(FaultKind.MUTE):
             return
-        data = encode_acknowledgement(message)
+        data = encode_acknowledgement(said)
         if self._recorder is not None:
             self._recorder.put(Kind.ACKNOWLEDGEMENT, data)
         acknowledge(self._session, self._keys, data)
+
+    def _send(self, measured: Measured) -> None:
+        """Solve what was measured; send the matrix in parts, then its manifest."""
+        manifest, matrix = product(measured, self._computer.identity, time.time_ns())
+        parts = [] if matrix is None else split(matrix, manifest.layout.chunk_bytes)
+        for index, part in enumerate(parts):
+            self._session.put(
+                self._keys.measured_chunk(manifest.id, index),
+                part,
+                encoding=Encodings.BYTES,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+        self._session.put(
+            self._keys.measured_commit(manifest.id),
+            encode_measured_manifest(manifest),
+            encoding=Encodings.MEASURED_COMMIT,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.DATA_HIGH,
+        )
+        _log.info(
+            "matrix.measured",
+            id=manifest.id,
+            pattern=str(manifest.pattern),
+            shape=manifest.layout.shape,
+            reason=manifest.reason or "",
+        )

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from service.commands.arguments import OTHER_PROGRAMS, command_line
+from service.commands.arguments import OTHER_PROGRAMS, check_files, command_line
 from service.commands.terminal import with_negative_numbers
 from service.errors import PyrcalError, shown
 
@@ -24,6 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = command_line().parse_args(with_negative_numbers(words))
     options.own_process = arguments is None
     try:
+        check_files(options)
         command = import_module(f"service.commands.{options.command}")
         if arguments is None and options.command != "run":
             signal.signal(signal.SIGINT, signal.default_int_handler)

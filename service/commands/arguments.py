@@ -8,11 +8,13 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 
 from service import __version__
 from service.commands.terminal import OneLineParser
+from service.errors import ConfigurationError
+from service.files import is_hdf5
+from service.files.request import parse_alpha, parse_arms, parse_modes
 
 OTHER_PROGRAMS = {
     "demo": ("studies.demo", "the main job, end to end, on a simulated telescope"),
@@ -101,13 +103,13 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
     )
     fit.add_argument(
         "--modes",
-        type=_read_by("parse_modes"),
+        type=_read_by(parse_modes),
         metavar="FIRST:END",
         help="basis indices to use, like 0:400 (400 is not) or 3,5,9; default all",
     )
     fit.add_argument(
         "--start",
-        type=_read_by("parse_alpha"),
+        type=_read_by(parse_alpha),
         metavar="X,Y,ROT,MAG",
         help="where to begin: subapertures, degrees, ratio",
     )
@@ -127,7 +129,7 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
     )
     turned.add_argument(
         "--arms",
-        type=_read_by("parse_arms"),
+        type=_read_by(parse_arms),
         metavar="WIDTH:DEG,DEG...",
         help="the spider's arms at rotation 0: the rotation is told that their shadows in the "
         "flux map have",
@@ -200,17 +202,44 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def _read_by(name: str) -> Callable[[str], object]:
-    """Return a function of ``service.files.request``, imported when there is something to read.
-
-    What it refuses argparse prints as it is.
-    """
+def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
+    """Return a function that reads a text; what it refuses argparse prints as it is."""
 
     def read(text: str) -> object:
-        parse = getattr(import_module("service.files.request"), name)
         try:
             return parse(text)
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
 
     return read
+
+
+def check_files(options: argparse.Namespace) -> None:
+    """Refuse files that cannot be what they are given as, before anything large is imported.
+
+    Raises
+    ------
+    PyrcalError
+        One line that names the file.
+    """
+    if options.command in {"fit", "reconstruct"}:
+        from service.config.instrument_schema import read_instrument_file
+
+        read_instrument_file(options.instrument)
+    for path in _paths(options, "output", "plot"):
+        if not path.absolute().parent.is_dir():
+            raise ConfigurationError(f"{path}: found no folder {path.parent}, expected it to exist")
+    measured = ("reference",) if options.command == "fit" else ()
+    for path in _paths(options, "flux_map", "flux_reference", *measured):
+        is_hdf5(path)
+    if options.command == "reconstruct" and not Path(options.alpha).is_file():
+        try:
+            parse_alpha(options.alpha)
+        except ValueError as error:
+            raise ConfigurationError(f"ALPHA: no such file, and {error}") from error
+
+
+def _paths(options: argparse.Namespace, *names: str) -> list[Path]:
+    """Return the files of these names that were given."""
+    found = [getattr(options, name, None) for name in names]
+    return [path for path in found if path is not None]

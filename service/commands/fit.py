@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from service.archive.store import write_whole
-from service.commands.terminal import check_folder, say, show_progress
+from service.commands.terminal import say, show_progress
 from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.files.figures import check_plots, write_sheet
@@ -34,8 +34,6 @@ def main(options: argparse.Namespace) -> int:
     """
     if options.plot is not None:
         check_plots()
-    for path in (options.plot, options.output):
-        check_folder(path)
     instrument = load_instrument(options.instrument)
     light = _light(options, instrument)
     asked = FitOptions(

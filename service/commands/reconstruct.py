@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.archive.store import write_whole
-from service.commands.terminal import check_folder, say, show_progress
+from service.commands.terminal import say, show_progress
 from service.config import load_instrument
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import Method, Prior, Provenance, Recipe, Source, reconstruct
@@ -48,7 +48,6 @@ def main(options: argparse.Namespace) -> int:
     PyrcalError
         If something that was given cannot be used.
     """
-    check_folder(options.output)
     if options.max_condition < 1.0:
         raise ConfigurationError(
             f"--max-condition: found {options.max_condition:g}, expected at least 1"
@@ -102,9 +101,7 @@ def _known(options: argparse.Namespace) -> KnownFit:
     Raises
     ------
     MatrixError
-        If the file is of a refused fit.
-    ConfigurationError
-        If the words are neither a registration nor a file.
+        If the file is of a refused fit, or its reference another one.
     """
     path = Path(options.alpha)
     if path.is_file():
@@ -115,10 +112,7 @@ def _known(options: argparse.Namespace) -> KnownFit:
                 "better gives the registration itself: X,Y,ROT,MAG"
             )
     else:
-        try:
-            known = KnownFit(alpha=parse_alpha(options.alpha))
-        except ValueError as error:
-            raise ConfigurationError(f"ALPHA: no such file, and {error}") from error
+        known = KnownFit(alpha=parse_alpha(options.alpha))
     if options.reference is not None:
         found = file_sha256(options.reference)
         if known.reference_sha256 not in {None, found}:

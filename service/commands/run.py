@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
-import contextlib
-import logging
 import os
-import sys
-from typing import TextIO, cast
+from functools import partial
 
-import structlog
-from structlog.typing import EventDict
-from threadpoolctl import threadpool_limits
-from typing_extensions import override
-
-from service.config import load_instrument, load_settings
-from service.errors import shown
+from service.config import load_settings
+from service.config.instrument_schema import read_instrument_file
+from service.processes import Worker
 
 _OPTIONS = {
     "instrument": "service.instrument",
@@ -41,69 +33,17 @@ def main(options: argparse.Namespace) -> int:
         if key in given:
             given[key] = [given[key]]
     settings = load_settings(options.config, os.environ, given)
-    instrument = load_instrument(settings.service.instrument)
-    from service.worker import begin_early  # the rest of the program takes seconds to import
+    read_instrument_file(settings.service.instrument)
+    # from here on each import takes its time: the worker's first, so that it imports beside them
+    early = Worker().begin() if options.own_process else Worker()
+    from service.config import load_instrument
+    from service.config.policy import compute_of
+    from service.worker import start_worker
 
-    if options.own_process:
-        begin_early()
-    from service.commands.serve import serve
+    instrument, compute = load_instrument(settings.service.instrument), compute_of(settings)
+    start_worker(instrument, compute, early)
+    from service.commands.serve import run
+    from service.runtime.workers import WorkerPool
 
-    # the event loop's own products are small; a second BLAS thread would only fight the RTC link
-    threadpool_limits(1)
-    log_to_the_terminal()
-    for remark in instrument.remarks:
-        structlog.get_logger().warning("instrument.remark", text=remark)
-    return asyncio.run(serve(settings, instrument))
-
-
-def log_to_the_terminal() -> None:
-    """Have everything that is logged, by libraries too, written to standard error."""
-    structlog.configure(
-        processors=[
-            structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.processors.format_exc_info,
-            _harmless,
-            structlog.dev.ConsoleRenderer(
-                colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
-            ),
-        ],
-        logger_factory=structlog.PrintLoggerFactory(cast(TextIO, _Forgiving(sys.stderr))),
-    )
-    logging.getLogger().handlers = [_IntoStructlog()]
-
-
-class _Forgiving:
-    """A file for the log: a disk that refuses it must not end what is logged."""
-
-    def __init__(self, file: TextIO) -> None:
-        self._file = file
-
-    def write(self, text: str) -> None:
-        """Write it if that can be."""
-        with contextlib.suppress(OSError):
-            self._file.write(text)
-
-    def flush(self) -> None:
-        """Have it on the disk if that can be."""
-        with contextlib.suppress(OSError):
-            self._file.flush()
-
-
-def _harmless(_logger: object, _method: str, event: EventDict) -> EventDict:
-    """Write out the control characters in what the RTC, files and clients have said."""
-    return {
-        key: shown(value, keep="\n" if key == "exception" else "")
-        if isinstance(value, str)
-        else value
-        for key, value in event.items()
-    }
-
-
-class _IntoStructlog(logging.Handler):
-    """Takes what libraries log."""
-
-    @override
-    def emit(self, record: logging.LogRecord) -> None:
-        log = structlog.get_logger()
-        log.log(record.levelno, record.getMessage(), exc_info=record.exc_info or None)
+    workers = WorkerPool(partial(start_worker, instrument, compute), early)
+    return run(settings, instrument, workers)

@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from typing import TextIO, cast
 
 import structlog
 import uvicorn
+from structlog.typing import EventDict
+from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
 from service.api import create_app
 from service.archive import Archive
 from service.config import Settings, load_instrument, packaged_instrument
 from service.config.policy import policy_of
-from service.errors import ConfigurationError, PyrcalError
+from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.uploads import UploadFitter
 from service.model.instrument import Instrument
-from service.prepared import usual_folder
 from service.routes.admission import Hosts, server_config
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
@@ -33,8 +37,7 @@ from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
 from service.tracking.measuring import MEASUREMENTS_KEPT, NOISY_KEPT
 from service.tracking.reconstructors import restored
-from service.tracking.state import TrackerState
-from service.worker import Compute, start_worker
+from service.tracking.state import Mode, TrackerState
 
 REQUESTS_WITHIN_S = 2
 """Requests under way when the service is asked to stop may take this long: an upload would take
@@ -45,10 +48,19 @@ END_WITHIN_S = 4.5
 and process managers wait."""
 
 
-async def serve(settings: Settings, instrument: Instrument) -> int:
+def run(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
+    """Run the service until it is asked to stop or fails; return the exit status."""
+    # the event loop's own products are small; a second BLAS thread would only fight the RTC link
+    threadpool_limits(1)
+    log_to_the_terminal()
+    for remark in instrument.remarks:
+        structlog.get_logger().warning("instrument.remark", text=remark)
+    return asyncio.run(_serve(settings, instrument, workers))
+
+
+async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
     """Open everything, run until asked to stop or the service fails, close everything."""
     system = settings.service.system or instrument.name
-    workers = WorkerPool(lambda: start_worker(instrument, _compute(settings)))
     archive = Archive(settings.service.data_dir)
     with _listener(settings.api.host, settings.api.port) as listener:
         archive.open()
@@ -184,7 +196,7 @@ def _supervisor(
     policy = policy_of(settings)
     state = TrackerState(
         system=system,
-        mode=settings.service.mode,
+        mode=Mode(settings.service.mode),
         reconstructors=restored(archive.records()),
         measurements=archive.measured.records()[-MEASUREMENTS_KEPT:],
         noisy=archive.noisy.records()[-NOISY_KEPT:],
@@ -233,17 +245,54 @@ def _endpoint(settings: Settings, system: str) -> Endpoint:
     )
 
 
-def _compute(settings: Settings) -> Compute:
-    table = settings.compute
-    return Compute(
-        threads=table.threads,
-        nice=table.nice,
-        pupil_sampling=table.pupil_sampling,
-        detector_nodes=table.detector_nodes,
-        working_point_modes=table.working_point_modes,
-        method=settings.control.method,
-        max_condition=settings.control.max_condition,
-        slope_noise=settings.control.slope_noise,
-        wind_m_s=settings.control.wind_m_s,
-        cache=settings.service.cache_dir or usual_folder(os.environ),
+def log_to_the_terminal() -> None:
+    """Have everything that is logged, by libraries too, written to standard error."""
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.format_exc_info,
+            _harmless,
+            structlog.dev.ConsoleRenderer(
+                colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
+            ),
+        ],
+        logger_factory=structlog.PrintLoggerFactory(cast(TextIO, _Forgiving(sys.stderr))),
     )
+    logging.getLogger().handlers = [_IntoStructlog()]
+
+
+class _Forgiving:
+    """A file for the log: a disk that refuses it must not end what is logged."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, text: str) -> None:
+        """Write it if that can be."""
+        with contextlib.suppress(OSError):
+            self._file.write(text)
+
+    def flush(self) -> None:
+        """Have it on the disk if that can be."""
+        with contextlib.suppress(OSError):
+            self._file.flush()
+
+
+def _harmless(_logger: object, _method: str, event: EventDict) -> EventDict:
+    """Write out the control characters in what the RTC, files and clients have said."""
+    return {
+        key: shown(value, keep="\n" if key == "exception" else "")
+        if isinstance(value, str)
+        else value
+        for key, value in event.items()
+    }
+
+
+class _IntoStructlog(logging.Handler):
+    """Takes what libraries log."""
+
+    @override
+    def emit(self, record: logging.LogRecord) -> None:
+        log = structlog.get_logger()
+        log.log(record.levelno, record.getMessage(), exc_info=record.exc_info or None)

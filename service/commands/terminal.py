@@ -6,12 +6,11 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NoReturn
 
 from typing_extensions import override
 
-from service.errors import ConfigurationError, shown
+from service.errors import shown
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -43,15 +42,3 @@ def show_progress(step: str) -> None:
     """Tell somebody who watches how far it is; a log needs no such lines."""
     if sys.stderr.isatty():
         say(f"... {step}")
-
-
-def check_folder(path: Path | None) -> None:
-    """Refuse a file whose folder does not exist, before the work and not after it.
-
-    Raises
-    ------
-    ConfigurationError
-        If there is no such folder.
-    """
-    if path is not None and not path.absolute().parent.is_dir():
-        raise ConfigurationError(f"{path}: found no folder {path.parent}, expected it to exist")

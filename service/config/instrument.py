@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,9 +15,11 @@ from service.config.instrument_schema import (
     LoopTable,
     ModesTable,
     WfsTable,
+    packaged_file,
+    read_instrument_file,
 )
 from service.config.mirrors import MirrorFile, own_modes, read_mirror
-from service.config.sources import Place, in_file, read_dataset, read_toml, refuse, validated
+from service.config.sources import Place, in_file, read_dataset, refuse
 from service.errors import ConfigurationError, ModelError
 from service.model.instrument import (
     FrameWindows,
@@ -57,35 +58,8 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         One line with the file and the key: unknown, missing, of the wrong type, out of range, or
         in contradiction to another.
     """
-    path = Path(name_or_path)
-    if path.suffix == ".toml" or path.name != str(name_or_path):
-        return _read(path)
-    return packaged_instrument(str(name_or_path))
-
-
-def packaged_instrument(name: str) -> Instrument:
-    """Return the instrument of a packaged name.
-
-    Raises
-    ------
-    ConfigurationError
-        If none has this name.
-    """
-    packaged = resources.files("service") / "instruments"
-    known = {Path(r.name).stem: r for r in packaged.iterdir() if r.name.endswith(".toml")}
-    if name not in known:
-        raise ConfigurationError(
-            f"instrument {name}: neither a packaged name ({', '.join(sorted(known))}) "
-            "nor the path of a .toml file"
-        )
-    with resources.as_file(known[name]) as path:
-        return _read(path)
-
-
-def _read(path: Path) -> Instrument:
+    tables, path = read_instrument_file(name_or_path)
     source = _Source(path.parent, in_file(path))
-    data = read_toml(path)
-    tables = validated(InstrumentFile, data, source.place)
     about = tables.instrument
     wfs = _pyramid(tables.wfs, source)
     mirror, remarks = read_mirror(
@@ -114,6 +88,17 @@ def _read(path: Path) -> Instrument:
         basis_id=about.basis_id,
         config_id=about.config_id,
     )
+
+
+def packaged_instrument(name: str) -> Instrument:
+    """Return the instrument of a packaged name, which is never that of a file of this machine.
+
+    Raises
+    ------
+    ConfigurationError
+        If none has this name.
+    """
+    return load_instrument(packaged_file(name))
 
 
 def _modes(table: ModesTable, mirror: Mirror | TabulatedModes, source: _Source) -> KarhunenLoeve:

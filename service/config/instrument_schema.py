@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from service.config.sources import Id, Table
+from service.config.sources import Id, Table, in_file, read_toml, validated
+from service.errors import ConfigurationError
 
 Positive = Annotated[float, Field(gt=0.0)]
 Count = Annotated[int, Field(ge=1)]
@@ -204,3 +206,37 @@ class InstrumentFile(Table):
     modes: ModesTable = ModesTable()
     slopes: SlopesTable = SlopesTable()
     loop: LoopTable = LoopTable()
+
+
+_PACKAGED = Path(__file__).parents[1] / "instruments"
+
+
+def read_instrument_file(name_or_path: str | Path) -> tuple[InstrumentFile, Path]:
+    """Return what the file of a packaged instrument or of a user's own says, and where it is.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such file, or one line with the key that cannot be used.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml" and path.name == str(name_or_path):
+        path = packaged_file(str(name_or_path))
+    return validated(InstrumentFile, read_toml(path), in_file(path)), path
+
+
+def packaged_file(name: str) -> Path:
+    """Return where the file of a packaged instrument is.
+
+    Raises
+    ------
+    ConfigurationError
+        If none has this name.
+    """
+    known = {path.stem: path for path in _PACKAGED.glob("*.toml")}
+    if name not in known:
+        raise ConfigurationError(
+            f"instrument {name}: neither a packaged name ({', '.join(sorted(known))}) "
+            "nor the path of a .toml file"
+        )
+    return known[name]

@@ -1,13 +1,18 @@
-"""The tracker's policy, and how far the model itself leads astray, from the user's settings."""
+"""The tracker's policy, how far the model itself leads astray, and what the worker may use."""
 
 from __future__ import annotations
+
+import os
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.config.settings import Settings
+from service.control.reconstructor import Method
 from service.model.misregistration import BOUNDARY_SCALE
+from service.prepared import usual_folder
 from service.tracking.policy import Policy
+from service.worker import Compute
 
 FLAT = (0.004, 0.01, 0.001)
 """Shift in subapertures, rotation in degrees, magnification: where telemetry of a working pyramid
@@ -82,3 +87,20 @@ def policy_of(settings: Settings) -> Policy:
 def _four(shift_subap: float, rotation_deg: float, magnification: float) -> NDArray[np.float64]:
     """Return ``(4,)`` in numeric units: the same for both shifts."""
     return np.array([shift_subap, shift_subap, np.deg2rad(rotation_deg), magnification])
+
+
+def compute_of(settings: Settings) -> Compute:
+    """Return what the worker may use and how finely it samples the optics."""
+    table = settings.compute
+    return Compute(
+        threads=table.threads,
+        nice=table.nice,
+        pupil_sampling=table.pupil_sampling,
+        detector_nodes=table.detector_nodes,
+        working_point_modes=table.working_point_modes,
+        method=Method(settings.control.method),
+        max_condition=settings.control.max_condition,
+        slope_noise=settings.control.slope_noise,
+        wind_m_s=settings.control.wind_m_s,
+        cache=settings.service.cache_dir or usual_folder(os.environ),
+    )

@@ -12,13 +12,14 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar, get_args
 
-from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, StringConstraints, ValidationError
 from pydantic_core import ErrorDetails
 
 from service.errors import ConfigurationError, MatrixError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from service.files.container import Container, StoredArray
 
 _EXPECTED = "Input should be "

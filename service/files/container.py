@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import MatrixError
+from service.files import is_hdf5
 
 MOST_BYTES = 4 << 30
 """Largest array that is read: a cube of 400 full frames of 512 x 512 is a tenth of it."""
@@ -25,9 +26,6 @@ ROOMY_BYTES = 64 << 20
 
 MOST_SWELLING = 1000
 """Bytes in memory for each in the file, of larger ones: gzip does not compress noise any better."""
-
-_FITS_BEGINS = (b"SIMPLE  =", b"\x1f\x8b")
-"""First bytes of a FITS file, and of anything compressed with gzip, which FITS files often are."""
 
 _LISTED = 12
 """Arrays of a file that a message names."""
@@ -129,29 +127,8 @@ def opened(path: Path) -> Iterator[Container]:
     MatrixError
         If there is no such file, it is neither, or it is damaged.
     """
-    try:
-        with path.open("rb") as file:
-            begins = file.read(9)
-    except OSError as error:
-        raise MatrixError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if h5py.is_hdf5(path):
-        with _hdf5(path) as container:
-            yield container
-    elif begins.startswith(_FITS_BEGINS):
-        with _fits(path) as container:
-            yield container
-    else:
-        raise MatrixError(f"{path}: found {_kind(begins)}, expected an HDF5 or a FITS file")
-
-
-def _kind(begins: bytes) -> str:
-    if not begins:
-        return "an empty file"
-    if begins.startswith(b"\x93NUMPY"):
-        return "a NumPy file"
-    if begins.startswith(b"MATLAB 5"):
-        return "a MATLAB file older than 7.3"
-    return "something else"
+    with (_hdf5 if is_hdf5(path) else _fits)(path) as container:
+        yield container
 
 
 @contextmanager

@@ -1,14 +1,20 @@
-"""What a user asks of a fit, in the words of the command line and of REST."""
+"""What a user asks of a fit, in the words of the command line and of REST.
+
+Numbers are looked at before anything large is imported: a mistake is told at once.
+"""
 
 from __future__ import annotations
 
+import math
 import re
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-from service.fit.pupil_rotation import Arms
-from service.model.misregistration import PARAMETERS, Misregistration
+    from service.fit.pupil_rotation import Arms
+    from service.model.misregistration import Misregistration
 
 MOST_MODES = 100_000
 
@@ -42,6 +48,8 @@ def parse_modes(text: str) -> NDArray[np.intp]:
         raise ValueError(f"found {text!r}, which is no mode at all; {expected}")
     if len(set(indices)) < len(indices):
         raise ValueError(f"found {text!r}, expected no mode twice")
+    import numpy as np
+
     return np.array(indices, dtype=np.intp)
 
 
@@ -53,13 +61,12 @@ def parse_alpha(text: str) -> Misregistration:
     ValueError
         If it is not four finite numbers, or the magnification is not positive.
     """
-    expected = "expected X,Y,ROT,MAG: subapertures, degrees, ratio, like 0.3,-0.1,65,0.98"
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        raise ValueError(f"found {text.strip()!r}, {expected}") from None
-    if len(values) != len(PARAMETERS) or not np.all(np.isfinite(values)) or values[3] <= 0.0:
+    values = _numbers(text)
+    if len(values) != 4 or values[3] <= 0.0:
+        expected = "expected X,Y,ROT,MAG: subapertures, degrees, ratio, like 0.3,-0.1,65,0.98"
         raise ValueError(f"found {text.strip()!r}, {expected}")
+    from service.model.misregistration import PARAMETERS, Misregistration
+
     return Misregistration.from_boundary(dict(zip(PARAMETERS, values, strict=True)))
 
 
@@ -71,15 +78,20 @@ def parse_arms(text: str) -> Arms:
     ValueError
         If it is not a width above 0 and at least one finite angle.
     """
-    expected = "expected WIDTH:DEG,DEG,... of the spider's arms, like 0.9:90,210,330"
-    width, _, angles = text.partition(":")
-    try:
-        arms = Arms(
-            angles_rad=tuple(np.deg2rad([float(angle) for angle in angles.split(",")]).tolist()),
-            width_subap=float(width),
-        )
-    except ValueError:
-        raise ValueError(f"found {text.strip()!r}, {expected}") from None
-    if not (0.0 < arms.width_subap < np.inf and np.all(np.isfinite(arms.angles_rad))):
+    first, _, rest = text.partition(":")
+    width, angles = _numbers(first), _numbers(rest)
+    if not angles or len(width) != 1 or width[0] <= 0.0:
+        expected = "expected WIDTH:DEG,DEG,... of the spider's arms, like 0.9:90,210,330"
         raise ValueError(f"found {text.strip()!r}, {expected}")
-    return arms
+    from service.fit.pupil_rotation import Arms
+
+    return Arms(angles_rad=tuple(math.radians(a) for a in angles), width_subap=width[0])
+
+
+def _numbers(text: str) -> list[float]:
+    """Return the finite numbers that a text lists; none where something else is among them."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
+    return values if all(math.isfinite(value) for value in values) else []

@@ -15,7 +15,8 @@ from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
-from service.worker import Apart, Done, OpticsWorker, Worker, run_job
+from service.processes import Apart, Worker
+from service.worker import Done, OpticsWorker, run_job
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -44,12 +45,13 @@ LOOK_S = 0.5
 class WorkerPool:
     """Hands jobs to a worker made by ``start``; a dead or hung one costs one job, not the service.
 
-    Belongs to the event loop. What is most urgent goes first, see :data:`PATIENCE_S`.
+    Belongs to the event loop. What is most urgent goes first, see :data:`PATIENCE_S`. One that
+    has begun ``early`` is the first.
     """
 
-    def __init__(self, start: Callable[[], Worker]) -> None:
+    def __init__(self, start: Callable[[], Worker], early: Worker | None = None) -> None:
         self._start = start
-        self._worker: Worker | None = None
+        self._worker = early
         self.first: Callable[[], Done[None]] | None = None
         """What every new worker does before anything else; None: nothing."""
 

@@ -5,11 +5,10 @@ alone.
 """
 
 from service.worker.optics_worker import OpticsWorker
-from service.worker.process import Apart, Done, Worker, begin_early, run_job, start_worker
+from service.worker.process import Done, run_job, start_worker
 from service.worker.records import Compute, Description, InUse, Made, Margin
 
 __all__ = [
-    "Apart",
     "Compute",
     "Description",
     "Done",
@@ -17,8 +16,6 @@ __all__ = [
     "Made",
     "Margin",
     "OpticsWorker",
-    "Worker",
-    "begin_early",
     "run_job",
     "start_worker",
 ]

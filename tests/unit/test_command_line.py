@@ -9,11 +9,13 @@ import pytest
 from service import __version__
 from service.__main__ import main
 from service.commands.arguments import command_line
+from service.config import Settings, load_settings
+from service.control.reconstructor import MAX_CONDITION, Recipe
 from service.control.reconstructor import Method as MakeMethod
-from service.control.reconstructor import Recipe
 from service.fit.options import FitOptions
 from service.fit.options import Method as FitMethod
 from service.tracking.state import Mode
+from service.wire import CHUNK_LIMIT
 
 ROOT = Path(__file__).parents[2]
 
@@ -191,6 +193,14 @@ def processor_s(*words):
         (["run", "--prot", "1"], 2),
         (["reconstruct", "flao-lbt", "0,0,0,1"], 2),
         (["status", "--url", "http://127.0.0.1:1"], 2),
+        (["run", "--config", "none.toml"], 2),
+        (["run", "--port", "99999"], 2),
+        (["run", "--instrument", "nobodys"], 2),
+        (["fit", "nobodys", "none.h5"], 2),
+        (["fit", "flao-lbt", "none.h5"], 2),
+        (["fit", "flao-lbt", __file__], 2),
+        (["fit", "a", "b", "--modes", "1,1"], 2),
+        (["reconstruct", "flao-lbt", "none.json", "--modes", "1", "--output", "cm.h5"], 2),
     ],
 )
 def test_what_needs_no_mathematics_comes_at_once(words, status):
@@ -213,6 +223,11 @@ def test_the_command_line_offers_what_the_program_has():
             assert default_of("method", *words, "--method", method.value) == method
     for mode in Mode:
         assert default_of("mode", "run", "--mode", mode.value) == mode
+        assert Mode(load_settings(None, {}, {"service.mode": mode.value}).service.mode) is mode
+    for method in MakeMethod:
+        load_settings(None, {}, {"control.method": method.value})
+    assert Settings().control.max_condition == MAX_CONDITION
+    assert Settings().zenoh.chunk_bytes == CHUNK_LIMIT
 
 
 def test_a_start_imports_no_more_than_it_needs():

@@ -609,7 +609,7 @@ def test_the_mask_is_in_the_rtcs_axes_and_the_model_turns_it(write, tmp_path):
 def test_without_file_or_environment_the_defaults_hold():
     settings = load_settings(None, {})
     assert settings == Settings()
-    assert settings.service.mode is Mode.PROPOSE
+    assert settings.service.mode == Mode.PROPOSE
     assert settings.service.data_dir == Path("var")
     assert settings.zenoh.listen == ("tcp/127.0.0.1:7447",)
     assert settings.control.n_modes_target == 500
@@ -639,7 +639,7 @@ def test_environment_values_take_the_type_of_their_key():
         },
     )
     assert settings.service.system == "12"
-    assert settings.service.mode is Mode.AUTO
+    assert settings.service.mode == Mode.AUTO
     assert settings.service.data_dir == Path("/data/7")
     assert settings.dither.enabled is False
     assert settings.dither.modes == (501, 450)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.archive.store import write_whole
-from service.commands.arguments import command_line
+from service.commands.arguments import check_files, command_line
 from service.commands.reconstruct import SAMPLING, main
 from service.commands.terminal import with_negative_numbers
 from service.config import load_instrument
@@ -39,7 +39,9 @@ def empty_folder(monkeypatch, tmp_path):
 
 def made(alpha, *more, modes="50"):
     given = ["reconstruct", str(TINY), alpha, "--modes", modes, "--output", "cm.h5", *more]
-    assert main(command_line().parse_args(with_negative_numbers(given))) == 0
+    options = command_line().parse_args(with_negative_numbers(given))
+    check_files(options)
+    assert main(options) == 0
     return h5py.File("cm.h5", "r")
 
 

@@ -9,7 +9,7 @@ import pytest
 import structlog
 
 from service.__main__ import main
-from service.commands.run import log_to_the_terminal
+from service.commands.serve import log_to_the_terminal
 from service.commands.terminal import say
 from service.errors import MatrixError, shown
 

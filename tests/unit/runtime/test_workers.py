@@ -8,9 +8,10 @@ from functools import partial
 import pytest
 
 from service.errors import WorkerError
+from service.processes import Worker
 from service.runtime import workers as crew_module
 from service.runtime.workers import WorkerPool
-from service.worker import OpticsWorker, begin_early, run_job, start_worker
+from service.worker import OpticsWorker, run_job, start_worker
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 pytestmark = pytest.mark.timeout(60)
@@ -128,11 +129,11 @@ async def test_an_interrupt_from_the_keyboard_is_the_services_business(workers):
 
 
 async def test_a_worker_that_began_early_is_the_first_one_and_as_polite():
-    begin_early()
-    worker = start_worker(small_instrument(), type(COMPUTE)(threads=1, nice=5))
+    worker = Worker().begin()
     early = worker.pid
+    start_worker(small_instrument(), type(COMPUTE)(threads=1, nice=5), worker)
     assert early is not None
-    workers = WorkerPool(lambda: worker)
+    workers = WorkerPool(lambda: worker, worker)
     try:
         assert await workers.call(process_id) == early
         assert await workers.call(niceness) == os.nice(0) + 5

@@ -194,7 +194,7 @@ def followed(
     except ModelError as error:
         unusable = None if dither is None else replace(dither, asked_ns_utc=0)
         note = ev.Noted(name="dither.unusable", text=str(error), level=Level.WARNING)
-        return replace(streams, lock_in=None, random=None, dither=unusable), note
+        return replace(streams, cutter=None, dither=unusable), note
 
 
 def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Event]:

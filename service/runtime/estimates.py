@@ -18,13 +18,13 @@ from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
 from service.telemetry import lockin, random_dither
 from service.telemetry.frames import Loop, Telemetry, WindowRefused
-from service.telemetry.lockin import Spectra
+from service.telemetry.lockin import Spectra, WindowEstimate
+from service.telemetry.openloop import FarEstimate
 from service.telemetry.passive import Passive
 from service.telemetry.random_dither import Correlated, RandomEstimate, noisy_matrix
 from service.tracking import events as ev
 from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
 from service.tracking.events import Event
-from service.tracking.loop import RtcView
 from service.tracking.products import NoisyFinding, NoisyRecord, NoisyState, ReconstructorRecord
 from service.tracking.state import Level, TrackerState
 from service.tracking.windows import fit_begins_at
@@ -86,66 +86,50 @@ class Backlog:
 def _joined(one: Spectra | Correlated, other: Spectra | Correlated) -> Spectra | Correlated | None:
     if isinstance(one, Spectra) and isinstance(other, Spectra):
         return lockin.joined(one, other)
-    if isinstance(one, Correlated) and isinstance(other, Correlated) and _alike(one, other):
+    if isinstance(one, Correlated) and isinstance(other, Correlated) and one.is_like(other):
         return random_dither.joined(one, other)
     return None
-
-
-def _alike(one: Correlated, other: Correlated) -> bool:
-    return (one.session, one.cm_id, replace(one.plan, first_seq=0)) == (
-        other.session,
-        other.cm_id,
-        replace(other.plan, first_seq=0),
-    )
 
 
 async def fitted(
     window: Spectra | Correlated, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
 ) -> Event:
     """Return what becomes of one window: an estimate, or why there is none."""
-    if isinstance(window, Correlated):
-        return await _correlated(window, state, workers)
-    return await _demodulated(window, state, workers, matrix_of)
-
-
-async def _correlated(window: Correlated, state: TrackerState, workers: WorkerPort) -> Event:
-    """Return what a window of random dither says; it needs no reconstructor."""
-    known = state.registration
     try:
-        start = None if known is None else known.alpha
-        outcome = await workers.call(OpticsWorker.fit_random, window, start)
+        outcome = await _outcome(window, state, workers, matrix_of)
     except PyrcalError as error:
         return lost(window, str(error))
     if isinstance(outcome, WindowRefused):
         return ev.WindowLost(refused=outcome)
-    return ev.WindowFitted(estimate=outcome, began_ns_utc=_began_ns(window, state.rtc))
+    began_ns = 0
+    if state.rtc is not None:
+        n_frames = window.n_windows * window.plan.n_frames
+        began_ns = window.t_end_ns_utc - round(n_frames * 1e9 / state.rtc.frame_rate_hz)
+    if isinstance(outcome, FarEstimate):
+        return ev.FarFitted(found=outcome, began_ns_utc=began_ns)
+    return ev.WindowFitted(estimate=outcome, began_ns_utc=began_ns)
 
 
-async def _demodulated(
-    spectra: Spectra, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
-) -> Event:
-    """Return what a window of sines says of the registration."""
+async def _outcome(
+    window: Spectra | Correlated, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
+) -> WindowEstimate | RandomEstimate | FarEstimate | WindowRefused:
     rtc, known = state.rtc, state.registration
+    start = None if known is None else known.alpha
+    if isinstance(window, Correlated):
+        return await workers.call(OpticsWorker.fit_random, window, start)
     if state.acquisition.looks_afar:
-        return await _found(spectra, state, workers)
+        flux = None if rtc is None else rtc.flux
+        return await workers.call(OpticsWorker.find, window, state.acquisition.alpha, flux)
     if rtc is None:
-        return lost(spectra, "the RTC is not known")
-    try:
-        matrix = await asyncio.to_thread(_reconstructor, spectra, state, matrix_of)
-        loop = Loop(
-            reconstructor=matrix,
-            gains=np.array(rtc.gains),
-            leak=rtc.leak,
-            delay_frames=rtc.delay_frames,
-            frame_rate_hz=rtc.frame_rate_hz,
-        )
-        start = None if known is None else known.alpha
-        outcome = await workers.call(OpticsWorker.fit, spectra, loop, start)
-    except PyrcalError as error:
-        return lost(spectra, str(error))
-    if isinstance(outcome, WindowRefused):
-        return ev.WindowLost(refused=outcome)
-    return ev.WindowFitted(estimate=outcome, began_ns_utc=_began_ns(spectra, rtc))
+        return WindowRefused(reason="the RTC is not known", t_ns_utc=window.t_end_ns_utc)
+    loop = Loop(
+        reconstructor=await asyncio.to_thread(_reconstructor, window, state, matrix_of),
+        gains=np.array(rtc.gains),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        frame_rate_hz=rtc.frame_rate_hz,
+    )
+    return await workers.call(OpticsWorker.fit, window, loop, start)
 
 
 def _reconstructor(
@@ -155,25 +139,12 @@ def _reconstructor(
 
     The fit takes the dither alone for its instrument then, which costs precision and no truth.
     """
-    unknown = np.zeros((0, spectra.slopes.shape[-1]), np.float32)
-    if spectra.cm_id is None and state.in_use is None:
-        return unknown
     try:
-        return matrix_of(spectra.cm_id or state.in_use or "")
+        if spectra.cm_id is not None or state.in_use is not None:
+            return matrix_of(spectra.cm_id or state.in_use or "")
     except UnknownIdError:
-        return unknown
-
-
-async def _found(spectra: Spectra, state: TrackerState, workers: WorkerPort) -> Event:
-    """Return where a window with the loop open puts the mirror, or why it does not."""
-    flux = None if state.rtc is None else state.rtc.flux
-    try:
-        outcome = await workers.call(OpticsWorker.find, spectra, state.acquisition.alpha, flux)
-    except PyrcalError as error:
-        return lost(spectra, str(error))
-    if isinstance(outcome, WindowRefused):
-        return ev.WindowLost(refused=outcome)
-    return ev.FarFitted(found=outcome, began_ns_utc=_began_ns(spectra, state.rtc))
+        pass
+    return np.zeros((0, spectra.slopes.shape[-1]), np.float32)
 
 
 async def watched(
@@ -197,14 +168,6 @@ async def watched(
         return None
     loop = () if state.rtc is None else state.rtc.loop_numbers
     return ev.Watched(estimate=estimate, t_ns_utc=end_ns, began_ns_utc=sums.since_ns_utc, loop=loop)
-
-
-def _began_ns(window: Spectra | Correlated, rtc: RtcView | None) -> int:
-    """Return when a window began, by the RTC's clock; 0: no RTC tells how long it was."""
-    if rtc is None:
-        return 0
-    n_frames = window.n_windows * window.plan.n_frames
-    return window.t_end_ns_utc - round(n_frames * 1e9 / rtc.frame_rate_hz)
 
 
 async def listened(

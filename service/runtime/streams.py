@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.runtime.loops import terms_of
-from service.telemetry import lockin, loopcheck, passive, random_dither
+from service.telemetry import loopcheck, passive
 from service.telemetry.frames import FrameBlock, Loop, WindowRefused
 from service.telemetry.health import (
     EdgeHealth,
@@ -66,11 +66,8 @@ class Streams:
     still: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     """Controlled modes that have no gain."""
 
-    lock_in: LockIn | None = None
-    """None while no sine is dithered."""
-
-    random: RandomDither | None = None
-    """None while no random signs are dithered."""
+    cutter: LockIn | RandomDither | None = None
+    """Windows of the dither; None while there is none, or none that can be read."""
 
     dither: DitherView | None = None
     """The one whose windows are under way, or cannot be."""
@@ -124,8 +121,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
             loop=None,
             vibrations=None,
             passive=None,
-            lock_in=None,
-            random=None,
+            cutter=None,
             dither=None,
             check=LoopCheck(),
             off=None,
@@ -154,7 +150,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
         since_ns_utc=streams.heard_ns_utc,
     )
     if before is None or not same_rate(before.frame_rate_hz, rtc.frame_rate_hz):
-        streams = replace(streams, lock_in=None, random=None, dither=None)
+        streams = replace(streams, cutter=None, dither=None)
         monitor = VibrationMonitor.begin(rtc.n_slopes)
         return replace(streams, vibrations=monitor, passive=memory)
     return _cut(replace(streams, passive=memory), rtc)
@@ -178,14 +174,9 @@ def _cut(streams: Streams, rtc: RtcView) -> Streams:
     at the same frames again.
     """
     settled_seq = rtc.seq + round(SETTLING_S * rtc.frame_rate_hz)
-    lock_in, random = streams.lock_in, streams.random
-    if lock_in is not None:
-        sines = replace(lock_in.plan, first_seq=max(lock_in.plan.first_seq, settled_seq))
-        return replace(streams, lock_in=LockIn(plan=sines))
-    if random is not None:
-        signs = replace(random.plan, first_seq=max(random.plan.first_seq, settled_seq))
-        return replace(streams, random=RandomDither(plan=signs))
-    return streams
+    if streams.cutter is None:
+        return streams
+    return replace(streams, cutter=streams.cutter.begun_anew(settled_seq))
 
 
 def with_matrix(streams: Streams, cm_id: str, matrix: NDArray[np.float32]) -> Streams:
@@ -245,26 +236,28 @@ def with_dither(streams: Streams, dither: DitherView | None, window_s: float) ->
     """
     rtc = streams.rtc
     if dither is None or dither.start_seq is None or rtc is None:
-        streams = replace(streams, dither=None, dither_silent_s=0.0, meter=None, played=None)
-        return replace(streams, lock_in=None, random=None)
+        return replace(
+            streams, cutter=None, dither=None, dither_silent_s=0.0, meter=None, played=None
+        )
     dither = replace(dither, asked_ns_utc=0)
     if dither == streams.dither:
         return streams
     # a status may announce a dither that began long ago
     seen_seq = max(dither.start_seq or 0, rtc.seq)
-    streams = replace(
+    cutter: LockIn | RandomDither
+    if dither.kind is DitherKind.BINARY:
+        cutter = RandomDither(plan=random_plan(dither, rtc, window_s))
+    else:
+        cutter = LockIn(plan=lock_in_plan(dither, rtc, window_s))
+    return replace(
         streams,
-        lock_in=None,
-        random=None,
+        cutter=cutter,
         dither=dither,
         meter=Meter(asked=asked_of(dither, rtc)),
         played=None,
         dither_seen_seq=seen_seq,
         dither_silent_s=0.0,
     )
-    if dither.kind is DitherKind.BINARY:
-        return replace(streams, random=RandomDither(plan=random_plan(dither, rtc, window_s)))
-    return replace(streams, lock_in=LockIn(plan=lock_in_plan(dither, rtc, window_s)))
 
 
 def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
@@ -315,16 +308,12 @@ def _moving(streams: Streams, block: FrameBlock) -> FrameBlock:
 def _dithered(
     streams: Streams, rtc: RtcView, block: FrameBlock
 ) -> tuple[Streams, Sequence[Window]]:
-    """Feed whichever estimator reads the dither that runs."""
-    if streams.lock_in is not None:
-        lock_in, spectra = lockin.accumulate(streams.lock_in, block)
-        over = _beyond_the_dither(streams, rtc, lock_in)
-        return replace(streams, lock_in=None if over else lock_in), spectra
-    if streams.random is not None:
-        random, correlated = random_dither.accumulate(streams.random, block)
-        over = _beyond_the_dither(streams, rtc, random)
-        return replace(streams, random=None if over else random), correlated
-    return streams, ()
+    """Feed the estimator that reads the dither which runs."""
+    if streams.cutter is None:
+        return streams, ()
+    cutter, ended = streams.cutter.accumulate(block)
+    over = _beyond_the_dither(streams, rtc, cutter)
+    return replace(streams, cutter=None if over else cutter), ended
 
 
 def taken(streams: Streams) -> tuple[Streams, Passive | str]:
@@ -356,8 +345,8 @@ def taken(streams: Streams) -> tuple[Streams, Passive | str]:
         since_ns_utc=streams.heard_ns_utc - waiting_ns,
     )
     # a window that is under way is of the gains with which it began
-    dithered = streams.lock_in is not None or streams.random is not None
-    return replace(streams, passive=begun, loop=streams.loop if dithered else rtc), sums
+    loop = rtc if streams.cutter is None else streams.loop
+    return replace(streams, passive=begun, loop=loop), sums
 
 
 def _beyond_the_dither(streams: Streams, rtc: RtcView, reading: LockIn | RandomDither) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,8 +190,19 @@ class Telemetry:
     n_missing: int
     """Frames that never came."""
 
+    plan: WindowPlan
+    """What it was cut by."""
+
     n_windows: int = 1
     """Windows, one after the other, that are joined here."""
+
+    def is_like(self, other: Telemetry) -> bool:
+        """Return whether both are windows of one dither and one loop."""
+        return (self.session, self.cm_id, replace(self.plan, first_seq=0)) == (
+            other.session,
+            other.cm_id,
+            replace(other.plan, first_seq=0),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -233,6 +244,10 @@ class Window(Generic[S]):
     n_missing: int = 0
     """Frames before ``next_seq`` that never came."""
 
+    waiting: tuple[FrameBlock, ...] = ()
+    """Frames that are not in the sums yet, or are needed for the next; each follows the one
+    before."""
+
     @property
     def telemetry(self) -> dict[str, Any]:
         """Return the fields of ``Telemetry``, once it is finished."""
@@ -243,16 +258,6 @@ class Window(Generic[S]):
             "t_end_ns_utc": self.next_t_ns - self.dt_ns,
             "n_missing": self.n_missing,
         }
-
-    def with_rows(self, block: FrameBlock, sums: S) -> Window[S]:
-        """Return the window after a block; frames skipped before it count as missing."""
-        return replace(
-            self,
-            next_seq=block.next_seq,
-            next_t_ns=block.next_t_ns,
-            n_missing=self.n_missing + block.first_seq - self.next_seq,
-            sums=sums,
-        )
 
     def without_rest(self, n_frames: int) -> Window[S]:
         """Return a window of ``n_frames`` whose last frames never came."""
@@ -295,17 +300,28 @@ class WindowCutter(Generic[P, S, F]):
     plan: P
     window: Window[S] | None = None
 
+    overlap: ClassVar[int] = 0
+    """Frames before its own that a frame is summed with."""
+
     def begin(self, block: FrameBlock) -> S:
         """Return empty sums for frames like these."""
         raise NotImplementedError
 
     def add(self, sums: S, block: FrameBlock, place: int) -> S:
-        """Return the sums with a block that begins at this place of the window."""
+        """Return the sums with a block that begins at this place of the window.
+
+        Its first ``overlap`` frames are in them, or have none before them.
+        """
         raise NotImplementedError
 
     def close(self, window: Window[S]) -> F | WindowRefused:
         """Return what came of a window, or why its dither is not the one asked for."""
         raise NotImplementedError
+
+    def begun_anew(self, first_seq: int) -> Self:
+        """Return it without the window under way; none begins before this frame."""
+        first_seq = max(self.plan.first_seq, first_seq)
+        return replace(self, plan=replace(self.plan, first_seq=first_seq), window=None)
 
     def accumulate(self, block: FrameBlock) -> tuple[Self, list[F | WindowRefused]]:
         """Add a block of frames; return the new state and the windows that ended in it."""
@@ -341,10 +357,33 @@ class WindowCutter(Generic[P, S, F]):
             return None, 0, WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
         end_seq = window.first_seq + n_frames
         if block.first_seq >= end_seq:  # the window's last frames never came
-            return None, 0, self.close(window.without_rest(n_frames))
-        part = block.rows(0, min(block.n_frames, end_seq - block.first_seq))
-        sums = self.add(window.sums, part, part.first_seq - window.first_seq)
-        window = window.with_rows(part, sums)
+            return None, 0, self.close(self._added(window).without_rest(n_frames))
+        part = block.rows(0, min(block.n_frames, end_seq - block.first_seq, CHUNK_FRAMES))
+        window = self._with_rows(window, part)
         if window.next_seq < end_seq:
             return window, part.n_frames, None
-        return None, part.n_frames, self.close(window)
+        return None, part.n_frames, self.close(self._added(window))
+
+    def _with_rows(self, window: Window[S], rows: FrameBlock) -> Window[S]:
+        """Return the window after some rows, which wait until there are enough to be added."""
+        if window.waiting and not rows.follows(window.waiting[-1]):
+            window = replace(self._added(window), waiting=())
+        window = replace(
+            window,
+            next_seq=rows.next_seq,
+            next_t_ns=rows.next_t_ns,
+            # frames skipped before these count as missing
+            n_missing=window.n_missing + rows.first_seq - window.next_seq,
+            waiting=(*window.waiting, rows),
+        )
+        enough = sum(block.n_frames for block in window.waiting) >= CHUNK_FRAMES
+        return self._added(window) if enough else window
+
+    def _added(self, window: Window[S]) -> Window[S]:
+        """Return the window with the frames that wait in its sums."""
+        if sum(block.n_frames for block in window.waiting) <= self.overlap:
+            return window
+        block = joined_frames(window.waiting)
+        sums = self.add(window.sums, block, block.first_seq - window.first_seq)
+        kept = (block.last(self.overlap),) if self.overlap else ()
+        return replace(window, sums=sums, waiting=kept)

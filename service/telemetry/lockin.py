@@ -28,7 +28,6 @@ from service.telemetry.frames import (
     Window,
     WindowCutter,
     WindowPlan,
-    joined_frames,
 )
 from service.telemetry.frames import WindowRefused as WindowRefused
 
@@ -114,7 +113,7 @@ class Spectra(Telemetry):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LockInSums:
-    """Sums so far, and the frames that wait to be added to them."""
+    """Sums so far."""
 
     slopes: Array
     """``(2 * n_bins, n_slopes)``: real parts of every bin, then imaginary ones; so the others."""
@@ -124,12 +123,6 @@ class LockInSums:
 
     dither: Array
     """``(2 * n_lines, n_modes)``."""
-
-    waiting: tuple[FrameBlock, ...] = ()
-    """Each follows the one before."""
-
-    place: int = 0
-    """In the window, of the first frame that waits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -149,20 +142,22 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
     @override
     def add(self, sums: LockInSums, block: FrameBlock, place: int) -> LockInSums:
         """Return the sums with a block that begins at this place of the window."""
-        for start in range(0, block.n_frames, CHUNK_FRAMES):
-            part = block.rows(start, min(start + CHUNK_FRAMES, block.n_frames))
-            if sums.waiting and not part.follows(sums.waiting[-1]):
-                sums = self._projected(sums)
-            first = sums.place if sums.waiting else place + start
-            sums = replace(sums, waiting=(*sums.waiting, part), place=first)
-            if sum(waiting.n_frames for waiting in sums.waiting) >= CHUNK_FRAMES:
-                sums = self._projected(sums)
-        return sums
+        phasors = _phasors(self.plan, place, block.n_frames)
+        # real products: the columns are real
+        parts = np.concatenate([phasors.real, phasors.imag])
+        lines = parts[:: self.plan.bins_hz.shape[1]]
+        # no block without dither columns comes this far
+        dither = block.commands_m if block.dither_m is None else block.dither_m
+        return LockInSums(
+            slopes=sums.slopes + parts @ block.slopes,
+            commands=sums.commands + parts @ block.commands_m,
+            dither=sums.dither + lines @ dither,
+        )
 
     @override
     def close(self, window: Window[LockInSums]) -> Spectra | WindowRefused:
         """Return the finished window, or why its dither is not the one asked for."""
-        plan, sums = self.plan, self._projected(window.sums)
+        plan, sums = self.plan, window.sums
         dither = _complex(sums.dither, len(plan.modes))
         weight = 0.5 * plan.n_frames / np.sqrt(2.0)
         applied = np.abs(dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
@@ -175,23 +170,6 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
             commands=_complex(sums.commands, *plan.bins_hz.shape),
             dither=dither,
             **window.telemetry,
-        )
-
-    def _projected(self, sums: LockInSums) -> LockInSums:
-        """Return the sums with the frames that waited in them."""
-        if not sums.waiting:
-            return sums
-        block = joined_frames(sums.waiting)
-        phasors = _phasors(self.plan, sums.place, block.n_frames)
-        # real products: the columns are real
-        parts = np.concatenate([phasors.real, phasors.imag])
-        lines = parts[:: self.plan.bins_hz.shape[1]]
-        # no block without dither columns comes this far
-        dither = block.commands_m if block.dither_m is None else block.dither_m
-        return LockInSums(
-            slopes=sums.slopes + parts @ block.slopes,
-            commands=sums.commands + parts @ block.commands_m,
-            dither=sums.dither + lines @ dither,
         )
 
 
@@ -207,8 +185,7 @@ def joined(one: Spectra, other: Spectra) -> Spectra | None:
     """
     later = other.first_seq - one.first_seq
     follows = later // one.plan.n_frames in {one.n_windows, one.n_windows + 1}
-    same = replace(one.plan, first_seq=0) == replace(other.plan, first_seq=0)
-    if not (same and follows and (one.session, one.cm_id) == (other.session, other.cm_id)):
+    if not follows or not one.is_like(other):
         return None
     turns = np.exp(-2j * np.pi * later * one.plan.bins_hz / one.plan.frame_rate_hz)
     n_windows = one.n_windows + other.n_windows

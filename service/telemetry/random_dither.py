@@ -9,7 +9,7 @@ loop's own reply, which pulls the fit toward the old geometry.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import DitheredEstimate
 from service.telemetry.frames import (
-    CHUNK_FRAMES,
     FrameBlock,
     Telemetry,
     Window,
@@ -118,50 +117,37 @@ class Correlated(Telemetry):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RandomSums:
-    """What a window has so far, and the frames that wait to be added to it."""
+class RandomDither(WindowCutter[RandomPlan, Correlations | None, Correlated]):
+    """The window of random signs under way; no sums: no two frames have come."""
 
-    done: Correlations | None = None
-    """None: nothing yet."""
-
-    batch: int = 0
-    """The frames that wait belong to it, but for one that was the last before them."""
-
-    waiting: tuple[FrameBlock, ...] = ()
-    """Each follows the one before."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RandomDither(WindowCutter[RandomPlan, RandomSums, Correlated]):
-    """The window of random signs under way."""
+    overlap: ClassVar[int] = 1
 
     @override
-    def begin(self, block: FrameBlock) -> RandomSums:
+    def begin(self, block: FrameBlock) -> None:
         """Return empty sums."""
-        return RandomSums()
+        return
 
     @override
-    def add(self, sums: RandomSums, block: FrameBlock, place: int) -> RandomSums:
-        """Return the sums with a block that begins at this place of the window."""
+    def add(self, sums: Correlations | None, block: FrameBlock, place: int) -> Correlations | None:
+        """Return the sums with a block that begins at this place of the window.
+
+        They are updated in place: the window is the only one that holds them, and copying a matrix
+        of all modes would cost more than the product.
+        """
         n_frames, n_batches = self.plan.n_frames, self.plan.n_batches
-        start = 0
+        start = self.overlap
         while start < block.n_frames:
             batch = (place + start) * n_batches // n_frames
             next_batch = -(-(batch + 1) * n_frames // n_batches)
-            part = block.rows(start, min(block.n_frames, next_batch - place))
-            if sums.waiting and not part.follows(sums.waiting[-1]):
-                sums = replace(self._summed(sums), waiting=())
-            n_waiting = sum(waiting.n_frames for waiting in sums.waiting)
-            if batch != sums.batch or n_waiting >= CHUNK_FRAMES:
-                sums = replace(self._summed(sums), batch=batch)
-            sums = replace(sums, waiting=(*sums.waiting, part))
-            start += part.n_frames
+            end = min(block.n_frames, next_batch - place)
+            sums = self._summed(sums, block.rows(start - self.overlap, end), batch)
+            start = end
         return sums
 
     @override
-    def close(self, window: Window[RandomSums]) -> Correlated | WindowRefused:
+    def close(self, window: Window[Correlations | None]) -> Correlated | WindowRefused:
         """Return the finished window, or why its dither is not the one asked for."""
-        sums = self._summed(window.sums).done
+        sums = window.sums
         if sums is None:
             reason = "no two frames of the window came one after the other: check the link"
             return WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
@@ -171,31 +157,19 @@ class RandomDither(WindowCutter[RandomPlan, RandomSums, Correlated]):
             return WindowRefused(reason=refusal, t_ns_utc=window.next_t_ns)
         return Correlated(plan=self.plan, sums=sums, **window.telemetry)
 
-    def _summed(self, sums: RandomSums) -> RandomSums:
-        """Return the sums with the frames that waited, the last of them kept for the next one.
-
-        They are updated in place: the window is the only one that holds them, and copying a matrix
-        of all modes would cost more than the product.
-        """
-        if sum(block.n_frames for block in sums.waiting) < 2:
-            return sums
-        plan, modes = self.plan, list(self.plan.modes)
-        slopes = np.concatenate([block.slopes for block in sums.waiting])
-        # no block without dither columns comes this far
-        parts = [block.dither_m for block in sums.waiting if block.dither_m is not None]
-        dither = np.concatenate([part[:, modes] for part in parts])
-        done = sums.done or _nothing(plan, slopes)
+    def _summed(self, sums: Correlations | None, block: FrameBlock, batch: int) -> Correlations:
+        """Return the sums with the frames of a batch, the last one before them included."""
+        if block.dither_m is None:
+            raise ValueError("no block without dither columns comes this far")
+        plan, slopes, dither = self.plan, block.slopes, block.dither_m[:, list(self.plan.modes)]
+        done = sums or _nothing(plan, slopes)
         fresh = slopes[1:] - np.float32(done.memory) * slopes[:-1]
-        done.response[sums.batch] += fresh.T @ dither[1:]
+        done.response[batch] += fresh.T @ dither[1:]
         done.late[...] += slopes[1:].T @ dither[:-1, plan.late_columns]
-        done.dither_power[sums.batch] += dither[1:].T @ dither[1:]
+        done.dither_power[batch] += dither[1:].T @ dither[1:]
         done.noise_power[...] += np.einsum("ks,ks->s", fresh, fresh)
         done.slope_power[...] += np.einsum("ks,ks->s", slopes[1:], slopes[1:])
-        return replace(
-            sums,
-            done=replace(done, n_pairs=done.n_pairs + len(fresh)),
-            waiting=(sums.waiting[-1].last(1),),
-        )
+        return replace(done, n_pairs=done.n_pairs + len(fresh))
 
 
 accumulate = RandomDither.accumulate

@@ -8,6 +8,7 @@ import pytest
 from service.errors import CommandError, ModelError
 from service.runtime.streams import Streams, fed, with_dither, with_rtc
 from service.telemetry.frames import FrameBlock, WindowRefused
+from service.telemetry.lockin import LockIn
 from service.telemetry.random_dither import Correlated
 from service.tracking.dither_plan import RandomChoice, plan_random
 from service.tracking.loop import DitherKind, DitherView
@@ -68,15 +69,15 @@ def test_random_signs_are_correlated_in_windows_of_the_dithers_own_length(stream
     assert [(type(w), w.first_seq) for w in windows] == [(Correlated, 300), (Correlated, 700)]
     assert windows[0].plan.modes == (1, 6)
     # a third window would be cut by the end of the dither: it is never begun
-    assert streams.random is None
-    assert streams.lock_in is None
+    assert streams.cutter is None
+    assert streams.cutter is None
 
 
 def test_another_loop_makes_the_open_window_void(streams):
     streams, _ = play(streams, 0, 5)
     streams = with_rtc(streams, replace(RTC, leak=0.99, seq=499))
-    assert streams.random.window is None
-    assert streams.random.plan.first_seq == 799
+    assert streams.cutter.window is None
+    assert streams.cutter.plan.first_seq == 799
 
 
 def test_a_sine_after_random_signs_is_read_as_a_sine(streams):
@@ -85,8 +86,8 @@ def test_a_sine_after_random_signs_is_read_as_a_sine(streams):
     )
     sine = replace(sine, frequency_hz=(240.0,), window_s=0.5, duration_s=60.0)
     streams = with_dither(streams, sine, 2.0)
-    assert streams.random is None
-    assert streams.lock_in.plan.modes == (6,)
+    assert isinstance(streams.cutter, LockIn)
+    assert streams.cutter.plan.modes == (6,)
 
 
 def test_a_window_too_short_for_its_modes_is_refused_with_how_long_it_must_be(streams):

@@ -85,20 +85,20 @@ def test_without_a_dither_there_are_no_windows(streams):
 
 def test_a_dither_the_rtc_has_not_accepted_yet_opens_nothing(streams):
     waiting = replace(DITHER, id="dither-2", start_seq=None)
-    assert with_dither(streams, waiting, WINDOW_S).lock_in is None
+    assert with_dither(streams, waiting, WINDOW_S).cutter is None
 
 
 def test_the_same_dither_keeps_its_open_window(streams):
     streams, _ = play(streams, 0, 5)
-    assert streams.lock_in.window is not None
+    assert streams.cutter.window is not None
     assert with_dither(streams, DITHER, WINDOW_S) is streams
 
 
 def test_another_dither_starts_another_series(streams):
     streams, _ = play(streams, 0, 5)
     streams = with_dither(streams, replace(DITHER, id="dither-2", start_seq=5000), WINDOW_S)
-    assert streams.lock_in.window is None
-    assert streams.lock_in.plan.first_seq == 5300
+    assert streams.cutter.window is None
+    assert streams.cutter.plan.first_seq == 5300
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_another_dither_starts_another_series(streams):
 def test_another_loop_makes_the_open_window_void(streams, changes):
     streams, _ = play(streams, 0, 6)
     streams = with_rtc(streams, replace(RTC, **changes))
-    assert streams.lock_in.window is None
+    assert streams.cutter.window is None
     _, windows = play(streams, 600, 6)
     assert [w.first_seq for w in windows] == [600]
 
@@ -126,7 +126,7 @@ def test_the_next_window_is_counted_from_the_status_not_from_when_it_was_read(
 def test_the_same_loop_seen_again_keeps_everything(streams):
     streams, _ = play(streams, 0, 6)
     again = with_rtc(streams, replace(RTC, t_ns_utc=5, magnitude=9.0, cm_id="cm-1"))
-    assert again.lock_in is streams.lock_in
+    assert again.cutter is streams.cutter
     assert again.passive is streams.passive
 
 
@@ -154,7 +154,7 @@ def test_frames_of_another_session_are_left_alone(streams):
 def test_without_an_rtc_nothing_is_taken_in(streams):
     gone = with_rtc(streams, None)
     after, windows = play(gone, 0, 14)
-    assert (after.lock_in, after.passive, windows) == (None, None, [])
+    assert (after.cutter, after.passive, windows) == (None, None, [])
 
 
 def test_a_dither_goes_on_after_the_rtc_was_not_trusted_for_a_while(streams):
@@ -376,7 +376,7 @@ def test_no_window_is_begun_that_the_end_of_the_dither_would_cut(streams):
     streams = with_dither(streams, replace(DITHER, duration_s=1.1), WINDOW_S)
     streams, windows = play(streams, 0, 9)
     assert [w.first_seq for w in windows] == [300]
-    assert streams.lock_in is None
+    assert streams.cutter is None
     _, windows = play(streams, 900, 10, dither=False)
     assert not windows
 

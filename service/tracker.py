@@ -23,7 +23,7 @@ from service.tracking.loop import CommandState
 from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
-from service.tracking.updates import decide
+from service.tracking.updates import decide, fetch_in_use
 from service.tracking.validity import age, end_alarm, point
 from service.tracking.worth import note_declined
 
@@ -55,6 +55,7 @@ def _go_on(turn: Turn) -> None:
     """Let what runs go on, and decide what else is wanted: what has the mirror comes first."""
     if turn.state.measuring is not None:
         return
+    fetch_in_use(turn)
     acquire(turn)
     if turn.acquisition.under_way:
         return

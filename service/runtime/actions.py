@@ -89,7 +89,7 @@ class Actions:
             case ev.JudgeMatrix() | ev.JudgeProposal():
                 return await self._judge(effect, state)
             case ev.FetchMatrix(id=matrix_id):
-                return await self._fetch(matrix_id)
+                return await self._fetch(matrix_id, state)
             case ev.SendMatrix():
                 return await self._send(effect, state)
             case ev.FinishNoisy(record=record):
@@ -275,11 +275,14 @@ class Actions:
             return ev.LoopAnswered(id=effect.id, accepted=False, reason=verdict.reason)
         return await self._ask(effect)
 
-    async def _fetch(self, matrix_id: str | None) -> Event:
+    async def _fetch(self, matrix_id: str | None, state: TrackerState) -> Event:
         manifest, matrix = await self._bridge.fetch_applied()
         if matrix_id not in {None, manifest.id}:
             raise LinkError(f"the RTC offers {manifest.id}, its status says it uses {matrix_id}")
         record = translate.record_of(manifest)
+        known = state.reconstructor(record.id)
+        if known is not None and known.sha256 not in {"", record.sha256}:
+            return ev.MatrixFetched(record=record)  # the tracker says what that means
         # first: the archive refuses other numbers under an id it knows
         await asyncio.to_thread(self._store_foreign, record, matrix)
         self._remember(record.id, matrix)

@@ -13,6 +13,7 @@ from service.tracking import events as ev
 from service.tracking.alarms import Act, forbids
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
+from service.tracking.reconstructors import why_unread
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Alarm, Mode, Party, TrackerState, Waiting
 
@@ -226,7 +227,9 @@ def _for_the_matrix(facts: Facts) -> Iterator[Waiting]:
             f"does; rtc/cm/applied is asked meanwhile{_told(state)}"
         )
         yield Waiting(name="matrix-name", party=Party.RTC, text=text)
-    elif rtc is not None and rtc.cm_id and state.reconstructor(rtc.cm_id) is None:
+    elif rtc is not None and (
+        why_unread(state, rtc.cm_id) or (rtc.cm_id and state.reconstructor(rtc.cm_id) is None)
+    ):
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_told(state)}"
         yield Waiting(name="matrix-in-use", party=Party.RTC, text=text)
     for record in state.reconstructors:

@@ -122,6 +122,7 @@ def forget_session(turn: Turn) -> None:
     turn.state = replace(
         turn.state,
         in_use=None,
+        proven=frozenset(),
         wrong_matrix=None,
         applied_asked_ns_utc=0,
         unfetched="",
@@ -313,19 +314,51 @@ def on_acknowledgement(turn: Turn, event: ev.Acknowledged) -> None:
 
 
 def on_fetched(turn: Turn, record: ReconstructorRecord) -> None:
-    """Keep the matrix the RTC uses, which the service did not make, or find its own again."""
+    """Keep the matrix the RTC uses, which the service did not make, or find its own again.
+
+    Ids are not enough: an RTC that starts anew may list its slopes otherwise, and hold the matrix
+    of an id that is known as it needs it then.
+    """
     not_fetched(turn, "")
     known = turn.state.reconstructor(record.id)
     if known is not None and known.sha256 not in {"", record.sha256}:
         _distrust(turn, known, MatrixState.APPLIED, record.sha256)
         return
     _trust(turn, record.id)
-    if known is not None and turn.state.in_use == record.id:
+    if turn.state.in_use == record.id:
         return
     if known is None:
         keep(turn, record)
-    use(turn, record.id)
     turn.log("reconstructor.adopted", f"the RTC uses {record.id}, {record.n_modes} modes")
+    use_named(turn, record.id)
+
+
+def use_named(turn: Turn, matrix_id: str) -> None:
+    """Take the reconstructor that the RTC's status names for applied, acknowledged or not.
+
+    Only once its numbers are known to be the RTC's, or are not to be had.
+    """
+    record = turn.state.reconstructor(matrix_id)
+    if record is None or why_unread(turn.state, matrix_id):
+        return
+    use(turn, matrix_id)
+    if record.state in {*_SENT, MatrixState.FAILED}:
+        turn.calm(NOT_ACKNOWLEDGED)
+    if record.state is MatrixState.FAILED:
+        text = f"{matrix_id} is in use after all, by the RTC's status; nobody acknowledged it"
+        change_state(turn, matrix_id, MatrixState.APPLIED, text)
+        turn.log("reconstructor.applied", text)
+
+
+def why_unread(state: TrackerState, matrix_id: str | None) -> str | None:
+    """Return why nobody knows the numbers of this matrix of the RTC's, or None."""
+    if matrix_id is None or matrix_id in state.proven:
+        return None
+    if matrix_id == state.wrong_matrix:
+        return f"the RTC holds other numbers as {matrix_id}"
+    if state.unfetched:
+        return None  # an RTC need not offer its matrix; its id is believed then
+    return f"the RTC's matrix {matrix_id} is being read back: wait some seconds"
 
 
 def on_margin(turn: Turn, event: ev.MarginJudged) -> None:
@@ -374,21 +407,29 @@ def _sendable(turn: Turn, matrix_id: str) -> tuple[ReconstructorRecord, RtcView]
 def _distrust(
     turn: Turn, record: ReconstructorRecord, state: MatrixState, sha256: str | None
 ) -> None:
-    """Believe that the RTC holds other numbers than were sent: nothing more goes out."""
+    """Believe that the RTC holds other numbers under an id than are known: nothing goes out."""
+    before = "sent were" if record.parent is not None else "it was, when it was read before,"
     text = (
-        f"the RTC has {state} other numbers as {record.id}: sha256 {sha256}, sent were "
-        f"{record.sha256}; nothing is published until it holds what was sent (rtc/cm/applied) or "
-        "begins a new session: open the loop if it suffers, look at the RTC's log"
+        f"the RTC has {state} other numbers as {record.id}: sha256 {sha256}, {before} "
+        f"{record.sha256}; nothing is published until it holds those (rtc/cm/applied), or another "
+        "matrix under an id of its own: open the loop if it suffers, look at the RTC's log"
     )
     change_state(turn, record.id, MatrixState.FAILED, text)
     if state is MatrixState.APPLIED:
         turn.state = replace(turn.state, in_use=None, margin=None, assessment=None)
-    turn.state = replace(turn.state, wrong_matrix=record.id, applied_asked_ns_utc=turn.now_ns)
+    turn.state = replace(
+        turn.state,
+        proven=turn.state.proven - {record.id},
+        wrong_matrix=record.id,
+        applied_asked_ns_utc=turn.now_ns,
+    )
     turn.alarm(OTHER_SUM, text)
 
 
 def _trust(turn: Turn, matrix_id: str) -> None:
     """Note that the RTC holds the numbers that it should."""
+    kept = {record.id for record in turn.state.reconstructors} & turn.state.proven
+    turn.state = replace(turn.state, proven=frozenset({*kept, matrix_id}))
     if turn.state.wrong_matrix is not None:
         turn.state = replace(turn.state, wrong_matrix=None)
         turn.log("reconstructor.right", f"the RTC holds {matrix_id} as it was sent")
@@ -461,7 +502,7 @@ def why_unsendable(state: TrackerState, record: ReconstructorRecord) -> str | No
         return f"α is invalid ({state.registration.doubt})"
     act = Act.SEND_KNOWN if known else Act.SEND_NEW
     alarm = forbidding(state, act)
-    return None if alarm is None else alarm.text
+    return why_unread(state, state.rtc.cm_id) if alarm is None else alarm.text
 
 
 def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:

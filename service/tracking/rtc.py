@@ -27,7 +27,7 @@ from service.tracking.reconstructors import (
     judge_again,
     made_none,
     not_fetched,
-    use,
+    use_named,
 )
 from service.tracking.stages import AcquisitionStage
 from service.tracking.turn import Turn, tell_bursts
@@ -90,8 +90,8 @@ def on_status(turn: Turn, rtc: RtcView) -> None:
     point(turn, rtc.pointing)
     _drop_other_basis(turn)
     _tell_of_gains(turn, before, rtc)
-    if rtc.cm_id is not None and rtc.cm_id != turn.state.wrong_matrix:
-        _use_by_status(turn, rtc.cm_id)
+    if rtc.cm_id is not None:
+        use_named(turn, rtc.cm_id)
     measuring, acquisition = turn.state.measuring, turn.acquisition
     opened = acquisition.under_way or (measuring is not None and measuring.opens_loop)
     # its alarm tells more, and not to close the loop on any matrix
@@ -101,20 +101,6 @@ def on_status(turn: Turn, rtc: RtcView) -> None:
     else:
         turn.calm(LOOP_OPEN)
     follow_status(turn, rtc)
-
-
-def _use_by_status(turn: Turn, matrix_id: str) -> None:
-    """Take a reconstructor for applied, whatever became of its acknowledgement."""
-    record = turn.state.reconstructor(matrix_id)
-    if record is None:
-        return
-    use(turn, matrix_id)
-    if record.state in {*_SENT, MatrixState.FAILED}:
-        turn.calm(NOT_ACKNOWLEDGED)
-    if record.state is MatrixState.FAILED:
-        text = f"{matrix_id} is in use after all, by the RTC's status; nobody acknowledged it"
-        change_state(turn, matrix_id, MatrixState.APPLIED, text)
-        turn.log("reconstructor.applied", text)
 
 
 def _tell_of_gains(turn: Turn, before: RtcView | None, rtc: RtcView) -> None:

@@ -153,6 +153,9 @@ class TrackerState:
     in_use: str | None = None
     """Id of the matrix the RTC multiplies with; None: unknown."""
 
+    proven: frozenset[str] = frozenset()
+    """Ids of matrices whose numbers the RTC has shown or acknowledged in this session."""
+
     wrong_matrix: str | None = None
     """Id under which the RTC holds other numbers than were sent; None: it holds what it should."""
 

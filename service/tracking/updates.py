@@ -36,32 +36,31 @@ NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 _SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
 
 
+def fetch_in_use(turn: Turn) -> None:
+    """Ask for the matrix in use until it was had once in this session."""
+    rtc, state = turn.rtc, turn.state
+    if rtc is None or turn.forbidden(Act.ASK) is not None:
+        return
+    if rtc.cm_id in state.proven:
+        return
+    anew = rtc.cm_id is not None and not state.unfetched and state.wrong_matrix is None
+    every_s = ASK_FIRST_S if anew else ASK_AGAIN_S
+    if turn.now_ns - state.applied_asked_ns_utc >= every_s * SECOND_NS:
+        fetch(turn, rtc)
+
+
 def decide(turn: Turn) -> None:
     """Ask for what is wanted now."""
     rtc = turn.rtc
     if rtc is None or turn.forbidden(Act.ASK) is not None:
         return
     idle = turn.forbidden(Act.DECIDE) is not None or ramping(turn.state, turn.now_ns) is not None
-    if not idle or turn.state.wrong_matrix is not None:
-        _fetch(turn, rtc)
     if idle:
         stop_unwanted(turn, rtc)
         return
     choose_dither(turn, rtc)
     _judge_in_use(turn)
     _choose_update(turn, rtc)
-
-
-def _fetch(turn: Turn, rtc: RtcView) -> None:
-    """Ask for the matrix in use when nobody here has it, its name, or a reason to trust it."""
-    state = turn.state
-    known = rtc.cm_id is not None and state.reconstructor(rtc.cm_id) is not None
-    if known and state.wrong_matrix is None:
-        return
-    anew = rtc.cm_id is not None and not state.unfetched and state.wrong_matrix is None
-    every_s = ASK_FIRST_S if anew else ASK_AGAIN_S
-    if turn.now_ns - state.applied_asked_ns_utc >= every_s * SECOND_NS:
-        fetch(turn, rtc)
 
 
 def _judge_in_use(turn: Turn) -> None:

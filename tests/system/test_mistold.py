@@ -83,3 +83,26 @@ def test_commands_in_nanometres_are_named_and_the_healthy_loop_stays_closed(nigh
         assert not rtc.applied
         assert "loop" not in [kind for kind, _ in rtc.commands]
         assert "nanometres" in wrong(night)["command-unit"]
+
+
+def test_an_rtc_that_starts_anew_with_other_slopes_is_not_believed_by_the_id_of_its_matrix(night):
+    night.service("auto")
+    response, variance_m2 = small_telescope(**ALPHA)
+    assumed, _ = small_telescope()
+    with Stranger(night.zenoh, response, variance_m2, assumed=assumed) as rtc:
+        wait_for(lambda: rtc.applied, 40.0, f"a matrix applied; {night.state['alarms']}")
+        night.client.put("/v1/mode", json={"mode": "hold"}).raise_for_status()
+        under_way = ("published", "staged")
+        wait_for(lambda: not any(map(night.ids, under_way)), 20.0, "nothing on its way")
+        wait_for(lambda: night.state["in_use"] == rtc.cm_id, 10.0, "the last one in use")
+        known = rtc.cm_id
+        rtc.response, rtc.matrix = -rtc.response, -rtc.matrix
+        rtc.restart("stranger-2")
+        wait_for(lambda: "wrong-matrix" in night.alarms, 10.0, "an alarm")
+        assert known in night.alarms["wrong-matrix"]
+        n_applied, rtc.residuals = len(rtc.applied), []
+        night.post("/v1/rollback")
+        time.sleep(8.0)
+        assert len(rtc.applied) == n_applied
+        assert "wrong-matrix" in night.alarms
+        assert rtc.worst_m < 1e-6

@@ -277,6 +277,16 @@ async def test_another_matrix_under_a_known_id_is_not_taken_for_the_same(actions
         await actions.perform(ev.FetchMatrix(id="initial"), STATE)
 
 
+async def test_other_numbers_under_an_id_the_tracker_knows_are_for_it_to_distrust(actions, bridge):
+    event = await actions.perform(ev.FetchMatrix(id="initial"), STATE)
+    state = replace(STATE, reconstructors=(event.record,))
+    other = BROUGHT * 2
+    bridge.applied = (manifest_of(foreign(), layout_of(other, 4096), RTC, "small"), other)
+    found = await actions.perform(ev.FetchMatrix(id="initial"), state)
+    assert found.record.sha256 != event.record.sha256
+    np.testing.assert_array_equal(actions.matrix("initial"), BROUGHT)
+
+
 async def test_a_matrix_swapped_while_it_was_asked_for_is_named(actions):
     with pytest.raises(LinkError, match="offers initial, its status says it uses cm-1"):
         await actions.perform(ev.FetchMatrix(id="cm-1"), STATE)

@@ -154,6 +154,7 @@ def test_nothing_is_waited_for_while_all_is_well():
         system="small",
         mode=Mode.AUTO,
         rtc=rtc(cm_id="a"),
+        proven=frozenset({"a"}),
         reconstructors=(record("a", MatrixState.APPLIED),),
     )
     assert waits(link(*WELL), state) == {}

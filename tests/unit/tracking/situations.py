@@ -127,7 +127,12 @@ def turned(state, act, *args, now_ns=START_NS, **kwargs):
 
 
 class Story:
-    """Tells events to the tracker one after another and keeps everything it wanted done."""
+    """Tells events to the tracker one after another and keeps everything it wanted done.
+
+    Its RTC holds what it should: asked for a matrix that the service knows, it ``shows`` that.
+    """
+
+    shows = True
 
     def __init__(self, mode=Mode.AUTO, policy=POLICY, state=None):
         self.state = state or TrackerState(system="flao", mode=mode)
@@ -140,6 +145,10 @@ class Story:
         self.now_ns += round(after_s * SECOND)
         self.state, effects = step(self.state, event, self.policy, self.now_ns)
         self.effects += effects
+        for effect in effects if self.shows else ():
+            known = isinstance(effect, ev.FetchMatrix) and self.state.reconstructor(effect.id or "")
+            if known:
+                effects += self.tell(ev.MatrixFetched(record=known))
         return effects
 
     def wait(self, seconds, every_s=1.0):

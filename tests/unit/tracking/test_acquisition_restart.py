@@ -10,7 +10,7 @@ from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode, TrackerState
-from tests.unit.tracking.situations import POLICY, SECOND
+from tests.unit.tracking.situations import POLICY, SECOND, foreign
 from tests.unit.tracking.test_acquisition import ACQUIRES, DIVERGING, FAR, Acquiring
 
 N_MODES = 594
@@ -33,6 +33,8 @@ class Again(Acquiring):
         seen = OPEN | {"session": f"s{self.session}"} | changes
         self.tell(ev.SessionStarted(session=seen["session"]), 0.1)
         self.status(**seen)
+        if self.state.rtc.cm_id == "initial":
+            self.tell(ev.MatrixFetched(record=foreign()))
         return self
 
     @property
@@ -280,7 +282,9 @@ class TestGap:
 
     def test_it_ends_in_the_same_state_as_after_a_restart_of_the_service(self, opened):
         again = Again(opened).find()
+        again.still_open()
         opened.tell(ev.RtcVanished())
+        opened.still_open()
         opened.still_open()
         one, other = again.state.acquisition, opened.state.acquisition
         assert (one.stage, one.attempt, one.found) == (other.stage, other.attempt, other.found)

@@ -28,6 +28,7 @@ def proposed(alpha):
     return TrackerState(
         system="flao",
         rtc=rtc(),
+        proven=frozenset({"initial"}),
         reconstructors=(record("cm-1", judged=then),),
         registration=known,
     )

@@ -20,6 +20,7 @@ def sent(story=None):
     story.tell(ev.MatrixFetched(record=foreign()))
     story.see(n_windows=2)
     story.make("cm-1", MatrixState.PUBLISHED, sha256=SUM)
+    story.shows = False
     return story
 
 
@@ -94,6 +95,68 @@ def test_a_commit_the_rtc_could_not_read_is_rejected_though_it_names_none():
     assert story.matrix_state("cm-1") is MatrixState.REJECTED
     story.tell(ev.Acknowledged(id=None, state=MatrixState.REJECTED, reason="x", frame_seq=None))
     assert "acknowledgement.unknown" in story.logged
+
+
+# ---------------------------------------------------------------- a known id in a new session
+
+
+def restarted(story=None):
+    """The RTC starts anew and names the matrix that it had."""
+    story = story or sent()
+    answer(story, SUM)
+    story.tell(ev.SessionStarted(session="s2"))
+    story.effects.clear()
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1", session="s2")))
+    return story
+
+
+def test_after_a_restart_a_known_matrix_is_read_back_before_it_is_believed():
+    story = restarted()
+    assert story.asked(ev.FetchMatrix) == [ev.FetchMatrix(id="cm-1")]
+    assert story.state.in_use is None
+    story.tell(ev.MatrixFetched(record=record("cm-1", sha256=SUM)))
+    assert story.state.in_use == "cm-1"
+    assert story.matrix_state("cm-1") is MatrixState.APPLIED
+    story.effects.clear()
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1", session="s2")))
+    story.wait(30.0)
+    assert not story.asked(ev.FetchMatrix)
+
+
+@pytest.mark.parametrize("order", [ev.Rollback(), ev.Publish(id="cm-1")])
+def test_nothing_is_sent_to_an_rtc_whose_matrix_is_being_read_back(order):
+    story = restarted()
+    story.tell(order)
+    story.make("cm-2", wanted=True)
+    assert not story.asked(ev.SendMatrix)
+    with pytest.raises(CommandError, match="read back"):
+        story.tell(ev.Approve(id="cm-2"))
+    story.tell(ev.MatrixFetched(record=record("cm-1", sha256=SUM)))
+    story.tell(ev.Approve(id="cm-2"))
+    assert story.asked(ev.SendMatrix)
+
+
+@pytest.mark.parametrize("order", [ev.Rollback(), ev.Publish(id="cm-1")])
+def test_other_numbers_under_a_known_id_forbid_all_sending(order):
+    story = restarted()
+    story.tell(ev.MatrixFetched(record=record("cm-1", sha256=OTHER)))
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1", session="s2")))
+    assert "wrong-matrix" in story.alarms
+    assert story.state.in_use is None
+    story.tell(order)
+    story.make("cm-2", wanted=True)
+    with pytest.raises(CommandError, match="other numbers"):
+        story.tell(ev.Approve(id="cm-2"))
+    assert not story.asked(ev.SendMatrix)
+
+
+def test_an_rtc_that_does_not_offer_its_matrix_is_believed_by_the_id():
+    story = restarted()
+    (fetch,) = story.asked(ev.FetchMatrix)
+    story.tell(ev.JobFailed(effect=fetch, text="no answer on rtc/cm/applied"))
+    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1", session="s2")))
+    assert story.state.in_use == "cm-1"
+    story.tell(ev.Rollback())
 
 
 # ---------------------------------------------------------------- a matrix without a name

@@ -216,7 +216,8 @@ class Bridge:
         WireError
             If the manifest does not describe the matrix, or its id names another one.
         LinkError
-            If the link is not open.
+            If the link is not open, or another session of the RTC's than the one that counts was
+            the last to speak: no commit goes out then.
         """
         await asyncio.to_thread(self._publish, manifest, matrix)
 
@@ -363,6 +364,9 @@ class Bridge:
         keys, name = self._keys, manifest.id
         for index, part in enumerate(offer.parts):
             link.put(session, keys.chunk(name, index), part, Encodings.BYTES, urgent=False)
+        other = self._intake.other_session
+        if other is not None:  # it may list its slopes otherwise
+            raise LinkError(f"{name} was not sent: the RTC may have begun session {other}")
         link.put(session, keys.commit(name), offer.commit, Encodings.COMMIT, urgent=True)
         self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
 

@@ -250,6 +250,12 @@ class Intake:
         except WireError as error:
             self.malformed("status", error)
 
+    @property
+    def other_session(self) -> str | None:
+        """A session that spoke after the last word of the one that counts, or None."""
+        with self._lock:
+            return self._sessions.other
+
     def statistics(self) -> LinkStatistics:
         """Return all counters as they are now."""
         with self._lock:

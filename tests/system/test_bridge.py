@@ -550,6 +550,21 @@ async def test_a_published_reconstructor_is_staged_applied_and_acknowledged(brid
     assert bridge.statistics().acknowledgements_unknown == 0
 
 
+async def test_nothing_is_committed_while_another_session_was_the_last_to_speak(bridge, rtc):
+    manifest, matrix = reconstructor(rtc)
+    rtc.send(0)
+    wait_until(lambda: bridge.statistics().session == "s1")
+    rtc.send(0, session="anew")
+    wait_until(lambda: bridge.statistics().frames_refused == {"session": 10})
+    with pytest.raises(LinkError, match="may have begun session anew"):
+        await bridge.publish(manifest, matrix)
+    assert not rtc.applied
+    rtc.send(10)
+    drained(bridge, 20)
+    await bridge.publish(manifest, matrix)
+    wait_until(lambda: rtc.applied)
+
+
 async def test_a_late_rtc_fetches_the_current_reconstructor_part_by_part(bridge, endpoint, rtc):
     manifest, matrix = reconstructor(rtc)
     bridge.offer(manifest, matrix)

@@ -91,10 +91,7 @@ def test_an_rtc_that_starts_anew_with_other_slopes_is_not_believed_by_the_id_of_
     assumed, _ = small_telescope()
     with Stranger(night.zenoh, response, variance_m2, assumed=assumed) as rtc:
         wait_for(lambda: rtc.applied, 40.0, f"a matrix applied; {night.state['alarms']}")
-        night.client.put("/v1/mode", json={"mode": "hold"}).raise_for_status()
-        under_way = ("published", "staged")
-        wait_for(lambda: not any(map(night.ids, under_way)), 20.0, "nothing on its way")
-        wait_for(lambda: night.state["in_use"] == rtc.cm_id, 10.0, "the last one in use")
+        # at once: the next one, of more modes, is being made
         known = rtc.cm_id
         rtc.response, rtc.matrix = -rtc.response, -rtc.matrix
         rtc.restart("stranger-2")

@@ -85,6 +85,21 @@ def test_a_session_is_replaced_once_it_has_been_silent():
     assert not watch.admit("b", 3.0).changed
 
 
+def test_a_session_is_in_doubt_from_the_first_word_of_another_to_the_next_of_its_own():
+    watch = SessionWatch()
+    watch.admit("a", 0.0)
+    assert watch.other is None
+    watch.admit("b", 0.1)
+    assert watch.other == "b"
+    watch.admit("a", 0.2)
+    assert watch.other is None
+    watch.admit("b", 0.3)
+    watch.admit("b", 2.3)
+    assert (watch.current, watch.other) == ("b", None)
+    watch.admit("a", 2.4)
+    assert watch.other is None
+
+
 def test_one_message_of_an_unknown_session_takes_nothing_over_and_is_named():
     watch = SessionWatch()
     watch.admit("a", 0.0)

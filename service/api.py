@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import socket
+from collections.abc import Iterator
 from typing import Any
 
+import structlog
+import uvicorn
 from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from typing_extensions import override
 
 from service import __version__
 from service.routes import commands, fits, health, matrices, problems, reading, views
-from service.routes.admission import Admission, Hosts
+from service.routes.admission import Admission, Hosts, server_config
 from service.routes.service import Fits, Service, Snapshot
 
-__all__ = ["Fits", "Service", "Snapshot", "create_app"]
+__all__ = ["Fits", "Service", "Snapshot", "answer", "create_app"]
+
+REQUESTS_WITHIN_S = 2
+"""Requests under way when the service is asked to stop may take this long: an upload would take
+longer."""
 
 _DESCRIPTION = """
 Calibration service of an adaptive telescope with a pyramid wavefront sensor.
@@ -22,6 +32,37 @@ Shifts are in subapertures, angles in degrees, magnification is a ratio; every n
 in its name. Times are nanoseconds since the Unix epoch, UTC. A number that is not known or not
 finite is `null`. Errors are `application/problem+json` (RFC 9457).
 """
+
+
+async def answer(
+    service: Service,
+    desk: Fits,
+    listener: socket.socket,
+    names: tuple[str, ...],
+    over: asyncio.Event,
+) -> None:
+    """Answer requests under these ``names`` until it is ``over``."""
+    host, port = listener.getsockname()[:2]
+    app = create_app(service, desk, hosts=Hosts(bound=host, allowed=names))
+    server = _Server(server_config(app, timeout_graceful_shutdown=REQUESTS_WITHIN_S))
+    server.over = over
+    structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
+    await server.serve(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    """A uvicorn that leaves signals alone: it would raise them again before all is closed."""
+
+    over: asyncio.Event
+
+    @override
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+    @override
+    async def on_tick(self, counter: int) -> bool:
+        return self.over.is_set() or await super().on_tick(counter)
 
 
 def create_app(

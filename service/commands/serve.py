@@ -12,23 +12,20 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from importlib import import_module
 from typing import TextIO, cast
 
 import structlog
-import uvicorn
 from structlog.typing import EventDict
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
-from service.api import create_app
 from service.archive import Archive
 from service.config import Settings, load_instrument, packaged_instrument
 from service.config.policy import policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.uploads import UploadFitter
 from service.model.instrument import Instrument
-from service.routes.admission import Hosts, server_config
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.recording import taken_up
@@ -38,10 +35,6 @@ from service.runtime.workers import WorkerPool
 from service.tracking.measuring import MEASUREMENTS_KEPT, NOISY_KEPT
 from service.tracking.reconstructors import restored
 from service.tracking.state import Mode, TrackerState
-
-REQUESTS_WITHIN_S = 2
-"""Requests under way when the service is asked to stop may take this long: an upload would take
-longer."""
 
 END_WITHIN_S = 4.5
 """After this what holds the service up is named, and left behind: five seconds is what operators
@@ -68,30 +61,32 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
             bridge.expect(instrument.basis_id, instrument.config_id)
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
             desk = _desk(settings, instrument)
-            hosts = Hosts(bound=settings.api.host, allowed=settings.api.allowed_hosts)
+            names = (settings.api.host, *settings.api.allowed_hosts)
             try:
-                return await _until_stopped(supervisor, desk, listener, hosts)
+                return await _until_stopped(supervisor, desk, listener, names)
             finally:
                 workers.close()
 
 
 async def _until_stopped(
-    supervisor: Supervisor, desk: FitQueue, listener: socket.socket, hosts: Hosts
+    supervisor: Supervisor, desk: FitQueue, listener: socket.socket, names: tuple[str, ...]
 ) -> int:
     desk.open()
-    app = create_app(supervisor, desk, hosts=hosts)
-    config = server_config(app, timeout_graceful_shutdown=REQUESTS_WITHIN_S)
-    server = _Server(config)
     ending = _Ending()
-    host, port = listener.getsockname()[:2]
-    structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
+
+    async def answer() -> None:
+        # takes a second, in which telemetry is taken in already
+        await asyncio.to_thread(import_module, "service.api")
+        from service import api
+
+        await api.answer(supervisor, desk, listener, names, ending.asked)
+
     work = asyncio.create_task(supervisor.run())
-    web = asyncio.create_task(server.serve(sockets=[listener]))
+    web = asyncio.create_task(answer())
     asked = asyncio.create_task(ending.asked.wait())
     await asyncio.wait({work, web, asked}, return_when=asyncio.FIRST_COMPLETED)
     failed = work.done() or web.done()
     ending.begin()
-    server.should_exit = True
     for task in (work, asked):
         task.cancel()
     outcomes = await asyncio.gather(work, web, return_exceptions=True)
@@ -117,34 +112,20 @@ def _explain(outcome: BaseException | None) -> None:
         structlog.get_logger().error("service.failed", exc_info=outcome)
 
 
-class _Server(uvicorn.Server):
-    """A uvicorn that leaves signals alone: it would raise them again before all is closed."""
-
-    @override
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield
-
-
 class _Ending:
     """Hears SIGINT and SIGTERM, once, and sees to it that the end comes."""
 
     def __init__(self) -> None:
         self.asked = asyncio.Event()
-        self._begun = False
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(self._ask))
-
-    def _ask(self) -> None:
-        self.begin()
-        self.asked.set()
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(self.begin))
 
     def begin(self) -> None:
         """Begin the end: it is not begun twice, and cannot be put off."""
-        if self._begun:
+        if self.asked.is_set():
             return
-        self._begun = True
+        self.asked.set()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
         guard = threading.Timer(END_WITHIN_S, _leave_behind)

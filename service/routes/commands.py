@@ -21,7 +21,8 @@ from pydantic import (
 )
 
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
-from service.routes.service import Service, ServiceDep
+from service.routes.service import Service
+from service.routes.views import ServiceDep
 from service.tracking.dither_plan import total_m
 from service.tracking.events import (
     AbortAcquisition,

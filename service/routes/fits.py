@@ -19,8 +19,7 @@ from service.fit.options import FitOptions, Method
 from service.routes import pictures as shown
 from service.routes.pictures import FitJobs
 from service.routes.problems import INVALID, UNKNOWN, problem_response
-from service.routes.service import FitsDep, ServiceDep
-from service.routes.views import answer, picture, shows
+from service.routes.views import FitsDep, ServiceDep, answer, picture, shows
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
 

@@ -28,8 +28,8 @@ from service.routes.commands import (
 )
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.reading import describes_numbers, numbers_of
-from service.routes.service import ServiceDep, Snapshot
-from service.routes.views import answer, shows
+from service.routes.service import Snapshot
+from service.routes.views import ServiceDep, answer, shows
 from service.tracking.dither_plan import NOISY_DITHER
 from service.tracking.events import GiveUp, GiveUpNoisy, Measure, MeasureNoisy
 from service.tracking.products import MeasurePattern, ModeSet

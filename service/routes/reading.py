@@ -19,8 +19,7 @@ from service.errors import CommandError, UnknownIdError
 from service.routes import pictures as shown
 from service.routes.pictures import Estimator, Estimators, GainTableShown
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
-from service.routes.service import ServiceDep
-from service.routes.views import answer, shows
+from service.routes.views import ServiceDep, answer, shows
 from service.telemetry.estimate import LOCK_IN, PASSIVE, RANDOM
 from service.tracking.loop_commands import table_of
 from service.tracking.registration import ModeGain, Source

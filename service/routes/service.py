@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import Annotated, Protocol
+from typing import Protocol
 
 import numpy as np
-from fastapi import Depends, Request
 from numpy.typing import NDArray
 
 from service.files.uploads import FitAsked, FitJob
@@ -268,20 +267,3 @@ class Fits(Protocol):
         UnknownIdError
             If none has this id.
         """
-
-
-def _service_of(request: Request) -> Service:
-    service: Service = request.app.state.service
-    return service
-
-
-def _fits_of(request: Request) -> Fits:
-    fits: Fits = request.app.state.fits
-    return fits
-
-
-ServiceDep = Annotated[Service, Depends(_service_of)]
-"""The service a route works for."""
-
-FitsDep = Annotated[Fits, Depends(_fits_of)]
-"""The desk a route works for."""

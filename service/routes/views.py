@@ -20,13 +20,15 @@ from functools import cache
 from itertools import pairwise
 from operator import attrgetter
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from fastapi import Depends, Request
 from fastapi.responses import JSONResponse
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.routes.service import Fits, Service
 
 Schema = dict[str, Any]
 """A JSON schema."""
@@ -122,6 +124,23 @@ def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a 
     if isinstance(value, Mapping):
         return {key: _plain(entry, of) for key, entry in value.items()}
     return picture(value, of)
+
+
+def _service_of(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+def _fits_of(request: Request) -> Fits:
+    fits: Fits = request.app.state.fits
+    return fits
+
+
+ServiceDep = Annotated[Service, Depends(_service_of)]
+"""The service a route works for."""
+
+FitsDep = Annotated[Fits, Depends(_fits_of)]
+"""The desk a route works for."""
 
 
 # --- the OpenAPI document

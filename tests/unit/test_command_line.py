@@ -236,7 +236,7 @@ def test_a_start_imports_no_more_than_it_needs():
         "import sys, service.commands.serve; from service.config import load_instrument; "
         "load_instrument('flao-lbt'); "
         "late = ('scipy.linalg', 'scipy.spatial', 'scipy.ndimage', 'scipy.interpolate', "
-        "'scipy.sparse', 'scipy.special', 'matplotlib', 'astropy'); "
+        "'scipy.sparse', 'scipy.special', 'matplotlib', 'astropy', 'fastapi', 'uvicorn'); "
         "print([name for name in late if name in sys.modules])"
     )
     root = Path(__file__).parents[2]

@@ -6,10 +6,11 @@ is seen in the state and in the events.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from fastapi import APIRouter, Body, Path
+from fastapi import APIRouter, Body
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -22,7 +23,7 @@ from pydantic import (
 
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.service import Service
-from service.routes.views import ServiceDep
+from service.routes.views import MatrixId, ServiceDep
 from service.tracking.dither_plan import total_m
 from service.tracking.events import (
     AbortAcquisition,
@@ -55,7 +56,6 @@ observatory = APIRouter(
     prefix="/v1", tags=["what the observatory tells it"], responses={**COMMAND, **INVALID}
 )
 
-MatrixId = Annotated[str, Path(alias="id", description="Id of a reconstructor")]
 Positive = Annotated[float, Field(gt=0.0)]
 
 MOST_SINES = 64
@@ -94,7 +94,7 @@ if TYPE_CHECKING:
 else:
     # a union of pydantic's own would name its branches in every message
     Modes = Annotated[
-        Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1, max_length=MOST_MODES)],
+        Annotated[list[BasisMode], Field(min_length=1, max_length=MOST_MODES)],
         WrapValidator(_named_or_listed),
         WithJsonSchema(_SCHEMA),
     ]
@@ -110,6 +110,10 @@ class Request(BaseModel):
         allow_inf_nan=False,
         use_attribute_docstrings=True,
     )
+
+    def fields(self) -> dict[str, Any]:
+        """Return what was asked as a command of the tracker has it: a list is a tuple there."""
+        return {name: tuple(v) if isinstance(v, list) else v for name, v in self}
 
 
 class NoFields(Request):
@@ -247,7 +251,7 @@ class LoopBody(Request):
             raise ValueError("at least one of loop, gains, leak, n_controlled, effective_gain")
         if self.gains is not None and self.effective_gain is not None:
             raise ValueError("gains or effective_gain, not both")
-        _none_twice(self.gains or [])
+        _none_twice(self.gains or ())
         return self
 
 
@@ -265,11 +269,11 @@ class RampBody(Request):
 
     @model_validator(mode="after")
     def _consistent(self) -> RampBody:
-        _none_twice(self.groups or [])
+        _none_twice(self.groups or ())
         return self
 
 
-def _none_twice(groups: list[GainGroupBody] | list[ModeGroup]) -> None:
+def _none_twice(groups: Sequence[ModeGroup]) -> None:
     ranges = sorted((group.first, group.last) for group in groups)
     for before, after in pairwise(ranges):
         if after[0] <= before[1]:
@@ -310,8 +314,7 @@ _ALL = "/v1/reconstructors"
 @router.post("/refit", status_code=202)
 async def refit(service: ServiceDep, body: RefitRequest | None = None) -> AcceptedView:
     """Compute a reconstructor for the current registration; gate and mode apply as always."""
-    n_modes = None if body is None else body.n_modes
-    return await accepted(service, Refit(n_modes=n_modes), reconstructors=_ALL)
+    return await accepted(service, Refit(**(body or RefitRequest()).fields()), reconstructors=_ALL)
 
 
 @router.post("/dither", status_code=202)
@@ -322,16 +325,9 @@ async def dither(
     """Start or stop the dither."""
     if isinstance(body, StopDitherRequest):
         return await accepted(service, StopDither())
-    modes = body.modes
-    command = StartDither(
-        kind=body.kind,
-        modes=tuple(modes) if isinstance(modes, list) else modes,
-        amplitude_m=body.amplitude_m,
-        total_m=body.total_amplitude_m,
-        frequency_hz=None if body.frequency_hz is None else tuple(body.frequency_hz),
-        duration_s=body.duration_s,
-        over_budget=body.over_budget,
-    )
+    asked = body.fields()
+    asked.pop("action")
+    command = StartDither(total_m=asked.pop("total_amplitude_m"), **asked)
     answer = await accepted(service, command)
     state = service.snapshot().tracker
     if state.dither is None:
@@ -354,7 +350,7 @@ async def reject(
     service: ServiceDep, matrix_id: MatrixId, body: RejectRequest | None = None
 ) -> AcceptedView:
     """Discard a proposed reconstructor."""
-    command = Reject(id=matrix_id, reason="" if body is None else body.reason)
+    command = Reject(id=matrix_id, **(body or RejectRequest()).fields())
     return await accepted(service, command, reconstructor=_link(matrix_id))
 
 
@@ -391,17 +387,11 @@ async def loop(service: ServiceDep, body: LoopBody) -> AcceptedView:
     The answer comes when the RTC has accepted; 409 with its reason when it refuses. The state shows
     the loop as the RTC's next status tells it.
     """
-    groups = None
+    asked = body.fields()
+    loop = asked.pop("loop")
     if body.gains is not None:
-        groups = tuple(GainGroup(first=g.first, last=g.last, gain=g.gain) for g in body.gains)
-    command = SetLoop(
-        closed=None if body.loop is None else body.loop == "closed",
-        gains=groups,
-        leak=body.leak,
-        n_controlled=body.n_controlled,
-        effective_gain=body.effective_gain,
-    )
-    return await accepted(service, command)
+        asked["gains"] = tuple(GainGroup(**group.fields()) for group in body.gains)
+    return await accepted(service, SetLoop(closed=loop and loop == "closed", **asked))
 
 
 @router.post("/loop/ramp", status_code=202)
@@ -411,13 +401,10 @@ async def ramp(service: ServiceDep, body: RampBody | None = None) -> AcceptedVie
     The answer comes when the RTC has begun; 409 with its reason when it refuses. What it chose is
     seen in the gains of the state, which change while it tries, too.
     """
-    body = body or RampBody()
-    command = Ramp(
-        groups=None if body.groups is None else tuple((g.first, g.last) for g in body.groups),
-        gains=None if body.gains is None else tuple(body.gains),
-        step_s=body.step_s,
-    )
-    return await accepted(service, command)
+    asked = (body or RampBody()).fields()
+    if asked["groups"] is not None:
+        asked["groups"] = tuple((group.first, group.last) for group in asked["groups"])
+    return await accepted(service, Ramp(**asked))
 
 
 @router.post("/acquisition", status_code=202)
@@ -437,5 +424,4 @@ async def pointing(service: ServiceDep, body: PointingRequest) -> AcceptedView:
 
     The registration moves with it. An RTC that says so in its status overrules this.
     """
-    told = Pointing(elevation_deg=body.elevation_deg, azimuth_deg=body.azimuth_deg)
-    return await accepted(service, SetPointing(pointing=told))
+    return await accepted(service, SetPointing(pointing=Pointing(**body.fields())))

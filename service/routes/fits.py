@@ -16,10 +16,9 @@ from service.errors import MatrixError
 from service.files.request import parse_alpha, parse_modes
 from service.files.uploads import FitAsked, FitState
 from service.fit.options import FitOptions, Method
-from service.routes import pictures as shown
-from service.routes.pictures import FitJobs
+from service.routes import views as shown
 from service.routes.problems import INVALID, UNKNOWN, problem_response
-from service.routes.views import FitsDep, ServiceDep, answer, picture, shows
+from service.routes.views import FitJobs, FitsDep, ServiceDep, answer, picture, shows
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
 

@@ -13,10 +13,9 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from service.errors import UnknownIdError
-from service.routes import pictures as shown
+from service.routes import views as shown
 from service.routes.commands import (
     MOST_MODES,
     AcceptedView,
@@ -27,9 +26,9 @@ from service.routes.commands import (
     accepted,
 )
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
-from service.routes.reading import describes_numbers, numbers_of
+from service.routes.reading import Parameters, describes_numbers, numbers_of
 from service.routes.service import Snapshot
-from service.routes.views import ServiceDep, answer, shows
+from service.routes.views import ServiceDep, answer, known, shows
 from service.tracking.dither_plan import NOISY_DITHER
 from service.tracking.events import GiveUp, GiveUpNoisy, Measure, MeasureNoisy
 from service.tracking.products import MeasurePattern, ModeSet
@@ -108,10 +107,8 @@ class MeasuredFormat(StrEnum):
     """The archived product, with how it was measured."""
 
 
-class MeasuredParameters(BaseModel):
+class MeasuredParameters(Parameters):
     """How to return a measured matrix."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     format: MeasuredFormat = MeasuredFormat.NPY
     """"npy", "raw" or "hdf5"."""
@@ -147,16 +144,7 @@ async def measure(service: ServiceDep, body: MeasureBody | None = None) -> Matri
 
     The answer comes when the RTC has begun; the matrix follows seconds to minutes later.
     """
-    body = body or MeasureBody()
-    command = Measure(
-        id=_new_id("im-", service.snapshot()),
-        pattern=body.pattern,
-        modes=None if body.modes is None else tuple(body.modes),
-        amplitude_m=body.amplitude_m,
-        n_average=body.n_average,
-        frequency_hz=None if body.frequency_hz is None else tuple(body.frequency_hz),
-        duration_s=body.duration_s,
-    )
+    command = Measure(id=_new_id("im-", service.snapshot()), **(body or MeasureBody()).fields())
     answered = await accepted(service, command, measurement=f"{_MEASURED}/{command.id}")
     return MatrixAcceptedView(id=command.id, **answered.model_dump())
 
@@ -171,9 +159,7 @@ async def measurements(service: ServiceDep) -> Response:
 async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Response:
     """Return how a matrix was measured, or how far it is."""
     record = service.snapshot().tracker.measurement(measurement_id)
-    if record is None:
-        raise UnknownIdError(f"measurement {measurement_id}: nobody has heard of it")
-    return answer(record)
+    return answer(known(record, f"measurement {measurement_id}"))
 
 
 @router.delete("/measurements/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
@@ -235,14 +221,9 @@ async def measure_noisy(service: ServiceDep, body: NoisyBody | None = None) -> M
 
     The service's own dither makes way for it; every window of it is fitted like any other.
     """
-    body = body or NoisyBody()
-    command = MeasureNoisy(
-        id=_new_id(NOISY_DITHER, service.snapshot()),
-        modes=body.modes if isinstance(body.modes, ModeSet) else tuple(body.modes),
-        total_m=body.total_amplitude_m,
-        duration_s=body.duration_s,
-        over_budget=body.over_budget,
-    )
+    asked = (body or NoisyBody()).fields()
+    name, total_m = _new_id(NOISY_DITHER, service.snapshot()), asked.pop("total_amplitude_m")
+    command = MeasureNoisy(id=name, total_m=total_m, **asked)
     answered = await accepted(service, command, matrix=f"{_NOISY}/{command.id}")
     return MatrixAcceptedView(id=command.id, **answered.model_dump())
 
@@ -257,9 +238,7 @@ async def noisy_matrices(service: ServiceDep) -> Response:
 async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return what is known of one, or how far it is."""
     record = service.snapshot().tracker.noisy_matrix(noisy_id)
-    if record is None:
-        raise UnknownIdError(f"noisy matrix {noisy_id}: nobody has heard of it")
-    return answer(record)
+    return answer(known(record, f"noisy matrix {noisy_id}"))
 
 
 @noisy.delete("/noisy-matrix/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})

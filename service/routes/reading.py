@@ -10,23 +10,19 @@ from http import HTTPStatus
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.errors import CommandError, UnknownIdError
-from service.routes import pictures as shown
-from service.routes.pictures import Estimator, Estimators, GainTableShown
+from service.errors import CommandError
+from service.routes import views as shown
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
-from service.routes.views import ServiceDep, answer, shows
-from service.telemetry.estimate import LOCK_IN, PASSIVE, RANDOM
+from service.routes.views import GainTableShown, MatrixId, ServiceDep, answer, known, shows
 from service.tracking.loop_commands import table_of
-from service.tracking.registration import ModeGain, Source
+from service.tracking.registration import ModeGain
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
-
-MatrixId = Annotated[str, Path(alias="id", description="Id of a reconstructor")]
 
 
 class MatrixFormat(StrEnum):
@@ -113,14 +109,14 @@ async def alpha(request: Request, service: ServiceDep) -> Response:
     """Return the registration now: estimate, 1 σ, covariance and age."""
     snapshot = service.snapshot()
     tracker = snapshot.tracker
-    known = snapshot.alpha
-    if known is None:
+    current = snapshot.alpha
+    if current is None:
         detail = (
             f"no estimate yet: {tracker.windows_accepted} windows accepted, "
             f"{tracker.windows_refused} refused; {snapshot.ready_reason}"
         )
         return problem(request, HTTPStatus.NOT_FOUND, "no-estimate", detail)
-    return answer(known)
+    return answer(current)
 
 
 @router.get("/alpha/history", responses={200: shows(shown.HISTORY)})
@@ -143,9 +139,7 @@ async def reconstructors(service: ServiceDep) -> Response:
 async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return what is known of one reconstructor."""
     record = service.snapshot().tracker.reconstructor(matrix_id)
-    if record is None:
-        raise UnknownIdError(f"reconstructor {matrix_id}: nobody has heard of it")
-    return answer(record)
+    return answer(known(record, f"reconstructor {matrix_id}"))
 
 
 @router.get(
@@ -188,16 +182,16 @@ async def gains(service: ServiceDep) -> Response:
     tracker = service.snapshot().tracker
     if tracker.rtc is None:
         raise CommandError("gains: no RTC is there: the number of modes is not known")
-    known = tracker.registration
-    return _gain_table(None, () if known is None else known.optical_gains, tracker.rtc.n_modes)
+    current = tracker.registration
+    measured = () if current is None else current.optical_gains
+    return _gain_table(None, measured, tracker.rtc.n_modes)
 
 
 @router.get("/reconstructors/{id}/gains", responses={200: shows(shown.GAINS), **UNKNOWN})
 async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the table that was measured when this reconstructor was made, for its modes."""
-    record = service.snapshot().tracker.reconstructor(matrix_id)
-    if record is None:
-        raise UnknownIdError(f"reconstructor {matrix_id}: nobody has heard of it")
+    found = service.snapshot().tracker.reconstructor(matrix_id)
+    record = known(found, f"reconstructor {matrix_id}")
     return _gain_table(record.id, record.optical_gains, record.n_modes)
 
 
@@ -212,11 +206,3 @@ def _gain_table(matrix_id: str | None, measured: tuple[ModeGain, ...], n_modes: 
             factor=table.factors.tolist(),
         )
     )
-
-
-@router.get("/estimators", responses={200: shows(shown.ESTIMATORS)})
-async def estimators() -> Response:
-    """Return what the estimators can tell of the registration, and what they cannot."""
-    of = {Source.LOCK_IN: LOCK_IN, Source.RANDOM: RANDOM, Source.PASSIVE: PASSIVE}
-    found = (Estimator(source=source, determines=told) for source, told in of.items())
-    return answer(Estimators(estimators=tuple(found)))

@@ -13,49 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.misregistration import PARAMETERS, Misregistration
+from service.model.misregistration import Misregistration
 
 MODEL_ERROR = 15.0
 """Variance of α per unit of misfit above 1, over that of its scatter: what the model leaves over is
 smooth across the pupil and pulls at α more than noise of the same power. From campaigns on the
 diffractive telescope, two truths and two models (docs/results/night.md)."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Determines:
-    """Which of the four parameters a kind of estimate can tell."""
-
-    parameters: tuple[str, ...]
-    """Names, as of ``PARAMETERS``."""
-
-    text: str
-    """What an operator should know of the others, and of what it costs."""
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Names of those it cannot tell, or not as well as a registration needs."""
-        return tuple(name for name in PARAMETERS if name not in self.parameters)
-
-
-LOCK_IN = Determines(
-    parameters=PARAMETERS,
-    text="sines on a few modes: all four, whatever the wind; lines must be clear of vibrations, "
-    "and the reconstructor in use must be known",
-)
-
-RANDOM = Determines(
-    parameters=PARAMETERS,
-    text="random signs on chosen modes or on all: all four, and the noisy interaction matrix; "
-    "robust to lines and gaps, needs no reconstructor, refused when the mirror answers a frame "
-    "late",
-)
-
-PASSIVE = Determines(
-    parameters=("rotation_deg", "magnification"),
-    text="no dither: rotation and magnification; shifts carry the wind's bias, 10 % of a "
-    "subaperture or more unless a dither has taught it; needs a closed loop, a delay of two frames "
-    "or more, and telemetry with few gaps",
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

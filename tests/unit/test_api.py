@@ -830,7 +830,6 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
         "GET /v1/reconstructors/{id}/matrix",
         "GET /v1/reconstructors/{id}/gains",
         "GET /v1/gains",
-        "GET /v1/estimators",
         "GET /v1/events",
         "POST /v1/noisy-matrix",
         "GET /v1/noisy-matrix",

@@ -9,8 +9,7 @@ import pytest
 from service.api import Snapshot, create_app
 from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
-from service.routes.pictures import GATHERING
-from service.routes.views import picture
+from service.routes.views import GATHERING, picture
 from service.tracking.events import GiveUpNoisy, MeasureNoisy
 from service.tracking.products import ModeSet, NoisyFinding, NoisyRecord, NoisyState
 from service.tracking.state import TrackerState
@@ -195,13 +194,3 @@ async def test_the_state_shows_the_one_under_way(client):
     state = picture(TrackerState(system="x", noisy=(RUNNING,)).gathering, GATHERING)
     found = (state["id"], state["state"], state["duration_s"])
     assert found == ("noisy-2", NoisyState.RUNNING, 30.0)
-
-
-async def test_every_estimator_says_what_it_cannot_tell(client):
-    found = (await client.get("/v1/estimators")).json()["estimators"]
-    missing = {entry["source"]: entry["missing"] for entry in found}
-    assert missing == {
-        "lock-in": [],
-        "random": [],
-        "passive": ["shift_x_subap", "shift_y_subap"],
-    }

@@ -23,7 +23,7 @@ from service.config import load_instrument
 from service.model.instrument import Mirror
 from service.model.modes import karhunen_loeve_basis
 from service.telemetry import lockin, loopcheck, passive, random_dither
-from service.telemetry.frames import FrameBlock, Loop
+from service.telemetry.frames import ClosedLoop, FrameBlock
 from service.telemetry.health import (
     Actuators,
     EdgeHealth,
@@ -156,7 +156,7 @@ def _watchers() -> Iterator[Part]:
         begin=EdgeHealth(),
         feed=lambda state, block: observe_edge(state, block, watch),
     )
-    terms = Loop(
+    terms = ClosedLoop(
         cm_id="cm",
         reconstructor=np.ones((N_CONTROLLED, N_SLOPES), np.float32),
         gains=np.full(N_CONTROLLED, 0.5, np.float32),

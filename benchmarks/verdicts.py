@@ -22,14 +22,13 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.control.expected_gain import Timing
-from service.control.gate import LoopSettings
+from service.control.loop import ControlLoop
 from service.control.reconstructor import Recipe, reconstruct
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.prepared import usual_folder
-from service.telemetry.frames import Loop
+from service.telemetry.frames import ClosedLoop
 from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan, Spectra, fit_window
 from service.tracking.state import Mode
 from service.tracking.updates import JUDGE_INTERVAL_S
@@ -158,8 +157,9 @@ def _jobs(
     )
 
 
-def _settings(n_modes: int) -> LoopSettings:
-    return LoopSettings(
+def _settings(n_modes: int) -> ControlLoop:
+    return ControlLoop(
+        frame_rate_hz=1000.0,
         gains=np.full(n_modes, GAIN),
         leak=LEAK,
         delay_frames=DELAY_FRAMES,
@@ -167,8 +167,8 @@ def _settings(n_modes: int) -> LoopSettings:
     )
 
 
-def _timing(n_modes: int) -> Timing:
-    return Timing(
+def _timing(n_modes: int) -> ControlLoop:
+    return ControlLoop(
         frame_rate_hz=RATE_HZ,
         delay_frames=DELAY_FRAMES,
         leak=LEAK,
@@ -177,10 +177,10 @@ def _timing(n_modes: int) -> Timing:
     )
 
 
-def _loop(matrix: NDArray[np.float32]) -> Loop:
+def _loop(matrix: NDArray[np.float32]) -> ClosedLoop:
     gains = np.zeros(N_MODES)
     gains[: len(matrix)] = GAIN
-    return Loop(
+    return ClosedLoop(
         reconstructor=matrix,
         gains=gains,
         leak=LEAK,

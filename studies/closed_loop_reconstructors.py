@@ -20,7 +20,8 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.control.expected_gain import noise_of_counts
 from service.control.gains import CalibrationGains
-from service.control.gate import GateVerdict, LoopSettings, judge
+from service.control.gate import GateVerdict, judge
+from service.control.loop import ControlLoop
 from service.control.reconstructor import Method, Prior, Recipe, reconstruct
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
@@ -95,7 +96,8 @@ def verdict(
     candidate: Candidate, linear: Linearisation, alpha: Misregistration, gain: float
 ) -> GateVerdict:
     """Return what the gate says, by day: the sensor shows twice the model's response."""
-    loop = LoopSettings(
+    loop = ControlLoop(
+        frame_rate_hz=1000.0,
         gains=np.full(len(candidate.matrix), gain),
         leak=1.0,
         delay_frames=2.0,

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.control.gate import Outer, edge_motion_m, pole_radius
+from service.control.gate import edge_motion_m
+from service.control.loop import pole_radius
 from service.control.reconstructor import invert
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -106,7 +107,7 @@ def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, f
     gains = np.full(n, gain * OPTICAL_GAIN)
     eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
     actuators = actuators_of(model.instrument)
-    outer = Outer(actuators=actuators.strokes[actuators.outer])
+    outer = actuators.strokes[actuators.outer]
     motion = edge_motion_m(matrix, coupling, gains, outer, leak=case.leak, delay_frames=2.0)
     return float(pole_radius(eigenvalues, leak=case.leak).max()), motion
 

@@ -18,14 +18,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.control.expected_gain import (
-    ExpectedGain,
-    Sky,
-    Timing,
-    beyond_m2,
-    expected_gain,
-    noise_of_star,
-)
+from service.control.expected_gain import ExpectedGain, Sky, beyond_m2, expected_gain, noise_of_star
+from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -129,7 +123,7 @@ def predicted(
         crossing_hz=given.wind / instrument.diameter_m,
         slope_noise=float(noise[0]),
     )
-    timing = Timing(
+    timing = ControlLoop(
         frame_rate_hz=1000.0,
         delay_frames=2.0,
         leak=given.leak,

@@ -24,7 +24,7 @@ from service.model.instrument import (
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from service.telemetry.frames import FrameBlock, Loop
+from service.telemetry.frames import ClosedLoop, FrameBlock
 from service.telemetry.lockin import LockInPlan
 
 Array = NDArray[Any]
@@ -178,12 +178,12 @@ class Sky:
 
 def small_loop(
     *, gain: float = 0.3, leak: float = 0.999, alpha: Misregistration | None = None
-) -> Loop:
+) -> ClosedLoop:
     """A loop whose reconstructor was computed for ``alpha``, by default perfect registration."""
     matrix = small_model().interaction_matrix(alpha or Misregistration())
     gains = np.zeros(N_MODES)
     gains[:N_CONTROLLED] = gain
-    return Loop(
+    return ClosedLoop(
         reconstructor=invert(matrix, N_CONTROLLED).matrix,
         gains=gains,
         leak=leak,
@@ -192,7 +192,7 @@ def small_loop(
     )
 
 
-def closed_loop(loop: Loop, sky: Sky, dither: Array) -> FrameBlock:
+def closed_loop(loop: ClosedLoop, sky: Sky, dither: Array) -> FrameBlock:
     """Run ``c[k+2] = leak c[k+1] - gain R s[k]`` on AR(1) turbulence, with the dither added.
 
     The first 200 frames, in which the loop closes, are run before the block begins.

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.gate import loop_modes, pole_radius
+from service.control.loop import ControlLoop, loop_modes
 from service.errors import ModelError
 from service.model.instrument import Instrument
 
@@ -63,20 +63,6 @@ class Sky:
     """1 σ of one slope in one frame."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Timing:
-    """How the loop moves in time."""
-
-    frame_rate_hz: float
-    delay_frames: float
-    leak: float
-    gains: Array
-    """``(n_controlled,)`` integrator gain of each mode."""
-
-    optical_gain: Array
-    """``(n_basis,)`` how much of the model's response the sensor shows."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExpectedGain:
     """What is lost with the reconstructor in use, by the linear model of the loop."""
@@ -110,7 +96,7 @@ def expected_gain(
     in_use: NDArray[np.float32],
     fresh: NDArray[np.float32],
     interaction_matrix: NDArray[np.float32],
-    timing: Timing,
+    loop: ControlLoop,
     sky: Sky,
 ) -> ExpectedGain:
     """Return what ``fresh`` would win over ``in_use``, both ``(n_controlled, n_slopes)``.
@@ -118,14 +104,14 @@ def expected_gain(
     ``interaction_matrix`` ``(n_slopes, n_basis)`` is the sensor's at the present registration.
     A mode without gain is one beyond the loop, whichever its number.
     """
-    moving = np.flatnonzero(timing.gains if timing.gains.any() else timing.gains == 0.0)
+    moving = np.flatnonzero(loop.gains if loop.gains.any() else loop.gains == 0.0)
     order = np.concatenate([moving, np.setdiff1d(np.arange(len(sky.variance_m2)), moving)])
-    seen = (interaction_matrix * timing.optical_gain.astype(np.float32))[:, order]
-    spectra = _Spectra(timing, sky, order)
-    timing = replace(timing, gains=timing.gains[moving])
+    seen = (interaction_matrix * np.asarray(loop.optical_gain, np.float32))[:, order]
+    spectra = _Spectra(loop, sky, order)
+    loop = replace(loop, gains=loop.gains[moving])
     sky = replace(sky, variance_m2=sky.variance_m2[order])
-    now_m2, radius = _left(in_use[moving], seen, timing, sky, spectra)
-    then_m2, fresh_radius = _left(fresh[moving], seen, timing, sky, spectra)
+    now_m2, radius = _left(in_use[moving], seen, loop, sky, spectra)
+    then_m2, fresh_radius = _left(fresh[moving], seen, loop, sky, spectra)
     rest_m2 = float(sky.variance_m2[len(moving) :].sum()) + sky.beyond_m2
     wavefront = float(np.sqrt(then_m2 + rest_m2))
     loss = float(np.sqrt(now_m2 + rest_m2)) - wavefront
@@ -153,11 +139,11 @@ def explained_by_noise(loss_m: float, step: Array, covariance: Array) -> float:
 class _Spectra:
     """Frequencies of a frame, their weights, and the temporal spectrum of groups of modes."""
 
-    def __init__(self, timing: Timing, sky: Sky, order: NDArray[np.intp]) -> None:
+    def __init__(self, loop: ControlLoop, sky: Sky, order: NDArray[np.intp]) -> None:
         edges = np.geomspace(1e-3, 0.5, N_FREQUENCIES + 1)
         per_frame = np.sqrt(edges[1:] * edges[:-1])
         z: Complex = np.exp(-2j * np.pi * per_frame)
-        self.integrator: Complex = z**timing.delay_frames / (1.0 - timing.leak * z)
+        self.integrator: Complex = z**loop.delay_frames / (1.0 - loop.leak * z)
         self.widths: Array = np.diff(edges)
         corners = _CORNER * (radial_order(len(sky.variance_m2)) + 1.0) * sky.crossing_hz
         bounds = np.geomspace(corners[0] * 0.999, corners[-1] * 1.001, _N_GROUPS + 1)
@@ -166,7 +152,7 @@ class _Spectra:
         self.shapes: Array = np.zeros((_N_GROUPS, N_FREQUENCIES))
         for k in range(_N_GROUPS):
             if np.any(self.group == k):
-                corner = float(corners[self.group == k].mean()) / timing.frame_rate_hz
+                corner = float(corners[self.group == k].mean()) / loop.frame_rate_hz
                 shape = 1.0 / (1.0 + (per_frame / corner) ** _STEEPNESS)
                 self.shapes[k] = shape * self.widths / (shape @ self.widths)
 
@@ -180,16 +166,16 @@ def radial_order(n_modes: int) -> Array:
 def _left(
     reconstructor: NDArray[np.float32],
     seen: NDArray[np.float32],
-    timing: Timing,
+    loop: ControlLoop,
     sky: Sky,
     spectra: _Spectra,
 ) -> tuple[float, float]:
     """Return the variance left on the controlled modes, metres², and the largest pole radius."""
     n = len(reconstructor)
-    gains = timing.gains[:, None]
+    gains = loop.gains[:, None]
     coupling = gains * (reconstructor @ seen).astype(float)
     eigenvalues, vectors = loop_modes(coupling[:, :n])
-    radius = pole_radius(eigenvalues, leak=timing.leak, delay_frames=timing.delay_frames).max()
+    radius = loop.pole_radius(eigenvalues).max()
     rejected = 1.0 / (1.0 + spectra.integrator[:, None] * eigenvalues)
     passed = spectra.integrator[:, None] * rejected
     basis = _Separate() if vectors is None else _Mixed(vectors)

@@ -12,12 +12,11 @@ radii said nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import ModelError
+from service.control.loop import ControlLoop, loop_modes
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
@@ -62,42 +61,12 @@ class GateVerdict:
     """Largest RMS motion of an outer actuator for slope noise of 1, metres; None: not known."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopSettings:
-    """The loop a reconstructor would run in."""
-
-    gains: NDArray[np.float64]
-    """``(n_controlled,)`` integrator gain of each mode the reconstructor commands."""
-
-    leak: float
-    delay_frames: float
-    optical_gain: float | NDArray[np.float64] = 1.0
-    """How much of the model's response the sensor shows, of all modes or ``(n_controlled,)``:
-    below 1 on sky, up to 2 in double pass."""
-
-    n_holding: int | None = None
-    """Modes with which it is closed now, at these gains, and does not slip; None: it is not, or
-    nobody knows."""
-
-    outer: Outer | None = None
-    """The mirror's outermost ring; None: the modes are measured, it is not known."""
-
-    def of_first(self, n_modes: int) -> LoopSettings:
-        """Return the same loop with only its first modes controlled."""
-        gain = self.optical_gain
-        return replace(
-            self,
-            gains=self.gains[:n_modes],
-            optical_gain=gain if isinstance(gain, float) else gain[:n_modes],
-        )
-
-
 def judge(
     reconstructor: NDArray[np.float32],
     linearisation: Linearisation,
     registration: Misregistration,
     covariance: NDArray[np.float64],
-    loop: LoopSettings,
+    loop: ControlLoop,
     *,
     bound: float,
 ) -> GateVerdict:
@@ -117,7 +86,7 @@ def judge(
     slopes = [reconstructor @ derivative[:, :n] for derivative in linearisation.derivatives]
     gains = (loop.gains * loop.optical_gain).astype(np.float32)
     steps = _ellipsoid_ends(covariance).astype(np.float32)
-    aligned = float(pole_radius(gains, leak=loop.leak, delay_frames=loop.delay_frames).max())
+    aligned = float(loop.pole_radius(gains).max())
     bound = max(bound, (1.0 + aligned) / 2)
     worst = _worst_pole(centre, np.array(slopes), steps, gains, loop, min(bound, 1.0))
     stable = _verdict(worst, aligned, bound, 1 + 2 * len(steps))
@@ -141,25 +110,18 @@ def judge(
 
 
 def _moving(
-    reconstructor: NDArray[np.float32], linearisation: Linearisation, loop: LoopSettings
-) -> tuple[NDArray[np.float32], Linearisation, LoopSettings]:
+    reconstructor: NDArray[np.float32], linearisation: Linearisation, loop: ControlLoop
+) -> tuple[NDArray[np.float32], Linearisation, ControlLoop]:
     """Return what is left of them without the modes that have no gain; all have none: all."""
     modes = np.flatnonzero(loop.gains)
     if len(modes) in {0, len(loop.gains)}:
         return reconstructor, linearisation, loop
-    gain, outer = loop.optical_gain, loop.outer
-    loop = replace(
-        loop,
-        gains=loop.gains[modes],
-        optical_gain=gain if isinstance(gain, float) else gain[modes],
-        outer=outer and Outer(actuators=outer.actuators[:, modes]),
-    )
     linearisation = replace(
         linearisation,
         matrix=linearisation.matrix[:, modes],
         derivatives=linearisation.derivatives[:, :, modes],
     )
-    return reconstructor[modes], linearisation, loop
+    return reconstructor[modes], linearisation, loop.of(modes)
 
 
 def _worst_pole(
@@ -167,7 +129,7 @@ def _worst_pole(
     slopes: Coupling,
     steps: Coupling,
     gains: Coupling,
-    loop: LoopSettings,
+    loop: ControlLoop,
     limit: float,
 ) -> float:
     """Return the largest pole radius at the centre and at both ends of every step.
@@ -184,13 +146,13 @@ def _worst_pole(
         if worst > limit or ceilings[k] <= max(worst, min(limit, worst + NEAR)):
             break
         eigenvalues = np.linalg.eigvals(gains[:, None] * (centre + ends[k]))
-        radii = pole_radius(eigenvalues, leak=loop.leak, delay_frames=loop.delay_frames)
+        radii = loop.pole_radius(eigenvalues)
         worst = max(worst, float(radii.max()))
     return worst
 
 
 def _ceilings(
-    centre: Coupling, moves: Coupling, gains: Coupling, loop: LoopSettings
+    centre: Coupling, moves: Coupling, gains: Coupling, loop: ControlLoop
 ) -> NDArray[np.float64]:
     """Return radii that no pole exceeds: at the centre, and at both ends of every move.
 
@@ -217,11 +179,11 @@ def _extent(matrix: Coupling) -> NDArray[np.float64]:
     return np.array([real[0] - slack, real[-1] + slack, turn + slack], dtype=np.float64)
 
 
-def _largest_on_border(extent: NDArray[np.float64], loop: LoopSettings) -> float:
+def _largest_on_border(extent: NDArray[np.float64], loop: ControlLoop) -> float:
     low, high, turn = extent
     along, up = np.linspace(low, high, _BORDER), np.linspace(0.0, turn, _BORDER)
     border = np.concatenate([along + 1j * turn, low + 1j * up, high + 1j * up])
-    radii = pole_radius(border, leak=loop.leak, delay_frames=loop.delay_frames)
+    radii = loop.pole_radius(border)
     return float(radii.max()) + ROUNDING
 
 
@@ -258,53 +220,6 @@ def _verdict(worst: float, aligned: float, bound: float, n_points: int) -> GateV
     )
 
 
-OFF_DIAGONAL = 1e-5
-"""Of couplings computed in single precision, over the largest."""
-
-
-def loop_modes(coupling: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """Return eigenvalues ``(n,)`` and vectors ``(n, n)`` of g R D; None: the modes themselves.
-
-    A new reconstructor leaves rounding beside the diagonal, and its eigenvectors mean nothing.
-    """
-    own = np.diag(coupling)
-    beside = np.abs(coupling - np.diag(own)).max(initial=0.0)
-    if beside <= OFF_DIAGONAL * np.abs(own).max(initial=0.0):
-        return own, None
-    return np.linalg.eig(coupling)
-
-
-def pole_radius(
-    loop_eigenvalues: NDArray[Any], *, leak: float = 1.0, delay_frames: float = 2.0
-) -> NDArray[np.float64]:
-    """Return the largest pole radius of each eigenvalue of ``gain R D G``, same shape.
-
-    The loop ``c[k+d] = leak c[k+d-1] - R s[k]`` has its poles at the roots of
-    ``z^d - leak z^(d-1) + λ``. A fractional delay is a share of each neighbouring whole one:
-    ``z^(n+1) - leak z^n + λ ((1 - f) z + f)`` for ``d = n + f``.
-
-    Raises
-    ------
-    ModelError
-        If the delay is below one frame: no loop can answer an exposure before it ends.
-    """
-    if delay_frames < 1.0:
-        raise ModelError(f"poles: found a delay of {delay_frames} frames; expected at least 1")
-    whole = int(np.floor(delay_frames))
-    share = delay_frames - whole
-    values = np.asarray(loop_eigenvalues, dtype=complex)
-    order = whole + (1 if share > 0.0 else 0)
-    companion = np.zeros((*values.shape, order, order), dtype=complex)
-    companion[..., range(1, order), range(order - 1)] = 1.0
-    companion[..., 0, 0] = leak
-    if share > 0.0:
-        companion[..., 0, order - 2] -= values * (1.0 - share)
-        companion[..., 0, order - 1] -= values * share
-    else:
-        companion[..., 0, order - 1] -= values
-    return np.asarray(np.abs(np.linalg.eigvals(companion)).max(axis=-1))
-
-
 LIMIT_M = 195e-9
 """Largest motion of an outer actuator per unit of slope noise that a loop without leak bears."""
 
@@ -319,27 +234,20 @@ FORGIVING_LEAK = 0.99
 _N_FREQUENCIES = 256
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Outer:
-    """The outermost ring of the mirror."""
-
-    actuators: NDArray[np.float64]
-    """``(n_outer, n_modes)`` position of each, metres, for a unit command of each mode."""
-
-
 def edge_motion_m(
     reconstructor: NDArray[np.float32],
     coupling: NDArray[np.float32],
     gains: Array,
-    outer: Outer,
+    outer: Array,
     *,
     leak: float,
     delay_frames: float,
 ) -> float:
     """Return the largest RMS motion of an outer actuator for white slope noise of 1, metres.
 
-    ``coupling`` ``(n, n)`` is R D(α); ``gains`` ``(n,)`` is integrator times optical gain. In the
-    eigenbasis of ``g R D = V Λ V^-1`` the command answers noise by
+    ``coupling`` ``(n, n)`` is R D(α); ``gains`` ``(n,)`` is integrator times optical gain;
+    ``outer`` is as a ``ControlLoop`` has it. In the eigenbasis of ``g R D = V Λ V^-1`` the command
+    answers noise by
     ``H_i = z^-d / (1 - leak z^-1 + λ_i z^-d)``, so that its covariance is ``V (N o <H H*>) V*``
     with ``N`` that of ``V^-1 g R n`` and the mean taken over the unit circle.
     """
@@ -347,7 +255,7 @@ def edge_motion_m(
     commanded = gains[:, None] * reconstructor.astype(float)
     # V^-1 S V^-H of the real n by n S: the slopes are many, and complex they would cost most of all
     driven = commanded @ commanded.T
-    seen = outer.actuators[:, : len(gains)]
+    seen = outer[:, : len(gains)]
     if vectors is not None:
         driven = np.linalg.solve(vectors, np.linalg.solve(vectors, driven).conj().T)
         seen = seen @ vectors

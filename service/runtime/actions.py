@@ -13,18 +13,20 @@ from numpy.typing import NDArray
 
 from service import __version__
 from service.control.gate import GateVerdict
+from service.control.loop import ControlLoop
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.link.events import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.runtime import translate
 from service.runtime.asking import Question, ask
 from service.runtime.estimates import NoisySums
-from service.runtime.loops import judged_now, loop_settings, modes_that_hold, timing
 from service.runtime.ports import RtcPort, StorePort, WorkerPort
 from service.tracking import events as ev
+from service.tracking.alarms import Act, forbidding
 from service.tracking.events import Effect, Event
-from service.tracking.loop import RtcView
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.loop import RtcView, same_gains
+from service.tracking.loop_commands import table_of
+from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import commanded_gains, extended_gains
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
@@ -158,7 +160,7 @@ class Actions:
             OpticsWorker.make,
             registration.alpha,
             registration.total_covariance,
-            loop_settings(rtc, gains, registration, n_holding=modes_that_hold(state, gains)),
+            loop_to_judge(state, gains),
             self._publishing.pole_radius_bound,
             effect.fewer,
         )
@@ -170,7 +172,7 @@ class Actions:
             state=MatrixState.PROPOSED if accepted else MatrixState.REFUSED,
             condition_number=made.condition_number,
             gate=made.gate,
-            judged=judged_now(rtc, gains[: len(made.matrix)], registration),
+            judged=judged_now(state, gains[: len(made.matrix)]),
             sha256=checksum(made.matrix),
         )
         await self._keep(record, made.matrix, registration, effect.why)
@@ -185,8 +187,8 @@ class Actions:
         gate, judged, why = None, None, effect.why
         gains = commanded_gains(rtc, len(matrix))
         if registration is not None and any(gains):
-            gate = await self._verdict(matrix, gains, state, registration)
-            judged = judged_now(rtc, gains, registration)
+            gate = await self._verdict(matrix, gains, state)
+            judged = judged_now(state, gains)
         else:
             unknown = "α is unknown" if registration is None else "an open loop tells no gains"
             why = f"{why}; the gate could not judge it: {unknown}"
@@ -210,10 +212,9 @@ class Actions:
     ) -> Event | None:
         if isinstance(effect, ev.JudgeMatrix):
             return await self._margin(effect, state)
-        rtc, registration = _there(state), _registered(state)
         matrix = await asyncio.to_thread(self.matrix, effect.id)
-        judged = judged_now(rtc, effect.gains, registration)
-        verdict = await self._verdict(matrix, effect.gains, state, registration)
+        judged = judged_now(state, effect.gains)
+        verdict = await self._verdict(matrix, effect.gains, state)
         return ev.ProposalJudged(id=effect.id, verdict=verdict, judged=judged)
 
     async def _margin(self, effect: ev.JudgeMatrix, state: TrackerState) -> Event | None:
@@ -228,17 +229,15 @@ class Actions:
                 matrix=matrix,
                 alpha=registration.alpha,
                 covariance=registration.total_covariance,
-                loop=loop_settings(
-                    rtc, gains, registration, n_holding=modes_that_hold(state, gains)
-                ),
+                loop=loop_to_judge(state, gains),
                 bound=self._publishing.pole_radius_bound,
-                timing=timing(rtc, len(matrix), registration),
+                optical_gain=expected_gains(registration, rtc.n_modes),
                 magnitude=rtc.magnitude,
             )
             margin = await self._workers.call(OpticsWorker.margin, question)
         finally:
             self._judging.discard(effect.id)
-        judged = judged_now(rtc, gains, registration)
+        judged = judged_now(state, gains)
         return ev.MarginJudged(
             id=effect.id,
             verdict=margin.verdict,
@@ -248,29 +247,24 @@ class Actions:
         )
 
     async def _verdict(
-        self,
-        matrix: NDArray[np.float32],
-        gains: tuple[float, ...],
-        state: TrackerState,
-        registration: Registration,
+        self, matrix: NDArray[np.float32], gains: tuple[float, ...], state: TrackerState
     ) -> GateVerdict:
-        n_holding = modes_that_hold(state, gains)
+        registration = _registered(state)
         return await self._workers.call(
             OpticsWorker.judge,
             matrix,
             registration.alpha,
             registration.total_covariance,
-            loop_settings(_there(state), gains, registration, n_holding=n_holding),
+            loop_to_judge(state, gains),
             self._publishing.pole_radius_bound,
         )
 
     async def _ask_judged(self, effect: ev.AskLoop, state: TrackerState) -> Event | None:
         """Ask for gains only if the gate lets the matrix in use run with them."""
-        registration = _registered(state)
         if state.in_use is None or effect.gains is None:
             raise CommandError("the reconstructor in use is not known: its gains cannot be judged")
         matrix = await asyncio.to_thread(self.matrix, state.in_use)
-        verdict = await self._verdict(matrix, effect.gains[: len(matrix)], state, registration)
+        verdict = await self._verdict(matrix, effect.gains[: len(matrix)], state)
         if not verdict.accepted:
             return ev.LoopAnswered(id=effect.id, accepted=False, reason=verdict.reason)
         return await self._ask(effect)
@@ -364,6 +358,56 @@ class Actions:
                 f"the RTC's matrix {record.id} is not the one archived under that id: give it "
                 "another id, or use another data directory"
             )
+
+
+GAIN_SAFETY = 1.1
+"""Above a mean optical gain that nobody says which modes it is of."""
+
+
+def loop_to_judge(state: TrackerState, gains: tuple[float, ...]) -> ControlLoop:
+    """Return the loop the gate is to judge, with the largest optical gains it may have."""
+    rtc, registration = _there(state), _registered(state)
+    mean = registration.optical_gain
+    highest: float | NDArray[np.float64] = 1.0 if mean is None else GAIN_SAFETY * mean
+    if registration.optical_gains:
+        highest = table_of(registration.optical_gains, len(gains)).highest
+    return ControlLoop(
+        gains=np.array(gains),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        frame_rate_hz=rtc.frame_rate_hz,
+        optical_gain=highest,
+        n_holding=modes_that_hold(state, gains),
+    )
+
+
+def expected_gains(registration: Registration, n_modes: int) -> NDArray[np.float64]:
+    """Return the optical gain that each mode is expected to have, ``(n_modes,)``."""
+    if registration.optical_gains:
+        return table_of(registration.optical_gains, n_modes).optical_gain
+    return np.full(n_modes, registration.optical_gain or 1.0)
+
+
+def judged_now(state: TrackerState, gains: tuple[float, ...]) -> Judged:
+    """Return what a verdict that is asked for now will be of."""
+    rtc, registration = _there(state), _registered(state)
+    return Judged(
+        session=rtc.session,
+        gains=tuple(gains),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        alpha=registration.alpha,
+        sigma=registration.sigma,
+    )
+
+
+def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None:
+    """Return how many modes the loop holds with, if these are its gains; None: it does not."""
+    rtc = state.rtc
+    if rtc is None or rtc.loop == "open" or forbidding(state, Act.MEASURE) is not None:
+        return None
+    n_modes = rtc.n_controlled
+    return n_modes if same_gains(gains[:n_modes], rtc.gains[:n_modes]) else None
 
 
 def _there(state: TrackerState) -> RtcView:

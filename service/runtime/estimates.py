@@ -17,7 +17,7 @@ from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
 from service.telemetry import lockin, random_dither
-from service.telemetry.frames import Loop, Telemetry, WindowRefused
+from service.telemetry.frames import ClosedLoop, Telemetry, WindowRefused
 from service.telemetry.lockin import Spectra, WindowEstimate
 from service.telemetry.openloop import FarEstimate
 from service.telemetry.passive import Passive
@@ -122,7 +122,7 @@ async def _outcome(
         return await workers.call(OpticsWorker.find, window, state.acquisition.alpha, flux)
     if rtc is None:
         return WindowRefused(reason="the RTC is not known", t_ns_utc=window.t_end_ns_utc)
-    loop = Loop(
+    loop = ClosedLoop(
         reconstructor=await asyncio.to_thread(_reconstructor, window, state, matrix_of),
         gains=np.array(rtc.gains),
         leak=rtc.leak,

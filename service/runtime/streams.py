@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.runtime.loops import terms_of
 from service.telemetry import loopcheck, passive
-from service.telemetry.frames import FrameBlock, Loop, WindowRefused
+from service.telemetry.frames import ClosedLoop, FrameBlock, WindowRefused
 from service.telemetry.health import (
     EdgeHealth,
     EdgeWatch,
@@ -185,12 +184,22 @@ def with_matrix(streams: Streams, cm_id: str, matrix: NDArray[np.float32]) -> St
     return replace(streams, matrices=(*others, (cm_id, matrix))[-MATRICES_KEPT:])
 
 
-def _terms(streams: Streams, cm_id: str | None) -> Loop | None:
-    """Return the loop that a reconstructor closes; None: it is open, or not known."""
+def _terms(streams: Streams, cm_id: str | None) -> ClosedLoop | None:
+    """Return the loop that a reconstructor closes; None: it is open, not known, or another's."""
+    rtc = streams.rtc
     matrix = next((matrix for known, matrix in streams.matrices if known == cm_id), None)
-    if streams.rtc is None or cm_id is None or matrix is None:
+    if rtc is None or rtc.loop == "open" or cm_id is None or matrix is None:
         return None
-    return terms_of(streams.rtc, cm_id, matrix)
+    if matrix.shape[1] != rtc.n_slopes or len(matrix) > rtc.n_modes:
+        return None
+    return ClosedLoop(
+        cm_id=cm_id,
+        reconstructor=matrix,
+        gains=np.array(rtc.gains[: len(matrix)], np.float32),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        frame_rate_hz=rtc.frame_rate_hz,
+    )
 
 
 def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:

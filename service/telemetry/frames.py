@@ -8,6 +8,8 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.loop import ControlLoop
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameBlock:
@@ -110,18 +112,12 @@ def joined_frames(blocks: tuple[FrameBlock, ...]) -> FrameBlock:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Loop:
-    """The control loop that runs: ``c[k+d] = leak c[k+d-1] - gain R s[k]``."""
+class ClosedLoop(ControlLoop):
+    """The loop that runs; its optical gains are not known."""
 
     reconstructor: NDArray[np.float32]
     """``(n_controlled, n_slopes)`` metres per slope; row i commands mode i."""
 
-    gains: NDArray[np.floating]
-    """``(n_controlled,)``."""
-
-    leak: float
-    delay_frames: float
-    frame_rate_hz: float
     cm_id: str | None = None
     """Of the reconstructor; None: the RTC does not know."""
 

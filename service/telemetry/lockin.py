@@ -22,8 +22,8 @@ from service.model.misregistration import Misregistration
 from service.telemetry.estimate import DitheredEstimate
 from service.telemetry.frames import (
     CHUNK_FRAMES,
+    ClosedLoop,
     FrameBlock,
-    Loop,
     Telemetry,
     Window,
     WindowCutter,
@@ -255,7 +255,7 @@ class WindowEstimate(DitheredEstimate):
     """Length of the window, seconds; 0: not known."""
 
 
-def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> WindowEstimate:
+def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop) -> WindowEstimate:
     """Estimate α from one window, to first order about the linearisation.
 
     Solves ``Re(F(Z)* F(C)^T) x = Re(F(Z)* r)`` by Gauss-Newton for α and one complex gain per
@@ -300,13 +300,17 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: Loop) -> Wi
     )
 
 
-def _instrument(spectra: Spectra, coupling: Array, loop: Loop, gains: Array) -> Array:
+def _instrument(spectra: Spectra, coupling: Array, loop: ClosedLoop, gains: Array) -> Array:
     """Return ``(n_lines, n_modes)`` the command each line's dither alone would cause."""
     return closed_loop_responses(spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains)
 
 
 def closed_loop_responses(
-    dither: Array, coupling: Array, loop: Loop, frequencies_hz: tuple[float, ...], gains: Array
+    dither: Array,
+    coupling: Array,
+    loop: ClosedLoop,
+    frequencies_hz: tuple[float, ...],
+    gains: Array,
 ) -> Array:
     """Return the total commands ``(n_lines, n_modes)`` that dithers of these amplitudes lead to.
 

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.telemetry.frames import FrameBlock, Loop, joined_frames
+from service.telemetry.frames import ClosedLoop, FrameBlock, joined_frames
 
 Array = NDArray[Any]
 
@@ -183,7 +183,7 @@ class Obedience:
         )
 
 
-def observe(check: LoopCheck, block: FrameBlock, loop: Loop) -> LoopCheck:
+def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
     """Return the check after one more block, as far as it is of this loop."""
     n_delay = int(loop.delay_frames)
     if n_delay > LARGEST_DELAY_FRAMES or block.cm_id != loop.cm_id:
@@ -206,7 +206,7 @@ def observe(check: LoopCheck, block: FrameBlock, loop: Loop) -> LoopCheck:
 
 def obedience(
     check: LoopCheck,
-    loop: Loop,
+    loop: ClosedLoop,
     first_seq: int,
     last_seq: int,
     enough: int = ENOUGH_SAMPLES,
@@ -239,7 +239,7 @@ def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
     return (int(seq[0]), int(seq[-1])) if len(seq) == ENOUGH_SAMPLES else None
 
 
-def _judged(asked: Array, taken: Array, held: Array, loop: Loop) -> Obedience:
+def _judged(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> Obedience:
     weights = _lag(asked, taken, loop)
     obeys = np.abs(_shares(np.tensordot(weights, asked, axes=1), taken)[0] - 1.0) < TOLERANCE
     if obeys.any():
@@ -270,7 +270,7 @@ def _shares(model: Array, taken: Array) -> tuple[Array, Array]:
     return common / power, np.sqrt(left / power / (len(model) - 1))
 
 
-def _lag(asked: Array, taken: Array, loop: Loop) -> Array:
+def _lag(asked: Array, taken: Array, loop: ClosedLoop) -> Array:
     """Return ``(_TAPS,)`` weights of the frames, adding up to 1: how late the modes are.
 
     Fitted with every mode counting alike; where the fit is no delay the status' word stands.
@@ -298,7 +298,7 @@ def _goes_on(tail: FrameBlock, block: FrameBlock) -> bool:
     return block.follows(tail) and block.cm_id == tail.cm_id and late_ns <= block.dt_ns / 2
 
 
-def _sample(frames: FrameBlock, loop: Loop) -> _Sample:
+def _sample(frames: FrameBlock, loop: ClosedLoop) -> _Sample:
     commands = frames.commands_m[-_STEPS - 1 :, : len(loop.gains)]
     slopes = frames.slopes
     return _Sample(
@@ -315,7 +315,7 @@ def _twice(rows: Array) -> Array:
     return np.asarray(rows[2] - 2 * rows[1] + rows[0])
 
 
-def _multiplied(check: LoopCheck, loop: Loop) -> LoopCheck:
+def _multiplied(check: LoopCheck, loop: ClosedLoop) -> LoopCheck:
     if not check.waiting:
         return check
     slopes = np.stack([sample.slopes for sample in check.waiting], axis=1)
@@ -381,7 +381,7 @@ class FoundLaw:
     """What disagrees, found and told; empty: nothing does."""
 
 
-def follow(law: LoopLaw, block: FrameBlock, loop: Loop) -> LoopLaw:
+def follow(law: LoopLaw, block: FrameBlock, loop: ClosedLoop) -> LoopLaw:
     """Return the law after one more block, as far as it is of this loop."""
     if block.first_seq < law.from_seq:
         return law
@@ -403,7 +403,7 @@ def follow(law: LoopLaw, block: FrameBlock, loop: Loop) -> LoopLaw:
     )
 
 
-def judged(law: LoopLaw, loop: Loop, last_seq: int) -> tuple[LoopLaw, FoundLaw | None]:
+def judged(law: LoopLaw, loop: ClosedLoop, last_seq: int) -> tuple[LoopLaw, FoundLaw | None]:
     """Return what the frames up to one say of the loop; None: nothing, or nothing new."""
     modes, commands, seen = law.modes, law.commands_m, law.seen_m
     if law.seq is None or modes is None or commands is None or seen is None:
@@ -468,7 +468,7 @@ def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
     )
 
 
-def _compared(fits: _Fits, clear: Array, gains: Array, loop: Loop) -> FoundLaw:
+def _compared(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> FoundLaw:
     leak, sigma, late = (
         float(np.median(found[clear])) for found in (fits.leak, fits.leak_sigma, fits.delay_frames)
     )
@@ -497,7 +497,7 @@ def _hint(gain: float) -> str:
     return ""
 
 
-def _begun(law: LoopLaw, cm_id: str | None, loop: Loop) -> LoopLaw:
+def _begun(law: LoopLaw, cm_id: str | None, loop: ClosedLoop) -> LoopLaw:
     in_loop = np.flatnonzero(loop.gains > 0.0)
     chosen = np.unique(np.linspace(0, len(in_loop) - 1, MODES_WATCHED).round().astype(int))
     return LoopLaw(

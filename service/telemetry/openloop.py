@@ -19,7 +19,7 @@ from service.fit import solver
 from service.fit.solver import LONGEST_STEP, Columns
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import Loop, WindowRefused
+from service.telemetry.frames import ClosedLoop, WindowRefused
 from service.telemetry.lockin import MAX_LAG_FRAMES, Spectra, WindowEstimate, fit_window
 
 Array = NDArray[Any]
@@ -87,7 +87,7 @@ class FarSearch:
 def find(spectra: Spectra, search: FarSearch) -> FarEstimate | WindowRefused:
     """Return where the first start leads from which the model explains the columns."""
     columns, noise = _columns(spectra)
-    loop = Loop(
+    loop = ClosedLoop(
         reconstructor=np.zeros((0, len(columns.matrix)), np.float32),
         gains=np.zeros(0),
         leak=1.0,

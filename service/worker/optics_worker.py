@@ -12,15 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.dither import information
-from service.control.expected_gain import (
-    ExpectedGain,
-    Sky,
-    Timing,
-    beyond_m2,
-    expected_gain,
-    noise_of_star,
-)
-from service.control.gate import GateVerdict, LoopSettings, judge
+from service.control.expected_gain import ExpectedGain, Sky, beyond_m2, expected_gain, noise_of_star
+from service.control.gate import GateVerdict, judge
+from service.control.loop import ControlLoop
 from service.control.reconstructor import Method, Prior, Recipe, reconstruct
 from service.fit.dialect import LIKELY, Dialect, of_answer, of_reconstructor
 from service.fit.light import far_starts
@@ -33,7 +27,7 @@ from service.model.turbulence import Halo
 from service.prepared import Prepared
 from service.telemetry import passive
 from service.telemetry.estimate import DitheredEstimate
-from service.telemetry.frames import Loop, WindowRefused
+from service.telemetry.frames import ClosedLoop, WindowRefused
 from service.telemetry.lockin import Spectra, WindowEstimate, fit_window
 from service.telemetry.openloop import NOT_FOUND, FarEstimate, FarSearch, find
 from service.telemetry.random_dither import Correlated, RandomEstimate, fit_random
@@ -146,7 +140,7 @@ class OpticsWorker:
         return Linearisation(alpha=start, **kept)
 
     def fit(
-        self, spectra: Spectra, loop: Loop, start: Misregistration | None
+        self, spectra: Spectra, loop: ClosedLoop, start: Misregistration | None
     ) -> WindowEstimate | WindowRefused:
         """Estimate α from one window, from ``start`` or, without one, from the nominal rotation.
 
@@ -170,7 +164,7 @@ class OpticsWorker:
         return WindowRefused(reason=answer.wrong, t_ns_utc=spectra.t_end_ns_utc, mistold=True)
 
     def _fitted(
-        self, spectra: Spectra, loop: Loop, start: Misregistration
+        self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
     ) -> WindowEstimate | WindowRefused:
         try:
             estimate = self._settled_fit(spectra, loop, start)
@@ -210,7 +204,7 @@ class OpticsWorker:
             self._equip(oriented(self._model.instrument, *setting))
 
     def _settled_fit(
-        self, spectra: Spectra, loop: Loop, start: Misregistration
+        self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
     ) -> WindowEstimate | None:
         """Return the fit about a linearisation that is near enough to it; None: there is none."""
         estimate = fit_window(spectra, self._sensor.near(start), loop)
@@ -290,7 +284,7 @@ class OpticsWorker:
     def _approach(
         self,
         spectra: Spectra,
-        loop: Loop,
+        loop: ClosedLoop,
         estimate: WindowEstimate,
         start: Misregistration,
     ) -> Misregistration | None:
@@ -310,7 +304,7 @@ class OpticsWorker:
         self,
         alpha: Misregistration,
         covariance: NDArray[np.float64],
-        loop: LoopSettings,
+        loop: ControlLoop,
         bound: float,
         fewer: tuple[int, ...] = (),
     ) -> Made:
@@ -323,7 +317,9 @@ class OpticsWorker:
 
         def judged(n_modes: int) -> Made:
             inversion = reconstruct(matrix, self._recipe(n_modes))
-            verdict = self.judge(inversion.matrix, alpha, covariance, loop.of_first(n_modes), bound)
+            verdict = self.judge(
+                inversion.matrix, alpha, covariance, loop.of(slice(n_modes)), bound
+            )
             return Made(
                 matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
             )
@@ -334,7 +330,7 @@ class OpticsWorker:
         self,
         in_use: NDArray[np.float32],
         alpha: Misregistration,
-        timing: Timing,
+        loop: ControlLoop,
         magnitude: float | None,
     ) -> ExpectedGain | None:
         """Return what a new reconstructor would win over the one in use; None: nobody can say.
@@ -350,7 +346,7 @@ class OpticsWorker:
             of_star = noise_of_star(
                 model.instrument,
                 magnitude=magnitude,
-                frame_rate_hz=timing.frame_rate_hz,
+                frame_rate_hz=loop.frame_rate_hz,
                 n_valid=model.n_slopes // 2,
             )
             noise = float(of_star[0])
@@ -361,7 +357,7 @@ class OpticsWorker:
             slope_noise=noise,
         )
         try:
-            return expected_gain(in_use, fresh, seen, timing, sky)
+            return expected_gain(in_use, fresh, seen, loop, sky)
         except np.linalg.LinAlgError:
             return None
 
@@ -384,7 +380,7 @@ class OpticsWorker:
         reconstructor: NDArray[np.float32],
         alpha: Misregistration,
         covariance: NDArray[np.float64],
-        loop: LoopSettings,
+        loop: ControlLoop,
         bound: float,
     ) -> GateVerdict:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
@@ -395,15 +391,14 @@ class OpticsWorker:
     def margin(self, question: InUse) -> Margin:
         """Return verdict and worth of a matrix in use; the last ones while nothing has moved."""
         if self._margin is None or not question.is_about(self._margin[0]):
-            alpha, matrix = question.alpha, question.matrix
+            alpha, matrix, loop = question.alpha, question.matrix, question.loop
+            expected = replace(loop, optical_gain=question.optical_gain)
             found = Margin(
-                verdict=self.judge(
-                    matrix, alpha, question.covariance, question.loop, question.bound
-                ),
-                expected=self.assess(matrix, alpha, question.timing, question.magnitude),
+                verdict=self.judge(matrix, alpha, question.covariance, loop, question.bound),
+                expected=self.assess(matrix, alpha, expected, question.magnitude),
                 alpha=alpha,
                 sigma=question.sigma,
-                gains=tuple(question.loop.gains.tolist()),
+                gains=tuple(loop.gains.tolist()),
             )
             self._margin = question, found
         return self._margin[1]

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.expected_gain import ExpectedGain, Timing
-from service.control.gate import GateVerdict, LoopSettings, Outer
+from service.control.expected_gain import ExpectedGain
+from service.control.gate import GateVerdict
+from service.control.loop import ControlLoop
 from service.control.reconstructor import MAX_CONDITION, Method
 from service.errors import ModelError
 from service.model.instrument import Influence, Instrument, Mirror
@@ -96,14 +98,14 @@ def actuators_of(model: RtcInteractionModel) -> Actuators | None:
     return Actuators(positions=mirror.positions_m, strokes=basis.mode_to_actuator)
 
 
-def outer_of(model: RtcInteractionModel) -> Outer | None:
-    """Return the outermost ring where a stroke is the height of the surface in metres."""
+def outer_of(model: RtcInteractionModel) -> Array | None:
+    """Return the outermost ring as a ``ControlLoop`` has it; None: strokes are no metres."""
     actuators, mirror = actuators_of(model), model.instrument.mirror
     if actuators is None or not isinstance(mirror, Mirror):
         return None
     if mirror.influence is not Influence.THIN_PLATE or not mirror.stroke_known:
         return None
-    return Outer(actuators=actuators.strokes[actuators.outer])
+    return actuators.strokes[actuators.outer]
 
 
 def check_controllable(instrument: Instrument) -> None:
@@ -151,12 +153,12 @@ class InUse:
     covariance: Array
     """``(4, 4)`` numeric units, floor included."""
 
-    loop: LoopSettings
+    loop: ControlLoop
     """As the gate is to see it."""
 
     bound: float
-    timing: Timing
-    """As the expected gain is to see it."""
+    optical_gain: Array
+    """``(n_basis,)`` as the expected gain is to see it."""
 
     magnitude: float | None
     """Of the star; None: the noise of the settings."""
@@ -181,8 +183,8 @@ class InUse:
     def _same_loop(self, other: InUse) -> bool:
         one, two = self.loop, other.loop
         numbers = [
-            (one.leak, one.delay_frames, one.n_holding, self.bound, self.timing.frame_rate_hz),
-            (two.leak, two.delay_frames, two.n_holding, other.bound, other.timing.frame_rate_hz),
+            (q.loop.leak, q.loop.delay_frames, q.loop.n_holding, q.loop.frame_rate_hz, q.bound)
+            for q in (self, other)
         ]
         stars = [q.magnitude for q in (self, other)]
         return (
@@ -190,7 +192,7 @@ class InUse:
             and _same_star(*stars)
             and _alike(one.gains, two.gains)
             and _alike(one.optical_gain, two.optical_gain)
-            and _alike(self.timing.optical_gain, other.timing.optical_gain)
+            and _alike(self.optical_gain, other.optical_gain)
         )
 
 
@@ -218,6 +220,6 @@ def _same_star(one: float | None, other: float | None) -> bool:
     return abs(one - other) <= SAME_MAGNITUDE
 
 
-def _alike(some: Array | float, others: Array | float) -> bool:
+def _alike(some: NDArray[Any] | float, others: NDArray[Any] | float) -> bool:
     same_shape = np.shape(some) == np.shape(others)
     return same_shape and np.allclose(some, others, rtol=SAME_GAIN, atol=0.0)

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.telemetry.frames import Loop, WindowRefused
+from service.telemetry.frames import ClosedLoop, WindowRefused
 from service.telemetry.lockin import Spectra, WindowEstimate
 from service.telemetry.passive import Passive, PassiveEstimate
 from service.telemetry.random_dither import Correlated, RandomEstimate
@@ -39,7 +39,7 @@ class Seen:
     """One window of a night's telemetry, and the truth behind it."""
 
     window: Window
-    loop: Loop
+    loop: ClosedLoop
     true: Misregistration
     errors_nm: tuple[float, ...]
     """Wavefront error of its batches, RMS."""
@@ -122,12 +122,12 @@ def simulated(night: Night) -> list[str]:
     return words + options_for(night.trouble, LINE_FRACTIONS[1])
 
 
-def loop_of(telescope: Telescope) -> Loop:
+def loop_of(telescope: Telescope) -> ClosedLoop:
     """Return the loop as it starts."""
     settings = telescope.settings
     gains = np.array(settings.gains)
     gains[len(telescope.reconstructor.matrix) :] = 0.0
-    return Loop(
+    return ClosedLoop(
         reconstructor=telescope.reconstructor.matrix,
         gains=gains,
         leak=settings.leak,

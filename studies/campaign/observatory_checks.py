@@ -13,7 +13,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.gate import GateVerdict, pole_radius
+from service.control.gate import GateVerdict
+from service.control.loop import pole_radius
 from service.model.misregistration import Misregistration
 from sim_rtc.computer.telemetry import Snapshot
 from sim_rtc.telescope.diffractive import DiffractiveOptics

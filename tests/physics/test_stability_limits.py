@@ -7,7 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from service.control.gate import LoopSettings, judge, pole_radius
+from service.control.gate import judge
+from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
@@ -59,7 +60,7 @@ def test_the_gate_refuses_at_the_limit_and_accepts_well_inside():
     """A linearisation half-way: what the service would have at hand."""
     shifts = (0.05, 0.34)
     at_hand: Linearisation = flao_model().linearise(Misregistration(shift_x_subap=0.2))
-    loop = LoopSettings(gains=np.full(400, GAIN), leak=1.0, delay_frames=2.0)
+    loop = ControlLoop(frame_rate_hz=1000.0, gains=np.full(400, GAIN), leak=1.0, delay_frames=2.0)
     near, far = (
         judge(
             reconstructor(400),

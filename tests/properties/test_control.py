@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from service.control.gate import pole_radius
+from service.control.loop import pole_radius
 from service.control.reconstructor import invert
-from tests.unit.control.test_gate_poles import integrator_limit
+from tests.unit.control.test_loop import integrator_limit
 
 arguments = st.floats(-np.pi, np.pi)
 moduli = st.floats(1e-3, 3.0)

@@ -12,7 +12,7 @@ from service.link.intake import Intake
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime import translate
 from service.runtime.engine import Engine
-from service.telemetry.frames import Loop as FitLoop
+from service.telemetry.frames import ClosedLoop as FitLoop
 from service.telemetry.lockin import WindowEstimate
 from service.tracking import events as ev
 from service.tracking.policy import Policy

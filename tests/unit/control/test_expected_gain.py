@@ -7,12 +7,12 @@ import pytest
 
 from service.control.expected_gain import (
     Sky,
-    Timing,
     beyond_m2,
     expected_gain,
     explained_by_noise,
     radial_order,
 )
+from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
 from service.model.misregistration import Misregistration
 from tests.numerics import N_CONTROLLED, N_MODES, small_basis, small_model
@@ -24,7 +24,7 @@ SKY = Sky(
     crossing_hz=1.5,
     slope_noise=NOISE,
 )
-TIMING = Timing(
+TIMING = ControlLoop(
     frame_rate_hz=500.0,
     delay_frames=2.0,
     leak=1.0,

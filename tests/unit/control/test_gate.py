@@ -7,16 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.control.gate import (
-    FORGIVING_LEAK,
-    HELD_LIMIT_M,
-    LIMIT_M,
-    NEAR,
-    LoopSettings,
-    Outer,
-    judge,
-    pole_radius,
-)
+from service.control.gate import FORGIVING_LEAK, HELD_LIMIT_M, LIMIT_M, NEAR, judge
+from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
 from service.model.misregistration import Misregistration
 from tests.numerics import N_CONTROLLED, SOMEWHERE, small_linearisation, small_model
@@ -25,8 +17,10 @@ SIGMA = np.array([0.01, 0.01, np.deg2rad(0.01), 0.0005])
 BOUND = 0.95
 
 
-def settings(gain: float = 0.5, **other) -> LoopSettings:
-    return LoopSettings(gains=np.full(N_CONTROLLED, gain), leak=1.0, delay_frames=2.0, **other)
+def settings(gain: float = 0.5, **other) -> ControlLoop:
+    return ControlLoop(
+        frame_rate_hz=1000.0, gains=np.full(N_CONTROLLED, gain), leak=1.0, delay_frames=2.0, **other
+    )
 
 
 def reconstructor_for(alpha: Misregistration):
@@ -169,7 +163,9 @@ def test_a_longer_delay_costs_margin():
             small_linearisation(),
             Misregistration(),
             np.diag(SIGMA**2),
-            LoopSettings(gains=np.full(N_CONTROLLED, 0.5), leak=1.0, delay_frames=delay),
+            ControlLoop(
+                frame_rate_hz=1000.0, gains=np.full(N_CONTROLLED, 0.5), leak=1.0, delay_frames=delay
+            ),
             bound=BOUND,
         )
         for delay in (2.0, 3.0)
@@ -179,7 +175,7 @@ def test_a_longer_delay_costs_margin():
 
 def test_a_reconstructor_of_fewer_modes_is_judged_on_its_own_modes():
     few = invert(small_linearisation().matrix, 10).matrix
-    loop = LoopSettings(gains=np.full(10, 0.5), leak=1.0, delay_frames=2.0)
+    loop = ControlLoop(frame_rate_hz=1000.0, gains=np.full(10, 0.5), leak=1.0, delay_frames=2.0)
     found = judge(few, small_linearisation(), turned(8.0), np.diag(SIGMA**2), loop, bound=BOUND)
     assert found.worst_pole_radius < verdict(truth=turned(8.0)).worst_pole_radius
 
@@ -188,7 +184,7 @@ class TestModesWithoutGain:
     """A loop some of whose gains an operator has set to 0."""
 
     @staticmethod
-    def loop(*still: int, leak: float = 0.999) -> LoopSettings:
+    def loop(*still: int, leak: float = 0.999) -> ControlLoop:
         gains = np.full(N_CONTROLLED, 0.5)
         gains[list(still)] = 0.0
         return replace(settings(), gains=gains, leak=leak)
@@ -220,7 +216,7 @@ class TestModesWithoutGain:
         assert not refused.accepted
 
     def test_optical_gains_and_the_outer_ring_are_those_of_the_modes_that_are_left(self):
-        ring = Outer(actuators=np.eye(3, N_CONTROLLED))
+        ring = np.eye(3, N_CONTROLLED)
         gain = np.linspace(0.5, 0.9, N_CONTROLLED)
         whole = replace(settings(), outer=ring, optical_gain=gain)
         still = replace(self.loop(0, 1, 2, leak=1.0), outer=ring, optical_gain=gain)
@@ -233,9 +229,9 @@ class TestModesWithoutGain:
         assert verdict(loop=none).worst_pole_radius == pytest.approx(0.999)
 
 
-def with_ring(scale: float, leak: float = 1.0) -> LoopSettings:
+def with_ring(scale: float, leak: float = 1.0) -> ControlLoop:
     """The aligned loop with an outer ring that a mode moves by this many metres per metre."""
-    ring = Outer(actuators=scale * np.random.default_rng(1).normal(size=(9, N_CONTROLLED)))
+    ring = scale * np.random.default_rng(1).normal(size=(9, N_CONTROLLED))
     return replace(settings(outer=ring), leak=leak)
 
 
@@ -253,7 +249,7 @@ class TestHolding:
     """The edge of a loop that is closed already with as many modes, and holds."""
 
     @staticmethod
-    def loop(motion_m: float, **changes) -> LoopSettings:
+    def loop(motion_m: float, **changes) -> ControlLoop:
         of_unit = verdict(loop=with_ring(1.0)).edge_motion_m
         return replace(with_ring(motion_m / of_unit), **changes)
 
@@ -305,8 +301,11 @@ def test_whatever_is_left_out_the_word_is_that_of_all_nine_points(seed):
     truth = Misregistration.from_vector(Misregistration().vector + away)
     sigma = SIGMA * rng.uniform(0.2, 12.0)
     gains = rng.uniform(0.05, 0.9) * rng.uniform(0.6, 1.0, N_CONTROLLED)
-    loop = LoopSettings(
-        gains=gains, leak=rng.uniform(0.98, 1.0), delay_frames=rng.uniform(1.0, 2.5)
+    loop = ControlLoop(
+        frame_rate_hz=1000.0,
+        gains=gains,
+        leak=rng.uniform(0.98, 1.0),
+        delay_frames=rng.uniform(1.0, 2.5),
     )
     matrix = reconstructor_for(Misregistration())
     found = judge(matrix, small_linearisation(), truth, np.diag(sigma**2), loop, bound=BOUND)

@@ -9,7 +9,6 @@ from service.control.gate import (
     FORGIVING_LEAK,
     HELD_LIMIT_M,
     LIMIT_M,
-    Outer,
     edge_motion_m,
     why_slippery,
 )
@@ -17,8 +16,8 @@ from service.control.gate import (
 N = 6
 
 
-def outer(seed: int = 1) -> Outer:
-    return Outer(actuators=np.random.default_rng(seed).normal(size=(4, N)))
+def outer(seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(4, N))
 
 
 def reconstructor(seed: int = 2) -> np.ndarray:
@@ -34,7 +33,7 @@ def simulated(matrix, coupling, gain, ring, leak, delay) -> float:
     for k in range(n_frames):
         reply = noise[k] + coupling @ command[k]
         command[k + delay] = leak * command[k + delay - 1] - gain * reply
-    return float((command[1000:] @ ring.actuators.T).std(axis=0).max())
+    return float((command[1000:] @ ring.T).std(axis=0).max())
 
 
 @pytest.mark.parametrize(("leak", "delay"), [(0.999, 2), (0.95, 1), (1.0, 3)])
@@ -61,7 +60,7 @@ def test_one_aligned_mode_without_delay_to_speak_of_has_the_textbook_variance():
         matrix,
         np.eye(1, dtype=np.float32),
         np.array([0.5]),
-        Outer(actuators=np.ones((1, 1))),
+        np.ones((1, 1)),
         leak=1.0,
         delay_frames=1.0,
     )

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from service.control.gate import LoopSettings, judge
+from service.control.gate import judge
+from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
 from service.model.misregistration import Misregistration
 from tests.numerics import N_CONTROLLED, small_linearisation
@@ -13,8 +14,12 @@ SIGMA = np.array([0.003, 0.003, 9e-5, 3e-4])
 
 def worst(optical_gain, gains):
     linear = small_linearisation()
-    loop = LoopSettings(
-        gains=np.asarray(gains), leak=1.0, delay_frames=2.0, optical_gain=optical_gain
+    loop = ControlLoop(
+        frame_rate_hz=1000.0,
+        gains=np.asarray(gains),
+        leak=1.0,
+        delay_frames=2.0,
+        optical_gain=optical_gain,
     )
     matrix = invert(linear.matrix_at(Misregistration()), N_CONTROLLED).matrix
     found = judge(matrix, linear, Misregistration(), np.diag(SIGMA**2), loop, bound=0.95)
@@ -40,11 +45,17 @@ def test_one_mode_with_too_high_a_gain_is_seen():
 
 
 def test_fewer_modes_of_a_loop_keep_their_own_gains():
-    loop = LoopSettings(
-        gains=np.arange(5.0), leak=1.0, delay_frames=2.0, optical_gain=np.arange(5.0) + 10.0
+    loop = ControlLoop(
+        frame_rate_hz=1000.0,
+        gains=np.arange(5.0),
+        leak=1.0,
+        delay_frames=2.0,
+        optical_gain=np.arange(5.0) + 10.0,
     )
-    few = loop.of_first(3)
+    few = loop.of(slice(3))
     assert few.gains.tolist() == [0.0, 1.0, 2.0]
     assert few.optical_gain.tolist() == [10.0, 11.0, 12.0]
-    one = LoopSettings(gains=np.arange(5.0), leak=1.0, delay_frames=2.0, optical_gain=0.5)
-    assert one.of_first(2).optical_gain == 0.5
+    one = ControlLoop(
+        frame_rate_hz=1000.0, gains=np.arange(5.0), leak=1.0, delay_frames=2.0, optical_gain=0.5
+    )
+    assert one.of(slice(2)).optical_gain == 0.5

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.gate import LoopSettings, judge
+from service.control.gate import judge
+from service.control.loop import ControlLoop
 from service.control.reconstructor import Prior, invert, invert_with_prior
 from service.errors import ModelError
 from service.model.misregistration import Misregistration
@@ -89,7 +90,9 @@ def test_the_condition_number_is_that_of_the_controlled_columns():
 def test_the_gate_judges_it_like_any_other(degrees, accepted):
     found = invert_with_prior(MATRIX, N_CONTROLLED, prior()).matrix
     sigma = np.array([0.01, 0.01, np.deg2rad(0.01), 0.0005])
-    loop = LoopSettings(gains=np.full(N_CONTROLLED, 0.5), leak=1.0, delay_frames=2.0)
+    loop = ControlLoop(
+        frame_rate_hz=1000.0, gains=np.full(N_CONTROLLED, 0.5), leak=1.0, delay_frames=2.0
+    )
     at = Misregistration(rotation_rad=np.deg2rad(degrees))
     verdict = judge(found, small_linearisation(), at, np.diag(sigma**2), loop, bound=0.95)
     assert verdict.accepted is accepted

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from service.config import load_instrument
-from service.control.gate import LoopSettings
+from service.control.loop import ControlLoop
 from service.prepared import usual_folder
 from service.worker import Compute
 
@@ -23,4 +23,6 @@ def small_instrument():
 
 
 def loop_settings(n_modes=N_CONTROLLED, gain=0.4):
-    return LoopSettings(gains=np.full(n_modes, gain), leak=0.999, delay_frames=2.0)
+    return ControlLoop(
+        frame_rate_hz=1000.0, gains=np.full(n_modes, gain), leak=0.999, delay_frames=2.0
+    )

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.control.expected_gain import Timing
 from service.model.misregistration import Misregistration
 from service.worker import InUse, OpticsWorker
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, loop_settings, small_instrument
@@ -40,13 +39,7 @@ def question(bench):
         covariance=np.diag(SIGMA**2),
         loop=loop,
         bound=0.95,
-        timing=Timing(
-            frame_rate_hz=1000.0,
-            delay_frames=loop.delay_frames,
-            leak=loop.leak,
-            gains=loop.gains,
-            optical_gain=np.full(90, 0.6),
-        ),
+        optical_gain=np.full(90, 0.6),
         magnitude=8.0,
     )
 
@@ -96,7 +89,7 @@ MOVED = {
     "bound": lambda q: replace(q, bound=0.9),
     "star": lambda q: replace(q, magnitude=9.0),
     "no star": lambda q: replace(q, magnitude=None),
-    "sky": lambda q: replace(q, timing=replace(q.timing, optical_gain=1.1 * q.timing.optical_gain)),
+    "sky": lambda q: replace(q, optical_gain=1.1 * q.optical_gain),
     "matrix": lambda q: replace(q, matrix=q.matrix * np.float32(1.001)),
 }
 

@@ -10,7 +10,7 @@ from service.control.gate import judge
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.turbulence import working_point
-from service.telemetry.frames import Loop
+from service.telemetry.frames import ClosedLoop
 from service.worker import OpticsWorker, sensor
 from service.worker.sensor import FOLLOWED, STRENGTHS
 from tests.unit.runtime.small import (
@@ -55,7 +55,7 @@ def on_sky(strength):
 
 def still():
     n_slopes = OpticsWorker(small_instrument(), COMPUTE).describe().n_slopes
-    return Loop(
+    return ClosedLoop(
         reconstructor=np.zeros((N_CONTROLLED, n_slopes), np.float32),
         gains=np.zeros(90),
         leak=0.999,

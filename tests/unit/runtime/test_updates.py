@@ -8,11 +8,18 @@ import pytest
 from scipy.optimize import brentq
 
 from service.archive import Archive
-from service.control.gate import HELD_LIMIT_M, LIMIT_M, LoopSettings
+from service.control.gate import HELD_LIMIT_M, LIMIT_M
+from service.control.loop import ControlLoop
 from service.errors import CommandError
 from service.model.misregistration import Misregistration
-from service.runtime.actions import Actions, Publishing
-from service.runtime.loops import GAIN_SAFETY, loop_settings, modes_that_hold, timing
+from service.runtime.actions import (
+    GAIN_SAFETY,
+    Actions,
+    Publishing,
+    expected_gains,
+    loop_to_judge,
+    modes_that_hold,
+)
 from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
@@ -132,7 +139,9 @@ def just_beyond(bench):
     """A loop whose ring moves by a nanometre more than that of one to be closed may."""
 
     def loop(gain):
-        return LoopSettings(gains=np.full(N_CONTROLLED, gain), leak=0.999, delay_frames=2.0)
+        return ControlLoop(
+            frame_rate_hz=1000.0, gains=np.full(N_CONTROLLED, gain), leak=0.999, delay_frames=2.0
+        )
 
     def excess_m(gain):
         return make_in(bench, loop(gain)).gate.edge_motion_m - (LIMIT_M + 1e-9)
@@ -243,23 +252,28 @@ class TestGains:
             await actions.perform(asked, replace(STATE, in_use=None))
 
 
+def loop_with(registration):
+    state = replace(STATE, rtc=loop_of(0.4), registration=registration)
+    return loop_to_judge(state, (0.4,) * N_CONTROLLED)
+
+
 class TestLoopOfTheGate:
     """The optical gains the gate and the expected loss are told."""
 
     def test_the_gate_gets_more_than_the_expected_gain_of_every_mode(self):
         known = replace(REGISTRATION, optical_gains=MEASURED)
-        loop = loop_settings(loop_of(0.4), (0.4,) * N_CONTROLLED, known)
-        expected = timing(loop_of(0.4), N_CONTROLLED, known).optical_gain
+        loop = loop_with(known)
+        expected = expected_gains(known, N_MODES)
         assert expected.shape == (N_MODES,)
         assert np.all(loop.optical_gain > 1.05 * expected[:N_CONTROLLED])
 
     def test_a_mean_of_unknown_modes_is_taken_for_all_with_some_safety(self):
-        loop = loop_settings(loop_of(0.4), (0.4,) * N_CONTROLLED, REGISTRATION)
+        loop = loop_with(REGISTRATION)
         assert loop.optical_gain == pytest.approx(GAIN_SAFETY * REGISTRATION.optical_gain)
 
     def test_with_nothing_measured_the_model_is_believed(self):
         blind = replace(REGISTRATION, optical_gain=None)
-        assert loop_settings(loop_of(0.4), (0.4,) * N_CONTROLLED, blind).optical_gain == 1.0
+        assert loop_with(blind).optical_gain == 1.0
 
 
 class TestModesThatHold:

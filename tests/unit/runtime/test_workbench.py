@@ -8,7 +8,7 @@ import pytest
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.telemetry import passive
-from service.telemetry.frames import FrameBlock, Loop, WindowRefused
+from service.telemetry.frames import ClosedLoop, FrameBlock, WindowRefused
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
 from service.worker import OpticsWorker, run_job
 from tests.unit.runtime.small import (
@@ -70,7 +70,7 @@ def dithered_window(bench, alpha, *, gain=1.0, noise=1e-4, seed=1):
 
 
 def open_loop(reconstructor):
-    return Loop(
+    return ClosedLoop(
         reconstructor=reconstructor,
         gains=np.zeros(90),
         leak=0.999,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.gate import pole_radius
+from service.control.loop import pole_radius
 from service.model.misregistration import Misregistration
 from service.telemetry.health import CALM_RATIO, DIVERGING_RATIO, LoopHealth, observe
 from tests.numerics import (

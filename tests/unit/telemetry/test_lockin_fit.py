@@ -68,7 +68,7 @@ class Case:
     plan: LockInPlan
 
     @property
-    def loop(self) -> lockin.Loop:
+    def loop(self) -> lockin.ClosedLoop:
         return small_loop(gain=self.gain)
 
 

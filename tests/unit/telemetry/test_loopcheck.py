@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.telemetry.frames import FrameBlock, Loop
+from service.telemetry.frames import ClosedLoop, FrameBlock
 from service.telemetry.loopcheck import (
     ENOUGH_SAMPLES,
     KEPT_SAMPLES,
@@ -94,7 +94,7 @@ def blocks(telemetry, lengths=(37, 5, 50, 1, 20), *, first=0):
 
 
 def terms(delay_frames=2.0, gains=GAINS, matrix=INVERSE, rate_hz=RATE_HZ):
-    return Loop(
+    return ClosedLoop(
         cm_id="cm-1",
         reconstructor=matrix,
         gains=gains,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.gate import pole_radius
+from service.control.loop import pole_radius
 
 
 def integrator_limit(eigenvalue_argument_rad):

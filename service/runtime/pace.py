@@ -10,13 +10,8 @@ from dataclasses import dataclass, field
 from service.routes.service import Pace
 from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
+from service.tracking.alarms import WORKER_BEHIND, WORKER_LOST
 from service.tracking.state import TrackerState
-
-WORKER_LOST = "worker-lost"
-"""The alarm of a worker that died or hangs, until another has done a job."""
-
-WORKER_BEHIND = "worker-behind"
-"""The alarm of a worker that does not keep up."""
 
 MEMORY_S = 60.0
 """What is told is of the last minute."""

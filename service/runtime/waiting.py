@@ -9,6 +9,7 @@ from typing import Final
 
 from service.link.intake import SPARED
 from service.link.statistics import MALFORMED, RECENT_S, USED, Fate, LinkStatistics
+from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.alarms import Act, forbids
 from service.tracking.policy import SECOND_NS
@@ -50,7 +51,7 @@ TOLD_AFTER_NS: Final = 2 * SECOND_NS
 TOLD_EVERY_NS: Final = 60 * SECOND_NS
 """Least time between two records of the same."""
 
-COMPLAINTS: Final = ("frames-unused", "messages-refused", "status-flood")
+COMPLAINTS: Final = (alarms.FRAMES_UNUSED, alarms.MESSAGES_REFUSED, alarms.STATUS_FLOOD)
 """Names of the alarms that are made here."""
 
 
@@ -60,9 +61,9 @@ _NUMBER: Final = re.compile(r"[0-9]+")
 def complaints(link: LinkStatistics) -> dict[str, str]:
     """Return the alarms of what came in the last seconds, by name."""
     made = {
-        "frames-unused": _unused(link),
-        "messages-refused": _refused(link),
-        "status-flood": _flood(link),
+        alarms.FRAMES_UNUSED: _unused(link),
+        alarms.MESSAGES_REFUSED: _refused(link),
+        alarms.STATUS_FLOOD: _flood(link),
     }
     return {name: text for name, text in made.items() if text}
 
@@ -175,7 +176,7 @@ def _for_the_worker(facts: Facts) -> Iterator[Waiting]:
         yield Waiting(name="model", party=Party.WORKER, text=text, hinders=True)
     if facts.worker_trouble:
         text = f"{facts.worker_trouble}: until it, or another, has done a job"
-        yield Waiting(name="worker-lost", party=Party.WORKER, text=text, hinders=True)
+        yield Waiting(name=alarms.WORKER_LOST, party=Party.WORKER, text=text, hinders=True)
     if facts.state.making_since_ns_utc is not None:
         text = "a reconstructor is being computed and judged: wait"
         yield Waiting(name="matrix", party=Party.WORKER, text=text)
@@ -215,7 +216,7 @@ def _for_messages(facts: Facts) -> Iterator[Waiting]:
 def _for_frames(facts: Facts) -> Iterator[Waiting]:
     text, fates = _unused(facts.link), facts.link.fates
     if text and not any(f.n for f in fates if f.kind == "frames" and f.outcome == USED):
-        yield Waiting(name="frames-unused", party=Party.RTC, text=text, hinders=True)
+        yield Waiting(name=alarms.FRAMES_UNUSED, party=Party.RTC, text=text, hinders=True)
 
 
 def _for_the_matrix(facts: Facts) -> Iterator[Waiting]:
@@ -246,18 +247,18 @@ def _told(state: TrackerState) -> str:
 
 
 _ALARMS: Final = {
-    "dither": Party.RTC,
-    "dither-lost": Party.RTC,
-    "dither-not-stopped": Party.RTC,
-    "dither-over-budget": Party.RTC,
-    "dither-not-as-asked": Party.RTC,
-    "no-acknowledgement": Party.RTC,
-    "wrong-matrix": Party.RTC,
-    "standing-by": Party.SERVICE,
-    "acquisition": Party.OPERATOR,
-    "loop-open": Party.OPERATOR,
-    "worker-behind": Party.WORKER,
-    "worker-lost": Party.WORKER,
+    alarms.NO_DITHER: Party.RTC,
+    alarms.DITHER_LOST: Party.RTC,
+    alarms.NOT_STOPPED: Party.RTC,
+    alarms.OVER_BUDGET: Party.RTC,
+    alarms.NOT_AS_ASKED: Party.RTC,
+    alarms.NOT_ACKNOWLEDGED: Party.RTC,
+    alarms.OTHER_SUM: Party.RTC,
+    alarms.STANDING_BY: Party.SERVICE,
+    alarms.ACQUISITION: Party.OPERATOR,
+    alarms.LOOP_OPEN: Party.OPERATOR,
+    alarms.WORKER_BEHIND: Party.WORKER,
+    alarms.WORKER_LOST: Party.WORKER,
 }
 """Alarms whose end is waited for though they may forbid nothing, and by whom it comes."""
 

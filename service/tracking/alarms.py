@@ -83,6 +83,21 @@ SECOND_SERVICE = "second-service"
 STANDING_BY = "standing-by"
 """A service that leaves the RTC to another one."""
 
+FRAMES_UNUSED = "frames-unused"
+"""Frames that come and are not used."""
+
+MESSAGES_REFUSED = "messages-refused"
+"""Other messages of the RTC that break the contract."""
+
+STATUS_FLOOD = "status-flood"
+"""Statuses more often than the contract allows."""
+
+WORKER_LOST = "worker-lost"
+"""A worker that died or hangs, until another has done a job."""
+
+WORKER_BEHIND = "worker-behind"
+"""A worker that does not keep up."""
+
 
 class Act(Enum):
     """What an alarm may forbid."""

@@ -38,13 +38,27 @@ def log_of_its_own():
     structlog.reset_defaults()
 
 
-def pytest_collection_modifyitems(items):
-    """Put them in order, and give system tests the time that they need on this machine."""
+def pytest_collection_modifyitems(config, items):
+    """Put them in order, and give them the time that they need on this machine."""
     items.sort(key=lambda item: _place(item.nodeid))
     for item in items:
-        limit = item.get_closest_marker("timeout")
-        if item.get_closest_marker("system") and limit is not None:
-            item.add_marker(pytest.mark.timeout(patience(limit.args[0])), append=False)
+        marked = item.get_closest_marker("timeout")
+        limit_s = marked.args[0] if marked else float(config.getini("timeout"))
+        in_system = item.get_closest_marker("system") is not None
+        # of each try, not of the first one and the second together
+        limit = pytest.mark.timeout(patience(limit_s), func_only=in_system)
+        item.add_marker(limit, append=False)
+        if in_system:
+            # Real time on a machine that others use: a change refused for a moment's stall costs
+            # hours, and what is broken fails twice. The first failure is told at the end.
+            item.add_marker(pytest.mark.flaky(reruns=1))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Tell why a test that passed at its second try failed at the first."""
+    for report in terminalreporter.getreports("rerun"):
+        terminalreporter.write_sep("_", f"first try of {report.nodeid}")
+        terminalreporter.line(report.longreprtext)
 
 
 def _place(nodeid):

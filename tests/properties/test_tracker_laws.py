@@ -25,6 +25,7 @@ from tests.unit.tracking.situations import (
     foreign,
     judged,
     moved,
+    of_kind,
     record,
     rtc,
     verdict,
@@ -262,6 +263,10 @@ class Night:
                 return None
 
 
+def the_shelf_stays_in_order(before, event, night):
+    check_shelf(night.state)
+
+
 def check_shelf(state):
     applied = [r.id for r in state.reconstructors if r.state is MatrixState.APPLIED]
     assert len(applied) <= 1
@@ -272,6 +277,10 @@ def check_shelf(state):
             assert applied == [state.in_use]
 
 
+def nothing_grows_for_ever(before, event, night):
+    check_bounds(night.state)
+
+
 def check_bounds(state):
     assert len(state.log) <= LOG_LENGTH
     assert len(state.history) <= HISTORY_LENGTH
@@ -280,43 +289,101 @@ def check_bounds(state):
     assert len({alarm.name for alarm in state.alarms}) == len(state.alarms)
 
 
+def what_the_gate_refused_is_never_sent(before, event, night):
+    refused = {r.id for r in before.reconstructors if r.state is MatrixState.REFUSED}
+    for effect in of_kind(night.last, ev.SendMatrix):
+        assert effect.id not in refused
+        assert night.state.reconstructor(effect.id).gate.accepted
+
+
+def nothing_is_sent_to_nobody_or_to_an_rtc_that_may_be_the_wrong_one(before, event, night):
+    if of_kind(night.last, ev.SendMatrix):
+        assert night.state.rtc is not None
+        assert not {a.name for a in night.state.alarms} & set(TROUBLES[:3])
+
+
+def an_uncertainty_is_never_nothing_nor_negative(before, event, night):
+    known = night.state.registration
+    if known is not None and known is not before.registration:
+        assert np.all(np.linalg.eigvalsh(known.covariance) > 0.0)
+        assert np.all(known.sigma >= known.floor)
+
+
+def while_a_matrix_is_measured_nothing_else_is_asked_of_the_rtc_or_learnt(before, event, night):
+    if before.measuring is None or night.state.measuring is None:
+        return
+    assert night.state.measuring.id == before.measuring.id
+    assert night.state.windows_accepted == before.windows_accepted
+    sent_before = {r.id for r in night.state.reconstructors if r.id.startswith("made")}
+    for effect in night.last:
+        assert isinstance(effect, ev.AskNoDither | ev.SendMatrix)
+        if isinstance(effect, ev.SendMatrix):
+            assert effect.id in sent_before
+
+
+OVER = {MeasureState.REFUSED, MeasureState.FAILED, MeasureState.STORED, MeasureState.GIVEN_UP}
+
+
+def a_measurement_that_is_over_stays_over_and_given_up_stays_given_up(before, event, night):
+    after = {r.id: r.state for r in night.state.measurements}
+    for was in before.measurements:
+        assert was.state not in OVER or after[was.id] in OVER
+        if was.state is MeasureState.GIVEN_UP:
+            assert after[was.id] is MeasureState.GIVEN_UP
+
+
+def no_dither_is_over_budget_unless_an_operator_means_it(before, event, night):
+    if not getattr(event, "over_budget", False):
+        for effect in of_kind(night.last, ev.AskDither):
+            assert total_m(effect.dither) <= POLICY.dither_budget_m * (1.0 + 1e-9)
+
+
+def an_open_loop_is_an_alarm_unless_a_measurement_has_opened_it(before, event, night):
+    if isinstance(event, ev.StatusSeen) and night.state.rtc.loop == "open":
+        measuring = night.state.measuring
+        expected = measuring is None or not measuring.opens_loop
+        assert ("loop-open" in {a.name for a in night.state.alarms}) is expected
+
+
+def only_one_reconstructor_is_under_way_at_a_time(before, event, night):
+    if isinstance(event, COMMANDS):
+        return
+    made = of_kind(night.last, ev.MakeMatrix)
+    assert len(made) <= 1
+    waiting = [r.id for r in before.reconstructors if r.state in SENT]
+    still = [name for name in waiting if night.state.reconstructor(name).state in SENT]
+    assert not (made and still)
+
+
+SENT = {MatrixState.PUBLISHED, MatrixState.STAGED}
+ALWAYS = (
+    the_shelf_stays_in_order,
+    nothing_grows_for_ever,
+    what_the_gate_refused_is_never_sent,
+    nothing_is_sent_to_nobody_or_to_an_rtc_that_may_be_the_wrong_one,
+    an_uncertainty_is_never_nothing_nor_negative,
+    while_a_matrix_is_measured_nothing_else_is_asked_of_the_rtc_or_learnt,
+    a_measurement_that_is_over_stays_over_and_given_up_stays_given_up,
+    no_dither_is_over_budget_unless_an_operator_means_it,
+    an_open_loop_is_an_alarm_unless_a_measurement_has_opened_it,
+    only_one_reconstructor_is_under_way_at_a_time,
+)
+"""What holds after every event, whatever the mode."""
+
 LAWS = settings(
     max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
 
 
-@LAWS
-@given(stories)
-def test_nothing_but_a_command_is_ever_refused_and_the_shelf_stays_in_order(story):
-    night = Night()
+@settings(LAWS, max_examples=250)
+@given(stories, st.sampled_from([Mode.AUTO, Mode.AUTO, Mode.PROPOSE, Mode.HOLD]))
+def test_nothing_but_a_command_is_ever_refused_and_every_law_holds(story, mode):
+    night = Night(mode)
     for event, after_s in story:
+        before = night.state
         night.tell(event, after_s)
-        check_shelf(night.state)
-        check_bounds(night.state)
-
-
-@LAWS
-@given(stories)
-def test_what_the_gate_refused_is_never_sent(story):
-    night = Night()
-    for event, after_s in story:
-        refused = {r.id for r in night.state.reconstructors if r.state is MatrixState.REFUSED}
-        night.tell(event, after_s)
-        sent = {e.id for e in night.last if isinstance(e, ev.SendMatrix)}
-        assert not sent & refused
-        for matrix_id in sent:
-            assert night.state.reconstructor(matrix_id).gate.accepted
-
-
-@LAWS
-@given(stories)
-def test_nothing_is_sent_to_nobody_or_to_an_rtc_that_may_be_the_wrong_one(story):
-    night = Night()
-    for event, after_s in story:
-        night.tell(event, after_s)
-        if any(isinstance(effect, ev.SendMatrix) for effect in night.last):
-            assert night.state.rtc is not None
-            assert not {a.name for a in night.state.alarms} & set(TROUBLES[:3])
+        for law in ALWAYS:
+            law(before, event, night)
 
 
 @LAWS
@@ -327,10 +394,7 @@ def test_in_hold_nothing_is_made_or_sent_by_itself(story):
         if isinstance(event, COMMANDS):
             continue
         night.tell(event, after_s)
-        assert not any(
-            isinstance(effect, ev.MakeMatrix | ev.CopyMatrix | ev.SendMatrix)
-            for effect in night.last
-        )
+        assert not of_kind(night.last, ev.MakeMatrix | ev.CopyMatrix | ev.SendMatrix)
 
 
 @LAWS
@@ -342,11 +406,11 @@ def test_in_propose_nothing_is_sent_but_what_an_operator_approved_or_asked_for_a
             continue
         copied = any(isinstance(effect, ev.CopyMatrix) for effect in night.open[:1])
         night.tell(event, after_s)
-        if any(isinstance(effect, ev.SendMatrix) for effect in night.last):
+        if of_kind(night.last, ev.SendMatrix):
             assert isinstance(event, ev.Approve) or copied
 
 
-@LAWS
+@settings(LAWS, max_examples=50)
 @given(stories, st.sampled_from([ev.RtcVanished(), ev.SessionStarted(session="s3")]))
 def test_the_registration_and_the_shelf_outlive_the_rtc(story, end):
     night = Night()
@@ -360,101 +424,6 @@ def test_the_registration_and_the_shelf_outlive_the_rtc(story, end):
     if before.registration is not None:
         assert after.registration.alpha == before.registration.alpha
         np.testing.assert_array_equal(after.registration.covariance, before.registration.covariance)
-
-
-@LAWS
-@given(stories)
-def test_an_uncertainty_is_never_nothing_nor_negative(story):
-    night = Night()
-    for event, after_s in story:
-        night.tell(event, after_s)
-        known = night.state.registration
-        if known is not None:
-            assert np.all(np.linalg.eigvalsh(known.covariance) > 0.0)
-            assert np.all(known.sigma >= known.floor)
-
-
-@LAWS
-@given(stories)
-def test_while_a_matrix_is_measured_nothing_else_is_asked_of_the_rtc_or_learnt(story):
-    night = Night()
-    for event, after_s in story:
-        measuring, accepted = night.state.measuring, night.state.windows_accepted
-        night.tell(event, after_s)
-        if measuring is not None and night.state.measuring is not None:
-            assert night.state.measuring.id == measuring.id
-            assert night.state.windows_accepted == accepted
-            sent_before = {r.id for r in night.state.reconstructors if r.id.startswith("made")}
-            for effect in night.last:
-                assert isinstance(effect, ev.AskNoDither | ev.SendMatrix)
-                if isinstance(effect, ev.SendMatrix):
-                    assert effect.id in sent_before
-
-
-@LAWS
-@given(stories)
-def test_a_measurement_that_is_over_stays_over_and_given_up_stays_given_up(story):
-    over = {
-        MeasureState.REFUSED,
-        MeasureState.FAILED,
-        MeasureState.STORED,
-        MeasureState.GIVEN_UP,
-    }
-    night = Night()
-    for event, after_s in story:
-        before = {r.id: r.state for r in night.state.measurements}
-        night.tell(event, after_s)
-        after = {r.id: r.state for r in night.state.measurements}
-        for name, state in before.items():
-            assert state not in over or after[name] in over
-            if state is MeasureState.GIVEN_UP:
-                assert after[name] is MeasureState.GIVEN_UP
-
-
-@LAWS
-@given(stories)
-def test_no_dither_is_over_budget_unless_an_operator_means_it(story):
-    night = Night()
-    for event, after_s in story:
-        night.tell(event, after_s)
-        meant = getattr(event, "over_budget", False)
-        for effect in night.last:
-            if isinstance(effect, ev.AskDither) and not meant:
-                assert total_m(effect.dither) <= POLICY.dither_budget_m * (1.0 + 1e-9)
-
-
-@LAWS
-@given(stories)
-def test_an_open_loop_is_an_alarm_unless_a_measurement_has_opened_it(story):
-    night = Night()
-    for event, after_s in story:
-        night.tell(event, after_s)
-        if isinstance(event, ev.StatusSeen) and night.state.rtc.loop == "open":
-            measuring = night.state.measuring
-            expected = measuring is None or not measuring.opens_loop
-            assert ("loop-open" in {a.name for a in night.state.alarms}) is expected
-
-
-@LAWS
-@given(stories)
-def test_only_one_reconstructor_is_under_way_at_a_time(story):
-    night = Night()
-    for event, after_s in story:
-        waiting = {
-            r.id
-            for r in night.state.reconstructors
-            if r.state in {MatrixState.PUBLISHED, MatrixState.STAGED}
-        }
-        night.tell(event, after_s)
-        if not isinstance(event, COMMANDS):
-            made = [effect for effect in night.last if isinstance(effect, ev.MakeMatrix)]
-            assert len(made) <= 1
-            still = {
-                m
-                for m in waiting
-                if night.state.reconstructor(m).state in {MatrixState.PUBLISHED, MatrixState.STAGED}
-            }
-            assert not (made and still)
 
 
 def test_a_long_night_fits_in_the_same_memory():

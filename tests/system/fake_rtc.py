@@ -39,6 +39,7 @@ from service.wire import (
     encode_status,
     split,
 )
+from tests.system.pace import patience
 
 T0_NS = 1_800_000_000_000_000_000
 DT_NS = 1_000_000
@@ -207,7 +208,7 @@ class FakeRtc:
 
     def fetch(self, selector):
         """Return the first reply's bytes, or the text of its error."""
-        for reply in self.zenoh.get(selector, timeout=2.0):
+        for reply in self.zenoh.get(selector, timeout=patience(2.0)):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
             return reply.err.payload.to_bytes().decode()

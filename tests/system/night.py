@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -11,7 +10,8 @@ from pathlib import Path
 
 import httpx
 
-from tests.system.pace import Deadline, patience
+from tests.system.cable import free_port
+from tests.system.pace import Deadline, patience, slowness
 
 ROOT = Path(__file__).parents[2]
 INSTRUMENT = Path(__file__).with_name("small.toml")
@@ -39,19 +39,18 @@ n_modes_target = {N_TARGET}
 minimum_interval_s = 1.0
 """
 
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+UNDER_LOAD = {"worker-behind", "estimate-stale"}
+"""Alarms that are right where others need the processors, too."""
 
 
-def wait_for(condition, timeout_s=30.0, what=""):
-    """Return the first truthy answer; say what was waited for when none comes."""
+def wait_for(condition, timeout_s=30.0, what="", *, every_s=0.1):
+    """Return the first truthy answer; say what was waited for, a text or how to get it, if none."""
     deadline = Deadline(timeout_s)
     while not (found := condition()):
-        assert not deadline.passed, f"not within {deadline}: {what or condition}"
-        time.sleep(0.1)
+        if deadline.passed:
+            text = what() if callable(what) else what or condition
+            raise AssertionError(f"not within {deadline}: {text}")
+        time.sleep(every_s)
     return found
 
 
@@ -98,6 +97,15 @@ class Process:
 
     def send(self, number):
         self.popen.send_signal(number)
+
+    def ended(self, timeout_s):
+        """Wait for its end; return its status."""
+        wait_for(lambda: self.popen.poll() is not None, timeout_s, lambda: f"its end; {self.log}")
+        return self.popen.returncode
+
+    def alone(self):
+        """Wait until none is left of the processes that it has started."""
+        wait_for(lambda: not session_members(self.popen.pid), 5.0, "no child process left")
 
     def kill(self):
         leaders = [self.popen.pid, *children_of(self.popen.pid)]
@@ -176,6 +184,25 @@ class Night:
     def alarms(self):
         return {alarm["name"]: alarm["text"] for alarm in self.state["alarms"]}
 
+    def check_alarms(self, *expected):
+        """See that there is no other alarm, but for those that a loaded machine deserves."""
+        others = {name: text for name, text in self.alarms.items() if name not in expected}
+        if others.keys() & UNDER_LOAD and slowness(again=True) > 1.5:
+            others = {name: text for name, text in others.items() if name not in UNDER_LOAD}
+        assert not others
+
+    def no_frame_is_lost(self):
+        """Wait for it: a frame that comes late counts as lost until then."""
+        wait_for(
+            lambda: self.state["link"]["frames_lost"] == 0,
+            5.0,
+            lambda: f"no frame lost; {self.state['link']}",
+        )
+
+    def rtc_says(self, key):
+        """Return a field of the RTC's status, None while there is none."""
+        return (self.state["rtc"] or {}).get(key)
+
     @property
     def metrics(self):
         lines = self.client.get("/metrics").text.splitlines()
@@ -193,16 +220,21 @@ class Night:
         return own[0] if own else 0
 
     def wait_for_rtc(self, process):
-        """Wait until the service knows the RTC; one that has ended says why."""
+        """Wait until the service knows the RTC; return the state then."""
 
         def met():
             assert process.popen.poll() is None, process.log
-            return self.state["rtc"] is not None
+            state = self.state
+            return state if state["rtc"] is not None else None
 
-        wait_for(met, 30.0, f"the RTC is known; {process.log_path}")
+        return wait_for(met, 30.0, f"the RTC is known; {process.log_path}")
 
     def wait_for_modes(self, n_modes, timeout_s=40.0):
-        wait_for(lambda: self.n_modes_in_use() == n_modes, timeout_s, f"{n_modes} modes in use")
+        wait_for(
+            lambda: self.n_modes_in_use() == n_modes,
+            timeout_s,
+            lambda: f"{n_modes} modes in use; {self.alarms}, {self.state['pace']}",
+        )
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """How slow this machine is just now: whoever waits for a process waits as much longer."""
 
+import os
 import time
 
 WORK_S = 0.12
@@ -15,12 +16,15 @@ _measured = []
 def slowness(*, again=False):
     """Return how many times longer than on an idle machine work takes; at least 1.
 
-    Measured once; ``again``, for whoever has waited in vain: the load may have come meanwhile.
+    Measured once; ``again``, for whoever has waited in vain: the load may have come meanwhile, or
+    come and gone, which the load average of the last minute still tells.
     """
     if again or not _measured:
         began_s = time.monotonic()
         _work()
-        _measured[:] = [min(max((time.monotonic() - began_s) / WORK_S, 1.0), MOST)]
+        took_s = time.monotonic() - began_s
+        crowd = os.getloadavg()[0] / (os.cpu_count() or 1)
+        _measured[:] = [min(max(took_s / WORK_S, crowd, 1.0), MOST)]
     return _measured[0]
 
 

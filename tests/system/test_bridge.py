@@ -1,7 +1,6 @@
 """The bridge over real zenoh on loopback, against a fake RTC."""
 
 import asyncio
-import socket
 import subprocess
 import sys
 import threading
@@ -41,8 +40,9 @@ from service.wire import (
     encode_state,
     layout_of,
 )
+from tests.system.cable import free_port
 from tests.system.fake_rtc import FakeRtc, client_session
-from tests.system.pace import Deadline, patience
+from tests.system.pace import Deadline, patience, slowness
 
 pytestmark = pytest.mark.system
 
@@ -52,10 +52,7 @@ SYSTEM = "bench"
 
 @pytest.fixture
 def endpoint():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    return Endpoint(system=SYSTEM, listen=(f"tcp/127.0.0.1:{port}",), chunk_bytes=64)
+    return Endpoint(system=SYSTEM, listen=(f"tcp/127.0.0.1:{free_port()}",), chunk_bytes=64)
 
 
 @pytest.fixture
@@ -186,20 +183,15 @@ def test_a_flao_loop_at_1_khz_loses_nothing_and_is_read_within_a_millisecond(end
         rtc_process(endpoint, "flao", n_slopes=1384, n_modes=594),
     ):
         wait_until(lambda: bridge.statistics().frames_received, 20.0)
-        blocks = []
-        end = time.monotonic() + 5.0
-        while time.monotonic() < end:
-            blocks += bridge.drain()
-            time.sleep(0.02)
+        blocks = drained(bridge, 5000, 10.0)
         statistics = bridge.statistics()
     seq = sequence(blocks)
     assert seq == list(range(seq[0], seq[0] + len(seq)))
     assert np.concatenate([b.slopes[:, 0] for b in blocks]).tolist() == seq
-    assert len(seq) > 4000
     assert (statistics.frames_lost, statistics.frames_overwritten) == (0, 0)
     with capsys.disabled():
         print(f" p50 {1e3 * statistics.latency_p50_s:.3f} ms, {len(seq)} frames", end="")  # noqa: T201
-    assert statistics.latency_p50_s < 1e-3
+    assert statistics.latency_p50_s < 1e-3 * slowness(again=True)
 
 
 def test_a_missing_batch_is_lost_until_it_comes_late_and_finds_its_place(bridge, rtc):
@@ -216,9 +208,9 @@ def test_a_missing_batch_is_lost_until_it_comes_late_and_finds_its_place(bridge,
 
 
 def test_a_hole_that_nothing_fills_holds_frames_back_for_half_a_second_only(bridge, rtc):
+    begin = time.monotonic()
     rtc.send(0)
     rtc.send(20)
-    begin = time.monotonic()
     blocks = drained(bridge, 20)
     assert 0.3 < time.monotonic() - begin < patience(1.5)
     assert [(b.first_seq, b.n_frames) for b in blocks] == [(0, 10), (20, 10)]
@@ -228,11 +220,14 @@ def test_a_hole_that_nothing_fills_holds_frames_back_for_half_a_second_only(brid
 
 
 def test_without_a_publisher_that_remembers_a_hole_is_given_up_at_once(bridge, rtc):
-    rtc.send(0, plain=True)
-    rtc.send(20, plain=True)
-    begin = time.monotonic()
-    drained(bridge, 20)
-    assert time.monotonic() - begin < patience(0.3)
+    took_s = []
+    for first in (0, 100, 200):  # the machine may stand still once
+        begin = time.monotonic()
+        rtc.send(first, plain=True)
+        rtc.send(first + 20, plain=True)
+        drained(bridge, 20)
+        took_s.append(time.monotonic() - begin)
+    assert min(took_s) < 0.3
 
 
 def test_the_first_of_two_equal_frames_wins(bridge, rtc):
@@ -412,7 +407,7 @@ def test_interleaved_sessions_are_a_second_rtc(bridge, rtc, endpoint):
             other.send(10 * k)
             time.sleep(0.1)
     assert "sessions s1 and s2" in seen.first(Trouble, name="second-rtc").text
-    assert bridge.statistics().frames_refused == {"session": 150}
+    wait_until(lambda: bridge.statistics().frames_refused == {"session": 150})
     assert {b.session for b in bridge.drain()} == {"s1"}
 
 
@@ -432,6 +427,7 @@ def tokens(session, key):
 
 def test_the_services_token_is_there_for_others_for_as_long_as_the_link_is_open(endpoint, rtc):
     key = rtc.keys.alive(Role.SERVICE)
+    wait_until(lambda: tokens(rtc.zenoh, key))
     time.sleep(0.2)
     assert tokens(rtc.zenoh, key) == [key]
 
@@ -490,7 +486,7 @@ def test_of_services_that_come_at_the_same_time_exactly_one_drives(endpoint):
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(10.0)
+            thread.join(patience(10.0))
         for left in (4, 3, 2, 1):
             driving = wait_until(
                 lambda left=left: [

@@ -87,12 +87,12 @@ def test_one_frame_with_a_leap_of_its_number_is_named_and_telemetry_goes_on(nigh
     rtc.on_frames = leap
     named(night, alarms, "frames-unused", "leaps from")
     goes_on(night)
-    assert night.state["ready"]
+    wait_for(lambda: night.state["ready"], 5.0, lambda: f"ready; {waits(night)}")
 
 
 @pytest.mark.long
 def test_a_sequence_that_starts_over_in_its_session_is_named_and_the_service_not_ready(night, rtc):
-    time.sleep(1.0)
+    wait_for(lambda: rtc.seq > 500, 5.0, "a second of frames")
     rtc.on_frames = lambda header, *rows: (header | {"seq0": header["seq0"] % 50}, *rows)
     named(night, alarms, "frames-unused", "goes back from")
     text = named(night, waits, "frames-unused", "goes back from")
@@ -117,8 +117,7 @@ def test_a_message_of_an_unknown_session_takes_nothing_over_and_is_named(night, 
             ack = {"v": 1, "id": "cm-x", "sha256": "0" * 64, "state": "applied", "reason": ""}
             ack |= {"frame_seq": 5} | other
             outside.put(f"{rtc.root}/cm/ack", msgpack.packb(ack))
-        time.sleep(0.2)
-    named(night, alarms, "second-rtc", other["session"])
+        named(night, alarms, "second-rtc", other["session"])
     assert night.state["link"]["session"] == rtc.session
     goes_on(night)
 
@@ -209,23 +208,19 @@ def test_another_sum_in_an_acknowledgement_is_an_alarm_until_the_matrix_is_read_
 
 @pytest.mark.long
 def test_five_hundred_statuses_a_second_end_no_window_and_leave_rest_alone(night, rtc):
-    rtc.status_hz = 50.0
-    pumped = 0
-    assert "wait" not in rtc.told
-    before, until = night.state["windows_accepted"], time.monotonic() + 15.0
-    slowest_s = 0.0
-    while time.monotonic() < until:
-        for _ in range(50):
-            rtc.send_status()
-            pumped += 1
-        began = time.monotonic()
-        assert night.client.get("/healthz").status_code == 200
-        slowest_s = max(slowest_s, time.monotonic() - began)
-        time.sleep(0.06)
-    assert pumped > 3000
-    named(night, alarms, "status-flood", "statuses")
-    assert slowest_s < patience(2.0)
-    assert night.state["windows_accepted"] > before
+    before, pumped = night.state["windows_accepted"], 0
+    with httpx.Client(base_url=night.client.base_url, timeout=patience(2.0)) as in_a_hurry:
+
+        def pump():
+            nonlocal pumped
+            for _ in range(50):
+                rtc.send_status()
+            pumped += 50
+            assert in_a_hurry.get("/healthz").status_code == 200
+            return pumped > 7000 and night.state["windows_accepted"] > before
+
+        wait_for(pump, 60.0, lambda: f"a window; {night.alarms}", every_s=0.05)
+        named(night, alarms, "status-flood", "statuses")
 
 
 @pytest.mark.long
@@ -240,8 +235,8 @@ def test_a_second_service_stands_by_and_the_rtc_hears_of_one_alone(night):
             named(second, waits, "standing-by", "another service drives", 20.0)
             named(night, alarms, "second-service", "end all but one")
             wait_for(lambda: rtc.applied, 60.0, "a matrix applied")
+            wait_for(lambda: night.ids("applied"), 5.0, "the service knows of it")
             time.sleep(5.0)
-            assert night.ids("applied")
             assert not second.shelf
             assert second.client.get("/readyz").status_code == 503
             answer = second.client.post("/v1/loop", json={"loop": "open"})
@@ -249,6 +244,7 @@ def test_a_second_service_stands_by_and_the_rtc_hears_of_one_alone(night):
             assert set(rtc.applied) <= {record["id"] for record in night.shelf}
     finally:
         second.client.close()
+        second.processes.pop().kill()
 
 
 def _state_of(night):
@@ -259,8 +255,6 @@ def _state_of(night):
 
 
 def test_what_an_rtc_does_not_offer_is_said_at_once(night, rtc):
-    began = time.monotonic()
-    answer = night.client.post("/v1/loop/ramp")
+    answer = night.client.post("/v1/loop/ramp", timeout=patience(2.0))
     assert answer.status_code in {409, 504}
     assert "offers no ramp" in answer.text
-    assert time.monotonic() - began < patience(2.0)

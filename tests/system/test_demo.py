@@ -40,7 +40,7 @@ def test_the_main_job_is_done_within_a_minute(night):
     alpha = ",".join(str(value) for value in given.values())
     began = time.monotonic()
     process = demo(night, "--seconds", "60", f"--alpha={alpha}", "--json", str(figures))
-    assert process.popen.wait(patience(280.0)) == 0, process.log
+    assert process.ended(280.0) == 0, process.log
 
     report = json.loads(figures.read_text(encoding="utf-8"))
     assert time.monotonic() - began < report["seconds_to_ready"] + 60.0 + patience(15.0)
@@ -60,7 +60,7 @@ def test_the_main_job_is_done_within_a_minute(night):
     assert all(swap["frames_skipped"] == 0 for swap in report["swaps"])
     assert report["seconds_to_first_applied"] < patience(45.0)
     assert "GOOD: the main job was done" in process.log
-    wait_for(lambda: not session_members(process.popen.pid), 5.0, "no child process left")
+    process.alone()
 
 
 def test_interrupted_it_stops_both_processes_and_says_what_is_missing(night):
@@ -80,8 +80,12 @@ def both_children(process):
 
 
 def ended_within(seconds, process, children):
-    process.popen.wait(patience(seconds))
-    assert not [member for child in children for member in session_members(child)]
+    process.ended(seconds)
+    wait_for(
+        lambda: not [member for child in children for member in session_members(child)],
+        1.0,  # what the standard library puts beside workers ends after them
+        "no child process left",
+    )
 
 
 def running(process, children):

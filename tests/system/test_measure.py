@@ -28,7 +28,12 @@ def quiet_night(night):
     night.service("hold")
     night.rtc()
     wait_for(lambda: night.state["in_use"], what="the RTC's matrix")
+    no_dither(night)
+
+
+def no_dither(night):
     night.post("/v1/dither", {"action": "stop"})
+    wait_for(lambda: night.state["dither"] is None, what="no dither")
 
 
 def measured(night, body, timeout_s=60.0):
@@ -89,8 +94,8 @@ def test_a_matrix_is_measured_kept_and_handed_out(night):
         assert file.attrs["instrument"] == "small"
     assert (night.directory / "data" / "interaction_matrices" / f"{record['id']}.h5").exists()
 
-    wait_for(lambda: night.state["rtc"]["loop"] == "closed", what="the loop closed again")
-    assert night.alarms.keys() <= {"loop-open"}
+    wait_for(lambda: night.rtc_says("loop") == "closed", what="the loop closed again")
+    night.check_alarms("loop-open")
 
     # one shape after the other: ten times the pushes, for turbulence in the open loop
     other = measured(night, {"pattern": "system-modes", "n_average": 60})
@@ -118,7 +123,7 @@ def test_what_cannot_be_done_now_is_refused_with_the_reason(night):
     answer = night.client.post("/v1/measurements", json={})
     assert answer.status_code == httpx.codes.CONFLICT
     assert "is running; stop it first" in answer.json()["detail"]
-    night.post("/v1/dither", {"action": "stop"})
+    no_dither(night)
 
     answer = night.client.post("/v1/measurements", json={"amplitude_m": 1e-6})
     assert answer.status_code == httpx.codes.CONFLICT

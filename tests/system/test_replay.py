@@ -1,7 +1,9 @@
 """A recorded night gives the tracker the very same answers, however often it is played."""
 
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -131,7 +133,7 @@ def test_a_recorded_night_gives_the_same_answers_every_time(tmp_path):
     with a_night(tmp_path) as night:
         night.service("auto")
         rtc = night.rtc("--record", str(path), "--seconds", "16")
-        assert rtc.popen.wait(patience(60.0)) == 0, rtc.log
+        assert rtc.ended(60.0) == 0, rtc.log
         there = lived(night)
     first, second = replayed(path), replayed(path)
     assert len(first.estimates) >= 6
@@ -157,8 +159,11 @@ def test_a_replay_over_zenoh_is_an_rtc_that_carries_out_nothing(tmp_path):
     (tmp_path / "recorded").mkdir()
     with a_night(tmp_path / "recorded") as night:
         night.service("auto")
-        rtc = night.rtc("--record", str(path), "--seconds", "14")
-        assert rtc.popen.wait(patience(60.0)) == 0, rtc.log
+        rtc = night.rtc("--record", str(path))
+        night.wait_for_modes(N_TARGET)
+        time.sleep(4.0)  # what is done to the replay afterwards takes some of it
+        rtc.send(signal.SIGTERM)
+        assert rtc.ended(60.0) == 0, rtc.log
         session = night.state["link"]["session"]
         alpha = night.state["registration"]["alpha"]
     (tmp_path / "replayed").mkdir()
@@ -173,14 +178,14 @@ def test_a_replay_over_zenoh_is_an_rtc_that_carries_out_nothing(tmp_path):
             alpha["shift_x_subap"], abs=0.01
         )
         assert "dither.adopted" in service.log
-        wait_for(lambda: night.state["rtc"]["n_controlled"] == N_TARGET, 20.0, "its last matrix")
+        wait_for(lambda: night.rtc_says("n_controlled") == N_TARGET, 20.0, "its last matrix")
         night.post("/v1/refit")
         made = wait_for(lambda: night.ids("proposed"), 20.0, "a reconstructor")
         night.post(f"/v1/reconstructors/{made[-1]}/approve")
         wait_for(lambda: night.ids("rejected"), 10.0, "its refusal")
         (refused,) = [r for r in night.shelf if r["state"] == "rejected"]
         assert refused["reason"] == "unsupported: a replay"
-        assert replay.popen.wait(patience(30.0)) == 0, replay.log
+        assert replay.ended(30.0) == 0, replay.log
 
 
 def test_a_replay_cannot_be_disturbed_or_found_nowhere(tmp_path):

@@ -7,7 +7,6 @@ import resource
 import signal
 import socket
 import sqlite3
-import time
 
 import h5py
 import httpx
@@ -61,7 +60,7 @@ def test_on_a_disk_that_refuses_nothing_is_ordered_and_afterwards_all_is_on_reco
     names = [name for name, _ in audit_of(night)]
     assert names == ["SetMode", "SetMode.refused", "SetMode", "Approve", "Approve.refused"]
     process.send(signal.SIGTERM)
-    assert process.popen.wait(patience(30.0)) == 0, process.log
+    assert process.ended(30.0) == 0, process.log
 
 
 def resident_mb(pid):
@@ -121,9 +120,8 @@ def test_endless_bodies_and_half_open_requests_cost_next_to_nothing(night):
     for _ in range(500):
         held.append(socket.create_connection(("127.0.0.1", night.port), timeout=patience(10.0)))
         held[-1].sendall(b"GET /v1/state HTTP/1.1\r\n")
-    began_s = time.monotonic()
+    # within the patience of the client
     assert night.client.get("/healthz").status_code == httpx.codes.OK
-    assert time.monotonic() - began_s < patience(5.0)
     wait_for(lambda: n_sockets(process.popen.pid) < 150, 5.0, "most connections to be ended")
     wait_for(lambda: n_sockets(process.popen.pid) < 50, 15.0, "all of them to be ended")
     assert resident_mb(process.popen.pid) - before_mb < 30.0

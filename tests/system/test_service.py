@@ -1,5 +1,6 @@
 """The service as an operator meets it: real processes, real zenoh, real HTTP."""
 
+import contextlib
 import json
 import os
 import signal
@@ -20,7 +21,6 @@ from tests.system.night import (
     session_members,
     wait_for,
 )
-from tests.system.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 
@@ -69,18 +69,16 @@ def test_in_auto_the_registration_is_found_and_the_loop_served_first_its_modes_t
     own = [record for record in night.shelf if record["parent"] is not None]
     assert [record["n_modes"] for record in own[:2]] == [N_START, N_TARGET]
     assert all(record["applied_frame_seq"] > 0 for record in own[:2])
-    assert state["link"]["frames_lost"] == 0
-    assert set(night.alarms) <= {"watchdog"}
+    night.no_frame_is_lost()
+    night.check_alarms("watchdog")
     status = night.start("status", ["service", "status", "--url", str(night.client.base_url)])
-    assert status.popen.wait(patience(20.0)) in {0, 1}, status.log
+    assert status.ended(20.0) in {0, 1}, status.log
     assert f"loop closed at 1000 Hz, {N_TARGET} of 90 modes" in status.log
 
     assert len(session_members(service.popen.pid)) > 1
-    began = time.monotonic()
     service.send(signal.SIGINT)
-    assert service.popen.wait(patience(8.0)) == 0, service.log
-    assert time.monotonic() - began < patience(5.0)
-    wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
+    assert service.ended(5.0) == 0, service.log
+    service.alone()
     assert "Traceback" not in service.log
 
 
@@ -109,6 +107,7 @@ def test_in_propose_the_operator_decides(night):
     copy = night.client.get(f"/v1/reconstructors/{night.state['in_use']}").json()
     assert copy["parent"] == initial
     assert night.state["mode"] == "hold"
+    time.sleep(1.0)  # one that was being made is on the shelf by now
     n_known = len(night.shelf)
     time.sleep(4.0)
     assert len(night.shelf) == n_known
@@ -130,9 +129,9 @@ def test_an_rtc_that_is_killed_and_restarted_is_calibrated_again(night):
     assert after["registration"]["alpha"] == pytest.approx(alpha, abs=0.05)
     assert len(night.shelf) >= n_known
 
-    night.wait_for_rtc(night.rtc(seed=4))
-    assert night.state["rtc"]["session"] != before["rtc"]["session"]
-    assert night.state["registration"]["n_windows"] == 0
+    anew = night.wait_for_rtc(night.rtc(seed=4))
+    assert anew["rtc"]["session"] != before["rtc"]["session"]
+    assert anew["registration"]["n_windows"] == 0
     night.wait_for_modes(N_TARGET)
     state = night.state
     assert "rtc-vanished" not in night.alarms
@@ -175,7 +174,8 @@ def test_a_killed_worker_costs_a_job_but_not_the_service(night):
     accepted = night.state["windows_accepted"]
     for member in session_members(service.popen.pid):
         if member != service.popen.pid:
-            os.kill(member, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # it goes with the one killed before
+                os.kill(member, signal.SIGKILL)
     wait_for(lambda: night.state["windows_accepted"] > accepted + 1, 30.0, "more windows")
     assert service.popen.poll() is None
 
@@ -185,7 +185,7 @@ class TestRefusedAtTheStart:
 
     def refused(self, night, *words):
         process = night.start("service", ["service", "run", *words])
-        assert process.popen.wait(patience(20.0)) == 2, process.log
+        assert process.ended(20.0) == 2, process.log
         lines = [line for line in process.log.splitlines() if line.startswith("pyrcal: ")]
         assert len(lines) == 1, process.log
         assert "Traceback" not in process.log
@@ -271,7 +271,7 @@ def test_a_stranger_on_the_network_cannot_stop_the_telemetry(night):
         wait_for(
             lambda: night.state["link"]["frames_received"] > received + 500, 10.0, "more frames"
         )
-    assert night.state["link"]["frames_lost"] == 0
+    night.no_frame_is_lost()
 
 
 @pytest.mark.long
@@ -313,14 +313,14 @@ def test_it_ends_in_good_order_while_the_model_is_still_being_prepared(night, nu
     wait_for(lambda: "api.listening" in service.log, 20.0, "the first line")
     time.sleep(0.5)
     service.send(number)
-    assert service.popen.wait(patience(8.0)) == 0, service.log
-    wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
+    assert service.ended(8.0) == 0, service.log
+    service.alone()
 
 
 @pytest.mark.long
 def test_ctrl_c_in_a_terminal_reaches_the_worker_too_and_still_ends_in_good_order(night):
     service = night.service("hold")
     os.killpg(service.popen.pid, signal.SIGINT)
-    assert service.popen.wait(patience(8.0)) == 0, service.log
-    wait_for(lambda: not session_members(service.popen.pid), 5.0, "no child process left")
+    assert service.ended(8.0) == 0, service.log
+    service.alone()
     assert "Traceback" not in service.log

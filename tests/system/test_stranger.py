@@ -20,7 +20,7 @@ def test_a_strangers_loop_is_registered_and_given_a_matrix_that_holds(night):
     response, variance_m2 = small_telescope(**ALPHA)
     assumed, _ = small_telescope()
     with Stranger(night.zenoh, response, variance_m2, assumed=assumed) as rtc:
-        wait_for(lambda: rtc.applied, 40.0, f"a matrix applied; {night.state['alarms']}")
+        wait_for(lambda: rtc.applied, 40.0, lambda: f"a matrix applied; {night.alarms}")
         known = night.state["registration"]
         for name, truth in ALPHA.items():
             error = known["alpha"][name] - truth

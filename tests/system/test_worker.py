@@ -3,13 +3,12 @@
 import os
 import signal
 import time
-from pathlib import Path
 
 import pytest
 
 from tests.system.night import a_night, session_members, wait_for
 from tests.system.pace import Deadline
-from tests.system.stranger import Stranger, small_telescope
+from tests.system.test_ending import stranger, workers_of
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(180)]
 
@@ -20,27 +19,14 @@ def night(tmp_path):
         yield night
 
 
-def worker_of(service):
-    """Return the process of the service that has numpy, besides itself."""
-    for member in session_members(service.popen.pid):
-        maps = Path(f"/proc/{member}/maps").read_text(encoding="utf-8")
-        if member != service.popen.pid and "_multiarray_umath" in maps:
-            return member
-    raise AssertionError("no worker")
-
-
-def stranger(night):
-    return Stranger(night.zenoh, *small_telescope(0.1, -0.05, 0.3, 1.003))
-
-
 def test_a_worker_that_hangs_is_named_killed_and_replaced(night):
     service = night.service("hold")
     with stranger(night):
         wait_for(lambda: night.state["windows_accepted"] > 0, 40.0, "it tracks")
-        worker = worker_of(service)
+        (worker,) = workers_of(service)
         os.kill(worker, signal.SIGSTOP)
-        wait_for(lambda: "worker-lost" in night.alarms, 12.0, "the alarm")
-        assert "stood still" in night.alarms["worker-lost"]
+        text = wait_for(lambda: night.alarms.get("worker-lost"), 12.0, "the alarm")
+        assert "stood still" in text
         answer = night.client.get("/readyz")
         assert answer.status_code == 503
         assert "stood still" in answer.json()["detail"]
@@ -48,7 +34,7 @@ def test_a_worker_that_hangs_is_named_killed_and_replaced(night):
         accepted = night.state["windows_accepted"]
         wait_for(lambda: night.state["windows_accepted"] > accepted, 40.0, "another one works")
         wait_for(lambda: "worker-lost" not in night.alarms, 5.0, "the alarm is over")
-        assert night.client.get("/readyz").status_code == 200
+        wait_for(lambda: night.client.get("/readyz").status_code == 200, 5.0, "it is ready")
 
 
 def test_a_slow_worker_gets_longer_windows_and_is_named(night):
@@ -56,7 +42,7 @@ def test_a_slow_worker_gets_longer_windows_and_is_named(night):
     service = night.service("hold")
     with stranger(night):
         wait_for(lambda: night.state["windows_accepted"] > 0, 40.0, "it tracks")
-        worker, before = worker_of(service), night.state
+        (worker,), before = workers_of(service), night.state
         deadline = Deadline(70.0)
         try:
             # what its first joined window is like shows when it is fitted, after the alarm perhaps

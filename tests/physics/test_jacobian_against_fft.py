@@ -98,6 +98,7 @@ def test_agreement_holds_at_the_sampling_of_the_service(basis, alpha):
     assert disagreement(*optics(basis, 3, 3), alpha) <= AGREEMENT
 
 
+@pytest.mark.long
 def test_most_of_the_disagreement_goes_away_when_the_reference_is_padded_more(basis):
     alpha = REGISTRATIONS["everything at once"]
     near, far = (disagreement(*optics(basis, 2, 2, w), alpha, MODES[::6]) for w in (160, 320))

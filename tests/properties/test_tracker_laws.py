@@ -371,11 +371,11 @@ ALWAYS = (
 """What holds after every event, whatever the mode."""
 
 LAWS = settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
 
 
-@settings(LAWS, max_examples=250)
+@settings(LAWS, max_examples=150)
 @given(stories, st.sampled_from([Mode.AUTO, Mode.AUTO, Mode.PROPOSE, Mode.HOLD]))
 def test_nothing_but_a_command_is_ever_refused_and_every_law_holds(story, mode):
     night = Night(mode)
@@ -410,7 +410,7 @@ def test_in_propose_nothing_is_sent_but_what_an_operator_approved_or_asked_for_a
             assert isinstance(event, ev.Approve) or copied
 
 
-@settings(LAWS, max_examples=50)
+@LAWS
 @given(stories, st.sampled_from([ev.RtcVanished(), ev.SessionStarted(session="s3")]))
 def test_the_registration_and_the_shelf_outlive_the_rtc(story, end):
     night = Night()

@@ -191,7 +191,7 @@ DECODERS = st.sampled_from(
 )
 
 
-@settings(max_examples=400)
+@settings(max_examples=200)
 @given(decode=DECODERS, data=st.binary(max_size=300) | MESSAGES | TREES.map(msgpack.packb))
 def test_no_bytes_do_more_than_raise_a_wire_error(decode, data):
     try:

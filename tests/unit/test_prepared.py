@@ -137,7 +137,7 @@ import numpy as np
 from service.prepared import Prepared
 from tests.numerics import small_instrument
 kept = Prepared(Path(sys.argv[1]))
-for k in range(40):
+for k in range(60):
     found = kept.arrays(small_instrument(), ("numbers",), lambda: {"numbers": np.full(50_000, 7.0)})
     assert (found["numbers"] == 7.0).all() and len(found["numbers"]) == 50_000
     if k % 3 == 0:
@@ -152,7 +152,7 @@ def test_processes_that_write_read_and_delete_at_once_do_not_disturb_each_other(
     command = [sys.executable, "-c", WRITER, str(tmp_path)]
     running = [
         subprocess.Popen(command, cwd=root, env=environment, stderr=subprocess.PIPE)
-        for _ in range(3)
+        for _ in range(2)
     ]
     for process in running:
         _, error = process.communicate(timeout=100)

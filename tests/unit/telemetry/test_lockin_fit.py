@@ -116,33 +116,35 @@ def in_sigma_of_the_mean(error: np.ndarray) -> np.ndarray:
     return error.mean(axis=0) / (error.std(axis=0, ddof=1) / np.sqrt(len(error)))
 
 
-CASES = pytest.mark.parametrize(
-    ("case", "spectra"), [(BRIGHT, bright_windows), (FAINT, faint_windows)], ids=["bright", "faint"]
+@pytest.fixture(
+    scope="module",
+    params=[(BRIGHT, bright_windows), (FAINT, faint_windows)],
+    ids=["bright", "faint"],
 )
+def found(request):
+    """A case and the estimates of its 48 windows."""
+    case, spectra = request.param
+    return case, settled(case, spectra())
 
 
-@CASES
-def test_the_mean_of_many_windows_is_the_truth(case, spectra):
+def test_the_mean_of_many_windows_is_the_truth(found):
     """Each parameter within 3 σ of the mean of 48 windows."""
-    error = errors(case, settled(case, spectra()))
+    error = errors(*found)
     assert np.abs(in_sigma_of_the_mean(error)).max() < 3.0
 
 
-@CASES
-def test_the_predicted_covariance_is_the_scatter_that_is_seen(case, spectra):
+def test_the_predicted_covariance_is_the_scatter_that_is_seen(found):
     """chi2/4 has a standard deviation of 0.10 over 48 windows; 0.94 was measured elsewhere."""
-    estimates = settled(case, spectra())
+    _, estimates = found
     chi2 = [
-        d @ np.linalg.solve(e.covariance, d)
-        for d, e in zip(errors(case, estimates), estimates, strict=True)
+        d @ np.linalg.solve(e.covariance, d) for d, e in zip(errors(*found), estimates, strict=True)
     ]
     assert 0.6 < np.mean(chi2) / 4 < 1.6
 
 
-@CASES
-def test_the_sigma_of_the_gains_is_the_scatter_that_is_seen(case, spectra):
+def test_the_sigma_of_the_gains_is_the_scatter_that_is_seen(found):
     """48 windows tell a standard deviation to 10 %."""
-    estimates = settled(case, spectra())
+    case, estimates = found
     seen = np.std([np.abs(e.optical_gain) for e in estimates], axis=0, ddof=1)
     said = np.sqrt(np.mean([e.gain_sigma**2 for e in estimates], axis=0))
     np.testing.assert_allclose(seen / said, 1.0, atol=0.3)

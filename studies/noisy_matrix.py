@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from service.archive.products import NoisyArchive
+from service.archive import Archive
 from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.estimates import finished, work_out
@@ -203,10 +203,11 @@ def _archive(
         basis_id="simulated",
         config_id="simulated",
     )
-    archive = NoisyArchive(given.archive)
-    archive.prepare()
-    archive.store(finished(record, total, found), found.numbers, instrument.name)
-    picture = draw(archive.path(record.id), instrument)
+    archive = Archive(given.archive)
+    archive.open()
+    with archive:
+        archive.noisy.store(finished(record, total, found), found.numbers, instrument.name)
+    picture = draw(archive.noisy.path_of(record.id), instrument)
     (given.archive / f"{record.id}.png").write_bytes(picture)
 
 

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, Self
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from service.archive.index import AuditEntry, Index
-from service.archive.products import MeasuredArchive, NoisyArchive
-from service.archive.records import COVARIANCE_SCALE, from_json, to_json
-from service.archive.store import DAMAGE, Provenance, Store
-from service.archive.tracking import TrackingFile
-from service.errors import ArchiveError, StorageError, UnknownIdError
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.tracking.loop_commands import table_of
-from service.tracking.products import MatrixState, ReconstructorRecord
-from service.wire import checked_id, checksum
+from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
+from service.archive.records import TrackingFile
+from service.archive.store import Provenance
+from service.errors import ArchiveError, StorageError
+from service.tracking.products import ReconstructorRecord
 
 PROBE_BYTES = 1 << 20
 """Least that must fit on the disk for it to be called writable."""
@@ -45,24 +38,16 @@ class Archive:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
-        self._products = Store(
-            directory / "reconstructors",
-            "reconstructor",
-            ReconstructorRecord,
-            "reconstructor",
-            "(n_modes, n_slopes), metres OPD per slope",
-        )
         self._index = Index(directory / "index.sqlite")
+        self._products = ReconstructorArchive(directory / "reconstructors", self._index)
         self.measured = MeasuredArchive(directory / "interaction_matrices", self._index)
         """Interaction matrices the RTC has measured."""
-        self.noisy = NoisyArchive(directory / "noisy_matrices")
+        self.noisy = NoisyArchive(directory / "noisy_matrices", self._index)
         """Noisy interaction matrices of random dithers."""
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
         self._lock: IO[str] | None = None
         self._largest_bytes = PROBE_BYTES
-        self._unsound: dict[str, str] = {}
-        self._stand_ins: dict[str, ReconstructorRecord] = {}
         self.wrong: tuple[str, ...] = ()
         """What :meth:`open` has found wrong, a line for each."""
 
@@ -102,11 +87,16 @@ class Archive:
             raise ArchiveError(f"{self._directory}: cannot be used: {error}") from error
         try:
             anew = self._index.open()
-            told += [*self._adopt(anew), *self._doubted()]
-            self.wrong = (*told, *self.measured.adopt(), *self.noisy.adopt())
+            for folder in folders:
+                told += folder.adopt(anew=anew)
         except ArchiveError:
             self.close()
             raise
+        if anew and (n_products := len(self._products.records())):
+            lost = self._directory / "index.sqlite"
+            text = f"was not there: made anew of {n_products} products; the audit trail begins here"
+            told.append(f"{lost}: {text}")
+        self.wrong = tuple(told)
         return self.wrong
 
     def close(self) -> None:
@@ -145,25 +135,8 @@ class Archive:
         WireError
             If the id is not one.
         """
-        checked_id(record.id, "a reconstructor to be stored")
-        n_slopes = matrix.shape[-1]
-        self._products.check_numbers(record.id, "a matrix", matrix, (record.n_modes, n_slopes))
-        sha256 = checksum(matrix)
-        self._products.check_sum(record.id, matrix, record.sha256 or sha256)
         self._largest_bytes = max(self._largest_bytes, matrix.nbytes)
-
-        def fill(file: h5py.File) -> None:
-            file.attrs.update(_attributes(record))
-            if record.optical_gains:
-                _add_gains(file, record)
-            if covariance is not None:
-                file["covariance"] = covariance * COVARIANCE_SCALE
-                file["covariance"].attrs["parameters"] = PARAMETERS
-            file.create_group("provenance").attrs.update(provenance)
-
-        self._products.write(record, matrix, fill)
-        if not self._index.add(record, sha256):
-            raise self._products.taken(record.id)
+        self._products.store(record, matrix, covariance, provenance)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor, ``(n_modes, n_slopes)``, its checksum verified.
@@ -175,10 +148,7 @@ class Archive:
         ArchiveError
             If its file is missing, damaged, or holds other numbers than were stored.
         """
-        sha256 = self._index.checksums(ReconstructorRecord).get(matrix_id)
-        if sha256 is None:
-            raise UnknownIdError(f"reconstructor {matrix_id}: no such matrix in the archive")
-        return self._products.matrix(matrix_id, sha256)
+        return self._products.matrix(matrix_id)
 
     def update(self, record: ReconstructorRecord) -> None:
         """Remember where a reconstructor is now, one that is not stored here (the RTC's) too."""
@@ -189,10 +159,7 @@ class Archive:
 
         One whose product was missing or damaged at the start has failed, with the reason.
         """
-        understood, wrong = self._index.records(ReconstructorRecord)
-        known = [*understood, *(r for name, r in self._stand_ins.items() if name in wrong)]
-        known.sort(key=lambda record: record.created_ns_utc)
-        return tuple(self._judged(record) for record in known)
+        return self._products.records()
 
     def audit(self, t_ns_utc: int, who: str, name: str, text: str) -> None:
         """Add to the audit trail, which only ever grows."""
@@ -207,8 +174,7 @@ class Archive:
             If the disk refuses.
         """
         for record in records:
-            if self._products.path_of(record.id).exists():
-                self._write_fate(record)
+            self._products.write_fate(record)
         self._index.record(records, entries)
 
     def probe(self) -> None:
@@ -233,101 +199,6 @@ class Archive:
     def audit_trail(self, limit: int = 100) -> tuple[AuditEntry, ...]:
         """Return the last ``limit`` entries of the audit trail, oldest first."""
         return self._index.audit_trail(limit)
-
-    def _adopt(self, anew: bool) -> list[str]:
-        """Take in the products that the index, made ``anew`` or not, does not know."""
-        known = self._index.checksums(ReconstructorRecord)
-        told, taken = [], 0
-        for name in self._products.ids():
-            if name in known:
-                continue
-            try:
-                record, matrix = self._products.record(name), self._products.matrix(name)
-            except ArchiveError as error:
-                told.append(str(error))
-                continue
-            fate = self._fate(name)
-            if fate is None and anew:
-                reason = "what became of it was lost with the index"
-                fate = replace(record, state=MatrixState.DISCARDED, reason=reason)
-            self._index.add(fate or record, checksum(matrix))
-            taken += 1
-        if anew and taken:
-            lost = self._directory / "index.sqlite"
-            text = f"was not there: made anew of {taken} products; the audit trail begins here"
-            told.append(f"{lost}: {text}")
-        return told
-
-    def _doubted(self) -> list[str]:
-        """Look at every product, and at every record that is not understood."""
-        self._unsound = self._products.unsound(sorted(self._index.checksums(ReconstructorRecord)))
-        self._stand_ins.clear()
-        told = [*self._unsound.values()]
-        for name, text in self._index.records(ReconstructorRecord)[1].items():
-            told.append(text)
-            with contextlib.suppress(ArchiveError):
-                self._stand_ins[name] = self._fate(name) or self._products.record(name)
-        return told
-
-    def _write_fate(self, record: ReconstructorRecord) -> None:
-        """Write beside a product what has become of it, for the day when the index is lost."""
-        path = self._products.path_of(record.id)
-        part = path.with_suffix(".json.part")
-        try:
-            part.write_text(to_json(record), encoding="utf-8")
-            part.replace(path.with_suffix(".json"))
-        except OSError as error:
-            raise StorageError(f"{part}: cannot be written: {error}") from error
-
-    def _fate(self, matrix_id: str) -> ReconstructorRecord | None:
-        """Return what has become of a product; None: nothing is known of it."""
-        path = self._products.path_of(matrix_id).with_suffix(".json")
-        try:
-            record = from_json(path.read_text(encoding="utf-8"), ReconstructorRecord)
-        except DAMAGE:
-            return None
-        return record if record.id == matrix_id else None
-
-    def _judged(self, record: ReconstructorRecord) -> ReconstructorRecord:
-        wrong = self._unsound.get(record.id)
-        if wrong is None:
-            return record
-        reason = f"it was {record.state}; {wrong}"
-        return replace(record, state=MatrixState.FAILED, reason=reason)
-
-
-def _attributes(record: ReconstructorRecord) -> dict[str, Provenance]:
-    """Return what a person wants to see in the file, each with its unit in its name."""
-    values: dict[str, Provenance] = {
-        "id": record.id,
-        "n_modes": record.n_modes,
-        "created_ns_utc": record.created_ns_utc,
-        "parent": record.parent or "",
-    }
-    if record.alpha is not None:
-        values |= record.alpha.to_boundary()
-    if record.sigma is not None:
-        sigma = record.sigma * BOUNDARY_SCALE
-        values |= {f"sigma_{p}": float(s) for p, s in zip(PARAMETERS, sigma, strict=True)}
-    if record.condition_number is not None:
-        values["condition_number"] = record.condition_number
-    if record.gate is not None:
-        values["worst_pole_radius"] = record.gate.worst_pole_radius
-    return values
-
-
-def _add_gains(file: h5py.File, record: ReconstructorRecord) -> None:
-    """Put the table of loop gains beside the matrix, which knows nothing of it."""
-    table = table_of(record.optical_gains, record.n_modes)
-    group = file.create_group("gains")
-    group.attrs["description"] = "optical gain of every mode; not part of the reconstructor"
-    group.attrs["measured_modes"] = [gain.mode for gain in record.optical_gains]
-    group.attrs["measured_gain"] = [gain.gain for gain in record.optical_gains]
-    group.attrs["measured_sigma"] = [gain.sigma for gain in record.optical_gains]
-    group["optical_gain"] = table.optical_gain
-    group["relative_sigma"] = table.relative_sigma
-    group["factor"] = table.factors
-    group["factor"].attrs["description"] = "multiplies one loop gain for all modes"
 
 
 def _locked(path: Path) -> IO[str]:

@@ -1,4 +1,4 @@
-"""Where each reconstructor is on its way, and who did what, when: SQLite."""
+"""Where each product is on its way, and who did what, when: SQLite."""
 
 from __future__ import annotations
 
@@ -12,48 +12,37 @@ from typing import TypeVar
 
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError
-from service.tracking.products import MeasurementRecord, ReconstructorRecord
+from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
 
-Indexed = TypeVar("Indexed", ReconstructorRecord, MeasurementRecord)
+Product = ReconstructorRecord | MeasurementRecord | NoisyRecord
+Indexed = TypeVar("Indexed", bound=Product)
 
-_SCHEMA_VERSION = 2
+_VERSION = 2
 
-_MEASUREMENTS = """
-CREATE TABLE measurement (
-    id TEXT PRIMARY KEY,
-    created_ns_utc INTEGER NOT NULL,
-    record TEXT NOT NULL,
-    product_sha256 TEXT NOT NULL
-);
-"""
-
-_SCHEMA = f"""
-BEGIN;
-CREATE TABLE reconstructor (
+_PRODUCTS = """
+CREATE TABLE IF NOT EXISTS {} (
     id TEXT PRIMARY KEY,
     created_ns_utc INTEGER NOT NULL,
     record TEXT NOT NULL,
     product_sha256 TEXT
 );
-CREATE TABLE audit (
+"""
+"""A table for each kind."""
+
+_SCHEMA = f"""
+BEGIN;
+{"".join(map(_PRODUCTS.format, ("reconstructor", "measurement", "noisy_matrix")))}
+CREATE TABLE IF NOT EXISTS audit (
     t_ns_utc INTEGER NOT NULL,
     who TEXT NOT NULL,
     name TEXT NOT NULL,
     text TEXT NOT NULL
 );
-CREATE TRIGGER audit_keeps_its_entries BEFORE DELETE ON audit
+CREATE TRIGGER IF NOT EXISTS audit_keeps_its_entries BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
-CREATE TRIGGER audit_keeps_its_words BEFORE UPDATE ON audit
+CREATE TRIGGER IF NOT EXISTS audit_keeps_its_words BEFORE UPDATE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
-{_MEASUREMENTS}
-PRAGMA user_version = {_SCHEMA_VERSION};
-COMMIT;
-"""
-
-_FROM_VERSION_1 = f"""
-BEGIN;
-{_MEASUREMENTS}
-PRAGMA user_version = {_SCHEMA_VERSION};
+PRAGMA user_version = {_VERSION};
 COMMIT;
 """
 
@@ -102,14 +91,11 @@ class Index:
                 connection.execute("PRAGMA journal_mode = WAL")
                 connection.execute("PRAGMA synchronous = FULL")
                 version = connection.execute("PRAGMA user_version").fetchone()[0]
-                if version == 0:
-                    connection.executescript(_SCHEMA)
-                elif version == 1:
-                    connection.executescript(_FROM_VERSION_1)
-                elif version != _SCHEMA_VERSION:
+                if version > _VERSION:
                     raise ArchiveError(
-                        f"{self._path}: found version {version}, expected {_SCHEMA_VERSION}"
+                        f"{self._path}: found version {version}, expected {_VERSION}"
                     )
+                connection.executescript(_SCHEMA)
                 return bool(version == 0)
         except sqlite3.OperationalError as error:
             raise ArchiveError(f"{self._path}: cannot be opened: {error}") from error
@@ -121,18 +107,18 @@ class Index:
                 self._connection.close()
                 self._connection = None
 
-    def add(self, record: ReconstructorRecord | MeasurementRecord, sha256: str) -> bool:
+    def add(self, table: str, record: Product, sha256: str) -> bool:
         """Enter what is known of a product that is on the disk.
 
         Return whether there was none of this id.
         """
         with self._use() as connection:
             done = connection.execute(
-                f"INSERT INTO {_table(type(record))} VALUES (?, ?, ?, ?)"
+                f"INSERT INTO {table} VALUES (?, ?, ?, ?)"
                 " ON CONFLICT (id) DO UPDATE SET"
                 " record = excluded.record, product_sha256 = excluded.product_sha256"
                 " WHERE product_sha256 IS NULL",
-                (record.id, record.created_ns_utc or 0, to_json(record), sha256),
+                (record.id, begun_ns_utc(record), to_json(record), sha256),
             )
         return done.rowcount > 0
 
@@ -154,24 +140,21 @@ class Index:
             )
             connection.execute("COMMIT")
 
-    def checksums(self, kind: type[Indexed]) -> dict[str, str]:
+    def checksums(self, table: str) -> dict[str, str]:
         """Return the checksum of every product of a kind that is stored, by id."""
         with self._use() as connection:
             rows = connection.execute(
-                f"SELECT id, product_sha256 FROM {_table(kind)} WHERE product_sha256 IS NOT NULL"
+                f"SELECT id, product_sha256 FROM {table} WHERE product_sha256 IS NOT NULL"
             ).fetchall()
         return dict(rows)
 
-    def records(self, kind: type[Indexed]) -> tuple[list[Indexed], dict[str, str]]:
-        """Return every record of a kind, oldest first, and by id what is wrong with the others.
+    def records(self, table: str, kind: type[Indexed]) -> tuple[list[Indexed], dict[str, str]]:
+        """Return every record of a kind, and by id what is wrong with the others.
 
         A record that another version has written may not be understood.
         """
-        table = _table(kind)
         with self._use() as connection:
-            rows = connection.execute(
-                f"SELECT id, record FROM {table} ORDER BY created_ns_utc, rowid"
-            ).fetchall()
+            rows = connection.execute(f"SELECT id, record FROM {table} ORDER BY rowid").fetchall()
         understood, wrong = [], {}
         for name, text in rows:
             try:
@@ -211,8 +194,11 @@ class Index:
                     self._connection.rollback()
 
 
-def _table(kind: type[ReconstructorRecord | MeasurementRecord]) -> str:
-    return "reconstructor" if kind is ReconstructorRecord else "measurement"
+def begun_ns_utc(record: Product) -> int:
+    """Return when a product was made or, where that is not known, asked for."""
+    if isinstance(record, NoisyRecord):
+        return record.asked_ns_utc
+    return record.created_ns_utc or 0
 
 
 def _storable(text: str) -> str:

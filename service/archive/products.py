@@ -1,58 +1,115 @@
-"""What lies in the archive besides reconstructors: measured and noisy interaction matrices."""
+"""What lies in the archive: reconstructors, measured and noisy interaction matrices."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.archive.index import Index
-from service.archive.records import COVARIANCE_SCALE
-from service.archive.store import Store
-from service.errors import ArchiveError, UnknownIdError
-from service.model.misregistration import PARAMETERS
-from service.tracking.products import MeasurementRecord, NoisyFinding, NoisyRecord, NoisyState
-from service.wire import checked_id, checksum
+from service.archive.records import COVARIANCE_SCALE, from_json, to_json
+from service.archive.store import DAMAGE, Provenance, Store
+from service.errors import ArchiveError, StorageError
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.tracking.loop_commands import table_of
+from service.tracking.products import (
+    MatrixState,
+    MeasurementRecord,
+    NoisyFinding,
+    NoisyRecord,
+    NoisyState,
+    ReconstructorRecord,
+)
+from service.wire import checksum
 
 
-class MeasuredArchive:
-    """Interaction matrices the RTC has measured: files, and their part of the index.
-
-    Belongs to an :class:`~service.archive.Archive`, which opens it.
-    """
+class ReconstructorArchive(Store[ReconstructorRecord]):
+    """Reconstructors, and beside each what has become of it, for the day when the index is lost."""
 
     def __init__(self, directory: Path, index: Index) -> None:
-        self._index = index
-        self._store = Store(
-            directory,
-            "measurement",
-            MeasurementRecord,
-            "interaction_matrix",
-            "(n_slopes, n_modes), slope per metre OPD",
+        description = "(n_modes, n_slopes), metres OPD per slope"
+        super().__init__(
+            directory, index, ReconstructorRecord, "reconstructor", description, "reconstructor"
         )
 
-    def prepare(self) -> tuple[str, ...]:
-        """Make the folder and clear it up, as :meth:`Store.prepare`; needs no index yet."""
-        return self._store.prepare()
+    def store(
+        self,
+        record: ReconstructorRecord,
+        matrix: NDArray[np.float32],
+        covariance: NDArray[np.float64] | None,
+        provenance: Mapping[str, Provenance],
+    ) -> None:
+        """Write one for good; see :meth:`service.archive.Archive.store`."""
 
-    def adopt(self) -> tuple[str, ...]:
-        """Enter complete files the index does not know; return a line for all that is wrong."""
-        understood, wrong = self._index.records(MeasurementRecord)
-        known = {record.id for record in understood} | wrong.keys()
-        told = [*wrong.values(), *self._store.unsound(r.id for r in understood).values()]
-        for name in self._store.ids():
-            if name in known:
-                continue
-            try:
-                record, matrix = self._store.record(name), self._store.matrix(name)
-            except ArchiveError as error:
-                told.append(str(error))
-                continue
-            self._index.add(record, checksum(matrix))
-        return tuple(told)
+        def fill(file: h5py.File) -> None:
+            file.attrs.update(_attributes(record))
+            if record.optical_gains:
+                _add_gains(file, record)
+            if covariance is not None:
+                _add_covariance(file, covariance)
+            file.create_group("provenance").attrs.update(provenance)
+
+        self._write(record, matrix, (record.n_modes, matrix.shape[-1]), record.sha256, fill)
+
+    @override
+    def records(self) -> tuple[ReconstructorRecord, ...]:
+        """Return what is known of each, oldest first.
+
+        One whose product was missing or damaged at the start has failed, with the reason.
+        """
+        return tuple(self._judged(record) for record in super().records())
+
+    def write_fate(self, record: ReconstructorRecord) -> None:
+        """Write beside a product that is stored here what has become of it.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses.
+        """
+        path = self.path_of(record.id)
+        if not path.exists():
+            return
+        part = path.with_suffix(".json.part")
+        try:
+            part.write_text(to_json(record), encoding="utf-8")
+            part.replace(path.with_suffix(".json"))
+        except OSError as error:
+            raise StorageError(f"{part}: cannot be written: {error}") from error
+
+    @override
+    def _became(self, record: ReconstructorRecord, *, anew: bool) -> ReconstructorRecord:
+        try:
+            text = self.path_of(record.id).with_suffix(".json").read_text(encoding="utf-8")
+            fate = from_json(text, ReconstructorRecord)
+        except DAMAGE:
+            fate = None
+        if fate is not None and fate.id == record.id:
+            return fate
+        if anew:
+            reason = "what became of it was lost with the index"
+            return replace(record, state=MatrixState.DISCARDED, reason=reason)
+        return record
+
+    def _judged(self, record: ReconstructorRecord) -> ReconstructorRecord:
+        wrong = self._unsound.get(record.id)
+        if wrong is None:
+            return record
+        reason = f"it was {record.state}; {wrong}"
+        return replace(record, state=MatrixState.FAILED, reason=reason)
+
+
+class MeasuredArchive(Store[MeasurementRecord]):
+    """Interaction matrices the RTC has measured."""
+
+    def __init__(self, directory: Path, index: Index) -> None:
+        description = "(n_slopes, n_modes), slope per metre OPD"
+        super().__init__(directory, index, MeasurementRecord, "measurement", description)
 
     def store(
         self, record: MeasurementRecord, matrix: NDArray[np.float32], instrument: str
@@ -76,66 +133,24 @@ class MeasuredArchive:
         WireError
             If the id is not one.
         """
-        checked_id(record.id, "a measured matrix to be stored")
-        expected = (record.n_slopes or 0, len(record.modes))
-        self._store.check_numbers(record.id, "a matrix", matrix, expected)
-        self._store.check_sum(record.id, matrix, record.sha256)
-        before = self._index.checksums(MeasurementRecord).get(record.id)
-        if before == record.sha256:
+        if self._index.checksums(self._table).get(record.id) == record.sha256 == checksum(matrix):
             return
-        if before is not None:
-            raise self._store.taken(record.id)
-
-        def fill(file: h5py.File) -> None:
-            file.attrs.update(
-                {
-                    "id": record.id,
-                    "pattern": str(record.pattern),
-                    "modes": np.array(record.modes, dtype=np.int64),
-                    "amplitude_m": np.array(record.amplitude_m),
-                    "n_average": record.n_average or 1,
-                    "double_pass": bool(record.double_pass),
-                    "session": record.session or "",
-                    "basis_id": record.basis_id or "",
-                    "config_id": record.config_id or "",
-                    "created_ns": record.created_ns_utc or 0,
-                    "instrument": instrument,
-                }
-            )
-
-        self._store.write(record, matrix, fill)
-        self._index.add(record, record.sha256)
-
-    def records(self) -> tuple[MeasurementRecord, ...]:
-        """Return what is known of every measured matrix, oldest first."""
-        return tuple(self._index.records(MeasurementRecord)[0])
-
-    def matrix(self, measurement_id: str) -> NDArray[np.float32]:
-        """Return a measured matrix, ``(n_slopes, n_modes)``, its checksum verified.
-
-        Raises
-        ------
-        UnknownIdError
-            If no such matrix was ever stored here.
-        ArchiveError
-            If its file is missing, damaged, or holds other numbers than were stored.
-        """
-        sha256 = self._index.checksums(MeasurementRecord).get(measurement_id)
-        if sha256 is None:
-            raise UnknownIdError(f"measurement {measurement_id}: no such matrix in the archive")
-        self._store.record(measurement_id)
-        return self._store.matrix(measurement_id, sha256)
-
-    def file(self, measurement_id: str) -> bytes:
-        """Return the HDF5 file as it was written, once its matrix is verified.
-
-        Raises
-        ------
-        UnknownIdError, ArchiveError
-            As :meth:`matrix`.
-        """
-        self.matrix(measurement_id)
-        return self._store.path_of(measurement_id).read_bytes()
+        attributes = {
+            "pattern": str(record.pattern),
+            "modes": np.array(record.modes, dtype=np.int64),
+            "amplitude_m": np.array(record.amplitude_m),
+            "n_average": record.n_average or 1,
+            "double_pass": bool(record.double_pass),
+            "session": record.session or "",
+            "basis_id": record.basis_id or "",
+            "config_id": record.config_id or "",
+            "created_ns": record.created_ns_utc or 0,
+            "instrument": instrument,
+        }
+        shape = (record.n_slopes or 0, len(record.modes))
+        self._write(
+            record, matrix, shape, record.sha256, lambda file: file.attrs.update(attributes)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -161,37 +176,15 @@ class NoisyNumbers:
     """``(n_modes,)`` RMS signal of a column's elements over their noise."""
 
 
-class NoisyArchive:
-    """Noisy interaction matrices: a folder of files, which are all there is to know.
+class NoisyArchive(Store[NoisyRecord]):
+    """Noisy interaction matrices: nothing that publishes a reconstructor can find one."""
 
-    What lies here is in no index of reconstructors: nothing that publishes can find it. Belongs to
-    an :class:`~service.archive.Archive`, which opens it.
-    """
-
-    def __init__(self, directory: Path) -> None:
-        self._records: dict[str, NoisyRecord] = {}
-        self._store = Store(
-            directory,
-            "noisy matrix",
-            NoisyRecord,
-            "interaction_matrix",
+    def __init__(self, directory: Path, index: Index) -> None:
+        description = (
             "(n_slopes, n_modes), slope per metre OPD, optical gain included: a measurement to fit "
-            "a model to, never one to control with",
+            "a model to, never one to control with"
         )
-
-    def prepare(self) -> tuple[str, ...]:
-        """Make the folder and clear it up, as :meth:`Store.prepare`."""
-        return self._store.prepare()
-
-    def adopt(self) -> tuple[str, ...]:
-        """Learn what is there; return a line for each damaged file."""
-        told = []
-        for name in self._store.ids():
-            try:
-                self._records[name] = self._store.record(name)
-            except ArchiveError as error:
-                told.append(str(error))
-        return tuple(told)
+        super().__init__(directory, index, NoisyRecord, "noisy matrix", description)
 
     def store(self, record: NoisyRecord, numbers: NoisyNumbers, instrument: str) -> None:
         """Write one for good.
@@ -212,7 +205,6 @@ class NoisyArchive:
         WireError
             If the id is not one.
         """
-        checked_id(record.id, "a noisy matrix to be stored")
         finding = record.finding
         if finding is None or record.state is not NoisyState.STORED:
             found = "nothing" if finding is None else "a finding"
@@ -220,44 +212,16 @@ class NoisyArchive:
                 f"noisy matrix {record.id}: found it {record.state} with {found}, expected it "
                 "stored with a finding"
             )
-        expected = (finding.n_slopes, len(record.modes))
+        shape = (finding.n_slopes, len(record.modes))
         for name in ("matrix", "noise", "synthetic"):
-            self._store.check_numbers(record.id, name, getattr(numbers, name), expected)
-        self._store.check_sum(record.id, numbers.matrix, finding.sha256)
-        self._store.write(
-            record, numbers.matrix, lambda file: _fill(file, record, finding, numbers, instrument)
+            self._check_numbers(record, name, getattr(numbers, name), shape)
+        self._write(
+            record,
+            numbers.matrix,
+            shape,
+            finding.sha256,
+            lambda file: _fill(file, record, finding, numbers, instrument),
         )
-        self._records[record.id] = record
-
-    def records(self) -> tuple[NoisyRecord, ...]:
-        """Return what is known of every one that is stored, oldest first."""
-        return tuple(sorted(self._records.values(), key=lambda record: record.asked_ns_utc))
-
-    def file(self, noisy_id: str) -> bytes:
-        """Return the HDF5 file as it was written, once its matrix is verified.
-
-        Raises
-        ------
-        UnknownIdError
-            If none of this id was ever stored here.
-        ArchiveError
-            If its file is missing or damaged.
-        """
-        path = self.path(noisy_id)
-        self._store.matrix(noisy_id)
-        return path.read_bytes()
-
-    def path(self, noisy_id: str) -> Path:
-        """Return where the file of a stored one is.
-
-        Raises
-        ------
-        UnknownIdError
-            If none of this id was ever stored here.
-        """
-        if noisy_id not in self._records:
-            raise UnknownIdError(f"noisy matrix {noisy_id}: no such matrix in the archive")
-        return self._store.path_of(noisy_id)
 
 
 def _fill(
@@ -277,11 +241,9 @@ def _fill(
     for name in ("optical_gain", "gain_sigma", "snr"):
         file[name] = getattr(numbers, name)
     if finding.covariance is not None:
-        file["covariance"] = finding.covariance * COVARIANCE_SCALE
-        file["covariance"].attrs["parameters"] = PARAMETERS
+        _add_covariance(file, finding.covariance)
     file.attrs.update(
         {
-            "id": record.id,
             "modes": np.array(record.modes, dtype=np.int64),
             "amplitude_m": record.amplitude_m,
             "total_m": record.total_m,
@@ -299,3 +261,41 @@ def _fill(
         }
         | ({} if finding.alpha is None else finding.alpha.to_boundary())
     )
+
+
+def _add_covariance(file: h5py.File, covariance: NDArray[np.float64]) -> None:
+    file["covariance"] = covariance * COVARIANCE_SCALE
+    file["covariance"].attrs["parameters"] = PARAMETERS
+
+
+def _attributes(record: ReconstructorRecord) -> dict[str, Provenance]:
+    """Return what a person wants to see in the file, each with its unit in its name."""
+    values: dict[str, Provenance] = {
+        "n_modes": record.n_modes,
+        "created_ns_utc": record.created_ns_utc,
+        "parent": record.parent or "",
+    }
+    if record.alpha is not None:
+        values |= record.alpha.to_boundary()
+    if record.sigma is not None:
+        sigma = record.sigma * BOUNDARY_SCALE
+        values |= {f"sigma_{p}": float(s) for p, s in zip(PARAMETERS, sigma, strict=True)}
+    if record.condition_number is not None:
+        values["condition_number"] = record.condition_number
+    if record.gate is not None:
+        values["worst_pole_radius"] = record.gate.worst_pole_radius
+    return values
+
+
+def _add_gains(file: h5py.File, record: ReconstructorRecord) -> None:
+    """Put the table of loop gains beside the matrix, which knows nothing of it."""
+    table = table_of(record.optical_gains, record.n_modes)
+    group = file.create_group("gains")
+    group.attrs["description"] = "optical gain of every mode; not part of the reconstructor"
+    group.attrs["measured_modes"] = [gain.mode for gain in record.optical_gains]
+    group.attrs["measured_gain"] = [gain.gain for gain in record.optical_gains]
+    group.attrs["measured_sigma"] = [gain.sigma for gain in record.optical_gains]
+    group["optical_gain"] = table.optical_gain
+    group["relative_sigma"] = table.relative_sigma
+    group["factor"] = table.factors
+    group["factor"].attrs["description"] = "multiplies one loop gain for all modes"

@@ -1,10 +1,10 @@
-"""A folder of products of one kind: each an immutable HDF5 file, complete or absent."""
+"""Products of one kind: each an immutable HDF5 file, complete or absent, and a row of the index."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import __version__
+from service.archive.index import Index, Product, begun_ns_utc
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
-from service.errors import ArchiveError, StorageError
-from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
-from service.wire import checksum
+from service.errors import ArchiveError, StorageError, UnknownIdError
+from service.wire import checked_id, checksum
 
 Provenance = str | int | float | bool | NDArray[Any]
 """What an HDF5 attribute can hold."""
@@ -24,44 +24,53 @@ Provenance = str | int | float | bool | NDArray[Any]
 DAMAGE = (OSError, RuntimeError, *NOT_UNDERSTOOD)
 """What h5py raises, depending on where a file is damaged."""
 
-Record = TypeVar("Record", bound=ReconstructorRecord | MeasurementRecord | NoisyRecord)
+Record = TypeVar("Record", bound=Product)
 
 
 class Store(Generic[Record]):
-    """A folder of products; the file of each holds its matrix, a checksum and its record.
+    """Products of one kind: their files, and their table in the index.
 
-    What a call has written is on the disk when it returns.
+    The file of each holds its matrix, a checksum and its record. What a call has written is on the
+    disk when it returns. Belongs to an :class:`~service.archive.Archive`, which opens it.
 
     Parameters
     ----------
     directory
         The folder.
-    noun
-        What one of them is called in messages.
+    index
+        Of all kinds.
     kind
         Of the record.
+    noun
+        What one of them is called in messages; the table's name, too.
+    description
+        Axes and unit of the matrix.
     dataset
         Name of the matrix in a file.
-    description
-        Its axes and unit.
     """
 
     def __init__(
-        self, directory: Path, noun: str, kind: type[Record], dataset: str, description: str
+        self,
+        directory: Path,
+        index: Index,
+        kind: type[Record],
+        noun: str,
+        description: str,
+        dataset: str = "interaction_matrix",
     ) -> None:
         self.directory = directory
-        self.noun = noun
+        self._index = index
         self._kind = kind
-        self._dataset = dataset
+        self._noun = noun
+        self._table = noun.replace(" ", "_")
         self._description = description
+        self._dataset = dataset
+        self._unsound: dict[str, str] = {}
+        self._stand_ins: dict[str, Record] = {}
 
     def path_of(self, product_id: str) -> Path:
         """Return where the file of a product is, or would be."""
         return self.directory / f"{product_id}.h5"
-
-    def ids(self) -> list[str]:
-        """Return the ids of all files that are there."""
-        return [path.stem for path in sorted(self.directory.glob("*.h5"))]
 
     def prepare(self) -> tuple[str, ...]:
         """Make the folder, remove what was half-written; return a line for what will not go.
@@ -80,67 +89,135 @@ class Store(Generic[Record]):
                 told.append(f"{leftover}: cannot be removed and is left alone: {error.strerror}")
         return tuple(told)
 
-    def write(
-        self, record: Record, matrix: NDArray[np.float32], fill: Callable[[h5py.File], None]
+    def adopt(self, *, anew: bool) -> list[str]:
+        """Take in complete files that the index, made ``anew`` or not, does not know.
+
+        Returns
+        -------
+        A line for each file that is missing or damaged, and each record that is not understood.
+        """
+        known, told = self._index.checksums(self._table), []
+        for path in sorted(self.directory.glob("*.h5")):
+            if path.stem not in known:
+                try:
+                    record, matrix = self._record(path.stem), self._matrix(path.stem)
+                except ArchiveError as error:
+                    told.append(str(error))
+                else:
+                    became = self._became(record, anew=anew)
+                    self._index.add(self._table, became, checksum(matrix))
+        _, wrong = self._index.records(self._table, self._kind)
+        self._unsound = self._damaged(sorted(known.keys() - wrong.keys()))
+        self._stand_ins.clear()
+        for name in wrong:
+            with contextlib.suppress(ArchiveError):
+                self._stand_ins[name] = self._became(self._record(name), anew=False)
+        return [*told, *self._unsound.values(), *wrong.values()]
+
+    def records(self) -> tuple[Record, ...]:
+        """Return what is known of each, oldest first.
+
+        Of a record that is not understood the one in the product is told.
+        """
+        understood, wrong = self._index.records(self._table, self._kind)
+        known = [*understood, *(r for name, r in self._stand_ins.items() if name in wrong)]
+        return tuple(sorted(known, key=begun_ns_utc))
+
+    def matrix(self, product_id: str) -> NDArray[np.float32]:
+        """Return a matrix, its checksum verified.
+
+        Raises
+        ------
+        UnknownIdError
+            If none of this id was ever stored here.
+        ArchiveError
+            If its file is missing, damaged, or holds other numbers than were stored.
+        """
+        sha256 = self._index.checksums(self._table).get(product_id)
+        if sha256 is None:
+            raise UnknownIdError(f"{self._noun} {product_id}: no such matrix in the archive")
+        return self._matrix(product_id, sha256)
+
+    def file(self, product_id: str) -> bytes:
+        """Return the HDF5 file as it was written, once its matrix is verified.
+
+        Raises
+        ------
+        UnknownIdError, ArchiveError
+            As :meth:`matrix`.
+        """
+        self.matrix(product_id)
+        return self.path_of(product_id).read_bytes()
+
+    def _became(self, record: Record, *, anew: bool) -> Record:
+        """Return what has become of a product, as far as is known without the index."""
+        return record
+
+    def _write(
+        self,
+        record: Record,
+        matrix: NDArray[np.float32],
+        shape: tuple[int, ...],
+        sha256: str | None,
+        fill: Callable[[h5py.File], None],
     ) -> None:
         """Write a product for good; ``fill`` adds what only this kind has.
 
         Raises
         ------
         ArchiveError
-            If there is a file of this id.
+            If the id is taken, or the matrix not of this shape and checksum.
         StorageError
             If the disk refuses.
+        WireError
+            If the id is not one.
         """
-        path = self.path_of(record.id)
+        checked_id(record.id, f"a {self._noun} to be stored")
+        path, found = self.path_of(record.id), checksum(matrix)
+        self._check_numbers(record, "a matrix", matrix, shape)
+        if found != (sha256 or found):
+            raise ArchiveError(
+                f"{self._noun} {record.id}: found a matrix of checksum {found}, "
+                f"expected {sha256} of its record"
+            )
+        taken = ArchiveError(f"{self._noun} {record.id}: already stored, ids are never reused")
         if path.exists():
-            raise self.taken(record.id)
+            raise taken
 
         def whole(file: h5py.File) -> None:
             file[self._dataset] = np.asarray(matrix, "<f4")
             file[self._dataset].attrs["description"] = self._description
             fill(file)
-            file.attrs["sha256"] = checksum(matrix)
+            file.attrs["id"] = record.id
+            file.attrs["sha256"] = found
             file.attrs["software_version"] = __version__
             file.attrs["record"] = to_json(record)
 
         write_whole(path, whole)
+        if not self._index.add(self._table, record, found):
+            raise taken
 
-    def taken(self, product_id: str) -> ArchiveError:
-        """Return the error of an id that names another product already."""
-        return ArchiveError(f"{self.noun} {product_id}: already stored, ids are never reused")
+    def _check_numbers(
+        self, record: Record, name: str, values: NDArray[Any], shape: tuple[int, ...]
+    ) -> None:
+        if values.shape != shape or not np.isfinite(values).all():
+            raise ArchiveError(
+                f"{self._noun} {record.id}: found {name} of shape {values.shape}, expected a "
+                f"finite one of {shape}"
+            )
 
-    def record(self, product_id: str) -> Record:
-        """Return the record in a file, as it was when the file was made.
-
-        Raises
-        ------
-        ArchiveError
-            If the file is missing, damaged or holds another product than its name says.
-        """
+    def _record(self, product_id: str) -> Record:
+        """Return the record in a file, as it was when the file was made."""
         path = self.path_of(product_id)
         with _opened(path) as file:
             record = from_json(file.attrs["record"], self._kind)
         if record.id != product_id:
-            text = f"found {self.noun} {record.id} in it, expected {product_id}"
+            text = f"found {self._noun} {record.id} in it, expected {product_id}"
             raise ArchiveError(f"{path}: {text}")
         return record
 
-    def matrix(self, product_id: str, sha256: str | None = None) -> NDArray[np.float32]:
-        """Return the matrix in a file, verified.
-
-        Parameters
-        ----------
-        product_id
-            Of the product.
-        sha256
-            Checksum it must have; None: that in the file.
-
-        Raises
-        ------
-        ArchiveError
-            If the file is missing or damaged, or the matrix has another checksum.
-        """
+    def _matrix(self, product_id: str, sha256: str | None = None) -> NDArray[np.float32]:
+        """Return the matrix in a file, which must have this checksum, or else that in the file."""
         path = self.path_of(product_id)
         with _opened(path) as file:
             matrix = np.asarray(file[self._dataset][()], np.float32)
@@ -150,7 +227,7 @@ class Store(Generic[Record]):
             raise ArchiveError(f"{path}: damaged: found checksum {found}, expected {expected}")
         return matrix
 
-    def unsound(self, product_ids: Iterable[str]) -> dict[str, str]:
+    def _damaged(self, product_ids: Iterable[str]) -> dict[str, str]:
         """Return, by id, what is wrong with files that are missing or cut; none of it is read."""
         wrong = {}
         for name in product_ids:
@@ -160,37 +237,6 @@ class Store(Generic[Record]):
             except ArchiveError as error:
                 wrong[name] = str(error)
         return wrong
-
-    def check_numbers(
-        self, product_id: str, name: str, values: NDArray[Any], shape: tuple[int, ...]
-    ) -> None:
-        """Look whether an array that is to be stored is finite and of this shape.
-
-        Raises
-        ------
-        ArchiveError
-            If it is not.
-        """
-        if values.shape != shape or not np.isfinite(values).all():
-            raise ArchiveError(
-                f"{self.noun} {product_id}: found {name} of shape {values.shape}, expected a "
-                f"finite one of {shape}"
-            )
-
-    def check_sum(self, product_id: str, matrix: NDArray[np.float32], sha256: str) -> None:
-        """Look whether a matrix that is to be stored is the one its record speaks of.
-
-        Raises
-        ------
-        ArchiveError
-            If it is not.
-        """
-        found = checksum(matrix)
-        if found != sha256:
-            raise ArchiveError(
-                f"{self.noun} {product_id}: found a matrix of checksum {found}, "
-                f"expected {sha256} of its record"
-            )
 
 
 def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
@@ -216,7 +262,7 @@ def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
         raise StorageError(f"{path}: cannot be written: {error}") from error
 
 
-@contextmanager
+@contextlib.contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r", locking=False) as file:

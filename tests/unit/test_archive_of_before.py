@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.archive import Archive, AuditEntry
-from service.archive.tracking import TrackingFile
+from service.archive.records import TrackingFile
 from service.tracking.products import MatrixState, MeasurePattern, MeasureState, NoisyState
 from service.tracking.registration import ModeGain
 from service.tracking.stages import AcquisitionStage

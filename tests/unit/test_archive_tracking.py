@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.archive import Archive
-from service.archive.tracking import TrackingFile
+from service.archive.records import TrackingFile
 from service.errors import ArchiveError
 from service.tracking import events as ev
 from service.tracking.loop import Pointing

@@ -116,7 +116,7 @@ async def test_windows_become_an_archived_matrix_and_the_registration_in_it(desk
 
 async def test_what_is_archived_is_the_matrix_within_its_stated_noise(desk, workers, archive):
     await finish(desk, workers)
-    with h5py.File(archive.noisy.path("noisy-1")) as file:
+    with h5py.File(archive.noisy.path_of("noisy-1")) as file:
         matrix, noise = file["interaction_matrix"][()], file["element_noise"][()]
         synthetic, gain = file["synthetic"][()], file["optical_gain"][()]
     true = 0.6 * workers.bench.response(ALPHA)[:, list(MODES)]

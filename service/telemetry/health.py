@@ -75,7 +75,7 @@ def observe(
     expected = float(mode_variance_m2[upper].sum())
     if expected <= 0.0:
         return health
-    levels = np.sqrt(np.sum(commands.astype(np.float64) ** 2, axis=1) / expected)
+    levels = np.sqrt(np.einsum("km,km->k", commands, commands).astype(float) / expected)
     absurd = _absurd(health, levels)
     if absurd != health.absurd:
         health = LoopHealth(ratio=float(np.sqrt(np.mean(levels**2))))
@@ -134,11 +134,15 @@ class Actuators:
 class EdgeWatch:
     """Where the actuators of one mirror stand for a modal command, in σ of turbulence."""
 
+    modes: NDArray[np.intp]
+    """``(n_watched,)`` those of the loop that are not left out."""
+
     outer: NDArray[np.float32]
-    """``(n_outer, n_modes)`` of the outermost ring; zero for modes left out."""
+    """``(n_outer, n_watched)`` of the outermost ring."""
 
     inner: NDArray[np.float32]
-    """``(n_inner, n_modes)`` of all others: they tell how strong the turbulence is tonight."""
+    """``(n_watched, n_watched)`` mean products of all others: a form of the command, their
+    mean square, which tells how strong the turbulence is tonight."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -167,14 +171,16 @@ def edge_watch(
 
     The same when nothing is known of the turbulence in the modes.
     """
-    used, high = np.zeros(len(mode_variance_m2)), in_loop[in_loop >= LOW_MODES]
-    used[high] = 1.0
-    expected = np.sqrt(actuators.strokes**2 @ (used * mode_variance_m2))
+    high, outer = in_loop[in_loop >= LOW_MODES], actuators.outer
+    strokes = actuators.strokes[:, high]
+    expected = np.sqrt(strokes**2 @ mode_variance_m2[high])
     if len(high) <= LOW_MODES or expected.min() <= 0.0:
         return None
-    shapes = (actuators.strokes * used / expected[:, None]).astype(np.float32)
-    outer = actuators.outer
-    return EdgeWatch(outer=shapes[outer], inner=shapes[~outer])
+    shapes = strokes / expected[:, None]
+    inner = shapes[~outer].T @ shapes[~outer] / np.count_nonzero(~outer)
+    return EdgeWatch(
+        modes=high, outer=shapes[outer].astype(np.float32), inner=inner.astype(np.float32)
+    )
 
 
 def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
@@ -192,12 +198,13 @@ def _seen(
     health: EdgeHealth, command: NDArray[np.float32], lasted_s: float, watch: EdgeWatch
 ) -> EdgeHealth:
     """Return the health after a command that stands for so much time."""
-    outer, inner = watch.outer @ command, watch.inner @ command
+    moved = command[watch.modes]
+    outer, inner = watch.outer @ moved, float(moved @ (watch.inner @ moved))
     fade = float(np.exp(-lasted_s / _EDGE_MEMORY_S))
     position = (1.0 - fade) * outer
     if health.position is not None:
         position += fade * health.position
-    power = fade * health.turbulence**2 + (1.0 - fade) * float(np.mean(inner**2))
+    power = fade * health.turbulence**2 + (1.0 - fade) * max(inner, 0.0)
     turbulence = float(np.sqrt(power))
     ratio = float(np.abs(position).max()) / max(turbulence, 1e-3)
     suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0

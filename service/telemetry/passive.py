@@ -79,6 +79,9 @@ MIN_SAMPLES = 8
 _REACH = N_TAPS - 1
 """Frames besides its own that a filtered one is made of."""
 
+_RANK = 1e-6
+"""Of the largest singular value: what is smaller is rounding."""
+
 _RIDGE = 1e-6
 _STILL_RIDGE = 1e-9
 
@@ -286,7 +289,9 @@ def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     others = _others(state, frames)
     if len(others):
         moving = np.hstack([commands[now][:, others], commands[before][:, others]])
-        filtered -= moving @ np.linalg.lstsq(moving, filtered, rcond=1e-6)[0]
+        shapes, size, _ = np.linalg.svd(moving.astype(float), full_matrices=False)
+        known = shapes[:, size > _RANK * size[0]]
+        filtered -= known @ (known.T @ filtered)
     weight = np.ones((n, 1), np.float32)
     rise = np.sin(np.pi / 2 * (np.arange(TAPER_FRAMES) + 0.5) / TAPER_FRAMES)[:, None] ** 2
     if not state.begun:

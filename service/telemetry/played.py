@@ -95,12 +95,11 @@ def measured(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
         max(asked.first_seq - block.first_seq, 0),
         max(min(asked.stop_seq - block.first_seq, block.n_frames), 0),
     )
-    dither = block.dither_m[rows].astype(float)
+    dither = block.dither_m[rows]
     if not dither.any():
         return meter, None
-    modes = list(asked.modes)
-    squares = np.einsum("km,km->m", dither, dither)
-    meter, lines = _demodulated(meter, block, rows, dither[:, modes])
+    squares = np.einsum("km,km->m", dither, dither).astype(float)
+    meter, lines = _demodulated(meter, block, rows, dither[:, list(asked.modes)])
     meter = replace(
         meter,
         n_frames=meter.n_frames + len(dither),

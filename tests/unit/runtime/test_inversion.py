@@ -22,7 +22,7 @@ def made_with(**settings):
 
 
 def test_the_default_is_the_truncated_svd():
-    assert load_settings(None, {}).control.method is Method.SVD
+    assert load_settings(None, {}).control.method == Method.SVD
     model, made = made_with()
     expected = invert(model.interaction_matrix(Misregistration()), N_CONTROLLED).matrix
     np.testing.assert_array_equal(made.matrix, expected)
@@ -41,5 +41,5 @@ def test_the_method_may_come_from_the_environment():
     settings = load_settings(
         None, {"PYRCAL_CONTROL__METHOD": "map", "PYRCAL_CONTROL__SLOPE_NOISE": "0.2"}
     )
-    assert settings.control.method is Method.MAP
+    assert settings.control.method == Method.MAP
     assert settings.control.slope_noise == 0.2

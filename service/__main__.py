@@ -8,8 +8,12 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from service.commands.arguments import OTHER_PROGRAMS, check_files, command_line
-from service.commands.terminal import with_negative_numbers
+from service.commands.arguments import (
+    OTHER_PROGRAMS,
+    check_files,
+    command_line,
+    with_negative_numbers,
+)
 from service.errors import PyrcalError, shown
 
 

@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.files.product import instrument_sha256
+from service.files.report import instrument_sha256
 from service.model import instrument as model_code
 from service.model.instrument import BasisKind, Instrument, Mirror
 from service.model.modes import Basis, ModalBasis, mirror_surface, modal_basis

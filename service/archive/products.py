@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.archive.index import Index
-from service.archive.records import COVARIANCE_SCALE, from_json, to_json
+from service.archive.records import from_json, to_json
 from service.archive.store import DAMAGE, Provenance, Store
 from service.errors import ArchiveError, StorageError
+from service.files.report import put_covariance
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.tracking.loop_commands import table_of
 from service.tracking.products import (
@@ -51,7 +52,7 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
             if record.optical_gains:
                 _add_gains(file, record)
             if covariance is not None:
-                _add_covariance(file, covariance)
+                put_covariance(file, covariance)
             file.create_group("provenance").attrs.update(provenance)
 
         self._write(record, matrix, (record.n_modes, matrix.shape[-1]), record.sha256, fill)
@@ -241,7 +242,7 @@ def _fill(
     for name in ("optical_gain", "gain_sigma", "snr"):
         file[name] = getattr(numbers, name)
     if finding.covariance is not None:
-        _add_covariance(file, finding.covariance)
+        put_covariance(file, finding.covariance)
     file.attrs.update(
         {
             "modes": np.array(record.modes, dtype=np.int64),
@@ -261,11 +262,6 @@ def _fill(
         }
         | ({} if finding.alpha is None else finding.alpha.to_boundary())
     )
-
-
-def _add_covariance(file: h5py.File, covariance: NDArray[np.float64]) -> None:
-    file["covariance"] = covariance * COVARIANCE_SCALE
-    file["covariance"].attrs["parameters"] = PARAMETERS
 
 
 def _attributes(record: ReconstructorRecord) -> dict[str, Provenance]:

@@ -14,15 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ArchiveError, ModelError, StorageError
-from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE, Misregistration
 from service.tracking.registration import Registration
 from service.tracking.state import Saved
 
 NOT_UNDERSTOOD = (ValueError, KeyError, TypeError, ModelError)
 """What reading a record of another version, or a damaged one, raises."""
-
-COVARIANCE_SCALE = np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)
-"""Multiply a covariance in numeric units by this to get boundary units."""
 
 _OF_THIS_RUN = "judged"
 """What a restarted service must find out anew."""

@@ -9,13 +9,12 @@ from functools import partial
 from pathlib import Path
 
 from service.archive.store import write_whole
-from service.commands.terminal import say, show_progress
+from service.commands.arguments import say, show_progress
 from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.files.figures import check_plots, write_sheet
 from service.files.light import Light, read_light
-from service.files.product import fill_fit
-from service.files.report import document, table
+from service.files.report import document, fill_fit, table
 from service.files.run import fit_file
 from service.fit.options import FitOptions, Method
 from service.fit.pupil_rotation import Arms

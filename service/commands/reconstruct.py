@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.archive.store import write_whole
-from service.commands.terminal import say, show_progress
+from service.commands.arguments import say, show_progress
 from service.config import load_instrument
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import Method, Prior, Provenance, Recipe, Source, reconstruct
 from service.errors import ConfigurationError, MatrixError
+from service.files.container import file_sha256
 from service.files.light import read_light
-from service.files.product import (
+from service.files.report import (
     KnownFit,
     fill_reconstructor,
     instrument_sha256,
+    orientation_words,
     read_fit,
 )
-from service.files.recorded import file_sha256
-from service.files.report import orientation_words
 from service.files.request import parse_alpha
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.errors import MatrixError
-from service.files.product import instrument_sha256
-from service.files.recorded import FLUX_FRAME, Recorded, read_recorded
-from service.files.report import FitReport
+from service.files.container import FLUX_FRAME, Recorded, read_recorded
+from service.files.report import FitReport, instrument_sha256
 from service.fit.matrix import fit_matrix
 from service.fit.options import FitOptions
 from service.fit.reference import Reference

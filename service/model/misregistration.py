@@ -16,6 +16,9 @@ PARAMETERS = ("shift_x_subap", "shift_y_subap", "rotation_deg", "magnification")
 BOUNDARY_SCALE = np.array([1.0, 1.0, 180.0 / np.pi, 1.0])
 """Multiply a 4-vector in numeric units (rotation in radians) by this to get boundary units."""
 
+COVARIANCE_SCALE = np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)
+"""The same for a covariance."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Misregistration:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.files.uploads import FitAsked, FitJob
 from service.link.statistics import LinkStatistics
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
 from service.tracking.events import Command, GainGroup
 from service.tracking.loop import RtcView
 from service.tracking.registration import Registration
@@ -111,8 +111,7 @@ class Alpha:
     @property
     def covariance(self) -> list[list[float]]:
         """4 x 4, now, floor included, in the units of the names and the order of ``parameters``."""
-        scale = np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)
-        found: list[list[float]] = (self.known.total_covariance * scale).tolist()
+        found: list[list[float]] = (self.known.total_covariance * COVARIANCE_SCALE).tolist()
         return found
 
     @property

@@ -23,10 +23,9 @@ from service.runtime.actions import Actions
 from service.runtime.asking import why_not
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
-from service.runtime.pace import PaceMeter
 from service.runtime.recording import Recorder
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, waiting_for
-from service.runtime.workers import WorkerPool
+from service.runtime.workers import PaceMeter, WorkerPool
 from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
 from service.tracking import events as ev

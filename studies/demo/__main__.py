@@ -6,7 +6,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from service.commands.terminal import with_negative_numbers
+from service.commands.arguments import with_negative_numbers
 from service.errors import PyrcalError, shown
 from studies.demo.arguments import demo_parser
 

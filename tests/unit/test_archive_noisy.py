@@ -10,7 +10,7 @@ from service.archive import Archive
 from service.archive.products import NoisyNumbers
 from service.archive.records import from_json, to_json
 from service.errors import ArchiveError, UnknownIdError, WireError
-from service.files.recorded import read_recorded
+from service.files.container import read_recorded
 from service.model.misregistration import Misregistration
 from service.tracking.products import NoisyFinding, NoisyRecord, NoisyState
 from service.wire import checksum

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from service.archive.store import write_whole
-from service.commands.arguments import check_files, command_line
+from service.commands.arguments import check_files, command_line, with_negative_numbers
 from service.commands.reconstruct import SAMPLING, main
-from service.commands.terminal import with_negative_numbers
 from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError
-from service.files.product import fill_fit, instrument_sha256
-from service.files.report import document
+from service.files.report import document, fill_fit, instrument_sha256
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis

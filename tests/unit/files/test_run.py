@@ -8,7 +8,7 @@ import pytest
 
 from service.config import load_instrument
 from service.errors import MatrixError
-from service.files.recorded import Recorded, read_recorded
+from service.files.container import Recorded, read_recorded
 from service.files.run import fit_file, reference_of
 from service.fit.options import FitOptions
 from service.model.instrument import FrameWindows

@@ -2,8 +2,8 @@
 
 import pytest
 
-from service.runtime import pace as pace_module
-from service.runtime.pace import PaceMeter
+from service.runtime import workers as workers_module
+from service.runtime.workers import PaceMeter
 from service.tracking.state import Alarm, TrackerState
 
 QUIET = TrackerState(system="small")
@@ -30,7 +30,7 @@ class Clocks:
 @pytest.fixture
 def clocks(monkeypatch):
     clocks = Clocks()
-    monkeypatch.setattr(pace_module, "time", clocks)
+    monkeypatch.setattr(workers_module, "time", clocks)
     return clocks
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from service.archive import Archive
 from service.errors import MatrixError
-from service.files.recorded import read_recorded
+from service.files.container import read_recorded
 from service.tracking.products import MeasurementRecord, MeasurePattern, MeasureState
 from service.wire import checksum
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import MatrixError
-from service.files.product import fill_fit, instrument_sha256, read_fit
-from service.files.report import document
+from service.files.report import document, fill_fit, instrument_sha256, read_fit
 from service.model.instrument import Stop
 from service.model.slopes import Orientation, SlopeOrder
 from tests.numerics import small_instrument

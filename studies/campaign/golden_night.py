@@ -12,7 +12,6 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import LinkError, PyrcalError
 from service.link.events import LinkEvent
-from service.runtime.estimates import Backlog
 from service.tracking import events as ev
 from service.tracking.events import Command, Effect, Event
 from service.tracking.policy import Policy
@@ -197,7 +196,7 @@ class GoldenNight(Observatory):
         self._told.restart(mode, self.dome.now_ns)
         self._agenda.clear()
         self._link.sent.clear()
-        self._fitting, self._backlog, self._worker_free_ns = False, Backlog(), 0
+        self._idle_worker()
         self._engine.state = self._told.state
         self._engine.begin_anew()
         self._begin()

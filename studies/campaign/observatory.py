@@ -24,6 +24,7 @@ from service.runtime.actions import Actions, Publishing
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.supervisor import WATCH_INTERVAL_S
+from service.runtime.workers import PATIENCE_S
 from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
 from service.tracker import step
@@ -37,12 +38,15 @@ from studies.campaign.observatory_checks import Publication, Swap, published, tr
 from studies.campaign.observatory_dome import Dome
 from studies.campaign.observatory_link import OwnHands, Shelf, ShortLink
 
+_Job = tuple[float, Callable[[], None]]
+"""How long the worker is at something, seconds, and what it has done then."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Latencies:
     """How long things take at the telescope, seconds of simulated time.
 
-    The worker does one thing after the other, so that what it takes adds up.
+    The worker does one thing after the other, the most urgent first, as the service's does.
     """
 
     fit_s: float = 0.5
@@ -141,9 +145,7 @@ class Observatory:
         self._agenda: list[_Due] = []
         self._numbers = itertools.count()
         self._with_poles = with_poles
-        self._worker_free_ns = 0
-        self._fitting = False
-        self._backlog = Backlog()
+        self._idle_worker()
         self._begin()
 
     @property
@@ -208,7 +210,12 @@ class Observatory:
         self._hear(ev.SessionStarted(session=session))
         self._every(self.latencies.status_s, self._hear_status)
         self._every(self.latencies.tick_s, lambda: self._post(ev.Tick()))
-        self._every(self.latencies.watch_interval_s, self._watch)
+        self._in(self.latencies.watch_interval_s, self._watch)
+
+    def _idle_worker(self) -> None:
+        self._jobs: list[tuple[float, int, Callable[[], _Job]]] = []
+        self._busy = self._fitting = False
+        self._backlog = Backlog()
 
     def _at(self, t_ns: int, happen: Callable[[], None]) -> None:
         heapq.heappush(self._agenda, _Due(t_ns, next(self._numbers), happen))
@@ -223,11 +230,24 @@ class Observatory:
 
         self._in(seconds, again)
 
-    def _worked(self, seconds: float) -> int:
-        """Return when the worker will be done with one more job."""
-        start_ns = max(self.dome.now_ns, self._worker_free_ns)
-        self._worker_free_ns = start_ns + round(seconds * SECOND_NS)
-        return self._worker_free_ns
+    def _work(self, name: str, begin: Callable[[], _Job]) -> None:
+        """Have the worker begin something once it has a hand free, and what is more urgent done."""
+        due_s = self.time_s + PATIENCE_S.get(name, 0.0)
+        heapq.heappush(self._jobs, (due_s, next(self._numbers), begin))
+        self._work_on()
+
+    def _work_on(self) -> None:
+        while self._jobs and not self._busy:
+            *_, begin = heapq.heappop(self._jobs)
+            lasts_s, done = begin()
+
+            def over(done: Callable[[], None] = done) -> None:
+                self._busy = False
+                done()
+                self._work_on()
+
+            self._busy = True
+            self._in(lasts_s, over)
 
     def _happen(self) -> None:
         """Let everything happen that is due."""
@@ -279,27 +299,35 @@ class Observatory:
         if given_up is not None:
             self._post(ev.WindowLost(refused=given_up))
         if not self._fitting:
-            self._fit_next()
+            self._fitting = True
+            self._work("fit", self._fit_next)
 
-    def _fit_next(self) -> None:
+    def _fit_next(self) -> _Job:
         window = self._backlog.take()
-        self._fitting = window is not None
         if window is None:
-            return
+            self._fitting = False
+            return 0.0, _nothing
         event = asyncio.run(fitted(window, self.state, self._workers, self._actions.matrix))
 
         def done() -> None:
             self._post(event)
-            self._fit_next()
+            self._work("fit", self._fit_next)
 
-        self._at(self._worked(self.latencies.fit_s), done)
+        return self.latencies.fit_s, done
 
     def _watch(self) -> None:
+        self._work("watch", self._look_at_sums)
+
+    def _look_at_sums(self) -> _Job:
         sums = self._engine.take_sums()
-        found = asyncio.run(watched(sums, self.state, self._workers))
-        if found is not None:
-            event = found
-            self._at(self._worked(self.latencies.watch_s), lambda: self._post(event))
+        event = asyncio.run(watched(sums, self.state, self._workers))
+
+        def done() -> None:
+            if event is not None:
+                self._post(event)
+            self._in(self.latencies.watch_interval_s, self._watch)
+
+        return 0.0 if event is None else self.latencies.watch_s, done
 
     def _post(self, event: Event) -> None:
         self._engine.post(event)
@@ -338,14 +366,26 @@ class Observatory:
 
     def _do(self, effect: Effect, state: TrackerState) -> None:
         """Carry an effect out; what comes of it is heard when it would be."""
-        due_ns = self._due(effect)
+        name, lasts_s = self._takes(effect)
+
+        def begin() -> _Job:
+            event = self._performed(effect, state)
+            return lasts_s, lambda: self._done(event)
+
+        if name:
+            self._work(name, begin)
+        else:
+            _, done = begin()
+            self._in(lasts_s, done)
+
+    def _performed(self, effect: Effect, state: TrackerState) -> Event | None:
         try:
             event = asyncio.run(self._actions.perform(effect, state))
         except PyrcalError as error:
             event = ev.JobFailed(effect=effect, text=str(error))
-        self._at(due_ns, lambda: self._done(event))
         while self._link.sent:
             self._in(self.latencies.send_s, partial(self._deliver, *self._link.sent.pop()))
+        return event
 
     def _deliver(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         for answer in self._link.deliver(manifest, matrix):
@@ -355,16 +395,18 @@ class Observatory:
         if event is not None:
             self._post(event)
 
-    def _due(self, effect: Effect) -> int:
-        """Return when an effect has been carried out."""
-        now_ns, wait = self.dome.now_ns, self.latencies
+    def _takes(self, effect: Effect) -> tuple[str, float]:
+        """Return the worker's job that an effect asks for, if any, and how long it takes."""
+        wait = self.latencies
         match effect:
             case ev.MakeMatrix():
-                return self._worked(wait.make_s)
-            case ev.CopyMatrix() | ev.JudgeMatrix() | ev.JudgeProposal():
-                return self._worked(wait.judge_s)
+                return "make", wait.make_s
+            case ev.JudgeMatrix():
+                return "margin", wait.judge_s
+            case ev.CopyMatrix() | ev.JudgeProposal():
+                return "judge", wait.judge_s
             case ev.FetchMatrix():
-                return now_ns + round(wait.fetch_s * SECOND_NS)
+                return "", wait.fetch_s
             case (
                 ev.SendMatrix()
                 | ev.AskDither()
@@ -374,9 +416,13 @@ class Observatory:
                 | ev.AskMeasurement()
                 | ev.FinishNoisy()
             ):
-                return now_ns + round(wait.command_s * SECOND_NS)
+                return "", wait.command_s
             case _:
                 raise TypeError(
                     f"observatory: found {type(effect).__name__}; expected an effect whose "
                     "duration is known here (studies.campaign.observatory)"
                 )
+
+
+def _nothing() -> None:
+    pass

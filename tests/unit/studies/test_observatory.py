@@ -57,10 +57,10 @@ def policy():
 
 @pytest.fixture(scope="module")
 def night(bench, policy):
-    """Fifteen seconds on auto, with a jump of a tenth of a subaperture in the middle."""
+    """Seventeen seconds on auto, with a jump of a tenth of a subaperture in the middle."""
     words = [*WORDS, f"--jump={JUMP_S}:{JUMP_SUBAP},0,0,0"]
     night = Observatory(words, policy, Mode.AUTO, bench)
-    night.advance(15.0)
+    night.advance(17.0)
     return night
 
 

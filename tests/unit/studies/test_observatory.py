@@ -46,8 +46,8 @@ def bench():
 @pytest.fixture(scope="module")
 def policy():
     given = {
-        "dither.budget_m": 10e-9,
-        "dither.amplitude_m": 5e-9,
+        "dither.budget_m": 20e-9,
+        "dither.amplitude_m": 10e-9,
         "dither.window_s": 1.0,
         "dither.longest_pause_s": 0.0,
         "control.n_modes_target": N_CONTROLLED,

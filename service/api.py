@@ -17,9 +17,8 @@ from typing_extensions import override
 from service import __version__
 from service.routes import commands, fits, health, matrices, problems, reading, views
 from service.routes.admission import Admission, Hosts, server_config
-from service.routes.service import Fits, Service, Snapshot
-
-__all__ = ["Fits", "Service", "Snapshot", "answer", "create_app"]
+from service.runtime.supervisor import Supervisor
+from service.runtime.uploads import FitQueue
 
 REQUESTS_WITHIN_S = 2
 """Requests under way when the service is asked to stop may take this long: an upload would take
@@ -35,8 +34,8 @@ finite is `null`. Errors are `application/problem+json` (RFC 9457).
 
 
 async def answer(
-    service: Service,
-    desk: Fits,
+    service: Supervisor,
+    desk: FitQueue,
     listener: socket.socket,
     names: tuple[str, ...],
     over: asyncio.Event,
@@ -66,7 +65,7 @@ class _Server(uvicorn.Server):
 
 
 def create_app(
-    service: Service, desk: Fits | None = None, *, hosts: Hosts | None = None
+    service: Supervisor, desk: FitQueue | None = None, *, hosts: Hosts | None = None
 ) -> FastAPI:
     """Return the REST application of a service, and of a desk for fits where there is one.
 

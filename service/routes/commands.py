@@ -22,8 +22,8 @@ from pydantic import (
 )
 
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
-from service.routes.service import Service
 from service.routes.views import MatrixId, ServiceDep
+from service.runtime.supervisor import Supervisor
 from service.tracking.dither_plan import total_m
 from service.tracking.events import (
     AbortAcquisition,
@@ -298,7 +298,7 @@ class PointingRequest(Request):
     """From north over east, degrees; only differences count."""
 
 
-async def accepted(service: Service, command: Command, **links: str) -> AcceptedView:
+async def accepted(service: Supervisor, command: Command, **links: str) -> AcceptedView:
     """Hand a command on; say what was set in motion and where to look for what becomes of it."""
     text = await service.submit(command)
     return AcceptedView(text=text, links={"state": "/v1/state", "events": "/v1/events", **links})

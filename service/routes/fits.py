@@ -196,7 +196,7 @@ async def fit(
     if parameters.measurement is not None:
         if content_length:
             raise MatrixError("found a body beside ?measurement=, expected one of the two")
-        content = await run_in_threadpool(service.measured_file, parameters.measurement)
+        content = await run_in_threadpool(service.archive.measured.file, parameters.measurement)
         body, content_length = _kept(content), len(content)
     job = await fits.take(parameters.asked(), body, content_length)
     return FitAcceptedView(id=job.id, links={"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"})

@@ -20,8 +20,8 @@ from service import __version__
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.routes.problems import problem, problem_response
-from service.routes.service import Pace, Snapshot
 from service.routes.views import ServiceDep
+from service.snapshot import Pace, Snapshot
 from service.tracking.products import MatrixState, MeasurePattern
 from service.tracking.registration import Source, Validity
 from service.tracking.stages import DitherPhase

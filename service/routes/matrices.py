@@ -27,8 +27,8 @@ from service.routes.commands import (
 )
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.reading import Parameters, describes_numbers, numbers_of
-from service.routes.service import Snapshot
 from service.routes.views import ServiceDep, answer, known, shows
+from service.snapshot import Snapshot
 from service.tracking.dither_plan import NOISY_DITHER
 from service.tracking.events import GiveUp, GiveUpNoisy, Measure, MeasureNoisy
 from service.tracking.products import MeasurePattern, ModeSet
@@ -191,9 +191,9 @@ async def measured_matrix(
     measurement's ``sha256``, ``hdf5`` the archived product with how it was measured.
     """
     if parameters.format is MeasuredFormat.HDF5:
-        return await _file(service.measured_file, measurement_id)
+        return await _file(service.archive.measured.file, measurement_id)
     raw = parameters.format is MeasuredFormat.RAW
-    return await numbers_of(service.measured_matrix, measurement_id, raw=raw)
+    return await numbers_of(service.archive.measured.matrix, measurement_id, raw=raw)
 
 
 class NoisyBody(Request):
@@ -260,4 +260,4 @@ async def give_up_noisy(service: ServiceDep, noisy_id: NoisyId) -> AcceptedView:
 )
 async def noisy_file(service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return the archived HDF5 file of one; ``pyrcal fit`` reads it."""
-    return await _file(service.noisy_file, noisy_id)
+    return await _file(service.archive.noisy.file, noisy_id)

@@ -33,7 +33,9 @@ from service.errors import UnknownIdError
 from service.files.uploads import FitJob
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
-from service.routes.service import Alpha, Fits, Pace, Rtc, Service, Snapshot
+from service.runtime.supervisor import Supervisor
+from service.runtime.uploads import FitQueue
+from service.snapshot import Alpha, Pace, Rtc, Snapshot
 from service.tracking.events import GainGroup
 from service.tracking.loop import DitherView, LoopCommand, Pointing
 from service.tracking.products import (
@@ -159,22 +161,22 @@ def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a 
     return picture(value, of)
 
 
-def _service_of(request: Request) -> Service:
-    service: Service = request.app.state.service
+def _service_of(request: Request) -> Supervisor:
+    service: Supervisor = request.app.state.service
     return service
 
 
-def _fits_of(request: Request) -> Fits:
-    fits: Fits = request.app.state.fits
+def _fits_of(request: Request) -> FitQueue:
+    fits: FitQueue = request.app.state.fits
     return fits
 
 
-ServiceDep = Annotated[Service, Depends(_service_of)]
+ServiceDep = Annotated[Supervisor, Depends(_service_of)]
 """The service a route works for."""
 
 MatrixId = Annotated[str, Path(alias="id", description="Id of a reconstructor")]
 
-FitsDep = Annotated[Fits, Depends(_fits_of)]
+FitsDep = Annotated[FitQueue, Depends(_fits_of)]
 """The desk a route works for."""
 
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from service.archive import Archive
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.link.events import MeasuredMatrix
-from service.routes.service import Snapshot
 from service.rtc_bridge import Bridge
 from service.runtime import translate
 from service.runtime.actions import Actions
@@ -26,6 +25,7 @@ from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.recording import Recorder
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
+from service.snapshot import Snapshot
 from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
 from service.tracking import events as ev
@@ -53,7 +53,7 @@ _LEVELS = {Level.INFO: "info", Level.WARNING: "warning", Level.ALARM: "error"}
 
 
 class Supervisor:
-    """The running service; also what REST reads and commands (``service.api.Service``)."""
+    """The running service; also what REST reads and commands."""
 
     def __init__(
         self,
@@ -68,7 +68,9 @@ class Supervisor:
         self._engine = Engine(state, policy, self)
         self._bridge = bridge
         self._workers = workers
-        self._archive = archive
+        self.archive = archive
+        """Products and their history; a call waits for the disk."""
+
         self._recorder = Recorder(archive, lambda: self._engine.state, self._post)
         self._actions = actions
         self._backlog = Backlog()
@@ -111,6 +113,15 @@ class Supervisor:
         """Set an operator's command in motion; return one line that says what was.
 
         It is on record before it is done, and so is why it is refused.
+
+        Raises
+        ------
+        CommandError
+            If it cannot be carried out in the present state.
+        UnknownIdError
+            If it names an unknown reconstructor.
+        StorageError
+            If it cannot be recorded; nothing has been done.
         """
         if isinstance(command, ev.SetPointing):  # told every second, and decides nothing
             effects = self._post(command)
@@ -139,18 +150,6 @@ class Supervisor:
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)``."""
         return self._actions.matrix(matrix_id)
-
-    def measured_matrix(self, measurement_id: str) -> NDArray[np.float32]:
-        """Return a measured interaction matrix ``(n_slopes, n_modes)``."""
-        return self._archive.measured.matrix(measurement_id)
-
-    def measured_file(self, measurement_id: str) -> bytes:
-        """Return the HDF5 file of a measured interaction matrix."""
-        return self._archive.measured.file(measurement_id)
-
-    def noisy_file(self, noisy_id: str) -> bytes:
-        """Return the HDF5 file of a noisy interaction matrix."""
-        return self._archive.noisy.file(noisy_id)
 
     async def run(self) -> None:
         """Work until cancelled: prepare the model, then listen, tick, fit, watch and record."""

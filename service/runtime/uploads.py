@@ -135,7 +135,19 @@ class FitQueue:
     async def take(
         self, asked: FitAsked, body: AsyncIterator[bytes], n_bytes: int | None
     ) -> FitJob:
-        """Keep an upload and put its fit in the queue; see :class:`service.routes.fits.Fits`."""
+        """Keep an upload and put its fit in the queue.
+
+        Raises
+        ------
+        TooLargeError
+            If it is beyond the limit; before it is read where its length ``n_bytes`` is told.
+        TooSlowError
+            If it stands still, or trickles.
+        BusyError
+            If too many wait already.
+        MatrixError
+            If it stops half-way, or is no file a matrix could be in.
+        """
         self._check_room(n_bytes)
         job = self._remember(asked)
         folder = self._folder / job.id

@@ -17,7 +17,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
 from service.processes import Apart, Worker
-from service.routes.service import Pace
+from service.snapshot import Pace
 from service.tracking import events as ev
 from service.tracking.alarms import WORKER_BEHIND, WORKER_LOST
 from service.tracking.state import TrackerState

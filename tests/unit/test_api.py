@@ -16,7 +16,7 @@ from prometheus_client.openmetrics.parser import (
 from prometheus_client.parser import text_string_to_metric_families
 
 from service import __version__
-from service.api import Snapshot, create_app
+from service.api import create_app
 from service.control.gate import GateVerdict
 from service.errors import (
     ArchiveError,
@@ -28,6 +28,7 @@ from service.errors import (
 )
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
+from service.snapshot import Snapshot
 from service.tracking.events import (
     Approve,
     Publish,

@@ -1,6 +1,7 @@
 """Fits over real HTTP messages, with a hand-written desk behind them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
@@ -47,18 +48,21 @@ def desk():
     return FakeDesk()
 
 
-class FakeService:
-    """Has measured one matrix."""
+class FakeMatrices:
+    """One that the RTC has measured."""
 
-    def measured_file(self, measurement_id):
+    def file(self, measurement_id):
         if measurement_id != "im-1":
             raise UnknownIdError(f"measurement {measurement_id}: no such matrix in the archive")
         return b"measured"
 
 
+SERVICE = SimpleNamespace(archive=SimpleNamespace(measured=FakeMatrices()))
+
+
 @pytest.fixture
 async def client(desk):
-    transport = httpx.ASGITransport(create_app(FakeService(), desk), raise_app_exceptions=False)
+    transport = httpx.ASGITransport(create_app(SERVICE, desk), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
         yield client
 

@@ -3,13 +3,15 @@
 import hashlib
 import io
 from dataclasses import replace
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
 import pytest
 
-from service.api import Snapshot, create_app
+from service.api import create_app
 from service.errors import CommandError, LinkError, UnknownIdError
+from service.snapshot import Snapshot
 from service.tracking.events import GiveUp, Measure
 from service.tracking.products import MeasurementRecord, MeasurePattern, MeasureState
 from service.tracking.state import TrackerState
@@ -50,6 +52,7 @@ class FakeService:
     def __init__(self):
         self.commands = []
         self.refusal = None
+        self.archive = SimpleNamespace(measured=FakeMatrices())
 
     def snapshot(self):
         return Snapshot(
@@ -67,13 +70,17 @@ class FakeService:
         self.commands.append(command)
         return "Measure: 1 action(s) under way"
 
-    def measured_matrix(self, measurement_id):
+
+class FakeMatrices:
+    """The archive's measured matrices."""
+
+    def matrix(self, measurement_id):
         if measurement_id != "im-1":
             raise UnknownIdError(f"measurement {measurement_id}: no such matrix in the archive")
         return MATRIX
 
-    def measured_file(self, measurement_id):
-        self.measured_matrix(measurement_id)
+    def file(self, measurement_id):
+        self.matrix(measurement_id)
         return FILE
 
 

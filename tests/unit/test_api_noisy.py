@@ -1,15 +1,17 @@
 """Noisy interaction matrices over real HTTP messages, with a hand-written service behind."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
 import pytest
 
-from service.api import Snapshot, create_app
+from service.api import create_app
 from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.routes.views import GATHERING, picture
+from service.snapshot import Snapshot
 from service.tracking.events import GiveUpNoisy, MeasureNoisy
 from service.tracking.products import ModeSet, NoisyFinding, NoisyRecord, NoisyState
 from service.tracking.state import TrackerState
@@ -50,7 +52,7 @@ class FakeService:
     def __init__(self):
         self.commands = []
         self.refusal = None
-        self.without_plots = False
+        self.archive = SimpleNamespace(noisy=FakeMatrices())
 
     def snapshot(self):
         return Snapshot(
@@ -68,7 +70,11 @@ class FakeService:
         self.commands.append(command)
         return "MeasureNoisy: 1 action(s) under way"
 
-    def noisy_file(self, noisy_id):
+
+class FakeMatrices:
+    """The archive's noisy matrices."""
+
+    def file(self, noisy_id):
         if noisy_id != "noisy-1":
             raise UnknownIdError(f"noisy matrix {noisy_id}: no such matrix in the archive")
         return FILE

@@ -3,7 +3,8 @@
 import httpx
 import pytest
 
-from service.api import Snapshot, create_app
+from service.api import create_app
+from service.snapshot import Snapshot
 from service.tracking.events import StartDither
 from service.tracking.loop import DitherKind
 from service.tracking.products import ModeSet

@@ -11,9 +11,9 @@ import pytest
 
 from service.__main__ import main
 from service.commands.status import status_lines
-from service.routes.service import Snapshot
 from service.routes.views import STATE as STATE_VIEW
 from service.routes.views import picture
+from service.snapshot import Snapshot
 from service.tracking.state import TrackerState
 from tests.unit.test_api import LINK, SECOND, STATE
 

@@ -1,19 +1,17 @@
-"""What REST needs of the service: a snapshot to read, a place to hand commands to."""
+"""Everything a reader may want to know of the service at one moment: what REST shows."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.files.uploads import FitAsked, FitJob
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
-from service.tracking.events import Command, GainGroup
+from service.tracking.events import GainGroup
 from service.tracking.loop import RtcView
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState, Waiting
@@ -167,102 +165,3 @@ class Rtc:
             groups.append(GainGroup(first=first, last=last, gain=gain))
             first = last + 1
         return tuple(groups)
-
-
-class Service(Protocol):
-    """The running service as the REST application sees it."""
-
-    def snapshot(self) -> Snapshot:
-        """Return what is known now; costs next to nothing."""
-
-    async def submit(self, command: Command) -> str:
-        """Set a command in motion and return one line that says what was.
-
-        Raises
-        ------
-        CommandError
-            If it cannot be carried out in the present state.
-        UnknownIdError
-            If it names an unknown reconstructor.
-        StorageError
-            If it cannot be recorded; nothing has been done.
-        """
-
-    def matrix(self, matrix_id: str) -> NDArray[np.float32]:
-        """Return a reconstructor, ``(n_modes, n_slopes)``; called from a worker thread.
-
-        Raises
-        ------
-        UnknownIdError
-            If there is none of this id.
-        ArchiveError
-            If it is damaged.
-        """
-
-    def measured_matrix(self, measurement_id: str) -> NDArray[np.float32]:
-        """Return a measured interaction matrix, ``(n_slopes, n_modes)``, slope per metre OPD.
-
-        Called from a worker thread.
-
-        Raises
-        ------
-        UnknownIdError
-            If there is none of this id.
-        ArchiveError
-            If it is damaged.
-        """
-
-    def measured_file(self, measurement_id: str) -> bytes:
-        """Return the HDF5 file of a measured interaction matrix; called from a worker thread.
-
-        Raises
-        ------
-        UnknownIdError
-            If there is none of this id.
-        ArchiveError
-            If it is missing.
-        """
-
-    def noisy_file(self, noisy_id: str) -> bytes:
-        """Return the HDF5 file of a noisy interaction matrix; called from a worker thread.
-
-        Raises
-        ------
-        UnknownIdError
-            If there is none of this id.
-        ArchiveError
-            If it is missing or damaged.
-        """
-
-
-class Fits(Protocol):
-    """The desk where fits of uploaded matrices are asked for, as REST sees it."""
-
-    async def take(
-        self, asked: FitAsked, body: AsyncIterator[bytes], n_bytes: int | None
-    ) -> FitJob:
-        """Keep an upload and put its fit in the queue.
-
-        Raises
-        ------
-        TooLargeError
-            If it is beyond the limit; before it is read where its length ``n_bytes`` is told.
-        TooSlowError
-            If it stands still, or trickles.
-        BusyError
-            If too many wait already.
-        MatrixError
-            If it stops half-way, or is no file a matrix could be in.
-        """
-
-    def jobs(self) -> Sequence[FitJob]:
-        """Return the fits that are remembered, oldest first."""
-
-    def job(self, fit_id: str) -> FitJob:
-        """Return one.
-
-        Raises
-        ------
-        UnknownIdError
-            If none has this id.
-        """

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.fit.matrix import fit_matrix
+from service.fit.matrix import Fit, FitOptions, fit_matrix
 from service.fit.methods import SAME, land
 from service.fit.models import FitModels
-from service.fit.options import Fit, FitOptions
 from service.fit.reference import Reference, Target, oriented, target_of
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration

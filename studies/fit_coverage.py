@@ -23,8 +23,7 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.fit.matrix import fit_matrix
-from service.fit.options import FitOptions
+from service.fit.matrix import FitOptions, fit_matrix
 from service.fit.reference import Reference
 from service.model.instrument import Instrument
 from service.model.interaction import reference_slopes

@@ -19,8 +19,7 @@ from scipy.ndimage import distance_transform_edt
 from threadpoolctl import threadpool_limits
 
 from service.config.instrument import load_instrument
-from service.fit.matrix import fit_matrix
-from service.fit.options import Fit
+from service.fit.matrix import Fit, fit_matrix
 from service.fit.reference import Reference
 from service.model.instrument import Instrument, Stop, TabulatedModes
 from service.model.interaction import InteractionModel

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.files.report import FitReport, verdict_line
-from service.fit.options import Fit, ScanStep
+from service.fit.matrix import Fit
+from service.fit.methods import ScanStep
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.interaction import rotation
 from service.model.misregistration import Misregistration

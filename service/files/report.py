@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from service import __version__
 from service.control.reconstructor import Provenance
 from service.errors import MatrixError, shown
-from service.fit.options import Fit, Method, ScanStep
+from service.fit.matrix import Fit, Method
+from service.fit.methods import ScanStep
 from service.model.instrument import Instrument
 from service.model.misregistration import (
     BOUNDARY_SCALE,

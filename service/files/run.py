@@ -14,8 +14,7 @@ from threadpoolctl import threadpool_limits
 from service.errors import MatrixError
 from service.files.container import FLUX_FRAME, Recorded, read_recorded
 from service.files.report import FitReport, instrument_sha256
-from service.fit.matrix import fit_matrix
-from service.fit.options import FitOptions
+from service.fit.matrix import FitOptions, fit_matrix
 from service.fit.reference import Reference
 from service.model.instrument import FrameWindows, Instrument
 from service.model.windows import frame_windows, slopes_from_frames

@@ -16,7 +16,7 @@ from service.errors import ConfigurationError, MatrixError, PyrcalError
 from service.files.container import check_sealed
 from service.files.report import document
 from service.files.run import fit_file
-from service.fit.options import FitOptions
+from service.fit.matrix import FitOptions
 from service.model.instrument import Instrument
 
 MOST_FILES = 32

@@ -30,7 +30,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.fit.models import FitModels
-from service.fit.options import ScanStep
 from service.fit.reference import Target
 from service.fit.solver import (
     LIMIT,
@@ -83,6 +82,26 @@ N_LEFT_OUT = 10
 
 _SHIFTS = (-1.3, 1.3)
 _TURNS_RAD = np.deg2rad([-6.0, 6.0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScanStep:
+    """One line of the paper's Table 1: one parameter scanned, the others held."""
+
+    parameter: str
+    """Name at the boundary, as in ``PARAMETERS``."""
+
+    step: float
+    """Distance of two samples, in boundary units (subaperture, degree, ratio)."""
+
+    samples: NDArray[np.float64]
+    """``(n_samples,)`` values tried, in boundary units."""
+
+    chi: NDArray[np.float64]
+    """``(n_samples,)`` χ² at each."""
+
+    minimum: float
+    """Lowest point of the parabola, in boundary units: where the next line begins."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -15,7 +15,7 @@ from starlette.requests import ClientDisconnect
 from service.errors import MatrixError
 from service.files.request import parse_alpha, parse_modes
 from service.files.uploads import FitAsked, FitState
-from service.fit.options import FitOptions, Method
+from service.fit.matrix import FitOptions, Method
 from service.routes import views as shown
 from service.routes.problems import INVALID, UNKNOWN, problem_response
 from service.routes.views import FitJobs, FitsDep, ServiceDep, answer, picture, shows

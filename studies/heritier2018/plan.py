@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from service.fit.options import Method
+from service.fit.matrix import Method
 from service.model.misregistration import Misregistration
 from studies.heritier2018.calibration import Measurement
 from studies.heritier2018.loops import LoopRun

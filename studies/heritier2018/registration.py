@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import PyrcalError
-from service.fit.matrix import fit_matrix
-from service.fit.options import Fit, FitOptions, Method
+from service.fit.matrix import Fit, FitOptions, Method, fit_matrix
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.slopes import Orientation
 from studies.heritier2018 import telescope

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import service
-from service.fit.options import Method
+from service.fit.matrix import Method
 from service.model.misregistration import PARAMETERS
 from studies.heritier2018 import closed, curves, influence, matrices, page, paper, scans
 from studies.heritier2018.calibration import MeasuredPart

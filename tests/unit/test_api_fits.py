@@ -11,7 +11,7 @@ from service.api import create_app
 from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
 from service.files.report import document
 from service.files.uploads import FitJob, FitState
-from service.fit.options import Method
+from service.fit.matrix import Method
 from tests.unit.files.made import a_report
 
 JOB = FitJob(id="fit-1", state=FitState.WAITING, asked_ns_utc=7, n_bytes=4, sha256="ab")

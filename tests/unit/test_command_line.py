@@ -12,8 +12,8 @@ from service.commands.arguments import command_line
 from service.config import Settings, load_settings
 from service.control.reconstructor import MAX_CONDITION, Recipe
 from service.control.reconstructor import Method as MakeMethod
-from service.fit.options import FitOptions
-from service.fit.options import Method as FitMethod
+from service.fit.matrix import FitOptions
+from service.fit.matrix import Method as FitMethod
 from service.tracking.state import Mode
 from service.wire import CHUNK_LIMIT
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from service.files.report import FitReport
-from service.fit.options import Fit, Method, ScanStep
+from service.fit.matrix import Fit, Method
+from service.fit.methods import ScanStep
 from service.model.misregistration import Misregistration
 from service.model.slopes import Orientation, SlopeOrder
 

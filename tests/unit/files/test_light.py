@@ -10,7 +10,7 @@ from service.config import load_instrument
 from service.errors import MatrixError
 from service.files.light import in_conventions, read_light
 from service.files.run import fit_file
-from service.fit.options import FitOptions
+from service.fit.matrix import FitOptions
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.slopes import Orientation

@@ -10,7 +10,7 @@ from service.config import load_instrument
 from service.errors import MatrixError
 from service.files.container import Recorded, read_recorded
 from service.files.run import fit_file, reference_of
-from service.fit.options import FitOptions
+from service.fit.matrix import FitOptions
 from service.model.instrument import FrameWindows
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

@@ -10,7 +10,7 @@ import pytest
 from service.config import load_instrument, packaged_instrument
 from service.errors import ConfigurationError, MatrixError
 from service.files.uploads import MOST_FILES, UPLOAD, FitAsked, UploadFitter, opened_parcel
-from service.fit.options import FitOptions
+from service.fit.matrix import FitOptions
 from tests.data.tiny.make import ALPHA, HERE
 from tests.numerics import small_instrument
 

@@ -7,8 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from service.fit.matrix import fit_matrix
-from service.fit.options import Fit, FitOptions
+from service.fit.matrix import Fit, FitOptions, fit_matrix
 from service.fit.reference import Reference
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, rtc_valid_subapertures

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.fit.options import FitOptions, Method
+from service.fit.matrix import FitOptions, Method
 from service.fit.uncertainty import FAR_SHARE, STRANGE_RESIDUAL
 from service.model.instrument import Stop
 from service.model.interaction import InteractionModel

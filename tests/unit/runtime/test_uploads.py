@@ -16,7 +16,7 @@ from service.errors import (
     UnknownIdError,
 )
 from service.files.uploads import FitAsked, FitState
-from service.fit.options import FitOptions
+from service.fit.matrix import FitOptions
 from service.runtime import uploads
 from service.runtime.uploads import FitLimits, FitQueue
 

@@ -17,20 +17,23 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.fit.orientation import (
+    FLIPS,
     LEAST_CORRELATION,
     LEAST_LEAD,
     Pose,
     Setting,
     poses_of,
+    setting_written,
     settings_of,
+    sign_written,
 )
 from service.fit.reference import Reference
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Misregistration, unit_like, wrapped
 from service.model.modes import Basis
 from service.model.pyramid import Mapper
-from service.model.slopes import Orientation, to_conventions, turned_mask
+from service.model.slopes import to_conventions, turned_mask
 
 Array = NDArray[Any]
 
@@ -55,12 +58,8 @@ LIKELY = (0.1, 3.0)
 TWICE = (1.5, 3.0)
 """The same of a matrix that halves every command, which no optical gain does."""
 
-UNITS = {"nanometres": 1e-9, "micrometres": 1e-6, "millimetres": 1e-3}
-
 _UNIT_DECADES = 1.4
 """Powers of ten around a unit that are still recognised as it: optical gains are in between."""
-
-_FLIPS = ("swap_xy", "flip_x", "flip_y")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,13 +146,6 @@ def of_answer(slopes: Array, expected: Array, turns_rad: Array, instrument: Inst
     return Dialect(wrong=_axes_named("the answer to the dither", found, told), found=found)
 
 
-def setting_written(setting: Setting) -> str:
-    """Return an order and an orientation as the instrument file says them."""
-    order, axes = setting
-    flags = [f"{name} = true" for name in _FLIPS if getattr(axes, name)]
-    return f'order = "{order}", orientation = {{ {", ".join([*flags, _sign_written(axes)])} }}'
-
-
 def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Dialect:
     told = _told(instrument)
     best = max(poses, key=lambda pose: pose.correlation)
@@ -166,13 +158,13 @@ def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Dial
         )
         return Dialect(wrong="" if stated else text)
     alike = [pose for pose in poses if pose.correlation > best.correlation - LEAST_LEAD]
-    near = [pose for pose in alike if _apart(pose.rotation_rad, start_rad) <= REACH_RAD]
-    settings = [(pose.order, pose.orientation) for pose in near]
+    near = [pose for pose in alike if abs(wrapped(pose.rotation_rad - start_rad)) <= REACH_RAD]
+    settings = [pose.setting for pose in near]
     if told in settings:
         return Dialect(found=told)
     if not near:
         turned_deg = np.rad2deg(
-            min(alike, key=lambda pose: _n_changes(_of(pose), told)).rotation_rad
+            min(alike, key=lambda pose: _n_changes(pose.setting, told)).rotation_rad
         )
         return Dialect(
             wrong=f"by the RTC's own matrix the mirror is turned by {turned_deg:.0f} deg, "
@@ -188,18 +180,10 @@ def _told(instrument: Instrument) -> Setting:
     return instrument.slopes.order, instrument.slopes.assumed_orientation
 
 
-def _of(pose: Pose) -> Setting:
-    return pose.order, pose.orientation
-
-
-def _apart(one_rad: float, other_rad: float) -> float:
-    return abs(float((one_rad - other_rad + np.pi) % (2 * np.pi) - np.pi))
-
-
 def _n_changes(setting: Setting, told: Setting) -> int:
     """Return how much of what was told a setting contradicts."""
     (order, axes), (told_order, told_axes) = setting, told
-    names = (*_FLIPS, "sign_x", "sign_y")
+    names = (*FLIPS, "sign_x", "sign_y")
     changed = sum(bool(getattr(axes, name) != getattr(told_axes, name)) for name in names)
     both_signs = axes.sign_x != told_axes.sign_x and axes.sign_y != told_axes.sign_y
     # light counted the other way round turns both signs: one thing
@@ -212,10 +196,10 @@ def _axes_named(witness: str, found: Setting, told: Setting) -> str:
     differ = []
     if order != told_order:
         differ.append(f'slopes.order = "{order}" ("{told_order}" told)')
-    flips = [name for name in _FLIPS if getattr(axes, name) != getattr(told_axes, name)]
+    flips = [name for name in FLIPS if getattr(axes, name) != getattr(told_axes, name)]
     differ += [f"orientation.{name} = {str(getattr(axes, name)).lower()}" for name in flips]
     if (axes.sign_x, axes.sign_y) != (told_axes.sign_x, told_axes.sign_y):
-        differ.append(f"orientation.{_sign_written(axes)} ({_sign_written(told_axes)} told)")
+        differ.append(f"orientation.{sign_written(axes)} ({sign_written(told_axes)} told)")
     other = "slopes have the other sign" if _only_the_sign(found, told) else "slopes lie otherwise"
     return (
         f"{other} than the instrument file says: {', '.join(differ)} by {witness}. Write "
@@ -227,12 +211,6 @@ def _only_the_sign(found: Setting, told: Setting) -> bool:
     (order, axes), (told_order, told_axes) = found, told
     turned = replace(told_axes, sign_x=-told_axes.sign_x, sign_y=-told_axes.sign_y)
     return order == told_order and axes == turned
-
-
-def _sign_written(axes: Orientation) -> str:
-    if axes.sign_x == axes.sign_y:
-        return f"sign = {axes.sign_x}"
-    return f"sign = [{axes.sign_x}, {axes.sign_y}]"
 
 
 def _unit_of_matrix(ratio: float, *, double_pass: bool) -> str:
@@ -255,10 +233,9 @@ def _unit_of_matrix(ratio: float, *, double_pass: bool) -> str:
 
 def _unit_named(ratio: float) -> str:
     """Return which unit of commands makes them answer so many times as metres of OPD would."""
-    exponent = np.log10(ratio)
-    name = min(UNITS, key=lambda unit: abs(np.log10(UNITS[unit]) - exponent))
-    if abs(np.log10(UNITS[name]) - exponent) < _UNIT_DECADES:
-        return f"commands look like {name}; metres of OPD are expected"
+    unit = unit_like(1.0 / max(ratio, 1e-30), _UNIT_DECADES)
+    if unit:
+        return f"commands look like {unit}; metres of OPD are expected"
     return "commands are in another unit than metres of OPD, or decoded wrongly"
 
 

@@ -24,13 +24,15 @@ from service.fit.reference import Reference, Target, oriented, target_of
 from service.fit.solver import vertex
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, rotation, rtc_valid_subapertures
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Misregistration, wrapped
 from service.model.modes import Basis
 from service.model.pyramid import Mapper
 from service.model.slopes import Orientation, SlopeOrder, turned_mask
 
 Array = NDArray[np.float64]
 Setting = tuple[SlopeOrder, Orientation]
+
+FLIPS = ("swap_xy", "flip_x", "flip_y")
 
 SAMPLING = 1
 """Pupil points per subaperture: enough for shapes this smooth."""
@@ -67,15 +69,28 @@ class Pose:
         """Flips and swaps of the axes."""
         return self.orientation.flip_x + self.orientation.flip_y + self.orientation.swap_xy
 
+    @property
+    def setting(self) -> Setting:
+        """Order and orientation of the slopes."""
+        return self.order, self.orientation
+
     def told(self) -> str:
         """Return it in the words of the instrument file."""
-        axes = self.orientation
-        flags = [
-            f"{name} = true" for name in ("swap_xy", "flip_x", "flip_y") if getattr(axes, name)
-        ]
-        sign = f"sign = [{axes.sign_x}, {axes.sign_y}]"
-        turned = np.rad2deg(self.rotation_rad)
-        return f'order = "{self.order}", {{ {", ".join([*flags, sign])} }} at {turned:.0f} deg'
+        return f"{setting_written(self.setting)} at {np.rad2deg(self.rotation_rad):.0f} deg"
+
+
+def setting_written(setting: Setting) -> str:
+    """Return an order and an orientation as the instrument file says them."""
+    order, axes = setting
+    flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
+    return f'order = "{order}", orientation = {{ {", ".join([*flags, sign_written(axes)])} }}'
+
+
+def sign_written(axes: Orientation) -> str:
+    """Return the signs of an orientation as the instrument file says them."""
+    if axes.sign_x == axes.sign_y:
+        return f"sign = {axes.sign_x}"
+    return f"sign = [{axes.sign_x}, {axes.sign_y}]"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,7 +199,7 @@ def _judged(poses: list[Pose], nominal_rad: float | None) -> Search:
 
     def preference(pose: Pose) -> tuple[float, float]:
         if nominal_rad is not None:
-            return abs(_wrapped(pose.rotation_rad - nominal_rad)), pose.n_changes
+            return abs(wrapped(pose.rotation_rad - nominal_rad)), pose.n_changes
         return pose.n_changes, abs(pose.rotation_rad)
 
     classes: dict[object, list[Pose]] = {}
@@ -193,10 +208,6 @@ def _judged(poses: list[Pose], nominal_rad: float | None) -> Search:
     chosen = min(classes.pop(leader.turned_class), key=preference)
     ties = tuple(min(others, key=preference) for others in classes.values())
     return Search(best=chosen, ties=ties)
-
-
-def _wrapped(angle_rad: float) -> float:
-    return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -241,6 +252,6 @@ class _Turned:
         return Pose(
             order=order,
             orientation=orientation,
-            rotation_rad=_wrapped(float(angle)),
+            rotation_rad=wrapped(float(angle)),
             correlation=float(at),
         )

@@ -12,6 +12,7 @@ from service.errors import MatrixError
 from service.fit.solver import Columns
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
+from service.model.misregistration import unit_like
 from service.model.slopes import Orientation, SlopeOrder, to_conventions
 
 Array = NDArray[Any]
@@ -170,10 +171,7 @@ def _check_unit(matrix: Array, wavelength_m: float) -> None:
     typical = float(np.median(np.sqrt(np.mean(matrix**2, axis=0)))) * wavelength_m
     if PLAUSIBLE < typical < 1.0 / PLAUSIBLE:
         return
-    distance = {"nanometre": np.log10(typical) + 9, "micrometre": np.log10(typical) + 6}
-    unit = min(distance, key=lambda name: abs(distance[name]))
-    if abs(distance[unit]) > _UNIT_DECADES:
-        unit = ""
+    unit = unit_like(1.0 / typical, _UNIT_DECADES).removesuffix("s")
     hint = f": it looks like slope per {unit}" if unit else ""
     raise MatrixError(
         f"reference: found {typical / wavelength_m:.3g} as the typical slope per metre{hint}; "

@@ -19,6 +19,21 @@ BOUNDARY_SCALE = np.array([1.0, 1.0, 180.0 / np.pi, 1.0])
 COVARIANCE_SCALE = np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)
 """The same for a covariance."""
 
+METRE_DECADES = {"nanometres": 9, "micrometres": 6, "millimetres": 3}
+"""Powers of ten by which numbers in these units are too large."""
+
+
+def unit_like(too_large: float, within_decades: float) -> str:
+    """Return in which unit numbers would be so many times too large; empty: in none of them."""
+    decades = np.log10(too_large)
+    unit = min(METRE_DECADES, key=lambda unit: abs(METRE_DECADES[unit] - decades))
+    return unit if abs(METRE_DECADES[unit] - decades) < within_decades else ""
+
+
+def wrapped(angle_rad: float) -> float:
+    """Return the angle in -pi..pi."""
+    return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Misregistration:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.archive.products import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
-from service.fit.dialect import setting_written
+from service.fit.orientation import setting_written
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort

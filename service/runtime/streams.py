@@ -274,31 +274,31 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     rtc = streams.rtc
     if rtc is None or block.session != rtc.session or not _fits(rtc, block):
         return streams, []
-    end_ns = block.t0_ns_utc + (block.n_frames - 1) * block.dt_ns
-    streams = replace(streams, heard_ns_utc=end_ns)
-    terms = _terms(streams, block.cm_id)
+    terms, check, law = _terms(streams, block.cm_id), streams.check, streams.law
     if terms is not None:
-        check = loopcheck.observe(streams.check, block, terms)
-        streams = replace(streams, check=check, law=loopcheck.follow(streams.law, block, terms))
-    streams = _listening(streams, rtc, block)
-    streams, ended = _dithered(streams, rtc, block)
+        check, law = loopcheck.observe(check, block, terms), loopcheck.follow(law, block, terms)
+    vibrations, sums, edge = streams.vibrations, streams.passive, streams.edge
+    if vibrations is not None and sums is not None and len(streams.in_loop):
+        lines = () if streams.dither is None else streams.dither.frequency_hz
+        vibrations = vibrations.update(block, lines)
+        sums = passive.accumulate(sums, _moving(streams, block))
+    health = observe(streams.health, block, streams.description.mode_variance_m2, streams.in_loop)
+    if streams.edge_watch is not None and not health.absurd:
+        edge = observe_edge(edge, block, streams.edge_watch)
+    streams = replace(
+        streams,
+        heard_ns_utc=block.next_t_ns - block.dt_ns,
+        check=check,
+        law=law,
+        vibrations=vibrations,
+        passive=sums,
+        health=health,
+        edge=edge,
+    )
+    streams, ended = _dithered(_listening(streams, rtc, block), rtc, block)
     if ended:
         streams = replace(streams, loop=rtc)  # the next one begins with the gains of now
-    windows = [_obeying(streams, window) for window in ended]
-    if streams.vibrations is not None and len(streams.in_loop):
-        lines = () if streams.dither is None else streams.dither.frequency_hz
-        streams = replace(streams, vibrations=streams.vibrations.update(block, lines))
-    if streams.passive is not None and len(streams.in_loop):
-        streams = replace(
-            streams, passive=passive.accumulate(streams.passive, _moving(streams, block))
-        )
-    variance = streams.description.mode_variance_m2
-    health = observe(streams.health, block, variance, streams.in_loop)
-    streams = replace(streams, health=health)
-    if streams.edge_watch is not None and not health.absurd:
-        edge = observe_edge(streams.edge, block, streams.edge_watch)
-        streams = replace(streams, edge=edge)
-    return streams, windows
+    return streams, [_obeying(streams, window) for window in ended]
 
 
 def _moving(streams: Streams, block: FrameBlock) -> FrameBlock:
@@ -369,7 +369,7 @@ def _beyond_the_dither(streams: Streams, rtc: RtcView, reading: LockIn | RandomD
 
 def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:
     """Note whether a block holds the dither that should be there."""
-    dither, next_seq = streams.dither, block.first_seq + block.n_frames
+    dither, next_seq = streams.dither, block.next_seq
     if streams.meter is not None:
         meter, found = measured(streams.meter, block)
         streams = replace(streams, meter=meter, played=found or streams.played)

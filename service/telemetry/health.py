@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from service.model.misregistration import unit_like
 from service.telemetry.frames import FrameBlock
 
 Array = NDArray[Any]
@@ -34,8 +35,6 @@ CALM_RATIO = 5.0
 
 ABSURD_RATIO = 1e4
 """Times the expected turbulence that no mirror reaches: commands are in another unit."""
-
-_DECADES = {9: "nanometres", 6: "micrometres"}
 
 _MEMORY_S = 0.5
 
@@ -54,11 +53,10 @@ class LoopHealth:
     @property
     def unit(self) -> str:
         """What the unit of absurd commands looks like."""
-        decades = np.log10(max(self.ratio, 1.0))
-        nearest = min(_DECADES, key=lambda decade: abs(decade - decades))
-        if abs(nearest - decades) > 2.0:
+        unit = unit_like(max(self.ratio, 1.0), 2.1)
+        if not unit:
             return "they are in another unit than metres of OPD, or decoded wrongly"
-        return f"they look like {_DECADES[nearest]}, metres of OPD are expected"
+        return f"they look like {unit}, metres of OPD are expected"
 
 
 def observe(

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.misregistration import unit_like
 from service.telemetry.frames import ClosedLoop, FrameBlock, joined_frames
 
 Array = NDArray[Any]
@@ -489,12 +490,9 @@ def _hint(gain: float) -> str:
     """Return what a gain that no loop has looks like."""
     if gain < 0.0:
         return ": slopes or commands have the other sign than the matrix that the RTC names"
-    decades = np.log10(gain)
-    for decade, unit in ((9, "nanometres"), (6, "micrometres"), (3, "millimetres")):
-        if abs(abs(decades) - decade) < 1.0:
-            whose = "commands" if decades > 0 else "the matrix's commands"
-            return f": {whose} look like {unit}, metres of OPD are expected"
-    return ""
+    unit = unit_like(max(gain, 1.0 / max(gain, 1e-30)), 1.0)
+    whose = "commands" if gain > 1.0 else "the matrix's commands"
+    return f": {whose} look like {unit}, metres of OPD are expected" if unit else ""
 
 
 def _begun(law: LoopLaw, cm_id: str | None, loop: ClosedLoop) -> LoopLaw:

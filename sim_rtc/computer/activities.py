@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, LoopRequest
-from sim_rtc.computer.gains import Tuning
+from sim_rtc.computer.gains import GainRamp
 from sim_rtc.computer.measure import Measured, Measurement
 from sim_rtc.computer.telemetry import Batch, DitherLimits, LoopSettings
 
@@ -34,7 +34,7 @@ class Activities:
         self._closes_again = False
         self.ended: deque[Measured] = deque(maxlen=_MOST_ENDED)
         """Measurements that have ended, for whoever sends them."""
-        self._tuning: Tuning | None = None
+        self._ramp: GainRamp | None = None
         self.late_dither_frames = 0
         """After the announced frame, that dithers to come really begin."""
 
@@ -52,8 +52,8 @@ class Activities:
 
     def in_the_loops_way(self) -> str:
         """Return what needs the loop as it is, in the wire's words; empty: nothing."""
-        if self._tuning is not None:
-            return f"busy: gain ramp {self._tuning.name} is under way; open the loop to end it"
+        if self._ramp is not None:
+            return f"busy: gain ramp {self._ramp.name} is under way; open the loop to end it"
         return self._measuring()
 
     def forbids(self, request: LoopRequest) -> str:
@@ -95,18 +95,18 @@ class Activities:
         """Let a measurement begin at its frame; the loop may have to be closed after it."""
         self._measurement, self._closes_again = measurement, closes_again
 
-    def begin_ramp(self, tuning: Tuning, settings: LoopSettings) -> LoopSettings:
+    def begin_ramp(self, ramp: GainRamp, settings: LoopSettings) -> LoopSettings:
         """Let a gain ramp begin; return the settings that it asks for."""
-        self._tuning = tuning
-        return replace(settings, gains=tuning.gains)
+        self._ramp = ramp
+        return replace(settings, gains=ramp.gains)
 
     def end_ramp(self, settings: LoopSettings, reason: str) -> LoopSettings:
         """Give up the ramp, if any; return settings with what it has chosen so far."""
-        tuning, self._tuning = self._tuning, None
-        if tuning is None:
+        ramp, self._ramp = self._ramp, None
+        if ramp is None:
             return settings
-        tuning.give_up(reason)
-        return replace(settings, gains=tuning.settled)
+        ramp.give_up(reason)
+        return replace(settings, gains=ramp.settled)
 
     def end_all(self, settings: LoopSettings, session: str) -> LoopSettings:
         """End everything, for the loop starts over; return the settings that are left."""
@@ -143,11 +143,11 @@ class Activities:
             if batch.seq0 + len(batch.slopes) >= measuring.stop_seq:
                 self._end_measurement(batch.session)
                 settings = replace(settings, closed=settings.closed or self._closes_again)
-        tuning = self._tuning
-        if tuning is not None and batch.closed and tuning.look(batch, matrix):
-            settings = replace(settings, gains=tuning.gains)
-            if tuning.done:
-                self._tuning = None
+        ramp = self._ramp
+        if ramp is not None and batch.closed and ramp.look(batch, matrix):
+            settings = replace(settings, gains=ramp.gains)
+            if ramp.done:
+                self._ramp = None
         return settings
 
 

@@ -26,7 +26,7 @@ from service.wire import (
 )
 from sim_rtc.computer.activities import Activities, refusal
 from sim_rtc.computer.feed import BATCH_FRAMES, Block
-from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, Plan, Tuning, ramp_refusal
+from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, Plan, ramp_refusal
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.computer.measure import Measured, MeasurementRules
 from sim_rtc.computer.reconstructors import Terms
@@ -239,12 +239,9 @@ class RealTimeComputer:
                 frame_rate_hz=settings.frame_rate_hz,
                 step_s=step_s,
             )
-            tuning = Tuning(
-                GainRamp(settings.gains, plan),
-                name="start",
-                wait_frames=round(_START_S * settings.frame_rate_hz),
-            )
-            self._set(self._activities.begin_ramp(tuning, settings))
+            wait_frames = round(_START_S * settings.frame_rate_hz)
+            ramp = GainRamp(settings.gains, plan, wait_frames=wait_frames)
+            self._set(self._activities.begin_ramp(ramp, settings))
 
     def _next_rows(self) -> tuple[Block, int]:
         if self._block is None or self._row >= self._block.n_frames:
@@ -341,8 +338,8 @@ class RealTimeComputer:
             if reason:
                 return refused(request.id, reason)
             plan = Plan.asked(request, frame_rate_hz=settings.frame_rate_hz)
-            tuning = Tuning(GainRamp(settings.gains, plan), name=request.id)
-            self._set(self._activities.begin_ramp(tuning, settings))
+            ramp = GainRamp(settings.gains, plan)
+            self._set(self._activities.begin_ramp(ramp, settings))
             return accepted(request.id, self._seq)
 
     def _change_loop(self, request: LoopRequest) -> Reply:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import structlog
@@ -55,6 +55,9 @@ class Step:
 class Plan:
     """What a ramp tries."""
 
+    name: str
+    """In log and refusals: of the request, or "start"."""
+
     groups: tuple[slice, ...]
     """Modes that get one gain; those that the loop does not control are not judged."""
 
@@ -78,6 +81,7 @@ class Plan:
         *first, last = groups_of(n_controlled)
         groups = (*first, slice(last.start, len(gains)))
         return cls(
+            name="start",
             groups=groups,
             gains=tuple(
                 tuple(min(gains[group.start] * factor, LARGEST_GAIN) for factor in FACTORS)
@@ -92,6 +96,7 @@ class Plan:
         """Return the ramp of a request: what settles is part of its frames, at most half."""
         settling = min(round(_SETTLING_S * frame_rate_hz), request.frames_per_gain // 2)
         return cls(
+            name=request.id,
             groups=tuple(slice(first, last + 1) for first, last in request.groups),
             gains=(request.gains,) * len(request.groups),
             settling_frames=settling,
@@ -114,16 +119,23 @@ def by_group(gains: tuple[float, ...], n_modes: int) -> tuple[float, ...]:
 
 
 class GainRamp:
-    """The ramp itself: told the residual, it says which gains are to be tried next."""
+    """The ramp itself: shown a closed loop, it says which gains are to be tried next."""
 
-    def __init__(self, gains: tuple[float, ...], plan: Plan) -> None:
-        """Take the gains as they are, one per mode of the basis."""
+    def __init__(self, gains: tuple[float, ...], plan: Plan, *, wait_frames: int = 0) -> None:
+        """Take the gains as they are, one per mode, and the frames after which it begins."""
         self._settled = np.array(gains)
         self._plan = plan
+        self._wait_frames = wait_frames
+        self._loop: tuple[str, bool] | None = None
         self._group = 0
         self.steps: tuple[Step, ...] = ()
         """Every gain tried so far, in order."""
         self._begin_group()
+
+    @property
+    def name(self) -> str:
+        """Of the request, or of the start."""
+        return self._plan.name
 
     @property
     def done(self) -> bool:
@@ -144,7 +156,7 @@ class GainRamp:
     def gains(self) -> tuple[float, ...]:
         """One per mode: what is to be in force now, and once done what was chosen."""
         gains = self._settled.copy()
-        if not self.done:
+        if not self.done and self._wait_frames <= 0:
             gains[self.modes] = self._waiting[0]
         return tuple(gains.tolist())
 
@@ -153,6 +165,22 @@ class GainRamp:
         """The same, one per group."""
         gains = self.gains
         return tuple(gains[group.start] for group in self._plan.groups)
+
+    def look(self, batch: Batch, matrix: Array32) -> bool:
+        """Take a batch and the matrix that multiplied its slopes; return whether gains change.
+
+        Another matrix, or a dither that begins or ends, makes another loop: what the group under
+        way has shown by then counts no more.
+        """
+        loop = (batch.cm_id, batch.dither_m is None)
+        known, self._loop = self._loop in {None, loop}, loop
+        if self._wait_frames > 0:
+            self._wait_frames -= len(batch.slopes)
+            return self._wait_frames <= 0
+        if not known:
+            self.again()
+            return True
+        return self.take(batch.slopes @ matrix[self.modes].T)
 
     def take(self, residual_m: Array32) -> bool:
         """Take the residual of the group's modes ``(n_frames, n_group)`` in the next frames.
@@ -171,6 +199,7 @@ class GainRamp:
         if self._frames < settling + self._plan.judged_frames:
             return False
         self._judge()
+        self._tell()
         return True
 
     def again(self) -> None:
@@ -178,6 +207,23 @@ class GainRamp:
         if not self.done:
             self.steps = tuple(step for step in self.steps if step.group != self._group)
             self._begin_group()
+
+    def give_up(self, reason: str) -> None:
+        """Tell the log why it ends before its time."""
+        _log.warning("gains.given-up", ramp=self.name, reason=reason)
+
+    def _tell(self) -> None:
+        step = self.steps[-1]
+        _log.info(
+            "gains.step",
+            ramp=self.name,
+            group=step.group,
+            gain=round(step.gain, 3),
+            residual_nm=round(1e9 * step.residual_m, 2),
+        )
+        if self.done:
+            chosen = [round(gain, 3) for gain in self.gains_by_group]
+            _log.info("gains.chosen", ramp=self.name, by_group=chosen)
 
     def _judge(self) -> None:
         residual_m = float(np.sqrt(self._power / self._judged)) if self._judged else np.inf
@@ -199,68 +245,6 @@ class GainRamp:
 
     def _begin_step(self, waiting: tuple[float, ...]) -> None:
         self._waiting, self._frames, self._power, self._judged = waiting, 0, 0.0, 0
-
-
-class Tuning:
-    """Shows a ramp the batches of a closed loop, and tells the log what it makes of them."""
-
-    def __init__(self, ramp: GainRamp, *, name: str, wait_frames: int = 0) -> None:
-        """Take a ramp, and the frames of closed loop after which it begins."""
-        self.name = name
-        self._ramp = ramp
-        self._wait_frames = wait_frames
-        self._loop: tuple[str, bool] | None = None
-
-    @property
-    def done(self) -> bool:
-        """Whether there is nothing left to try."""
-        return self._ramp.done
-
-    @property
-    def gains(self) -> tuple[float, ...]:
-        """One per mode of the basis: what is to be in force now."""
-        return self._ramp.settled if self._wait_frames > 0 else self._ramp.gains
-
-    @property
-    def settled(self) -> tuple[float, ...]:
-        """One per mode of the basis: what is to be in force if the ramp ends here."""
-        return self._ramp.settled
-
-    def look(self, batch: Batch, matrix: NDArray[Any]) -> bool:
-        """Take a batch and the matrix that multiplied its slopes; return whether gains change.
-
-        Another matrix, or a dither that begins or ends, makes another loop: what the group under
-        way has shown by then counts no more.
-        """
-        loop = (batch.cm_id, batch.dither_m is None)
-        known, self._loop = self._loop in {None, loop}, loop
-        if self._wait_frames > 0:
-            self._wait_frames -= len(batch.slopes)
-            return self._wait_frames <= 0
-        if not known:
-            self._ramp.again()
-            return True
-        if not self._ramp.take(batch.slopes @ matrix[self._ramp.modes].T):
-            return False
-        self._tell()
-        return True
-
-    def give_up(self, reason: str) -> None:
-        """Tell the log why it ends before its time."""
-        _log.warning("gains.given-up", ramp=self.name, reason=reason)
-
-    def _tell(self) -> None:
-        step = self._ramp.steps[-1]
-        _log.info(
-            "gains.step",
-            ramp=self.name,
-            group=step.group,
-            gain=round(step.gain, 3),
-            residual_nm=round(1e9 * step.residual_m, 2),
-        )
-        if self.done:
-            chosen = [round(gain, 3) for gain in self._ramp.gains_by_group]
-            _log.info("gains.chosen", ramp=self.name, by_group=chosen)
 
 
 def ramp_refusal(request: RampRequest, settings: LoopSettings, n_controlled: int) -> str:

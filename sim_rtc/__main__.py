@@ -106,7 +106,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
             computer.ramp_up(options.gain_ramp_s)
         watch = Watch(computer, pace, link, options)
         n_batches = 0
-        _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.snapshot().session)
+        _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.session)
         while not stopped.is_set() and n_batches < last_batch:
             pace.wait(stopped)
             computer_faults.before_batch(n_batches * batch_frames / options.frame_rate_hz, stopped)
@@ -160,7 +160,7 @@ class Watch:
         _log.info(
             "loop.report",
             frames=self._seq,
-            cm_id=self._computer.snapshot().reconstructor.manifest.id,
+            cm_id=self._computer.reconstructor.manifest.id,
             cpu_per_second=round((cpu_s - self._cpu_s) / elapsed_s, 3),
             overrun_frames=self._pace.late_frames - self._late,
             unpublished_frames=self._link.n_dropped_frames,

@@ -19,7 +19,7 @@ from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
 from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.reconstructors import identity_of, initial_reconstructor
-from sim_rtc.computer.telemetry import DitherLimits, Identity, LoopSettings, Reconstructor
+from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
 from sim_rtc.options import Options
 from sim_rtc.telescope.atmosphere import fried_parameter_m, frozen_layers
 from sim_rtc.telescope.detector import Detector, PixelDetector, binned
@@ -72,7 +72,6 @@ class Telescope:
             reconstructor=self.reconstructor,
             optics=self.optics.at(0.0),
             stroke_m=STROKE_M,
-            limits=DitherLimits(most_modes=len(self.settings.gains)),
             mode_to_actuator=self.mode_to_actuator,
             drive=self.drive,
         )

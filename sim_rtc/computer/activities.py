@@ -14,10 +14,15 @@ from numpy.typing import NDArray
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, LoopRequest
 from sim_rtc.computer.gains import GainRamp
 from sim_rtc.computer.measure import Measured, Measurement
-from sim_rtc.computer.telemetry import Batch, DitherLimits, LoopSettings
+from sim_rtc.computer.telemetry import Batch, LoopSettings
 
 Array32 = NDArray[np.float32]
 
+
+LARGEST_DITHER_M = 50e-9
+"""RMS of one mode, metres OPD."""
+
+_LONGEST_DITHER_S = 3600.0
 
 _MOST_ENDED = 4
 """Ended measurements kept for whoever sends them."""
@@ -198,20 +203,15 @@ class Dither:
         return np.asarray(self._amplitude_m * np.sqrt(2.0) * np.sin(phase))
 
 
-def refusal(
-    request: DitherRequest, limits: DitherLimits, *, n_modes: int, frame_rate_hz: float
-) -> str:
+def refusal(request: DitherRequest, *, n_modes: int, frame_rate_hz: float) -> str:
     """Return why a dither cannot be played, in the wire's words; empty: it can."""
-    modes, amplitude_m = request.modes, request.amplitude_m
-    if max(modes) >= n_modes:
-        return f"range: mode {max(modes)}, expected 0 to {n_modes - 1}"
-    if len(modes) > limits.most_modes:
-        return f"range: {len(modes)} modes, expected at most {limits.most_modes}"
-    if max(amplitude_m) > limits.largest_m:
-        return f"range: amplitude_m {max(amplitude_m):.3g}, expected at most {limits.largest_m:.3g}"
-    highest = max(request.frequency_hz or (), default=0.0)
-    if highest >= frame_rate_hz / 2:
-        return f"range: frequency_hz {highest:g}, expected below {frame_rate_hz / 2:g}"
-    if request.duration_s > limits.longest_s:
-        return f"range: duration_s {request.duration_s:g}, expected at most {limits.longest_s:g}"
+    largest_m, highest_hz = max(request.amplitude_m), max(request.frequency_hz or (0.0,))
+    if max(request.modes) >= n_modes:
+        return f"range: mode {max(request.modes)}, expected 0 to {n_modes - 1}"
+    if largest_m > LARGEST_DITHER_M:
+        return f"range: amplitude_m {largest_m:.3g}, expected at most {LARGEST_DITHER_M:.3g}"
+    if highest_hz >= frame_rate_hz / 2:
+        return f"range: frequency_hz {highest_hz:g}, expected below {frame_rate_hz / 2:g}"
+    if request.duration_s > _LONGEST_DITHER_S:
+        return f"range: duration_s {request.duration_s:g}, expected at most {_LONGEST_DITHER_S:g}"
     return ""

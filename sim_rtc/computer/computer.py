@@ -23,8 +23,9 @@ from service.wire import (
     MeasureRequest,
     RampRequest,
     Reply,
+    Status,
 )
-from sim_rtc.computer.activities import Activities, refusal
+from sim_rtc.computer.activities import LARGEST_DITHER_M, Activities, refusal
 from sim_rtc.computer.feed import BATCH_FRAMES, Block
 from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, Plan, ramp_refusal
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
@@ -32,11 +33,9 @@ from sim_rtc.computer.measure import Measured, MeasurementRules
 from sim_rtc.computer.reconstructors import Terms
 from sim_rtc.computer.telemetry import (
     Batch,
-    DitherLimits,
     Identity,
     LoopSettings,
     Reconstructor,
-    Snapshot,
     new_session,
 )
 from sim_rtc.telescope.mirror import MirrorDrive
@@ -70,14 +69,12 @@ class RealTimeComputer:
         reconstructor: Reconstructor,
         optics: Optics,
         stroke_m: float,
-        limits: DitherLimits,
         drive: MirrorDrive | None = None,
         mode_to_actuator: NDArray[np.float64] | None = None,
     ) -> None:
         self._blocks = blocks
         self.identity = identity
         self._settings = settings
-        self._limits = limits
         self._n_slopes, self._n_modes = optics.n_slopes, optics.opd_per_command.shape[1]
         self._loop = ModalLoop(
             n_modes=self._n_modes,
@@ -200,19 +197,50 @@ class RealTimeComputer:
         """Bytes of a matrix for all modes."""
         return int(4 * self._n_modes * self._n_slopes)
 
-    def snapshot(self) -> Snapshot:
-        """Return what a status message tells."""
+    @property
+    def session(self) -> str:
+        """Of the frames to come."""
+        return self._session
+
+    @property
+    def settings(self) -> LoopSettings:
+        """How the loop is run now."""
+        return self._settings
+
+    @property
+    def reconstructor(self) -> Reconstructor:
+        """What multiplies the slopes now."""
+        return self._active
+
+    @property
+    def images(self) -> NDArray[np.float64]:
+        """``(2, n, 2, n)`` share of the light in every pixel."""
+        return self._optics.images
+
+    def status(self) -> Status:
+        """Return what the computer knows of itself; time, light and pointing are not its own."""
         with self._lock:
-            return Snapshot(
+            settings = self._settings
+            return Status(
                 session=self._session,
                 seq=max(self._seq - 1, 0),
-                settings=self._settings,
+                t_ns=0,
                 loop=self._loop_state(),
+                frame_rate_hz=settings.frame_rate_hz,
+                delay_frames=float(settings.delay_frames),
                 gains=self._effective_gains(),
-                reconstructor=self._active,
+                leak=settings.leak,
+                n_slopes=self._n_slopes,
+                n_modes=self._n_modes,
+                n_controlled=len(self._active.matrix),
+                cm_id=self._active.manifest.id,
+                basis_id=self.identity.basis_id,
+                config_id=self.identity.config_id,
                 dither=self._activities.dither,
-                limits=self._limits,
-                images=self._optics.images,
+                max_dither_m=LARGEST_DITHER_M,
+                max_dither_modes=self._n_modes,
+                magnitude=None,
+                flux=None,
             )
 
     def execute(self, command: Command) -> Reply:
@@ -294,7 +322,7 @@ class RealTimeComputer:
 
     def _start_dither(self, request: DitherRequest) -> Reply:
         rate_hz = self._settings.frame_rate_hz
-        reason = refusal(request, self._limits, n_modes=self._n_modes, frame_rate_hz=rate_hz)
+        reason = refusal(request, n_modes=self._n_modes, frame_rate_hz=rate_hz)
         with self._lock:
             reason = reason or self._activities.on_the_mirror()
             if reason:

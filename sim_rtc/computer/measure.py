@@ -32,19 +32,11 @@ from sim_rtc.computer.telemetry import Identity
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
+_LARGEST_M = 200e-9
+"""RMS of one mode's stroke, metres OPD."""
+
 _LINE_SPACING = 4.0
 """Least distance of two tones, in frequency bins: a Hann window's main lobe."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MeasureLimits:
-    """What the RTC accepts."""
-
-    largest_m: float = 200e-9
-    """RMS of one mode's stroke, metres OPD."""
-
-    longest_s: float = 1200.0
-    """Duration of the whole measurement, seconds."""
 
 
 class Measurement:
@@ -114,7 +106,8 @@ class MeasurementRules:
     mode_to_actuator: Array | None = None
     """``(n_actuators, n_modes)``; None: the mirror takes modes only."""
 
-    limits: MeasureLimits = MeasureLimits()
+    longest_s: float = 1200.0
+    """Duration of the whole measurement, seconds."""
 
     def refusal(self, request: MeasureRequest, n_controlled: int | None = None) -> str:
         """Return why a matrix cannot be measured so, in the wire's words; empty: it can.
@@ -124,10 +117,8 @@ class MeasurementRules:
         if max(request.modes) >= self.n_modes:
             return f"range: mode {max(request.modes)}, expected 0 to {self.n_modes - 1}"
         largest_m = max(request.amplitude_m)
-        if largest_m > self.limits.largest_m:
-            return (
-                f"range: amplitude_m {largest_m:.3g}, expected at most {self.limits.largest_m:.3g}"
-            )
+        if largest_m > _LARGEST_M:
+            return f"range: amplitude_m {largest_m:.3g}, expected at most {_LARGEST_M:.3g}"
         if request.pattern is Pattern.PUSH_PULL_ZONAL:
             reason = self._zonal_refusal(request)
         elif request.pattern is Pattern.SINE:
@@ -205,12 +196,9 @@ class MeasurementRules:
 
     def _length_refusal(self, request: MeasureRequest) -> str:
         duration_s = self._n_frames(request) / self.frame_rate_hz
-        if duration_s <= self.limits.longest_s:
+        if duration_s <= self.longest_s:
             return ""
-        return (
-            f"range: this would take {duration_s:.0f} s, expected at most "
-            f"{self.limits.longest_s:g} s"
-        )
+        return f"range: this would take {duration_s:.0f} s, expected at most {self.longest_s:g} s"
 
     def _n_frames(self, request: MeasureRequest) -> int:
         if request.pattern is Pattern.SINE:

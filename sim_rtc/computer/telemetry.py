@@ -5,13 +5,12 @@ from __future__ import annotations
 import threading
 import time
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.wire import DitherStatus, FrameHeader, Loop, Manifest, PointingStatus, Status
-from sim_rtc.telescope.detector import Detector
+from service.wire import FrameHeader, Manifest, Status
 from sim_rtc.telescope.plant import Optics
 
 Array32 = NDArray[np.float32]
@@ -45,20 +44,6 @@ class Identity:
     config_id: str
     double_pass: bool = False
     """Whether the light sees the mirror twice, as with a retro-reflector by day."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DitherLimits:
-    """What the RTC accepts."""
-
-    largest_m: float = 50e-9
-    """RMS of one mode, metres OPD."""
-
-    most_modes: int = 594
-    """Modes dithered at once."""
-
-    longest_s: float = 3600.0
-    """Duration, seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,26 +85,6 @@ class Batch:
     """``(n_points,)`` turbulence OPD during the first frame: never on the wire."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Snapshot:
-    """What the computer says about itself."""
-
-    session: str
-    seq: int
-    """Last frame processed; -1 before the first."""
-
-    settings: LoopSettings
-    loop: Loop
-    gains: tuple[float, ...]
-    """One per mode, 0 where uncontrolled."""
-
-    reconstructor: Reconstructor
-    dither: DitherStatus | None
-    limits: DitherLimits
-    images: NDArray[np.float64]
-    """``(2, n, 2, n)`` share of the light in every pixel."""
-
-
 def new_session() -> str:
     """Return a name no other session has."""
     return uuid.uuid4().hex[:16]
@@ -148,43 +113,6 @@ def frames_of(
     return header, np.hstack(columns)
 
 
-def status_of(
-    snapshot: Snapshot,
-    *,
-    identity: Identity,
-    clock: FrameClock,
-    detector: Detector,
-    magnitude: float,
-    basis_id: str,
-    pointing: PointingStatus | None = None,
-) -> Status:
-    """Return the status; ``basis_id`` is the one to be named, which a fault may have changed."""
-    settings, manifest = snapshot.settings, snapshot.reconstructor.manifest
-    n_controlled, n_slopes = manifest.layout.shape
-    return Status(
-        session=snapshot.session,
-        seq=snapshot.seq,
-        t_ns=clock.end_of_exposure_ns(snapshot.seq),
-        loop=snapshot.loop,
-        frame_rate_hz=settings.frame_rate_hz,
-        delay_frames=float(settings.delay_frames),
-        gains=snapshot.gains,
-        leak=settings.leak,
-        n_slopes=n_slopes,
-        n_modes=len(snapshot.gains),
-        n_controlled=n_controlled,
-        cm_id=manifest.id,
-        basis_id=basis_id,
-        config_id=identity.config_id,
-        dither=snapshot.dither,
-        max_dither_m=snapshot.limits.largest_m,
-        max_dither_modes=snapshot.limits.most_modes,
-        magnitude=magnitude,
-        flux=detector.counts(snapshot.images).astype("<f4").tobytes(),
-        pointing=pointing,
-    )
-
-
 @dataclass(slots=True, kw_only=True)
 class FrameClock:
     """Timestamps of the frames: they follow the sequence, never the machine's clock.
@@ -201,6 +129,10 @@ class FrameClock:
     def end_of_exposure_ns(self, seq: int) -> int:
         """Return the end of exposure of frame ``seq``, nanoseconds since the Unix epoch, UTC."""
         return self.start_ns_utc + (seq + 1) * self.dt_ns
+
+    def stamped(self, status: Status) -> Status:
+        """Return a status with the time of its last frame."""
+        return replace(status, t_ns=self.end_of_exposure_ns(status.seq or 0))
 
     def step(self, by_ns: int) -> None:
         """Let all frames to come be later by this much."""

@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import structlog
@@ -24,7 +24,7 @@ from typing_extensions import override
 from service.wire import Encodings, Keys, Role, encode_manifest, encode_status, split
 from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import Background
-from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of, status_of
+from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of
 from sim_rtc.faults import FaultPlan, WireFaults
 from sim_rtc.link.matrices import Matrices
 from sim_rtc.link.record import Kind, Recorder
@@ -205,7 +205,7 @@ class Link(Background):
         if self._recorder is None or cm_id == self._recorded_cm_id:
             return
         self._recorded_cm_id = cm_id
-        active = self._computer.snapshot().reconstructor
+        active = self._computer.reconstructor
         matrix = b"".join(split(active.matrix, active.manifest.layout.chunk_bytes))
         self._record(Kind.MATRIX, matrix, encode_manifest(active.manifest))
 
@@ -221,14 +221,13 @@ class Link(Background):
 
     def _status(self) -> bytes:
         time_s = self._plan.now_s
+        status = self._clock.stamped(self._computer.status())
         return encode_status(
-            status_of(
-                self._computer.snapshot(),
-                identity=self._computer.identity,
-                clock=self._clock,
-                detector=self._detector,
+            replace(
+                status,
+                basis_id=self._faults.basis_id(status.basis_id, time_s),
                 magnitude=self._magnitude,
-                basis_id=self._faults.basis_id(self._computer.identity.basis_id, time_s),
+                flux=self._detector.flux(self._computer.images),
                 pointing=self._elevation.at(time_s),
             )
         )

@@ -67,7 +67,7 @@ class Matrices(Background):
         self._computer = computer
         self._staging = Staging(computer.terms, limit_bytes=computer.largest_matrix_bytes)
         self._events: queue.Queue[Event] = queue.Queue(_MOST_EVENTS)
-        self._rtc_session = computer.snapshot().session
+        self._rtc_session = computer.session
         self._asked_current = False
         self._plan = plan or FaultPlan()
         self._recorder = recorder
@@ -133,7 +133,7 @@ class Matrices(Background):
 
     def _follow_session(self) -> None:
         """Void what was on its way when the computer has started a new session."""
-        current = self._computer.snapshot().session
+        current = self._computer.session
         if current != self._rtc_session:
             self._rtc_session = current
             self._staging.void()
@@ -196,7 +196,7 @@ class Matrices(Background):
         self._fetch(manifest.id, tuple(range(manifest.layout.n_chunks)))
 
     def _is_in_use(self, manifest: Manifest) -> bool:
-        active = self._computer.snapshot().reconstructor.manifest
+        active = self._computer.reconstructor.manifest
         return (active.id, active.layout.sha256) == (manifest.id, manifest.layout.sha256)
 
     def _fetch(self, matrix_id: str, chunks: tuple[int, ...]) -> None:

@@ -59,7 +59,7 @@ class Replies:
         return reply
 
     def _applied(self) -> tuple[bytes, list[bytes]]:
-        active = self._computer.snapshot().reconstructor
+        active = self._computer.reconstructor
         chunks = split(active.matrix, active.manifest.layout.chunk_bytes)
         return encode_manifest(active.manifest), chunks
 

@@ -205,7 +205,7 @@ class GoldenNight(Observatory):
         """Let the RTC send the interaction matrix it measures."""
         record = self.state.measuring
         if record is not None:
-            session = self.dome.computer.snapshot().session
+            session = self.dome.computer.session
             stored = replace(
                 record,
                 state=MeasureState.STORED,
@@ -269,7 +269,7 @@ class GoldenNight(Observatory):
             optical_gain=None,
             misfit=None,
             cm_id=self.state.in_use,
-            session=self.dome.computer.snapshot().session,
+            session=self.dome.computer.session,
             created_ns_utc=self.dome.now_ns,
             sha256="0" * 64,
         )

@@ -106,7 +106,7 @@ class MistoldDome(StrangeDome):
         if case.leak is not None:
             self.computer.execute(LoopRequest(id="true-leak", leak=case.leak))
         if case.gain != 1.0:
-            gains = tuple(case.gain * gain for gain in self.computer.snapshot().gains)
+            gains = tuple(case.gain * gain for gain in self.computer.status().gains)
             self.computer.execute(LoopRequest(id="true-gain", gains=gains))
 
     @override

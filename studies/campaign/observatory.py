@@ -201,12 +201,12 @@ class Observatory:
         """Let the RTC begin again with the matrix it started the night with."""
         self.dome.restart()
         self._link.void()
-        self._hear(ev.SessionStarted(session=self.dome.computer.snapshot().session))
+        self._hear(ev.SessionStarted(session=self.dome.computer.session))
 
     def _begin(self) -> None:
         self._post(ev.Noted(name="service.ready", text="a night in simulated time"))
         self._hear(ev.Noted(name="rtc.appeared", text="the RTC is there"))
-        session = self.dome.computer.snapshot().session
+        session = self.dome.computer.session
         self._hear(ev.SessionStarted(session=session))
         self._every(self.latencies.status_s, self._hear_status)
         self._every(self.latencies.tick_s, lambda: self._post(ev.Tick()))
@@ -266,7 +266,7 @@ class Observatory:
             self._hear(answer)
 
     def _note_swap(self) -> None:
-        rtc = self.dome.computer.snapshot()
+        rtc = self.dome.computer
         matrix, optics = rtc.reconstructor.matrix, self.dome.optics
         record = self.state.reconstructor(rtc.reconstructor.manifest.id)
         swap = Swap(
@@ -276,7 +276,7 @@ class Observatory:
             n_modes=len(matrix),
             time_s=self.time_s,
             alpha=self.dome.alpha,
-            radius=true_radius(matrix, optics, rtc) if self._with_poles else None,
+            radius=true_radius(matrix, optics, rtc.settings) if self._with_poles else None,
         )
         self.swaps.append(swap)
 

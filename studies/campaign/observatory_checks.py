@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.control.gate import GateVerdict
 from service.control.loop import pole_radius
 from service.model.misregistration import Misregistration
-from sim_rtc.computer.telemetry import Snapshot
+from sim_rtc.computer.telemetry import LoopSettings
 from sim_rtc.telescope.diffractive import DiffractiveOptics
 from sim_rtc.telescope.linear import LinearOptics
 from sim_rtc.telescope.plant import Optics
@@ -111,13 +111,14 @@ def published(swap: Swap, moments: Sequence[Moment], until_s: float) -> Publicat
     )
 
 
-def true_radius(reconstructor: NDArray[np.float32], optics: Optics, rtc: Snapshot) -> float:
+def true_radius(
+    reconstructor: NDArray[np.float32], optics: Optics, settings: LoopSettings
+) -> float:
     """Return the largest pole radius of the loop of these optics, its gains and this matrix."""
     n_modes = len(reconstructor)
     coupling = reconstructor @ _response(optics, n_modes)
-    gains = np.array(rtc.settings.gains[:n_modes], np.float32)
+    gains = np.array(settings.gains[:n_modes], np.float32)
     eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
-    settings = rtc.settings
     radii = pole_radius(eigenvalues, leak=settings.leak, delay_frames=settings.delay_frames)
     return float(radii.max())
 

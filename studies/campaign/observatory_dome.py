@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -18,7 +18,7 @@ from service.telemetry.frames import FrameBlock
 from service.wire import Command, Reply, Status, decode_status, encode_status
 from sim_rtc.assembly import build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES
-from sim_rtc.computer.telemetry import Batch, FrameClock, Reconstructor, status_of
+from sim_rtc.computer.telemetry import Batch, FrameClock, Reconstructor
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.plant import Optics
 from sim_rtc.truth import WavefrontError
@@ -145,14 +145,10 @@ class Dome:
 
     def status(self) -> Status:
         """Return what the RTC says of itself, as it comes out of the wire."""
-        identity = self.computer.identity
-        status = status_of(
-            self.computer.snapshot(),
-            identity=identity,
-            clock=self._clock,
-            detector=self.telescope.detector,
+        status = replace(
+            self._clock.stamped(self.computer.status()),
             magnitude=self.magnitude,
-            basis_id=identity.basis_id,
+            flux=self.telescope.detector.flux(self.computer.images),
         )
         return decode_status(encode_status(status))
 

@@ -42,7 +42,7 @@ class ShortLink:
 
     async def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
         """Return the matrix the RTC uses."""
-        active = self._dome.computer.snapshot().reconstructor
+        active = self._dome.computer.reconstructor
         return active.manifest, active.matrix
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:

@@ -27,6 +27,7 @@ from service.wire import (
     Status,
     layout_of,
 )
+from sim_rtc.computer.activities import LARGEST_DITHER_M
 from sim_rtc.computer.telemetry import Reconstructor
 from studies.campaign.observatory_dome import Dome
 from studies.campaign.observatory_link import ShortLink
@@ -185,7 +186,7 @@ class StrangeDome(Dome):
         """Tell the RTC something and return its answer."""
         if Mischief.STRONG_DITHER in self.mischief and isinstance(command, DitherRequest):
             self._asked[command.id] = command
-            most_m = self.computer.snapshot().limits.largest_m
+            most_m = LARGEST_DITHER_M
             strong = tuple(min(STRONG * a, most_m) for a in command.amplitude_m)
             command = replace(command, amplitude_m=strong)
         return super().order(command)
@@ -197,7 +198,7 @@ class StrangeDome(Dome):
 
     def applied(self) -> tuple[Manifest, NDArray[np.float32]]:
         """Return the matrix in use as the RTC shows it."""
-        active = self.computer.snapshot().reconstructor
+        active = self.computer.reconstructor
         matrix = self.dialect.told(active.matrix)
         layout = layout_of(matrix, active.manifest.layout.chunk_bytes)
         return replace(active.manifest, layout=layout), matrix

@@ -109,7 +109,7 @@ def strike(trouble: Trouble, computer: RealTimeComputer) -> bool:
     """Have happen what comes in the middle of a window; return whether the dither is over."""
     match trouble:
         case Trouble.SWAPPED:
-            in_use = computer.snapshot().reconstructor
+            in_use = computer.reconstructor
             other = replace(in_use.manifest, id=f"{in_use.manifest.id}-again")
             computer.stage(replace(in_use, manifest=other))
         case Trouble.OPENED:

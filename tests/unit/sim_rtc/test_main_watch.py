@@ -10,7 +10,7 @@ from sim_rtc.__main__ import Watch
 from sim_rtc.computer.telemetry import Pace
 from sim_rtc.options import parse_options
 
-STATUS = SimpleNamespace(reconstructor=SimpleNamespace(manifest=SimpleNamespace(id="cm")))
+COMPUTER = SimpleNamespace(reconstructor=SimpleNamespace(manifest=SimpleNamespace(id="cm")))
 
 
 def batch(k):
@@ -20,7 +20,7 @@ def batch(k):
 def test_a_loop_that_falls_behind_says_so_at_once_by_how_much_and_when_it_is_over():
     pace, stopped = Pace(batch_s=0.05, batch_frames=50), threading.Event()
     watch = Watch(
-        SimpleNamespace(snapshot=lambda: STATUS),
+        COMPUTER,
         pace,
         SimpleNamespace(n_dropped_frames=0),
         parse_options(["--rate", "1000"]),

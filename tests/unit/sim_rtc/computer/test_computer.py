@@ -14,7 +14,7 @@ from service.wire import (
 )
 from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import OpenLoopBlock
-from sim_rtc.computer.telemetry import DitherLimits, Identity, LoopSettings, Reconstructor
+from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
 from sim_rtc.link.replies import ReplyCache
 from sim_rtc.telescope.linear import LinearOptics
 
@@ -74,7 +74,6 @@ def computer():
         reconstructor=reconstructor("first", 3),
         optics=OPTICS,
         stroke_m=1e-5,
-        limits=DitherLimits(),
     )
 
 
@@ -122,7 +121,7 @@ def test_the_number_of_modes_waits_for_a_matrix_of_that_shape(computer):
     last = run(computer, 10)[-1]
     assert last.commands_m[-1, 3] == pytest.approx(-1e-7, rel=1e-3)
     assert computer.terms().n_controlled == (4,)
-    assert computer.snapshot().gains == (0.4,) * 4
+    assert computer.status().gains == (0.4,) * 4
 
 
 def test_modes_that_are_given_up_go_to_zero(computer):
@@ -140,21 +139,21 @@ def test_opening_begins_a_session_with_an_empty_integrator_and_nothing_pending(c
     computer.stage(reconstructor("second", 3))
     assert computer.execute(loop_request("o", loop=Loop.OPEN)).accepted
     after = run(computer, 3)
-    assert {b.session for b in after} == {computer.snapshot().session}
+    assert {b.session for b in after} == {computer.session}
     assert after[0].session != before.session
     assert after[0].seq0 == before.seq0 + 10
     assert not any(b.commands_m.any() for b in after)
     assert {b.cm_id for b in after} == {"first"}
-    assert computer.snapshot().loop is Loop.OPEN
-    assert set(computer.snapshot().gains) == {0.0}
+    assert computer.status().loop is Loop.OPEN
+    assert set(computer.status().gains) == {0.0}
 
 
 def test_a_controlled_mode_without_gain_makes_the_loop_partial(computer):
     computer.execute(loop_request("g", gains=(0.4, 0.0, 0.4, 0.4), leak=0.99))
-    snapshot = computer.snapshot()
-    assert snapshot.loop is Loop.PARTIAL
-    assert snapshot.gains == (0.4, 0.0, 0.4, 0.0)
-    assert snapshot.settings.leak == 0.99
+    status = computer.status()
+    assert status.loop is Loop.PARTIAL
+    assert status.gains == (0.4, 0.0, 0.4, 0.0)
+    assert computer.settings.leak == 0.99
     last = run(computer, 30)[-1]
     assert last.commands_m[-1, 1] == 0.0
 
@@ -169,11 +168,11 @@ def test_a_controlled_mode_without_gain_makes_the_loop_partial(computer):
     ],
 )
 def test_impossible_loop_commands_change_nothing(computer, changes, reason):
-    before = computer.snapshot().settings
+    before = computer.settings
     reply = computer.execute(loop_request("x", leak=0.5, **changes))
     assert not reply.accepted
     assert reply.reason.startswith(reason)
-    assert computer.snapshot().settings == before
+    assert computer.settings == before
 
 
 def test_a_dither_starts_at_the_announced_frame_and_ends_by_itself(computer):
@@ -182,7 +181,7 @@ def test_a_dither_starts_at_the_announced_frame_and_ends_by_itself(computer):
     batches = run(computer, 110)
     playing = [b for b in batches if b.dither_m is not None]
     assert (playing[0].seq0, playing[-1].seq0) == (reply.start_seq, reply.start_seq + 990)
-    assert computer.snapshot().dither is None
+    assert computer.status().dither is None
 
 
 def test_a_command_is_carried_out_once_for_ten_minutes(computer):

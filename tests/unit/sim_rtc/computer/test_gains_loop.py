@@ -7,7 +7,7 @@ from service.wire import Loop, LoopRequest, MeasureRequest, Pattern, RampRequest
 from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import OpenLoopBlock
 from sim_rtc.computer.gains import FACTORS
-from sim_rtc.computer.telemetry import DitherLimits, LoopSettings
+from sim_rtc.computer.telemetry import LoopSettings
 from tests.unit.sim_rtc.computer.test_computer import (
     IDENTITY,
     N_MODES,
@@ -47,7 +47,6 @@ def computer_of(slopes):
         reconstructor=reconstructor("first", 3),
         optics=OPTICS,
         stroke_m=1e-5,
-        limits=DitherLimits(),
     )
 
 
@@ -83,16 +82,16 @@ def run(computer, n_batches):
 def test_a_ramp_on_command_picks_the_gain_of_least_residual_for_each_group(swaying):
     run(swaying, 20)
     assert swaying.execute(ramp()).accepted
-    assert swaying.snapshot().gains[:3] == (0.1, 0.1, 0.4), "the first gain is in force at once"
+    assert swaying.status().gains[:3] == (0.1, 0.1, 0.4), "the first gain is in force at once"
     run(swaying, 330)
     # a wave of 10 Hz at 1 kHz: the higher the better, up to the resonance of two frames of delay
-    assert swaying.snapshot().gains == (0.6, 0.6, 0.1, 0.0)
+    assert swaying.status().gains == (0.6, 0.6, 0.1, 0.0)
     assert swaying.execute(ramp("again")).accepted, "it is over"
 
 
 def test_each_gain_is_in_force_for_the_frames_asked_for(noisy):
     reply = noisy.execute(ramp(groups=((0, 2),), gains=(0.1, 0.9, 0.5)))
-    seen = [(noisy.snapshot().gains[0], noisy.next_batch().seq0) for _ in range(121)]
+    seen = [(noisy.status().gains[0], noisy.next_batch().seq0) for _ in range(121)]
     first = {}
     for gain, seq in seen:
         first.setdefault(gain, seq)
@@ -104,9 +103,9 @@ def test_each_gain_is_in_force_for_the_frames_asked_for(noisy):
 def test_the_ramp_at_the_start_waits_two_seconds_and_tries_around_what_is_there(noisy):
     noisy.ramp_up(0.5)
     run(noisy, 200)
-    assert noisy.snapshot().gains[0] == pytest.approx(FACTORS[0] * 0.4)
+    assert noisy.status().gains[0] == pytest.approx(FACTORS[0] * 0.4)
     run(noisy, 10 * 140)
-    gains = noisy.snapshot().gains
+    gains = noisy.status().gains
     assert gains[:3] == pytest.approx((FACTORS[0] * 0.4,) * 3), "noise alone wants the lowest"
     assert gains[3] == 0.0, "not controlled"
 
@@ -128,12 +127,12 @@ def test_while_one_runs_another_is_refused_and_so_is_what_would_spoil_it(noisy):
 def test_opening_the_loop_ends_it_with_what_is_chosen_and_what_was_there(swaying):
     swaying.execute(ramp())
     run(swaying, 170)
-    assert swaying.snapshot().gains[:3] == (0.6, 0.6, 0.1), "the second group is being tried"
+    assert swaying.status().gains[:3] == (0.6, 0.6, 0.1), "the second group is being tried"
     assert swaying.execute(LoopRequest(id="o", loop=Loop.OPEN)).accepted
     run(swaying, 50)
     swaying.execute(LoopRequest(id="c", loop=Loop.CLOSED))
     run(swaying, 200)
-    assert swaying.snapshot().gains == (0.6, 0.6, 0.4, 0.0)
+    assert swaying.status().gains == (0.6, 0.6, 0.4, 0.0)
 
 
 def test_a_new_session_ends_it(noisy):
@@ -141,7 +140,7 @@ def test_a_new_session_ends_it(noisy):
     run(noisy, 5)
     noisy.restart()
     run(noisy, 50)
-    assert noisy.snapshot().gains == (0.4, 0.4, 0.4, 0.0)
+    assert noisy.status().gains == (0.4, 0.4, 0.4, 0.0)
     assert noisy.execute(ramp("other")).accepted
 
 
@@ -150,20 +149,20 @@ def test_fewer_modes_in_the_loop_end_it(noisy):
     run(noisy, 5)
     noisy.stage(reconstructor("two", 2))
     run(noisy, 5)
-    assert noisy.snapshot().gains == (0.4, 0.4, 0.0, 0.0)
+    assert noisy.status().gains == (0.4, 0.4, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("disturb", ["matrix", "dither"])
 def test_a_group_begins_again_when_the_loop_is_another(noisy, disturb):
     noisy.execute(ramp())
     run(noisy, 100)
-    assert noisy.snapshot().gains[0] == 0.6, "the third gain"
+    assert noisy.status().gains[0] == 0.6, "the third gain"
     if disturb == "matrix":
         noisy.stage(reconstructor("second", 3))
     else:
         assert noisy.execute(dither_request("d")).accepted, "a dither may go on meanwhile"
     run(noisy, 3)
-    assert noisy.snapshot().gains[0] == 0.1
+    assert noisy.status().gains[0] == 0.1
 
 
 def test_a_ramp_waits_for_a_measurement_to_end(noisy):
@@ -182,11 +181,11 @@ def test_a_ramp_waits_for_a_measurement_to_end(noisy):
     ],
 )
 def test_a_ramp_the_loop_cannot_do_is_refused_and_changes_nothing(noisy, changes, reason):
-    before = noisy.snapshot().settings
+    before = noisy.settings
     reply = noisy.execute(ramp(**changes))
     assert not reply.accepted
     assert reply.reason == reason
-    assert noisy.snapshot().settings == before
+    assert noisy.settings == before
 
 
 def test_an_open_loop_has_no_gains_to_try(noisy):

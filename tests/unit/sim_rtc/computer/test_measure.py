@@ -23,7 +23,7 @@ from service.wire import (
 from sim_rtc.assembly import build_telescope
 from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import OpenLoopBlock
-from sim_rtc.computer.measure import MeasureLimits, MeasurementRules, product
+from sim_rtc.computer.measure import MeasurementRules, product
 from sim_rtc.computer.strokes import (
     PushPull,
     frames_per_shape,
@@ -31,7 +31,7 @@ from sim_rtc.computer.strokes import (
     pokes,
     system_shapes,
 )
-from sim_rtc.computer.telemetry import DitherLimits, Identity, LoopSettings, Reconstructor
+from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.linear import LinearOptics
 
@@ -98,7 +98,6 @@ def computer_on(blocks, **changes):
         reconstructor=Reconstructor(manifest=manifest, matrix=matrix),
         optics=optics(),
         stroke_m=1e-5,
-        limits=DitherLimits(),
         **given,
     )
 
@@ -180,7 +179,7 @@ def test_a_wavefront_that_stands_or_drifts_meanwhile_cancels(pattern):
 
 def test_sines_find_the_matrix_with_the_loop_closed():
     computer = computer_on(sky())
-    session = computer.snapshot().session
+    session = computer.session
     manifest, matrix, batches = measured(computer, sines())
     assert relative(matrix, RESPONSE) < 1e-4
     assert manifest.session == session, "nothing was opened"
@@ -225,19 +224,19 @@ def test_hadamard_has_the_noise_of_many_more_pushes():
 
 def test_the_loop_is_opened_for_it_and_closed_again():
     computer = computer_on(sky(noise=0.001))
-    before = computer.snapshot()
+    before = computer.status()
     for _ in range(3):
         computer.next_batch()
     reply = computer.execute(push_pull())
-    during = computer.snapshot()
+    during = computer.status()
     assert during.loop is Loop.OPEN
     assert during.session != before.session, "opening zeroes the integrator"
     batches = []
     while not computer.take_measured():
         batches.append(computer.next_batch())
-    assert computer.snapshot().loop is Loop.CLOSED
-    assert computer.snapshot().session == during.session
-    assert computer.snapshot().gains == before.gains
+    assert computer.status().loop is Loop.CLOSED
+    assert computer.session == during.session
+    assert computer.status().gains == before.gains
     commands = np.vstack([batch.commands_m for batch in batches])
     first = reply.start_seq - batches[0].seq0
     assert not commands[:first].any(), "nothing answers the slopes"
@@ -251,9 +250,9 @@ def test_the_loop_is_opened_for_it_and_closed_again():
 def test_a_loop_that_was_open_stays_open():
     computer = computer_on(sky())
     computer.execute(LoopRequest(id="open", loop=Loop.OPEN))
-    session = computer.snapshot().session
+    session = computer.session
     manifest, _, _ = measured(computer, push_pull())
-    assert computer.snapshot().loop is Loop.OPEN
+    assert computer.status().loop is Loop.OPEN
     assert manifest.session == session
 
 
@@ -286,9 +285,7 @@ def test_what_cannot_be_measured_is_refused_in_the_wires_words(request_, reason)
 
 
 def test_a_measurement_of_hours_is_refused():
-    bench = MeasurementRules(
-        n_modes=6, n_slopes=16, frame_rate_hz=1000.0, limits=MeasureLimits(longest_s=60.0)
-    )
+    bench = MeasurementRules(n_modes=6, n_slopes=16, frame_rate_hz=1000.0, longest_s=60.0)
     assert bench.refusal(push_pull(n_average=4999)) == ""
     assert bench.refusal(push_pull(n_average=5000)).startswith("range: this would take 60 s")
 
@@ -311,7 +308,7 @@ def test_one_thing_at_a_time():
     computer = computer_on(sky())
     assert computer.execute(dither()).accepted
     assert computer.execute(push_pull()).reason.startswith("busy: dither d-start is on until frame")
-    assert computer.snapshot().loop is Loop.CLOSED, "a refused command changes nothing"
+    assert computer.status().loop is Loop.CLOSED, "a refused command changes nothing"
     assert computer.execute(DitherStop(id="d-stop")).accepted
     assert computer.execute(push_pull()).accepted
     assert computer.execute(push_pull("im-2")).reason.startswith("busy: matrix im-1")
@@ -355,7 +352,7 @@ def test_a_measurement_that_determines_nothing_says_why():
 def test_a_restart_ends_the_measurement_and_says_so():
     computer = computer_on(sky())
     computer.execute(push_pull())
-    session = computer.snapshot().session
+    session = computer.session
     computer.next_batch()
     computer.restart()
     (ended,) = computer.take_measured()
@@ -363,7 +360,7 @@ def test_a_restart_ends_the_measurement_and_says_so():
     assert matrix is None
     assert manifest.reason == "the loop started over during the measurement"
     assert manifest.session == session
-    assert computer.snapshot().loop is Loop.CLOSED
+    assert computer.status().loop is Loop.CLOSED
     assert not computer.next_batch().commands_m[:2].any()
 
 

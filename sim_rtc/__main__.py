@@ -22,7 +22,7 @@ from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import Ahead, message_frames
 from sim_rtc.computer.telemetry import Batch, FrameClock, Pace
 from sim_rtc.faults import ComputerFaults, FaultPlan
-from sim_rtc.link.link import Link, Rehearsal
+from sim_rtc.link.link import Link
 from sim_rtc.link.record import Recorder, Recording
 from sim_rtc.link.replay import Replay
 from sim_rtc.options import Options, parse_options
@@ -79,16 +79,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
             system = computer.identity.system
             recorder = stack.enter_context(Recorder(options.record, system=system))
         link = stack.enter_context(
-            Link(
-                computer,
-                endpoint=options.connect,
-                clock=clock,
-                detector=telescope.detector,
-                magnitude=options.magnitude,
-                batch_frames=batch_frames,
-                elevation=options.elevation,
-                rehearsal=Rehearsal(plan=plan, recorder=recorder, seed=options.seed),
-            )
+            Link(computer, options, telescope.detector, clock=clock, plan=plan, recorder=recorder)
         )
         truth = None
         if options.truth is not None:

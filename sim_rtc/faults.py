@@ -14,15 +14,16 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import structlog
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.wire import Command, FrameHeader, Loop, LoopRequest, Reply, encode_frames
+from service.wire import FrameHeader, Loop, LoopRequest, encode_frames
 from sim_rtc.arguments import refusal
+from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.telemetry import FrameClock, Pace, new_session
 
 _log = structlog.get_logger("sim_rtc")
@@ -204,29 +205,13 @@ def manual() -> str:
 _NEVER_FRAMES = 2**40
 
 
-class Target(Protocol):
-    """What of the computer the faults act on."""
-
-    def execute(self, command: Command) -> Reply:
-        """Carry out a command."""
-
-    def restart(self) -> None:
-        """Begin a session from frame 0 with the matrix of the start."""
-
-    def limit_stroke(self, stroke_m: float | None) -> None:
-        """Clip commands at this, metres RMS; None: as at the start."""
-
-    def delay_dithers(self, n_frames: int) -> None:
-        """Let dithers to come begin so many frames after the announced one."""
-
-
 class ComputerFaults:
     """Carries out the plan between two batches, in the loop's thread."""
 
     def __init__(
         self,
         plan: FaultPlan,
-        target: Target,
+        target: RealTimeComputer,
         *,
         clock: FrameClock,
         pace: Pace,
@@ -327,21 +312,14 @@ _OTHER_BASIS = "another-basis"
 _NONSENSE = b"\xc1 no header of frames"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Held:
-    """A batch that waits for its time."""
-
-    due_s: float
-    message: Sendable
-
-
 class WireFaults:
     """Turns each batch into what is really sent, in that order; for one thread."""
 
     def __init__(self, plan: FaultPlan, rng: np.random.Generator) -> None:
         self._plan = plan
         self._rng = rng
-        self._held: list[_Held] = []
+        self._held: list[tuple[float, Sendable]] = []
+        """Batches that wait, and until when."""
         self._frozen: Array32 | None = None
         self._overtaken: list[Sendable] = []
         self._second_session = new_session()
@@ -349,8 +327,8 @@ class WireFaults:
 
     def messages(self, header: FrameHeader, rows: Array32, time_s: float) -> list[Sendable]:
         """Return what is sent now: this batch or what has become of it, and what was held."""
-        due = [held.message for held in self._held if held.due_s <= time_s]
-        self._held = [held for held in self._held if held.due_s > time_s]
+        due = [message for due_s, message in self._held if due_s <= time_s]
+        self._held = [held for held in self._held if held[0] > time_s]
         header, rows = self._damaged(header, rows, time_s)
         sent = due + self._on_the_way(self._garbled(encode_frames(header, rows), time_s), time_s)
         if self._plan.active(FaultKind.SECOND, time_s):
@@ -396,7 +374,7 @@ class WireFaults:
         if self._struck(FaultKind.LOST, time_s):
             pass
         elif late is not None:
-            self._held.append(_Held(due_s=time_s + late.value("DELAY"), message=message))
+            self._held.append((time_s + late.value("DELAY"), message))
         else:
             sent = [message] * (2 if self._struck(FaultKind.DUPLICATED, time_s) else 1)
         if not self._overtaken and self._struck(FaultKind.REORDERED, time_s):

@@ -103,17 +103,19 @@ class RealTimeComputer:
         self._terms: LoopTerms | None = None
         self._block: Block | None = None
         self._row = 0
-        self._batch_frames = BATCH_FRAMES
+        self.batch_frames = BATCH_FRAMES
+        """Frames of a batch."""
         self._optics = optics
 
     def prepare(self) -> None:
         """Wait for the first frames of the feed, so that the first batch does not."""
         self._block, self._row = next(self._blocks), 0
+        self.batch_frames = self._block.batch_frames
 
     def next_batch(self) -> Batch:
         """Process the next frames, whatever the clock says."""
         block, row = self._next_rows()
-        n_frames = self._batch_frames = block.batch_frames
+        n_frames = self.batch_frames = block.batch_frames
         with self._lock:
             self._swap()
             terms = self._current_terms(block.optics)
@@ -327,7 +329,7 @@ class RealTimeComputer:
             reason = reason or self._activities.on_the_mirror()
             if reason:
                 return refused(request.id, reason)
-            start_seq = self._seq + _LEAD_BATCHES * self._batch_frames
+            start_seq = self._seq + _LEAD_BATCHES * self.batch_frames
             self._activities.begin_dither(request, start_seq)
         return accepted(request.id, start_seq)
 
@@ -352,7 +354,7 @@ class RealTimeComputer:
             if measurement.needs_open_loop and was_closed:
                 self._set(replace(self._settings, closed=False))
                 self._start_over()
-            start_seq = self._seq + _LEAD_BATCHES * self._batch_frames + _SETTLING_FRAMES
+            start_seq = self._seq + _LEAD_BATCHES * self.batch_frames + _SETTLING_FRAMES
             measurement.start_seq = start_seq
             activities.begin_measurement(measurement, closes_again=was_closed)
         return accepted(request.id, start_seq)

@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import structlog
@@ -29,8 +29,8 @@ from sim_rtc.faults import FaultPlan, WireFaults
 from sim_rtc.link.matrices import Matrices
 from sim_rtc.link.record import Kind, Recorder
 from sim_rtc.link.replies import Replies
+from sim_rtc.options import Options
 from sim_rtc.telescope.detector import Detector
-from sim_rtc.telescope.scene import Elevation
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -39,61 +39,33 @@ _BACKLOG_S = 1.0
 """Of telemetry that waits for the publishing thread; beyond it the oldest is dropped, counted."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rehearsal:
-    """What is done to the link on request."""
-
-    plan: FaultPlan
-    """Faults."""
-
-    recorder: Recorder | None = None
-    """Where everything that is sent is written, too."""
-
-    seed: int | None = None
-    """Of the faults' randomness."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Outgoing:
-    """A batch that waits to be published."""
-
-    batch: Batch
-    t0_ns: int
-    time_s: float
-    """Loop time."""
-
-
 class Link(Background):
     """Connects a computer to the service for as long as the ``with`` block lasts."""
 
     def __init__(
         self,
         computer: RealTimeComputer,
-        *,
-        endpoint: str,
-        clock: FrameClock,
+        options: Options,
         detector: Detector,
-        magnitude: float,
-        batch_frames: int,
-        elevation: Elevation | None = None,
-        rehearsal: Rehearsal | None = None,
+        *,
+        clock: FrameClock,
+        plan: FaultPlan,
+        recorder: Recorder | None = None,
     ) -> None:
+        """Take the plan of the faults, and where everything that is sent is written, too."""
         super().__init__("link")
-        rehearsal = rehearsal or Rehearsal(plan=FaultPlan())
-        self._plan = rehearsal.plan
-        self._recorder = rehearsal.recorder
-        self._faults = WireFaults(self._plan, np.random.default_rng(rehearsal.seed))
+        self._plan = plan
+        self._recorder = recorder
+        self._faults = WireFaults(plan, np.random.default_rng(options.seed))
         self._absent = threading.Event()
         self._recorded_cm_id: str | None = None
         self._computer = computer
-        self._endpoint = endpoint
+        self._options = options
         self._clock = clock
         self._detector = detector
-        self._magnitude = magnitude
-        self._batch_frames = batch_frames
-        self._elevation = elevation or Elevation()
         self._keys = Keys(computer.identity.system)
-        self._backlog: deque[_Outgoing] = deque()
+        self._backlog: deque[tuple[Batch, int, float]] = deque()
+        """Batches, when their first exposure ended, nanoseconds, and at what loop time."""
         self._ready = threading.Condition()
         self._dropped = 0
 
@@ -113,14 +85,9 @@ class Link(Background):
         """Queue a batch for publication; never waits."""
         with self._ready:
             if len(self._backlog) * len(batch.slopes) * self._clock.dt_ns >= _BACKLOG_S * 1e9:
-                self._dropped += len(self._backlog.popleft().batch.slopes)
-            self._backlog.append(
-                _Outgoing(
-                    batch=batch,
-                    t0_ns=self._clock.end_of_exposure_ns(batch.seq0),
-                    time_s=self._plan.now_s,
-                )
-            )
+                self._dropped += len(self._backlog.popleft()[0].slopes)
+            t0_ns = self._clock.end_of_exposure_ns(batch.seq0)
+            self._backlog.append((batch, t0_ns, self._plan.now_s))
             self._ready.notify()
 
     @contextmanager
@@ -135,7 +102,7 @@ class Link(Background):
     @override
     def _work(self) -> None:
         replies = Replies(self._keys, self._computer)
-        while (session := self._open()) is not None:
+        while (session := open_session(self._options.connect, self._stopped)) is not None:
             self._speak(session, replies)
 
     def _speak(self, session: zenoh.Session, replies: Replies) -> None:
@@ -155,36 +122,22 @@ class Link(Background):
                 ) as matrices,
                 Token(session, self._keys, self._recorder) as token,
             ):
-                _log.info("link.open", endpoint=self._endpoint, system=self._keys.system)
+                _log.info("link.open", endpoint=self._options.connect, system=self._keys.system)
                 self._publish(session, token, matrices)
 
-    def _open(self) -> zenoh.Session | None:
-        """Open the session, waiting for the service's router for as long as it takes."""
-        waiting = False
-        while not self._stopped.is_set():
-            try:
-                return zenoh.open(client_config(self._endpoint))
-            except zenoh.ZError:
-                if not waiting:
-                    _log.warning("link.waiting", endpoint=self._endpoint)
-                waiting = True
-                self._stopped.wait(RETRY_S)
-        return None
-
     def _publish(self, session: zenoh.Session, token: Token, matrices: Matrices) -> None:
-        rate_hz = 1e9 / self._clock.dt_ns
-        frames = frames_publisher(session, self._keys, rate_hz / self._batch_frames)
+        batches_per_s = self._options.frame_rate_hz / self._computer.batch_frames
+        frames = frames_publisher(session, self._keys, batches_per_s)
         status = status_publisher(session, self._keys)
         next_status_s = 0.0
         lifeline = Lifeline(time.monotonic())
         while not self._stopped.is_set():
             outgoing = self._next()
             if outgoing is not None:
-                self._note_matrix(outgoing.batch.cm_id)
-                header, rows = frames_of(
-                    outgoing.batch, self._computer.identity, outgoing.t0_ns, self._clock.dt_ns
-                )
-                for payload, attachment in self._faults.messages(header, rows, outgoing.time_s):
+                batch, t0_ns, time_s = outgoing
+                self._note_matrix(batch.cm_id)
+                header, rows = frames_of(batch, self._computer.identity, t0_ns, self._clock.dt_ns)
+                for payload, attachment in self._faults.messages(header, rows, time_s):
                     frames.put(payload, attachment=attachment)
                     self._record(Kind.FRAMES, payload, attachment)
             if self._computer.has_news:
@@ -213,7 +166,7 @@ class Link(Background):
         if self._recorder is not None:
             self._recorder.put(kind, payload, attachment)
 
-    def _next(self) -> _Outgoing | None:
+    def _next(self) -> tuple[Batch, int, float] | None:
         with self._ready:
             if not self._backlog:
                 self._ready.wait(_STATUS_PERIOD_S / 2)
@@ -226,14 +179,14 @@ class Link(Background):
             replace(
                 status,
                 basis_id=self._faults.basis_id(status.basis_id, time_s),
-                magnitude=self._magnitude,
+                magnitude=self._options.magnitude,
                 flux=self._detector.flux(self._computer.images),
-                pointing=self._elevation.at(time_s),
+                pointing=self._options.elevation.at(time_s),
             )
         )
 
 
-RETRY_S = 0.2
+_RETRY_S = 0.2
 """Between two attempts to find the service's router."""
 
 _CUT_OFF_S = 5.0
@@ -244,12 +197,26 @@ _LEASE_MS = 2000
 _WAIT_BEFORE_DROP_US = 20_000
 _QUEUED_MESSAGES = 16
 _RETRY = {
-    "period_init_ms": round(1000 * RETRY_S),
+    "period_init_ms": round(1000 * _RETRY_S),
     "period_increase_factor": 1.5,
     "period_max_ms": 1000,
 }
 _CACHE_S = 5.0
 _HEARTBEAT_S = 0.2
+
+
+def open_session(endpoint: str, stopped: threading.Event) -> zenoh.Session | None:
+    """Open a session, waiting for the service's router until ``stopped``: then None."""
+    waiting = False
+    while not stopped.is_set():
+        try:
+            return zenoh.open(client_config(endpoint))
+        except zenoh.ZError:
+            if not waiting:
+                _log.warning("link.waiting", endpoint=endpoint)
+            waiting = True
+            stopped.wait(_RETRY_S)
+    return None
 
 
 def client_config(endpoint: str) -> zenoh.Config:

@@ -30,7 +30,7 @@ from service.wire import (
     decode_status,
     encode_acknowledgement,
 )
-from sim_rtc.link.link import Token, client_config, frames_publisher, status_publisher
+from sim_rtc.link.link import Token, frames_publisher, open_session, status_publisher
 from sim_rtc.link.record import Kind, Message, Recording
 from sim_rtc.link.replies import acknowledge, answer_applied, answer_commands
 
@@ -62,7 +62,7 @@ class Replay:
 
     def run(self, stopped: threading.Event) -> None:
         """Play until the end or until ``stopped``."""
-        session = self._open(stopped)
+        session = open_session(self._endpoint, stopped)
         if session is None:
             return
         with session:
@@ -80,14 +80,6 @@ class Replay:
             n_messages = self._play(session, stopped)
             stopped.wait(_LINGER_S)
             _log.info("replay.end", messages=n_messages)
-
-    def _open(self, stopped: threading.Event) -> zenoh.Session | None:
-        while not stopped.is_set():
-            try:
-                return zenoh.open(client_config(self._endpoint))
-            except zenoh.ZError:
-                stopped.wait(_RETRY_S)
-        return None
 
     def _await_service(self, stopped: threading.Event) -> None:
         deadline_s = time.monotonic() + SERVICE_WITHIN_S

@@ -1,29 +1,79 @@
-"""Command-line values: text to numbers in range, or one line that says what was expected."""
+"""Options of the command line, and their values: text to numbers in range, or what was expected."""
 
 from __future__ import annotations
 
 import argparse
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from service.errors import ModelError
-from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from sim_rtc.telescope.atmosphere import Layer
 from sim_rtc.telescope.imperfections import SETS
-from sim_rtc.telescope.registration import Drift, Flexure, Jump, Walk
-from sim_rtc.telescope.scene import Elevation, Spiders
 from sim_rtc.telescope.sky import Shape, VibrationLine
 
 Reader = Callable[[str], Any]
 """Turns what was given into a value, or raises an ``argparse.ArgumentTypeError``."""
 
-_LARGEST_STUCK_M = 1e-4
 _ENDPOINT = re.compile(r"(tcp|tls|quic|ws)/.+:\d{1,5}|unixsock-stream/.+")
+
+
+def option(
+    usage: str,
+    text: str,
+    reader: Reader | None = None,
+    default: object = None,
+    *,
+    many: bool = False,
+    absent: object = None,
+    chapter: str | None = None,
+    **more: object,
+) -> Any:  # noqa: ANN401 - a field of any type
+    """Return a field that is read from the command line.
+
+    Parameters
+    ----------
+    usage, text
+        What ``--help`` shows: flags and what comes after them, and what it is for.
+    reader, default, more
+        Argparse's.
+    many
+        Whether it may be given more than once: the field has all its values.
+    absent
+        What stands for an option without a default that was not given.
+    chapter
+        Of ``--help``, which begins here.
+    """
+    if many:
+        text, more["action"] = f"{text}; may be repeated", "append"
+    if default is not None and "default" not in text:
+        text += f" (default: %(default){'g' if isinstance(default, float) else 's'})"
+    flags = [word for word in usage.split() if word.startswith("-")]
+    metavar = usage.split()[-1] if len(usage.split()) > len(flags) else None
+    told = {"help": text, "metavar": metavar, "type": reader, "default": default, **more}
+    given = {name: value for name, value in told.items() if value is not None}
+    metadata = {"flags": flags, "argparse": given, "absent": absent, "chapter": chapter}
+    return field(metadata=metadata)
+
+
+def several(
+    usage: str,
+    text: str,
+    make: Callable[..., Any],
+    ok: Callable[..., bool] | None = None,
+    limits: str = "",
+    **more: Any,  # noqa: ANN401 - as option has them
+) -> Any:  # noqa: ANN401 - a field of any type
+    """Return a field made of several numbers; ``limits`` say when they are ``ok``."""
+    return option(usage, text, numbers(usage.split()[-1], make, ok, limits), **more)
+
+
+def as_they_are(*found: float) -> tuple[float, ...]:
+    """Return the numbers themselves."""
+    return found
 
 
 def refusal(text: str, expected: str) -> argparse.ArgumentTypeError:
@@ -32,22 +82,28 @@ def refusal(text: str, expected: str) -> argparse.ArgumentTypeError:
 
 
 def numbers(
-    layout: str, expected: str, make: Callable[..., Any], ok: Callable[..., bool] | None = None
+    form: str,
+    make: Callable[..., Any],
+    ok: Callable[..., bool] | None = None,
+    limits: str = "",
 ) -> Reader:
     """Return a reader of finite numbers, with commas between them and colons between groups.
 
     Parameters
     ----------
-    layout
-        How many numbers each group has: ``"1:4"``, or ``"2|3"`` where there is a choice.
-    expected
-        For whoever gave something else.
+    form
+        One word a number, as ``--help`` shows them: ``T:DX,DY``; in brackets what may be left out.
     make
         Makes the value of the numbers.
     ok
         Whether the numbers are possible.
+    limits
+        When they are, in words.
     """
-    counts = [[int(n) for n in group.split("|")] for group in layout.split(":")]
+    counts = [
+        range(1 + group.split("[")[0].count(","), 2 + group.count(",")) for group in form.split(":")
+    ]
+    expected = form + limits
 
     def read(text: str) -> Any:  # noqa: ANN401 - whatever make returns
         groups = [group.split(",") for group in text.split(":")]
@@ -68,7 +124,7 @@ def numbers(
 def within(low: float, high: float) -> Reader:
     """Return a reader of one number from ``low`` to ``high``."""
     expected = f"a number from {low:g} to {high:g}"
-    return numbers("1", expected, float, lambda value: low <= value <= high)
+    return numbers(expected, float, lambda value: low <= value <= high)
 
 
 def count(low: int, high: int | None = None) -> Reader:
@@ -109,7 +165,7 @@ def vibration(text: str) -> VibrationLine | None:
         return frequency_hz > 0.0 <= rms_nm and 0.0 <= damping <= 0.5
 
     try:
-        return numbers("2|3", expected, line, possible)(rest.replace(":", ","))  # type: ignore[no-any-return]
+        return numbers("HZ,NM[,DAMPING]", line, possible)(rest.replace(":", ","))  # type: ignore[no-any-return]
     except argparse.ArgumentTypeError:
         raise refusal(text, expected) from None
 
@@ -132,79 +188,3 @@ def endpoint(text: str) -> str:
     if _ENDPOINT.fullmatch(text) is None:
         raise refusal(text, "PROTOCOL/ADDRESS like tcp/127.0.0.1:7447")
     return text
-
-
-alpha = numbers(
-    "4",
-    "X,Y,ROT_DEG,MAG, subapertures, degrees and a ratio > 0",
-    lambda *boundary: Misregistration.from_vector(np.array(boundary) / BOUNDARY_SCALE),
-)
-jump = numbers(
-    "1:4",
-    "T:DX,DY,DROT_DEG,DMAG, T > 0 seconds",
-    lambda time_s, *change: Jump.of(change, time_s=time_s),
-    lambda time_s, *_: time_s > 0.0,
-)
-drift = numbers("4", "DX,DY,DROT_DEG,DMAG per minute", lambda *change: Drift.of(change))
-flexure = numbers(
-    "4:1",
-    "DX,DY,DROT_DEG,DMAG:PERIOD_S, 120 to 86400 seconds",
-    lambda *found: Flexure.of(found[:4], period_s=found[4]),
-    lambda *found: 120.0 <= found[4] <= 86400.0,
-)
-walk = numbers(
-    "4",
-    "X,Y,ROT_DEG,MAG after a minute, none negative",
-    lambda *sigma: Walk.of(sigma),
-    lambda *sigma: min(sigma) >= 0.0,
-)
-elevation = numbers(
-    "1|2",
-    "DEG or DEG,DEG_PER_MIN, 0 to 90 degrees and at most 10 per minute either way",
-    lambda start, rate=0.0: Elevation(start_deg=start, rate_deg_per_minute=rate),
-    lambda start, rate=0.0: 0.0 <= start <= 90.0 and abs(rate) <= 10.0,
-)
-slew = numbers(
-    "1:1",
-    "T:DEG, T > 0 seconds and at most 90 degrees either way",
-    lambda *found: found,
-    lambda time_s, by_deg: time_s > 0.0 and abs(by_deg) <= 90.0,
-)
-layer = numbers(
-    "2|3",
-    "SPEED,DIR_DEG or SPEED,DIR_DEG,SHARE, speed > 0 m/s and share > 0",
-    lambda speed, direction, share=1.0: Layer(
-        fraction=share, speed_m_s=speed, direction_deg=direction
-    ),
-    lambda speed, _, share=1.0: speed > 0.0 < share,
-)
-seeing_at = numbers(
-    "1:1",
-    "T:ARCSEC, T > 0 seconds and 0.05 to 5 arcseconds",
-    lambda *found: found,
-    lambda time_s, arcsec: time_s > 0.0 and 0.05 <= arcsec <= 5.0,
-)
-spiders = numbers(
-    "1:1",
-    "N:WIDTH_M, 1 to 12 arms of 0.001 to 1 m",
-    lambda n_arms, width_m: Spiders(n_arms=int(n_arms), width_m=width_m),
-    lambda n_arms, width_m: n_arms in range(1, 13) and 0.001 <= width_m <= 1.0,
-)
-gain_range = numbers(
-    "2",
-    "LOW,HIGH, each > 0 and at most 1",
-    lambda *gains: gains,
-    lambda *gains: min(gains) > 0.0 and max(gains) <= 1.0,
-)
-group_gains = numbers(
-    "3",
-    "TIP_TILT,TO_100,REST, each 0 to 2",
-    lambda *gains: gains,
-    lambda *gains: min(gains) >= 0.0 and max(gains) <= 2.0,
-)
-stuck_actuator = numbers(
-    "1:1",
-    "N:METRES, an actuator from 0 and at most 1e-4 m of OPD either way",
-    lambda index, opd_m: (int(index), opd_m),
-    lambda index, opd_m: index >= 0.0 and index % 1 == 0.0 and abs(opd_m) <= _LARGEST_STUCK_M,
-)

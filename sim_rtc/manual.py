@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import NoReturn
+import re
+from collections.abc import Sequence
+from typing import Any, NoReturn
 
 from typing_extensions import override
 
@@ -140,6 +142,19 @@ class Parser(argparse.ArgumentParser):
             formatter_class=_Formatter,
             allow_abbrev=False,
         )
+
+    def read(self, given: Sequence[str]) -> dict[str, Any]:
+        """Return what was given, by the names of the fields.
+
+        A value that begins with a minus sign is tied to its option: argparse takes it for another.
+        """
+        joined: list[str] = []
+        for argument in given:
+            if joined and joined[-1].startswith("--") and re.match(r"-[\d.]", argument):
+                joined[-1] += f"={argument}"
+            else:
+                joined.append(argument)
+        return vars(self.parse_args(joined))
 
     @override
     def error(self, message: str) -> NoReturn:

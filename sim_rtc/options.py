@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from service.errors import ConfigurationError
-from service.model.misregistration import Misregistration
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from sim_rtc import arguments as read
 from sim_rtc import manual
-from sim_rtc.arguments import Reader, count, within
+from sim_rtc.arguments import as_they_are, count, option, several, within
 from sim_rtc.faults import Fault, read_fault
 from sim_rtc.telescope.atmosphere import PROFILES, Layer
 from sim_rtc.telescope.detector import Camera, preset_for
@@ -25,164 +26,193 @@ from sim_rtc.telescope.registration import Drift, Flexure, Jump, Walk
 from sim_rtc.telescope.scene import Elevation, Scene, SceneKind, Spiders
 from sim_rtc.telescope.sky import DAYTIME_LINES, SeeingSchedule, VibrationLine
 
-_MICROMETRE = 1e-6
 _MOST_LAYERS = 3
-
-
-def _option(
-    usage: str, text: str, reader: Reader | None = None, default: object = None, **more: object
-) -> Any:  # noqa: ANN401 - a field of any type
-    """Return a field that is read from the command line.
-
-    ``usage`` is what ``--help`` shows, flags and what comes after them; ``more`` is argparse's.
-    """
-    if default is not None and "default" not in text:
-        text += f" (default: %(default){'g' if isinstance(default, float) else 's'})"
-    flags = [word for word in usage.split() if word.startswith("-")]
-    metavar = usage.split()[-1] if len(usage.split()) > len(flags) else None
-    told = {"help": text, "metavar": metavar, "type": reader, "default": default, **more}
-    given = {name: value for name, value in told.items() if value is not None}
-    return field(metadata={"flags": flags, "argparse": given})
-
-
-def _many(usage: str, text: str, reader: Reader) -> Any:  # noqa: ANN401 - a field of any type
-    """Return a field of all the values of an option that may be given more than once."""
-    return _option(usage, f"{text}; may be repeated", reader, action="append")
+_PRESET = ("frame_rate_hz", "n_controlled", "binning")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """What the command line asked for: one field an option, then what several come to."""
 
-    instrument: str = _option(
-        "--instrument NAME|FILE", "packaged instrument or instrument file", default="flao-lbt"
+    instrument: str = option(
+        "--instrument NAME|FILE",
+        "packaged instrument or instrument file",
+        default="flao-lbt",
+        chapter="instrument and truth",
     )
-    plant: str = _option(
+    plant: str = option(
         "--plant", "model of the telescope", default="linear", choices=["linear", "diffractive"]
     )
-    alpha: Misregistration | None = _option(
+    alpha: Misregistration | None = several(
         "--alpha X,Y,ROT_DEG,MAG",
         "true registration (default: at random, |shift| <= 0.2, 0.3 deg, 0.5 %%)",
-        read.alpha,
+        lambda *boundary: Misregistration.from_vector(np.array(boundary) / BOUNDARY_SCALE),
+        limits=", subapertures, degrees and a ratio > 0",
     )
-    jumps: tuple[Jump, ...] = _many(
-        "--jump T:DX,DY,DROT_DEG,DMAG", "sudden change of the registration at T seconds", read.jump
+    jumps: tuple[Jump, ...] = several(
+        "--jump T:DX,DY,DROT_DEG,DMAG",
+        "sudden change of the registration at T seconds",
+        lambda time_s, *change: Jump.of(change, time_s=time_s),
+        lambda time_s, *_: time_s > 0.0,
+        ", T > 0 seconds",
+        many=True,
     )
-    drift: Drift = _option(
-        "--drift DX,DY,DROT_DEG,DMAG", "steady change of the registration, per minute", read.drift
+    drift: Drift = several(
+        "--drift DX,DY,DROT_DEG,DMAG",
+        "steady change of the registration, per minute",
+        lambda *change: Drift.of(change),
+        limits=" per minute",
+        absent=Drift(),
     )
-    flexure: Flexure = _option(
-        "--flexure X,Y,ROT_DEG,MAG:PERIOD_S",
+    flexure: Flexure = several(
+        "--flexure DX,DY,DROT_DEG,DMAG:PERIOD_S",
         "sinusoid around the registration, by these amplitudes, period 120 s or longer",
-        read.flexure,
+        lambda *found: Flexure.of(found[:4], period_s=found[4]),
+        lambda *found: 120.0 <= found[4] <= 86400.0,
+        ", 120 to 86400 seconds",
+        absent=Flexure(),
     )
-    walk: Walk = _option(
-        "--walk X,Y,ROT_DEG,MAG", "random walk: standard deviations after a minute", read.walk
+    walk: Walk = several(
+        "--walk X,Y,ROT_DEG,MAG",
+        "random walk: standard deviations after a minute",
+        lambda *sigma: Walk.of(sigma),
+        lambda *sigma: min(sigma) >= 0.0,
+        " after a minute, none negative",
+        absent=Walk(),
     )
-    pointing: Elevation = _option(
+    pointing: Elevation = several(
         "--elevation DEG[,DEG_PER_MIN]",
         "of the telescope, in the status; what it does to the registration is yours to say with "
         "--drift, --jump or --flexure (default: 60)",
-        read.elevation,
+        lambda start, rate=0.0: Elevation(start_deg=start, rate_deg_per_minute=rate),
+        lambda start, rate=0.0: 0.0 <= start <= 90.0 and abs(rate) <= 10.0,
+        ", 0 to 90 degrees and at most 10 per minute either way",
+        absent=Elevation(),
     )
-    slews: tuple[tuple[float, float], ...] = _many(
-        "--slew T:DEG", "change of elevation that begins at T seconds, 1 deg/s", read.slew
+    slews: tuple[tuple[float, float], ...] = several(
+        "--slew T:DEG",
+        "change of elevation that begins at T seconds, 1 deg/s",
+        as_they_are,
+        lambda time_s, by_deg: time_s > 0.0 and abs(by_deg) <= 90.0,
+        ", T > 0 seconds and at most 90 degrees either way",
+        many=True,
     )
-    truths: tuple[Path | str, ...] = _option(
+    truths: tuple[Path | str, ...] = option(
         "--truth FILE", "write the truth there (never on the wire)", read.truth, action="append"
     )
-    scene_kind: str = _option(
+    scene_kind: str = option(
         "--scene",
         "star and atmosphere, or fibre and retro-reflector",
         default=SceneKind.ONSKY.value,
         choices=[kind.value for kind in SceneKind],
+        chapter="scene: star and sky, or fibre",
     )
-    spiders: Spiders | None = _option(
+    spiders: Spiders | None = several(
         "--spiders N:WIDTH_M",
         "arms in front of the pupil, evenly spread, the first upwards (default: none)",
-        read.spiders,
+        lambda n_arms, width_m: Spiders(n_arms=int(n_arms), width_m=width_m),
+        lambda n_arms, width_m: n_arms in range(1, 13) and 0.001 <= width_m <= 1.0,
+        ", 1 to 12 arms of 0.001 to 1 m",
     )
-    profile: str | None = _option(
+    profile: str | None = option(
         "--profile", "named layers of turbulence (default: single)", choices=list(PROFILES)
     )
-    later_seeing: tuple[tuple[float, float], ...] = _many(
-        "--seeing-at T:ARCSEC", "seeing at T seconds; it changes smoothly", read.seeing_at
+    later_seeing: tuple[tuple[float, float], ...] = several(
+        "--seeing-at T:ARCSEC",
+        "seeing at T seconds; it changes smoothly",
+        as_they_are,
+        lambda time_s, arcsec: time_s > 0.0 and 0.05 <= arcsec <= 5.0,
+        ", T > 0 seconds and 0.05 to 5 arcseconds",
+        many=True,
     )
-    given_vibrations: tuple[VibrationLine | None, ...] = _many(
+    given_vibrations: tuple[VibrationLine | None, ...] = option(
         "--vibration SHAPE:HZ:NM[:DAMPING]",
         "a line on tip, tilt or focus; none: no line",
         read.vibration,
+        many=True,
     )
-    given_magnitude: float | None = _option(
+    given_magnitude: float | None = option(
         "--mag R",
         "magnitude of the guide star, or of the fibre (default: 8; by day 7)",
         within(-5.0, 20.0),
     )
-    seeing_arcsec: float = _option(
+    seeing_arcsec: float = option(
         "--seeing ARCSEC",
         "seeing at 500 nm; by day, of what is played",
         within(0.05, 5.0),
         default=1.0,
     )
-    outer_scale_m: float = _option(
+    outer_scale_m: float = option(
         "--outer-scale M", "outer scale of the turbulence", within(1.0, 1000.0), default=25.0
     )
-    wind: tuple[Layer, ...] = _many(
+    wind: tuple[Layer, ...] = several(
         "--wind SPEED,DIR_DEG[,SHARE]",
         "a layer: m/s, direction it moves to, share; up to 3, instead of a profile",
-        read.layer,
+        lambda speed, direction, share=1.0: Layer(
+            fraction=share, speed_m_s=speed, direction_deg=direction
+        ),
+        lambda speed, _, share=1.0: speed > 0.0 < share,
+        ", speed > 0 m/s and share > 0",
+        many=True,
     )
-    seed: int | None = _option("--seed N", "of everything random", count(0))
-    imperfection_set: str | None = _option(
+    seed: int | None = option("--seed N", "of everything random", count(0))
+    imperfection_set: str | None = option(
         "--imperfections --truth-model",
         "how far the telescope is from the drawing (default: usual)",
         choices=list(SETS),
+        chapter="imperfections",
     )
-    optical_gain: tuple[float, float] | None = _option(
+    optical_gain: tuple[float, float] | None = several(
         "--optical-gain LOW,HIGH",
         "of the first and the last mode; linear plant only",
-        read.gain_range,
+        as_they_are,
+        lambda *gains: min(gains) > 0.0 and max(gains) <= 1.0,
+        ", each > 0 and at most 1",
     )
-    unevenness: float | None = _option(
+    unevenness: float | None = option(
         "--unevenness RATIO", "largest departure of the light from its mean", within(0.0, 0.9)
     )
-    position_error: float | None = _option(
+    position_error: float | None = option(
         "--position-error PITCHES", "RMS error of actuator positions per axis", within(0.0, 0.3)
     )
-    distortion_subap: float | None = _option(
+    distortion_subap: float | None = option(
         "--distortion SUBAP", "radial distortion of the pupil image at its edge", within(-2.0, 2.0)
     )
-    anamorphosis: float | None = _option(
+    anamorphosis: float | None = option(
         "--anamorphosis RATIO", "stretch of the pupil image along x", within(-0.1, 0.1)
     )
-    modulation_error: float | None = _option(
+    modulation_error: float | None = option(
         "--modulation-error RATIO",
         "true modulation over the nominal one, less 1",
         within(-0.5, 1.0),
     )
-    slope_rotation_deg: float | None = _option(
+    slope_rotation_deg: float | None = option(
         "--slope-rotation DEG", "turn of the slope axes, +x towards +y", within(-45.0, 45.0)
     )
-    ncpa_nm: float | None = _option(
+    ncpa_nm: float | None = option(
         "--ncpa NM", "static wavefront only the sensor sees, RMS", within(0.0, 300.0)
     )
-    bad_pixels: int | None = _option(
+    bad_pixels: int | None = option(
         "--bad-pixels N",
         "dead pixels: dark, and their subapertures read slopes of 0",
         count(0, 100),
     )
-    frame_rate_hz: float = _option("--rate HZ", "frame rate", within(10.0, 4000.0), default=1000.0)
-    given_gain: float | None = _option(
+    frame_rate_hz: float = option(
+        "--rate HZ", "frame rate", within(10.0, 4000.0), default=1000.0, chapter="loop"
+    )
+    given_gain: float | None = option(
         "--gain G",
         "integrator gain of every controlled mode (default: 0.4; by day 0.2)",
         within(0.0, 2.0),
     )
-    group_gains: tuple[float, float, float] | None = _option(
+    group_gains: tuple[float, float, float] | None = several(
         "--gains TIP_TILT,TO_100,REST",
         "gains by group of modes, instead of --gain",
-        read.group_gains,
+        as_they_are,
+        lambda *gains: min(gains) >= 0.0 and max(gains) <= 2.0,
+        ", each 0 to 2",
     )
-    gain_ramp_s: float | None = _option(
+    gain_ramp_s: float | None = option(
         "--gain-ramp S",
         "at the start raise the gain of tip and tilt, of the modes to 100, and of the rest in "
         "turn, S seconds a step (default: 1), and keep those of least residual slopes; later "
@@ -191,99 +221,110 @@ class Options:
         nargs="?",
         const=1.0,
     )
-    leak: float = _option(
+    leak: float = option(
         "--leak L", "share of the command kept from frame to frame", within(0.0, 1.0), default=0.999
     )
-    delay_frames: int = _option(
+    delay_frames: int = option(
         "--delay FRAMES", "from an exposure to the command that answers it", count(1, 10), default=2
     )
-    n_controlled: int = _option(
+    n_controlled: int = option(
         "--n-controlled N", "modes in the loop at the start", count(1), default=400
     )
-    influence_cube: str | None = _option(
+    influence_cube: str | None = option(
         "--influence FILE:/DATASET",
         "influence functions (n_actuators, ny, nx) in HDF5, instead of the plant's own",
         read.dataset,
+        chapter="mirror",
     )
-    influence_pitch_m: float | None = _option(
+    influence_pitch_m: float | None = option(
         "--influence-pitch M",
         "distance of their points in the pupil (default: the dataset's attribute pitch_m)",
         within(1e-5, 10.0),
     )
-    rise_ms: float = _option(
+    rise_ms: float = option(
         "--rise-ms MS",
         "time of the mirror from 10 to 90 %% of a step; FLAO's takes 0.7 (default: at once)",
         within(0.0, 100.0),
         default=0.0,
     )
-    actuator_stroke_um: float = _option(
+    actuator_stroke_um: float = option(
         "--actuator-stroke UM",
         "largest OPD of one actuator either way (default: %(default)g um)",
         within(0.1, 1000.0),
-        default=MirrorLimits().stroke_m / _MICROMETRE,
+        default=MirrorLimits().stroke_m / 1e-6,
     )
-    actuator_bend_um: float = _option(
+    actuator_bend_um: float = option(
         "--actuator-bend UM",
         "largest OPD between an actuator and its neighbours' mean (default: %(default)g um)",
         within(0.1, 1000.0),
-        default=MirrorLimits().bend_m / _MICROMETRE,
+        default=MirrorLimits().bend_m / 1e-6,
     )
-    dead_actuators: tuple[int, ...] = _option(
+    dead_actuators: tuple[int, ...] = option(
         "--dead-actuators N,N...",
         "actuators that are switched off and follow their neighbours",
         read.indices,
+        absent=(),
     )
-    stuck_actuators: tuple[tuple[int, float], ...] = _many(
-        "--stuck-actuators N:METRES", "an actuator that stays at this OPD", read.stuck_actuator
+    stuck_actuators: tuple[tuple[int, float], ...] = several(
+        "--stuck-actuators N:METRES",
+        "an actuator that stays at this OPD",
+        lambda index, opd_m: (int(index), opd_m),
+        lambda index, opd_m: index >= 0.0 and index % 1 == 0.0 and abs(opd_m) <= 1e-4,
+        ", an actuator from 0 and at most 1e-4 m of OPD either way",
+        many=True,
     )
-    read_noise_electrons: float = _option(
+    read_noise_electrons: float = option(
         "--read-noise E",
         "electrons RMS per pixel",
         within(0.0, 1000.0),
         default=Camera().read_noise_electrons,
+        chapter="detector",
     )
-    excess_noise: float = _option(
+    excess_noise: float = option(
         "--excess-noise F2",
         "variance of the photon noise over Poisson's, 2 for an EMCCD",
         within(1.0, 4.0),
         default=1.0,
     )
-    preset: str | None = _option(
+    preset: str | None = option(
         "--preset",
         "frame rate, binning and modes that FLAO would choose for this magnitude; overrides "
         "--rate and --n-controlled; binning needs the diffractive plant",
         choices=["flao"],
     )
-    connect: str = _option(
+    connect: str = option(
         "--connect ENDPOINT",
         "zenoh endpoint of the service (default: %(default)s); may come up later",
         read.endpoint,
         default="tcp/127.0.0.1:7447",
+        chapter="run",
     )
-    seconds: float | None = _option(
+    seconds: float | None = option(
         "--seconds S", "stop after this much loop time", within(0.01, 1e7)
     )
-    given_speed: float | None = _option(
+    given_speed: float | None = option(
         "--speed X",
         "loop time over wall-clock time, 0: as fast as it goes (default: 1; diffractive: 0)",
         within(0.0, 100.0),
     )
-    snapshot: Path | None = _option(
+    snapshot: Path | None = option(
         "--snapshot FILE",
         "close the loop for 300 frames without a service, write a contact sheet of pupil "
         "images, slopes and residual wavefront, and end (needs the extra 'plots')",
         Path,
     )
-    quiet: bool = _option("--quiet", "say only what is wrong", action="store_true")
-    faults: tuple[Fault, ...] = _many(
+    quiet: bool = option("--quiet", "say only what is wrong", action="store_true")
+    faults: tuple[Fault, ...] = option(
         "--fault KIND@T[:ARGS]",
         "something goes wrong at T seconds, by one of the kinds below",
         read_fault,
+        many=True,
+        chapter="rehearsal: recording, replay, faults",
     )
-    record: Path | None = _option(
+    record: Path | None = option(
         "--record FILE", "write all that is sent to this new HDF5 file", Path
     )
-    replay: Path | None = _option("--replay FILE", "play a recording instead of a telescope", Path)
+    replay: Path | None = option("--replay FILE", "play a recording instead of a telescope", Path)
     binning: int = 1
     """Detector pixels per side of a subaperture, in pixels of the finest one: the preset's."""
 
@@ -335,11 +376,12 @@ class Options:
     @property
     def layers(self) -> tuple[Layer, ...]:
         """Of the turbulence."""
-        if self.wind and self.profile is not None:
+        n_own = len(self.wind)
+        if n_own and self.profile is not None:
             raise ConfigurationError("--profile: found beside --wind; expected one of them")
-        if len(self.wind) > _MOST_LAYERS:
+        if n_own > _MOST_LAYERS:
             raise ConfigurationError(
-                f"--wind: found {len(self.wind)} layers; expected at most {_MOST_LAYERS}"
+                f"--wind: found {n_own} layers; expected at most {_MOST_LAYERS}"
             )
         return self.wind or PROFILES[self.profile or "single"]
 
@@ -359,12 +401,11 @@ class Options:
     @property
     def imperfections(self) -> Imperfections:
         """A set of them, and those that were given one by one."""
-        named = {given for given in self.truths if isinstance(given, str)}
-        if self.imperfection_set is not None:
-            named.add(self.imperfection_set)
+        sets = (*self.truths, self.imperfection_set)
+        named = {given for given in sets if isinstance(given, str)}
         if len(named) > 1:
-            sets = " and ".join(sorted(named))
-            raise ConfigurationError(f"--imperfections: found {sets}; expected one set")
+            found = " and ".join(sorted(named))
+            raise ConfigurationError(f"--imperfections: found {found}; expected one set")
         changes: dict[str, Any] = {
             one.name: given
             for one in fields(Imperfections)
@@ -398,10 +439,8 @@ class Options:
     @property
     def mirror_limits(self) -> MirrorLimits:
         """How far and how sharply the mirror may be bent."""
-        return MirrorLimits(
-            stroke_m=self.actuator_stroke_um * _MICROMETRE,
-            bend_m=self.actuator_bend_um * _MICROMETRE,
-        )
+        stroke_m, bend_m = self.actuator_stroke_um * 1e-6, self.actuator_bend_um * 1e-6
+        return MirrorLimits(stroke_m=stroke_m, bend_m=bend_m)
 
     @property
     def needs_drive(self) -> bool:
@@ -429,39 +468,12 @@ class Options:
             )
         chosen = self
         if self.preset is not None:
-            preset = preset_for(self.magnitude)
-            chosen = replace(
-                self,
-                frame_rate_hz=preset.frame_rate_hz,
-                n_controlled=preset.n_controlled,
-                binning=preset.binning,
-            )
+            preset = asdict(preset_for(self.magnitude))
+            chosen = replace(self, **{name: preset[name] for name in _PRESET})
         for name, value in vars(Options).items():
             if isinstance(value, property):
                 getattr(chosen, name)
         return chosen
-
-
-_CHAPTERS = {
-    "instrument": "instrument and truth",
-    "scene_kind": "scene: star and sky, or fibre",
-    "imperfection_set": "imperfections",
-    "frame_rate_hz": "loop",
-    "influence_cube": "mirror",
-    "read_noise_electrons": "detector",
-    "connect": "run",
-    "faults": "rehearsal: recording, replay, faults",
-}
-"""Chapters of ``--help``, each by its first option."""
-
-_NOT_GIVEN: dict[str, object] = {
-    "drift": Drift(),
-    "flexure": Flexure(),
-    "walk": Walk(),
-    "pointing": Elevation(),
-    "dead_actuators": (),
-}
-"""What stands for an option that was not given, unless None, or nothing where there may be many."""
 
 
 def parse_options(given: Sequence[str] | None = None) -> Options:
@@ -470,30 +482,19 @@ def parse_options(given: Sequence[str] | None = None) -> Options:
     options = [one for one in fields(Options) if one.metadata]
     group: argparse._ActionsContainer = parser
     for one in options:
-        if one.name in _CHAPTERS:
-            group = parser.add_argument_group(_CHAPTERS[one.name])
+        if one.metadata["chapter"] is not None:
+            group = parser.add_argument_group(one.metadata["chapter"])
         group.add_argument(*one.metadata["flags"], dest=one.name, **one.metadata["argparse"])
-    found = vars(parser.parse_args(_joined(sys.argv[1:] if given is None else given)))
+    found = parser.read(sys.argv[1:] if given is None else given)
     for one in options:
         if one.metadata["argparse"].get("action") == "append":
             found[one.name] = tuple(found[one.name] or ())
         elif found[one.name] is None:
-            found[one.name] = _NOT_GIVEN.get(one.name)
+            found[one.name] = one.metadata["absent"]
     try:
         return Options(**found).complete()
     except ConfigurationError as error:
         parser.error(str(error))
-
-
-def _joined(given: Sequence[str]) -> list[str]:
-    """Tie values that begin with a minus sign to their option: argparse takes them for options."""
-    joined: list[str] = []
-    for argument in given:
-        if joined and joined[-1].startswith("--") and re.match(r"-[\d.]", argument):
-            joined[-1] += f"={argument}"
-        else:
-            joined.append(argument)
-    return joined
 
 
 if __name__ == "__main__":  # whether options make sense, for who would start the simulator later

@@ -26,9 +26,6 @@ from sim_rtc.telescope.registration import Drift, Flexure, Jump, Walk
 from sim_rtc.telescope.scene import Elevation, Scene, SceneKind, Spiders
 from sim_rtc.telescope.sky import DAYTIME_LINES, SeeingSchedule, VibrationLine
 
-_MOST_LAYERS = 3
-_PRESET = ("frame_rate_hz", "n_controlled", "binning")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
@@ -379,10 +376,8 @@ class Options:
         n_own = len(self.wind)
         if n_own and self.profile is not None:
             raise ConfigurationError("--profile: found beside --wind; expected one of them")
-        if n_own > _MOST_LAYERS:
-            raise ConfigurationError(
-                f"--wind: found {n_own} layers; expected at most {_MOST_LAYERS}"
-            )
+        if n_own > 3:
+            raise ConfigurationError(f"--wind: found {n_own} layers; expected at most 3")
         return self.wind or PROFILES[self.profile or "single"]
 
     @property
@@ -469,7 +464,8 @@ class Options:
         chosen = self
         if self.preset is not None:
             preset = asdict(preset_for(self.magnitude))
-            chosen = replace(self, **{name: preset[name] for name in _PRESET})
+            del preset["faintest"]
+            chosen = replace(self, **preset)
         for name, value in vars(Options).items():
             if isinstance(value, property):
                 getattr(chosen, name)

@@ -55,7 +55,8 @@ class WavefrontError:
         modes = batches[0].optics.opd_per_command
         commands = np.array([batch.commands_m[0] for batch in batches])
         n_moved = int(np.flatnonzero(commands.any(axis=0))[-1]) + 1 if commands.any() else 0
-        residual = commands[:, :n_moved] @ modes[:, :n_moved].T
+        # in this order: for ten commands a copy of the modes would cost as much as the product
+        residual = np.ascontiguousarray((modes[:, :n_moved] @ commands[:, :n_moved].T).T)
         residual += np.array([batch.phase_m for batch in batches])
         residual -= (residual @ self._weights)[:, None]
         return [float(rms) * 1e9 for rms in np.sqrt(residual**2 @ self._weights)]

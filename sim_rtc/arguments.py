@@ -103,7 +103,8 @@ def numbers(
     counts = [
         range(1 + group.split("[")[0].count(","), 2 + group.count(",")) for group in form.split(":")
     ]
-    expected = form + limits
+    short, full = re.sub(r"\[.*]", "", form), re.sub(r"[\[\]]", "", form)
+    expected = (form if short == full else f"{short} or {full}") + limits
 
     def read(text: str) -> Any:  # noqa: ANN401 - whatever make returns
         groups = [group.split(",") for group in text.split(":")]

@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument, load_settings
+from service.config import load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import BOUNDARY_SCALE
 from service.telemetry.openloop import FarEstimate
 from service.tracking.events import FarFitted
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode
-from service.worker import Compute, OpticsWorker
 from studies.campaign.acquisition_table import table
 from studies.campaign.observatory import Observatory
 from studies.campaign.rows import Row, RowFile, range_of, tell
+from studies.campaign.small import bench_of
 from studies.campaign.system_nights import GAINS
 
 RANGE = np.array([1.5, 1.5, 6.0, 0.05])
@@ -91,7 +90,7 @@ def play(start: Start) -> Row:
     begun = time.monotonic()
     with threadpool_limits(1):
         settings = load_settings(None, {}, {"control.n_modes_target": start.n_controlled})
-        bench = _bench(start.instrument, start.sampling)
+        bench = bench_of(start.instrument, start.sampling)
         linear = start.plant == "linear"
         night = Observatory(start.words, policy_of(settings), Mode.AUTO, bench, with_poles=linear)
         over_s = None
@@ -149,12 +148,6 @@ def _far(found: FarEstimate, night: Observatory) -> Row:
         "gains": [float(gains.min()), float(gains.max())],
         "n_starts": found.n_starts,
     }
-
-
-@cache
-def _bench(instrument: str, sampling: int) -> OpticsWorker:
-    compute = Compute(threads=1, pupil_sampling=sampling, detector_nodes=sampling)
-    return OpticsWorker(load_instrument(instrument), compute)
 
 
 def main() -> int:

@@ -28,14 +28,14 @@ from service.wire import Command as Order
 from service.worker import OpticsWorker
 from studies.campaign.golden import Entry, Teller
 from studies.campaign.golden_codec import encoded
-from studies.campaign.observatory import Latencies, Observatory
+from studies.campaign.observatory import Observatory
 from studies.campaign.observatory_link import OwnHands
+from studies.campaign.small import SETTINGS as SMALL_SETTINGS
+from studies.campaign.small import SMALL, latencies_of
 from studies.campaign.strange_rtc import Mischief, StrangeDome, StrangeLink
 
-TELESCOPE = "tests/system/small.toml"
-
 WORDS = (
-    f"--instrument={TELESCOPE}",
+    f"--instrument={SMALL}",
     "--plant=linear",
     "--imperfections=ideal",
     "--optical-gain=0.7,0.9",
@@ -47,16 +47,14 @@ WORDS = (
 """The simulator's command line, where a night has no other."""
 
 SETTINGS: Mapping[str, object] = {
+    **SMALL_SETTINGS,
     "dither.budget_m": 20e-9,
     "dither.amplitude_m": 10e-9,
-    "dither.window_s": 1.0,
     "dither.longest_window_s": 2.0,
     "dither.longest_pause_s": 0.0,
     "control.n_modes_target": 45,
-    "tracking.floor_rotation_deg": 0.04,
-    "tracking.floor_magnification": 0.0007,
 }
-"""Of the service, where a night has no others: few modes must tell as much as many."""
+"""Of the service, where a night has no others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,14 +134,13 @@ class GoldenNight(Observatory):
         """No status comes from the RTC."""
 
         words = [*(w for w in WORDS if not _again(w, plan.words)), *plan.words]
-        slow = plan.slow
         self._n_slopes = bench.describe().n_slopes
         super().__init__(
             words,
             policy_of(load_settings(None, {}, self._settings)),
             plan.mode,
             bench,
-            latencies=Latencies(fit_s=0.5 * slow, make_s=2.0 * slow, judge_s=slow),
+            latencies=replace(latencies_of(plan.slow), watch_s=0.5),
             with_poles=False,
             dome=GoldenDome(words),
             link=GoldenLink,

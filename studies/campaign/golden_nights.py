@@ -17,9 +17,10 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.worker import Compute, OpticsWorker
 from studies.campaign.golden import FOLDER, INSTRUMENT, written
-from studies.campaign.golden_night import TELESCOPE, GoldenNight
+from studies.campaign.golden_night import GoldenNight
 from studies.campaign.golden_orders import COMMANDED, MEASURING
 from studies.campaign.golden_skies import ACQUIRING, FAULTS, TRACKING
+from studies.campaign.small import SMALL
 
 NIGHTS = (*TRACKING, *ACQUIRING, *COMMANDED, *MEASURING, *FAULTS)
 
@@ -34,7 +35,7 @@ def main() -> int:
                 continue
             begun = time.process_time()
             # of this night alone: a worker may take up what a matrix tells of the slopes
-            night = GoldenNight(plan, OpticsWorker(load_instrument(TELESCOPE), Compute(threads=1)))
+            night = GoldenNight(plan, OpticsWorker(load_instrument(SMALL), Compute(threads=1)))
             night.play()
             path = given.folder / f"{plan.name}.jsonl.xz"
             written(night.recorded, path)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config import load_instrument, load_settings
+from service.config import load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import Misregistration
 from service.runtime.streams import PASSIVE_MEMORY_S
@@ -27,10 +26,10 @@ from service.telemetry.kalman import (
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.passive import Passive, accumulate
 from service.wire import DitherKind, DitherRequest
-from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.computer import RealTimeComputer
 from studies.campaign.night import loop_of
+from studies.campaign.small import bench_of
 from studies.campaign.telemetry import LINE_FRACTIONS, SETTLING_S, blocks_of
 
 DITHERED = (409, 427, 445, 463)
@@ -63,12 +62,6 @@ class PassiveNight:
 
     dither_every_s: float
     """0: never."""
-
-
-@cache
-def bench() -> OpticsWorker:
-    """One model per process."""
-    return OpticsWorker(load_instrument("flao-lbt"), Compute(threads=1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -154,7 +147,7 @@ class Watch:
         """Fold a dithered window in."""
         if isinstance(window, WindowRefused):
             return
-        found = bench().fit(window, self._loop, self._near)
+        found = bench_of("flao-lbt").fit(window, self._loop, self._near)
         if isinstance(found, WindowRefused):
             return
         measured, noise = found.alpha.vector, found.covariance
@@ -172,7 +165,7 @@ class Watch:
 
     def _look(self, t_s: float) -> Iterator[Look]:
         """Look at the passive estimate, and fold it in when a dither has begun the filter."""
-        found = bench().watch(self._passive, self._near)
+        found = bench_of("flao-lbt").watch(self._passive, self._near)
         if found is None:
             return
         # like the service: no two looks share telemetry

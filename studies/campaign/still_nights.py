@@ -14,22 +14,20 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
-from service.config import load_instrument, load_settings
+from service.config import load_settings
 from service.config.policy import policy_of
 from service.tracking.events import Event
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import new_lines
-from service.worker import Compute, OpticsWorker
-from studies.campaign.observatory import Latencies, Observatory
+from studies.campaign.observatory import Observatory
 from studies.campaign.rows import Row, RowFile
+from studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of
 
-SMALL = "tests/system/small.toml"
 PLANTS = {
     "small, linear": (f"--instrument={SMALL}", "--plant=linear", "--n-controlled=45"),
     "small, diffractive": (
@@ -55,20 +53,6 @@ SUSPECTED = "registration.jump-suspected"
 SETTLING_S = 20.0
 """The night's beginning, with the first matrix and more modes, is not counted."""
 
-_SETTINGS: dict[str, dict[str, object]] = {
-    SMALL: {
-        "dither.budget_m": 40e-9,
-        "dither.amplitude_m": 20e-9,
-        "dither.window_s": 1.0,
-        "dither.longest_window_s": 1.0,
-        "control.n_modes_target": 60,
-        "tracking.floor_rotation_deg": 0.04,
-        "tracking.floor_magnification": 0.0007,
-    },
-    "flao-lbt": {},
-}
-"""Fewer modes of a small telescope must tell as much."""
-
 
 class StillNight(Observatory):
     """A night that counts what the service says of jumps."""
@@ -76,15 +60,13 @@ class StillNight(Observatory):
     def __init__(self, words: Sequence[str], slower: float) -> None:
         self.said: Counter[str] = Counter()
         instrument = words[0].removeprefix("--instrument=")
-        settings = load_settings(None, {}, _SETTINGS[instrument])
+        settings = load_settings(None, {}, SETTINGS if instrument == SMALL else {})
         super().__init__(
             words,
             policy_of(settings),
             Mode.AUTO,
-            _workbench(instrument),
-            latencies=Latencies(
-                fit_s=0.5 * slower, make_s=2.0 * slower, judge_s=slower, watch_s=0.5 * slower
-            ),
+            bench_of(instrument),
+            latencies=latencies_of(slower),
             with_poles=False,
         )
 
@@ -113,11 +95,6 @@ def play(plant: str, sky: str, worker: str, seed: int, seconds: float) -> Row:
         "windows": night.state.windows_accepted,
         "cpu_s": time.process_time() - begun,
     }
-
-
-@cache
-def _workbench(instrument: str) -> OpticsWorker:
-    return OpticsWorker(load_instrument(instrument), Compute(threads=1))
 
 
 def table(rows: Sequence[Row]) -> str:

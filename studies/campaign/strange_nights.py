@@ -15,14 +15,13 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
-from service.config import load_instrument, load_settings
+from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import PyrcalError
 from service.link.events import LinkEvent
@@ -30,10 +29,10 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState, MeasurePattern
 from service.tracking.state import Mode
 from service.wire import Acknowledgement, Loop, LoopRequest
-from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Latencies, Observatory
 from studies.campaign.observatory_dome import Moment
 from studies.campaign.rows import Row, RowFile, range_of, tell
+from studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of
 from studies.campaign.strange_rtc import DIALECTS, Mischief, StrangeDome, StrangeLink
 
 LIMIT_NM, LIMIT_S = 1000.0, 1.0
@@ -42,7 +41,7 @@ LIMIT_NM, LIMIT_S = 1000.0, 1.0
 HEALTHY_NM = 300.0
 """A loop below it had no need to be opened."""
 
-N_CONTROLLED, N_TARGET = 45, 60
+N_CONTROLLED = 45
 _SEED = 20261122
 
 
@@ -62,11 +61,13 @@ class StrangeNight(Observatory):
 
     def __init__(self, words: Sequence[str], latencies: Latencies, *, listening: bool) -> None:
         mode = Mode.HOLD if listening else Mode.AUTO
+        dither = {"dither.enabled": not listening, "dither.longest_pause_s": 0.0}
+        settings = {**SETTINGS, **dither}
         super().__init__(
             words,
-            policy_of(load_settings(None, {}, _settings(listening=listening))),
+            policy_of(load_settings(None, {}, settings)),
             mode,
-            _bench(words[0].removeprefix("--instrument=")),
+            bench_of(words[0].removeprefix("--instrument=")),
             latencies=latencies,
             with_poles=False,
             dome=StrangeDome(words),
@@ -254,8 +255,7 @@ def _plan(seed: int, instrument: str, seconds: float) -> tuple[list[str], Latenc
         x, y = rng.uniform(-0.3, 0.3, 2)
         words.append(f"--jump={time_s:.2f}:{x:.3f},{y:.3f},{rng.uniform(-0.6, 0.6):.3f},0")
     slow = float(rng.choice([1.0, 1.0, 4.0]))
-    latencies = Latencies(fit_s=0.5 * slow, make_s=2.0 * slow, judge_s=slow, watch_s=0.5 * slow)
-    return words, latencies, deeds_of(rng, seconds)
+    return words, latencies_of(slow), deeds_of(rng, seconds)
 
 
 def _night(seed: int, instrument: str, seconds: float, *, listening: bool) -> StrangeNight:
@@ -264,26 +264,6 @@ def _night(seed: int, instrument: str, seconds: float, *, listening: bool) -> St
         night = StrangeNight(words, latencies, listening=listening)
         night.play(deeds, seconds)
     return night
-
-
-def _settings(*, listening: bool) -> dict[str, object]:
-    """Return the settings of a small telescope: fewer modes must tell as much."""
-    return {
-        "dither.enabled": not listening,
-        "dither.budget_m": 40e-9,
-        "dither.amplitude_m": 20e-9,
-        "dither.window_s": 1.0,
-        "dither.longest_window_s": 1.0,
-        "dither.longest_pause_s": 0.0,
-        "control.n_modes_target": N_TARGET,
-        "tracking.floor_rotation_deg": 0.04,
-        "tracking.floor_magnification": 0.0007,
-    }
-
-
-@cache
-def _bench(instrument: str) -> OpticsWorker:
-    return OpticsWorker(load_instrument(instrument), Compute(threads=1))
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -320,7 +300,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--output", type=Path, default=Path("strange.jsonl"), help="rows, resumed")
     parser.add_argument("--table", type=Path, metavar="FILE.md")
-    parser.add_argument("--instrument", default="tests/system/small.toml", metavar="NAME|FILE")
+    parser.add_argument("--instrument", default=SMALL, metavar="NAME|FILE")
     parser.add_argument("--seeds", type=range_of, default=range(4), metavar="FIRST:END")
     parser.add_argument("--seconds", type=float, default=40.0, help="of each night")
     return parser

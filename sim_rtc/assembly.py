@@ -116,13 +116,23 @@ def build_telescope(
         for _, response in optics.responses if sky.played is None else ():
             sky.turbulence.prepare(response)
 
-    optics = MovingOptics(
-        plant,
-        build_schedule(options, instrument, alpha_rng),
-        executor or background_executor(),
-        prepare=prepare,
+    schedule = Schedule(
+        start=options.alpha or random_registration(alpha_rng, instrument.start.rotation_rad),
+        drift=options.drift,
+        flexure=options.flexure,
+        walk=replace(options.walk, seed=int(alpha_rng.integers(2**63))),
+        jumps=options.jumps,
     )
-    detector = build_detector(options, instrument, plant, optics.start())
+    optics = MovingOptics(plant, schedule, executor or background_executor(), prepare=prepare)
+    detector = Detector(
+        instrument,
+        images=optics.start().images,
+        valid=plant.valid,
+        magnitude=options.magnitude,
+        frame_rate_hz=options.frame_rate_hz,
+        camera=options.camera,
+        silent=plant.slope_errors.silent,
+    )
     double_pass = options.scene.passes == 2
     identity = replace(identity_of(instrument, plant.valid), double_pass=double_pass)
     return Telescope(
@@ -228,32 +238,6 @@ def binned_basis(instrument: Instrument, basis: ModalBasis, binning: int) -> Mod
     surface = mirror_surface(instrument.analytic_mirror, binned(instrument, binning).subaperture_m)
     coefficients = surface.coefficients(basis.mode_to_actuator)
     return replace(basis, surface=surface, coefficients=coefficients)
-
-
-def build_schedule(options: Options, instrument: Instrument, rng: np.random.Generator) -> Schedule:
-    """Return how the registration moves; one that was not given begins near the nominal one."""
-    return Schedule(
-        start=options.alpha or random_registration(rng, instrument.start.rotation_rad),
-        drift=options.drift,
-        flexure=options.flexure,
-        walk=replace(options.walk, seed=int(rng.integers(2**63))),
-        jumps=options.jumps,
-    )
-
-
-def build_detector(
-    options: Options, instrument: Instrument, plant: Plant, optics: Optics
-) -> Detector:
-    """Return the detector under the light of these optics."""
-    return Detector(
-        instrument,
-        images=optics.images,
-        valid=plant.valid,
-        magnitude=options.magnitude,
-        frame_rate_hz=options.frame_rate_hz,
-        camera=options.camera,
-        silent=plant.slope_errors.silent,
-    )
 
 
 def build_feed(

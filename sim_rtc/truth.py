@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 import queue
-import threading
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Self, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.errors import ConfigurationError
 from sim_rtc.assembly import Telescope
-from sim_rtc.computer.feed import BATCH_FRAMES
+from sim_rtc.computer.feed import BATCH_FRAMES, Background
 from sim_rtc.computer.telemetry import Batch, FrameClock
 from sim_rtc.options import Options
 from sim_rtc.telescope.diffractive import DiffractiveOptics
@@ -62,7 +62,7 @@ class WavefrontError:
         return [float(rms) * 1e9 for rms in np.sqrt(residual**2 @ self._weights)]
 
 
-class TruthRecorder:
+class TruthRecorder(Background):
     """Writes JSON lines in a thread of its own while its ``with`` block lasts."""
 
     def __init__(
@@ -74,6 +74,7 @@ class TruthRecorder:
         options: Options | None = None,
     ) -> None:
         """Take the pupil's ``weights`` ``(n_points,)``, and the options if they are to be told."""
+        super().__init__("truth")
         self._path = path
         self._options = options
         self._error = WavefrontError(weights)
@@ -81,21 +82,21 @@ class TruthRecorder:
         self._line_frames = round(_LINE_S * 1e9 / clock.dt_ns)
         self._swap_frames = round(_SWAP_S * 1e9 / clock.dt_ns)
         self._queue: queue.Queue[tuple[Batch, int, float] | None] = queue.Queue(_BACKLOG_BATCHES)
-        self._thread = threading.Thread(target=self._run, name="truth", daemon=True)
         self._recent: deque[tuple[int, float]] = deque()
         self._swaps: list[_Swap] = []
         self._last: Batch | None = None
 
-    def __enter__(self) -> TruthRecorder:
+    @override
+    def __enter__(self) -> Self:
         self._file: TextIO = self._path.open("w", encoding="utf-8")
         if self._options is not None:
             self._write({"kind": "setup", **setup_of(self._options)})
-        self._thread.start()
-        return self
+        return super().__enter__()
 
+    @override
     def __exit__(self, *_: object) -> None:
         self._queue.put(None)
-        self._thread.join()
+        super().__exit__()
         self._file.close()
 
     def offer(self, batch: Batch, overrun_frames: int, behind_s: float = 0.0) -> None:
@@ -105,13 +106,11 @@ class TruthRecorder:
         """
         self._queue.put((batch, overrun_frames, behind_s))
 
-    def _run(self) -> None:
+    @override
+    def _work(self) -> None:
         pending: list[Batch] = []
         overruns, behind_s = 0, 0.0
-        while True:
-            item = self._queue.get()
-            if item is None:
-                break
+        while (item := self._queue.get()) is not None:
             batch, overruns, behind_s = item
             if pending and self._is_boundary(pending, batch):
                 self._write_interval(pending, overruns, behind_s)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, LoopRequest
 from sim_rtc.computer.gains import GainRamp
-from sim_rtc.computer.measure import Measured, Measurement
+from sim_rtc.computer.measure import Measurement
 from sim_rtc.computer.telemetry import Batch, LoopSettings
 
 Array32 = NDArray[np.float32]
@@ -31,13 +31,13 @@ _MOST_ENDED = 4
 class Activities:
     """What is under way; not for two threads at once."""
 
-    def __init__(self, *, n_modes: int, n_slopes: int, frame_rate_hz: float) -> None:
-        self._n_modes, self._n_slopes = n_modes, n_slopes
+    def __init__(self, *, n_modes: int, frame_rate_hz: float) -> None:
+        self._n_modes = n_modes
         self._frame_rate_hz = frame_rate_hz
         self._dither: Dither | None = None
         self._measurement: Measurement | None = None
         self._closes_again = False
-        self.ended: deque[Measured] = deque(maxlen=_MOST_ENDED)
+        self.ended: deque[Measurement] = deque(maxlen=_MOST_ENDED)
         """Measurements that have ended, for whoever sends them."""
         self._ramp: GainRamp | None = None
         self.late_dither_frames = 0
@@ -122,10 +122,8 @@ class Activities:
     def _end_measurement(self, session: str, failure: str = "") -> None:
         measurement, self._measurement = self._measurement, None
         if measurement is not None:
-            ended = Measured(
-                measurement=measurement, session=session, n_slopes=self._n_slopes, failure=failure
-            )
-            self.ended.append(ended)
+            measurement.session, measurement.failure = session, failure
+            self.ended.append(measurement)
 
     def commands(self, seq0: int, n_frames: int) -> Array32 | None:
         """Return what is added to the commands of the batch ``(n_frames, n_modes)``, metres."""

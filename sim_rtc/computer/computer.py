@@ -29,7 +29,7 @@ from sim_rtc.computer.activities import LARGEST_DITHER_M, Activities, refusal
 from sim_rtc.computer.feed import BATCH_FRAMES, Block
 from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, Plan, ramp_refusal
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
-from sim_rtc.computer.measure import Measured, MeasurementRules
+from sim_rtc.computer.measure import Measurement, MeasurementRules
 from sim_rtc.computer.reconstructors import Terms
 from sim_rtc.computer.telemetry import (
     Batch,
@@ -89,11 +89,7 @@ class RealTimeComputer:
         self._stroke_m = stroke_m
         self._staged: deque[Reconstructor] = deque()
         self._swaps: deque[tuple[str, int]] = deque(maxlen=16)
-        self._activities = Activities(
-            n_modes=self._n_modes,
-            n_slopes=self._n_slopes,
-            frame_rate_hz=settings.frame_rate_hz,
-        )
+        self._activities = Activities(n_modes=self._n_modes, frame_rate_hz=settings.frame_rate_hz)
         self._rules = MeasurementRules(
             n_modes=self._n_modes,
             n_slopes=self._n_slopes,
@@ -174,7 +170,7 @@ class RealTimeComputer:
             self._swaps.clear()
         return swaps
 
-    def take_measured(self) -> list[Measured]:
+    def take_measured(self) -> list[Measurement]:
         """Return the measurements that have ended since the last call."""
         with self._lock:
             ended = list(self._activities.ended)

@@ -46,6 +46,10 @@ class Measurement:
         self, request: MeasureRequest, strokes: PushPull | Tones, solver: Regression | Demodulation
     ) -> None:
         self.request = request
+        self.session = ""
+        """In which it has ended."""
+        self.failure = ""
+        """Why there is no matrix; empty: there may be one."""
         self.needs_open_loop = request.pattern is not Pattern.SINE
         """Whether the loop must not answer the strokes."""
         self.start_seq = 0
@@ -53,9 +57,9 @@ class Measurement:
         self._solver = solver
 
     @property
-    def n_frames(self) -> int:
-        """Length, frames."""
-        return self._strokes.n_frames
+    def n_slopes(self) -> int:
+        """Rows of its matrix."""
+        return self._solver.n_slopes
 
     @property
     def stop_seq(self) -> int:
@@ -211,33 +215,22 @@ class MeasurementRules:
         return n_shapes * frames_per_shape(request.n_average or 1)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Measured:
-    """A measurement that has ended."""
-
-    measurement: Measurement
-    session: str
-    n_slopes: int
-    failure: str = ""
-    """Why there is no matrix; empty: there may be one."""
-
-
 def product(
-    measured: Measured, identity: Identity, created_ns: int
+    measured: Measurement, identity: Identity, created_ns: int
 ) -> tuple[MeasuredManifest, Array32 | None]:
-    """Return what is sent of a measurement: its manifest, and the matrix or None.
+    """Return what is sent of a measurement that has ended: its manifest, and the matrix or None.
 
     ``created_ns`` is nanoseconds since the Unix epoch, UTC.
     """
     failure, matrix = measured.failure, None
     if not failure:
         try:
-            matrix = measured.measurement.matrix()
+            matrix = measured.matrix()
         except np.linalg.LinAlgError as error:
             failure = f"what was read back determines no matrix: {error}"
     if matrix is not None and not np.isfinite(matrix).all():
         failure, matrix = "the matrix came out with numbers that are not finite", None
-    request = measured.measurement.request
+    request = measured.request
     if matrix is None:
         layout = MatrixLayout(
             shape=(measured.n_slopes, len(request.modes)),

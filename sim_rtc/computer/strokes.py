@@ -139,6 +139,7 @@ class Regression:
     """
 
     def __init__(self, modes: tuple[int, ...], *, n_modes: int, n_slopes: int) -> None:
+        self.n_slopes = n_slopes
         self._modes = np.array(modes)
         self._products = np.zeros((n_modes, n_slopes), dtype=np.float32)
         self._powers = np.zeros((n_modes, n_modes))
@@ -181,6 +182,7 @@ class Demodulation:
     """
 
     def __init__(self, tones: Tones, *, n_slopes: int) -> None:
+        self.n_slopes = n_slopes
         self._tones = tones
         n = len(tones.modes)
         self._slopes = np.zeros((2 * n, n_slopes), dtype=np.float32)

@@ -27,7 +27,7 @@ from service.wire import (
 )
 from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import Background
-from sim_rtc.computer.measure import Measured, product
+from sim_rtc.computer.measure import Measurement, product
 from sim_rtc.computer.reconstructors import Outcome, Staging
 from sim_rtc.computer.telemetry import Reconstructor
 from sim_rtc.faults import Fault, FaultKind, FaultPlan
@@ -244,7 +244,7 @@ class Matrices(Background):
             self._recorder.put(Kind.ACKNOWLEDGEMENT, data)
         acknowledge(self._session, self._keys, data)
 
-    def _send(self, measured: Measured) -> None:
+    def _send(self, measured: Measurement) -> None:
         """Solve what was measured; send the matrix in parts, then its manifest."""
         manifest, matrix = product(measured, self._computer.identity, time.time_ns())
         parts = [] if matrix is None else split(matrix, manifest.layout.chunk_bytes)

@@ -246,29 +246,14 @@ def _told(state: TrackerState) -> str:
     return f" (last: {state.unfetched})" if state.unfetched else ""
 
 
-_ALARMS: Final = {
-    alarms.NO_DITHER: Party.RTC,
-    alarms.DITHER_LOST: Party.RTC,
-    alarms.NOT_STOPPED: Party.RTC,
-    alarms.OVER_BUDGET: Party.RTC,
-    alarms.NOT_AS_ASKED: Party.RTC,
-    alarms.NOT_ACKNOWLEDGED: Party.RTC,
-    alarms.OTHER_SUM: Party.RTC,
-    alarms.STANDING_BY: Party.SERVICE,
-    alarms.ACQUISITION: Party.OPERATOR,
-    alarms.LOOP_OPEN: Party.OPERATOR,
-    alarms.WORKER_BEHIND: Party.WORKER,
-    alarms.WORKER_LOST: Party.WORKER,
-}
-"""Alarms whose end is waited for though they may forbid nothing, and by whom it comes."""
-
-
 def _for_alarms(facts: Facts) -> Iterator[Waiting]:
     """Yield the alarms that keep the service from its job: their texts say what to do."""
     for alarm in facts.state.alarms:
         acts = [act for act in (Act.ASK, Act.DECIDE, Act.MEASURE) if forbids(alarm, act)]
-        if acts or alarm.name in _ALARMS:
-            party = _ALARMS.get(alarm.name, Party.OPERATOR)
+        kind = alarms.ALARMS.get(alarm.name)
+        party = None if kind is None else kind.party
+        if acts or party is not None:
+            party = party or Party.OPERATOR
             hinders = Act.ASK in acts
             yield Waiting(name=alarm.name, party=party, text=alarm.text, hinders=hinders)
 

@@ -24,7 +24,7 @@ class MatrixState(StrEnum):
     """It passed the gate and waits for an operator."""
 
     DISCARDED = "discarded"
-    """An operator rejected it."""
+    """An operator rejected it, or what it was made for has passed: another α, another proposal."""
 
     PUBLISHED = "published"
     """Sent; the RTC has not answered yet."""
@@ -42,7 +42,7 @@ class MatrixState(StrEnum):
     """The RTC refused it; the reason is the RTC's."""
 
     FAILED = "failed"
-    """No acknowledgement came in time."""
+    """No acknowledgement came in time, or the RTC holds other numbers; the reason says which."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

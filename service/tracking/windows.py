@@ -33,10 +33,10 @@ from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import count_miss
 from service.tracking.alarms import (
+    ALARMS,
     DISAGREES,
     DITHER_LOST,
     MISALIGNED,
-    RULES,
     SUSPECTED,
     WRONG_ANSWER,
     Act,
@@ -339,7 +339,7 @@ def why_no_measurement(state: TrackerState, when: Taken) -> str | None:
     alarm = forbidding(state, Act.MEASURE)
     if alarm is None:
         return why_void(state, when)
-    return f"{RULES[alarm.name].because}: its telemetry is no measurement"
+    return f"{ALARMS[alarm.name].because}: its telemetry is no measurement"
 
 
 def on_watchdog(turn: Turn, event: ev.Watched) -> None:

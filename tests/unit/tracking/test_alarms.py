@@ -6,8 +6,9 @@ import pytest
 
 from service.errors import CommandError
 from service.telemetry.frames import WindowRefused
+from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.alarms import RULES, Act, Rule
+from service.tracking.alarms import ALARMS, Act, Kind
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from tests.unit.tracking.situations import Story, judged, of_kind, record
@@ -84,8 +85,9 @@ def test_not_even_an_operator_sends_to_an_rtc_that_may_be_another(name):
 
 
 def test_where_only_new_matrices_are_forbidden_one_that_was_in_use_may_come_back(monkeypatch):
-    rule = Rule("the model was wrong", frozenset({Act.DECIDE, Act.SEND_NEW}))
-    monkeypatch.setitem(RULES, "wrong-model", rule)
+    forbids = frozenset({Act.DECIDE, Act.SEND_NEW})
+    kind = Kind(means="-", do="-", forbids=forbids, because="the model was wrong")
+    monkeypatch.setitem(ALARMS, "wrong-model", kind)
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=3)
     story.make("cm-1", wanted=True, sha256="1" * 64)
@@ -97,6 +99,13 @@ def test_where_only_new_matrices_are_forbidden_one_that_was_in_use_may_come_back
     assert not story.asked(ev.SendMatrix)
     story.tell(ev.MatrixMade(record=made(story, "cm-4", sha256="1" * 64), wanted=True))
     assert [sent.id for sent in story.asked(ev.SendMatrix)] == ["cm-4"]
+
+
+def test_every_alarm_is_in_the_table_and_says_what_it_refuses():
+    names = {value for name, value in vars(alarms).items() if name.isupper() and name != "ALARMS"}
+    assert names == set(ALARMS)
+    for name, kind in ALARMS.items():
+        assert bool(kind.because) == bool(kind.forbids), name
 
 
 def test_a_name_that_is_in_no_table_forbids_nothing():

@@ -1,0 +1,113 @@
+"""Writes docs/states.md: what the service can be in, from the tables that it goes by itself.
+
+Run: ``python -m studies.state_tables``, then ``git diff``; a test compares.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Sequence
+from enum import StrEnum
+from itertools import pairwise
+from pathlib import Path
+from typing import get_args
+
+from service.tracking.activity import ALLOWS
+from service.tracking.alarms import ALARMS, Act
+from service.tracking.events import Command
+from service.tracking.products import MatrixState, MeasureState
+from service.tracking.registration import Validity
+from service.tracking.stages import AcquisitionStage
+from service.tracking.state import Mode
+
+PAGE = Path(__file__).parents[1] / "docs" / "states.md"
+
+_STATES: dict[str, type[StrEnum]] = {
+    "Modes": Mode,
+    "What α is worth": Validity,
+    "An acquisition's way": AcquisitionStage,
+    "A reconstructor's way": MatrixState,
+    "A measured matrix's way": MeasureState,
+}
+
+
+def page() -> str:
+    """Return docs/states.md."""
+    parts = [
+        "# What the service can be in",
+        "Written by `python -m studies.state_tables` from the tables that the service goes by; "
+        "change those.",
+        "## What runs, and which commands that refuses",
+        "Two may run at a time: what refuses a command says so, and how to end it.",
+        _table(("while", "refused"), _refusals()),
+    ]
+    for title, kind in _STATES.items():
+        rows = [(f"`{state}`", text) for state, text in _described(kind).items()]
+        parts += [f"## {title}", _table(("state", "meaning"), rows)]
+    parts += [
+        "## Alarms",
+        "An alarm lasts as long as what it tells of. What one forbids: "
+        + "; ".join(f"*{_plain(act)}*: {_lower(text)}" for act, text in _described(Act).items()),
+        _table(("alarm", "it means", "do", "forbids"), _alarms()),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _refusals() -> list[tuple[str, ...]]:
+    every = get_args(Command)
+    return [
+        (
+            activity.value,
+            ", ".join(f"`{each.__name__}`" for each in every if each not in allowed),
+        )
+        for activity, allowed in ALLOWS.items()
+    ]
+
+
+def _alarms() -> list[tuple[str, ...]]:
+    return [
+        (
+            f"`{name}`",
+            kind.means,
+            kind.do,
+            ", ".join(_plain(act) for act in Act if act in kind.forbids),
+        )
+        for name, kind in ALARMS.items()
+    ]
+
+
+def _described(kind: type[StrEnum]) -> dict[str, str]:
+    """Return the values of an enumeration with the text that follows each in its source."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
+    (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
+    texts: dict[str, str] = {}
+    for statement, after in pairwise([*body, ast.Pass()]):
+        match statement, after:
+            case ast.Assign(targets=[ast.Name(id=name)]), ast.Expr(
+                value=ast.Constant(value=str(text))
+            ):
+                texts[kind[name].value] = " ".join(text.split())
+            case ast.Assign(targets=[ast.Name(id=name)]), _:
+                texts[kind[name].value] = ""
+            case _:
+                pass
+    return texts
+
+
+def _plain(act: str) -> str:
+    return act.replace("_", " ")
+
+
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:].rstrip(".")
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -150,20 +150,12 @@ class Archive:
         """
         return self._products.matrix(matrix_id)
 
-    def update(self, record: ReconstructorRecord) -> None:
-        """Remember where a reconstructor is now, one that is not stored here (the RTC's) too."""
-        self.record((record,), ())
-
     def records(self) -> tuple[ReconstructorRecord, ...]:
         """Return what is known of every reconstructor, oldest first.
 
         One whose product was missing or damaged at the start has failed, with the reason.
         """
         return self._products.records()
-
-    def audit(self, t_ns_utc: int, who: str, name: str, text: str) -> None:
-        """Add to the audit trail, which only ever grows."""
-        self._index.record((), (AuditEntry(t_ns_utc=t_ns_utc, who=who, name=name, text=text),))
 
     def record(self, records: Sequence[ReconstructorRecord], entries: Sequence[AuditEntry]) -> None:
         """Remember where reconstructors are now and add to the audit trail: all or nothing.

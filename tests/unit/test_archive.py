@@ -114,7 +114,7 @@ def test_records_come_back_after_a_restart_oldest_first(tmp_path):
 
 def test_a_record_without_registration_or_verdict_comes_back_as_it_was(archive):
     bare = ReconstructorRecord(id="rtc-7", state=MatrixState.APPLIED, n_modes=400, created_ns_utc=5)
-    archive.update(bare)
+    archive.record((bare,), ())
     assert_same(archive.records()[0], bare)
 
 
@@ -127,7 +127,7 @@ def test_what_a_verdict_was_of_is_not_kept_and_must_be_found_out_anew(archive):
         alpha=Misregistration(),
         sigma=np.full(4, 1e-3),
     )
-    archive.update(record_of(judged=then))
+    archive.record((record_of(judged=then),), ())
     assert_same(archive.records()[0], record_of())
 
 
@@ -135,7 +135,7 @@ def test_an_update_changes_the_index_but_not_the_product(archive):
     archive.store(record_of(), MATRIX, None, {})
     before = product(archive).read_bytes()
     applied = record_of(state=MatrixState.APPLIED, applied_frame_seq=77, published_ns_utc=5)
-    archive.update(applied)
+    archive.record((applied,), ())
     assert_same(archive.records()[0], applied)
     assert product(archive).read_bytes() == before
     np.testing.assert_array_equal(archive.matrix("cm-1"), MATRIX)
@@ -168,7 +168,7 @@ def test_an_id_is_never_reused(archive):
 
 
 def test_a_record_may_be_known_before_its_matrix_is_stored(archive):
-    archive.update(record_of(state=MatrixState.REFUSED))
+    archive.record((record_of(state=MatrixState.REFUSED),), ())
     archive.store(record_of(), MATRIX, None, {})
     assert [r.state for r in archive.records()] == [MatrixState.PROPOSED]
     np.testing.assert_array_equal(archive.matrix("cm-1"), MATRIX)
@@ -202,7 +202,7 @@ def test_an_id_that_is_no_id_never_becomes_a_file_name(archive, matrix_id):
 
 @pytest.mark.parametrize("matrix_id", ["nobody", "../index", "rtc-7"])
 def test_a_matrix_that_was_never_stored_is_unknown(archive, matrix_id):
-    archive.update(record_of("rtc-7"))
+    archive.record((record_of("rtc-7"),), ())
     with pytest.raises(UnknownIdError, match=f"{matrix_id}: no such matrix in the archive"):
         archive.matrix(matrix_id)
 
@@ -306,7 +306,7 @@ def begun_anew(archive):
 def test_a_missing_and_a_cut_product_are_told_at_the_start(archive):
     for name in ("cm-1", "cm-2", "cm-3"):
         archive.store(record_of(name), MATRIX, None, {})
-    archive.update(record_of("cm-2", state=MatrixState.SUPERSEDED))
+    archive.record((record_of("cm-2", state=MatrixState.SUPERSEDED),), ())
     product(archive, "cm-1").unlink()
     cut = product(archive, "cm-2")
     cut.chmod(0o644)
@@ -341,7 +341,7 @@ def test_a_record_nobody_understands_is_taken_from_its_product(archive):
 
 
 def test_a_record_nobody_understands_and_without_a_product_is_left_out_and_told(archive):
-    archive.update(record_of())
+    archive.record((record_of(),), ())
     archive.store(record_of("cm-2"), MATRIX, None, {})
     archive._index._connection.execute("UPDATE reconstructor SET record = '{' WHERE id = 'cm-1'")
     (told,) = begun_anew(archive)
@@ -368,7 +368,9 @@ def test_a_lost_index_is_made_anew_with_what_became_of_every_matrix(archive):
     }
     for name, state in became.items():
         archive.store(record_of(name), MATRIX, None, {})
-        archive.update(record_of(name, state=state, reason=f"it was {state}", published_ns_utc=7))
+        archive.record(
+            (record_of(name, state=state, reason=f"it was {state}", published_ns_utc=7),), ()
+        )
     archive.close()
     for leftover in archive._directory.glob("index.sqlite*"):
         leftover.unlink()
@@ -383,7 +385,7 @@ def test_a_lost_index_is_made_anew_with_what_became_of_every_matrix(archive):
 
 def test_of_a_matrix_whose_fate_is_lost_with_the_index_it_is_said(archive):
     archive.store(record_of(), MATRIX, None, {})
-    archive.update(record_of(state=MatrixState.APPLIED))
+    archive.record((record_of(state=MatrixState.APPLIED),), ())
     archive.close()
     for leftover in archive._directory.glob("index.sqlite*"):
         leftover.unlink()
@@ -405,9 +407,16 @@ def test_a_measurement_nobody_understands_does_not_refuse_the_start(archive):
 # --- audit trail
 
 
+def note(archive, t_ns_utc, text):
+    entry = AuditEntry(t_ns_utc=t_ns_utc, who="operator", name="mode.set", text=text)
+    archive.record((), (entry,))
+
+
 def test_the_audit_trail_keeps_the_last_entries_oldest_first(archive):
     for i in range(5):
-        archive.audit(i, "operator", "mode.set", f"entry {i}")
+        archive.record(
+            (), (AuditEntry(t_ns_utc=i, who="operator", name="mode.set", text=f"entry {i}"),)
+        )
     assert archive.audit_trail(2) == (
         AuditEntry(t_ns_utc=3, who="operator", name="mode.set", text="entry 3"),
         AuditEntry(t_ns_utc=4, who="operator", name="mode.set", text="entry 4"),
@@ -417,7 +426,7 @@ def test_the_audit_trail_keeps_the_last_entries_oldest_first(archive):
 
 @pytest.mark.parametrize("statement", ["DELETE FROM audit", "UPDATE audit SET who = 'nobody'"])
 def test_the_audit_trail_only_grows(archive, statement):
-    archive.audit(1, "operator", "mode.set", "auto")
+    note(archive, 1, "auto")
     with pytest.raises(sqlite3.IntegrityError, match="only grows"):
         archive._index._connection.execute(statement)
     assert len(archive.audit_trail()) == 1
@@ -426,7 +435,7 @@ def test_the_audit_trail_only_grows(archive, statement):
 def test_calls_from_several_threads_queue_up(archive):
     def work(k):
         archive.store(record_of(f"cm-{k}"), MATRIX + k, None, {})
-        archive.audit(k, "service", "stored", f"cm-{k}")
+        note(archive, k, f"cm-{k}")
 
     threads = [threading.Thread(target=work, args=(k,)) for k in range(8)]
     for thread in threads:
@@ -444,7 +453,7 @@ WRITER = """
 import sys
 from pathlib import Path
 import numpy as np
-from service.archive import Archive
+from service.archive import Archive, AuditEntry
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 
 archive = Archive(Path(sys.argv[1]))
@@ -455,7 +464,7 @@ for k in range(100_000):
         id=f"cm-{k:06d}", state=MatrixState.PROPOSED, n_modes=400, created_ns_utc=k
     )
     archive.store(record, matrix, None, {})
-    archive.audit(k, "service", "stored", record.id)
+    archive.record((), (AuditEntry(t_ns_utc=k, who="service", name="stored", text=record.id),))
     print(record.id, flush=True)
 """
 

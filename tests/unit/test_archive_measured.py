@@ -177,7 +177,7 @@ def test_an_index_from_before_there_were_measurements_is_brought_up_to_date(tmp_
     archive = Archive(tmp_path)
     archive.open()
     with archive:
-        archive.update(rtc_matrix)
+        archive.record((rtc_matrix,), ())
     connection = sqlite3.connect(tmp_path / "index.sqlite")
     connection.executescript("DROP TABLE measurement; PRAGMA user_version = 1;")
     connection.close()

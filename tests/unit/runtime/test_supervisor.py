@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service.archive import Archive
+from service.archive import Archive, AuditEntry
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
@@ -302,7 +302,9 @@ def full_disk(archive):
     for length in (4000, 400, 40, 1, 1):
         with contextlib.suppress(ArchiveError):
             while True:
-                archive.audit(1, "somebody", "else", "x" * length)
+                archive.record(
+                    (), (AuditEntry(t_ns_utc=1, who="somebody", name="else", text="x" * length),)
+                )
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
     try:

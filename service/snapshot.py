@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
 from service.tracking.events import GainGroup
-from service.tracking.loop import RtcView
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState, Waiting
+from service.wire import Status
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,7 +154,7 @@ class Alpha:
 class Rtc:
     """The RTC as its last status message shows it."""
 
-    known: RtcView
+    known: Status
 
     @property
     def gains(self) -> tuple[GainGroup, ...]:

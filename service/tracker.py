@@ -26,6 +26,17 @@ from service.tracking.turn import Turn
 from service.tracking.updates import decide, fetch_in_use
 from service.tracking.validity import age, end_alarm, point
 from service.tracking.worth import note_declined
+from service.wire import (
+    Acknowledgement,
+    DitherRequest,
+    DitherStop,
+    LoopRequest,
+    MeasureRequest,
+    RampRequest,
+    Reply,
+    Status,
+)
+from service.wire import Command as Request
 
 __all__ = ["Command", "Event", "Policy", "step"]
 
@@ -70,7 +81,7 @@ def _react(turn: Turn) -> None:  # noqa: C901 - one line for each event
             rtc.on_tick(turn)
             age(turn)
             loop_commands.close_again(turn)
-        case ev.StatusSeen(rtc=status):
+        case Status() as status:
             rtc.on_status(turn, status)
         case ev.SessionStarted(session=session):
             rtc.on_new_session(turn, session)
@@ -113,14 +124,14 @@ def _react_to_answer(turn: Turn) -> None:  # noqa: C901 - one line for each even
             reconstructors.on_margin(turn, judged)
         case ev.ProposalJudged() as verdict:
             reconstructors.on_proposal_judged(turn, verdict)
-        case ev.Acknowledged() as acknowledged:
+        case Acknowledgement() as acknowledged:
             reconstructors.on_acknowledgement(turn, acknowledged)
         case ev.MatrixMeasured(record=measured):
             measuring.on_measured(turn, measured)
         case ev.NoisyMade(record=noisy):
             measuring.on_noisy_made(turn, noisy)
-        case ev.DitherAnswered() as answer:
-            dither.on_answer(turn, answer)
+        case ev.Answered() as answered:
+            _react_to_reply(turn, answered.request, answered.reply)
         case ev.DitherSilent() as silent:
             dither.on_silence(turn, silent)
         case ev.DitherMeasured() as heard:
@@ -130,22 +141,32 @@ def _react_to_answer(turn: Turn) -> None:  # noqa: C901 - one line for each even
                 dither.stop_too_strong(turn, heard.id, loud)
         case ev.Vibrations() as vibrations:
             dither.hear_vibrations(turn, vibrations)
-        case ev.LoopAnswered(id=name, accepted=accepted, reason=reason):
-            outcome = CommandState.ACCEPTED if accepted else CommandState.REFUSED
-            loop_commands.on_answer(turn, name, outcome, reason)
         case ev.JobFailed() as failed:
             _react_to_failure(turn, failed.effect, failed.text)
         case _:
             _obey(turn)
 
 
+def _react_to_reply(turn: Turn, request: Request, reply: Reply) -> None:
+    match request:
+        case DitherRequest():
+            dither.on_answer(turn, request, reply)
+        case DitherStop():
+            dither.on_stop_answer(turn, reply)
+        case MeasureRequest():
+            measuring.on_answer(turn, request, reply)
+        case LoopRequest() | RampRequest():
+            outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
+            loop_commands.on_answer(turn, request.id, outcome, reply.reason)
+
+
 def _react_to_failure(turn: Turn, effect: Effect, text: str) -> None:
     match effect:
-        case ev.AskMeasurement(record=record):
-            measuring.measurement_failed(turn, record, text)
+        case ev.Ask(request=MeasureRequest(id=name)):
+            measuring.measurement_failed(turn, name, text)
         case ev.FinishNoisy(record=noisy):
             measuring.noisy_failed(turn, noisy, text)
-        case ev.AskLoop(id=command) | ev.AskRamp(id=command):
+        case ev.Ask(request=LoopRequest(id=command) | RampRequest(id=command)):
             loop_commands.on_answer(turn, command, CommandState.FAILED, text)
         case _:
             rtc.on_failure(turn, effect, text)

@@ -12,7 +12,7 @@ from typing import Final
 
 from service.errors import WireError
 from service.link.endpoint import Endpoint
-from service.link.events import Bursts, EventQueue, LinkEvent, Wakeup
+from service.link.matrices import LinkEvent
 from service.link.ring import LEAP, FrameCounts, FrameRing
 from service.link.rivals import SessionWatch
 from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
@@ -29,6 +29,12 @@ from service.wire import (
     decode_status,
     essentials,
 )
+
+QUEUE_LENGTH: Final = 1024
+"""Events kept; when more wait, the oldest are dropped and counted."""
+
+BURST_S: Final = 10.0
+"""The same complaint is reported once in this time, however often it is counted."""
 
 LATENCIES: Final = 1024
 """Batches the median latency is taken over."""
@@ -51,6 +57,74 @@ PLACED: Final = {
     "nonfinite": "a slope or a command is not finite",
 }
 """What becomes of frames in the sequence besides being used, and what is then wrong with them."""
+
+
+class Bursts:
+    """Lets the first of a burst of equal complaints through."""
+
+    __slots__ = ("_last",)
+
+    def __init__(self) -> None:
+        self._last: dict[str, float] = {}
+
+    def opens(self, kind: str, now_s: float) -> bool:
+        """Return whether this complaint is due again."""
+        last = self._last.get(kind)
+        if last is not None and now_s - last < BURST_S:
+            return False
+        self._last = {k: s for k, s in self._last.items() if now_s - s < BURST_S}
+        self._last[kind] = now_s
+        return True
+
+
+class EventQueue:
+    """Events on their way from zenoh's threads to the consumer; the oldest give way."""
+
+    __slots__ = ("_events", "_lock", "dropped")
+
+    def __init__(self, length: int = QUEUE_LENGTH) -> None:
+        self._events: deque[LinkEvent] = deque(maxlen=length)
+        self._lock = threading.Lock()
+        self.dropped = 0
+
+    def put(self, event: LinkEvent) -> None:
+        """Add an event."""
+        with self._lock:
+            self.dropped += len(self._events) == self._events.maxlen
+            self._events.append(event)
+
+    def take(self) -> list[LinkEvent]:
+        """Return what has come since the last call, oldest first."""
+        with self._lock:
+            events = list(self._events)
+            self._events.clear()
+        return events
+
+
+class Wakeup:
+    """Rings at most once between two visits of the consumer, from whatever thread."""
+
+    __slots__ = ("_callback", "_rung")
+
+    def __init__(self) -> None:
+        self._callback: Callable[[], object] | None = None
+        self._rung = False
+
+    def connect(self, callback: Callable[[], object] | None) -> None:
+        """Call ``callback`` from now on; None: nothing."""
+        self._callback = callback
+        self._rung = False
+
+    def ring(self) -> None:
+        """Say that something new is there."""
+        callback = self._callback
+        if callback is not None and not self._rung:
+            self._rung = True
+            callback()
+
+    def answer(self) -> None:
+        """Say that the consumer is about to look: what comes from now on rings again."""
+        self._rung = False
 
 
 class Intake:

@@ -7,8 +7,11 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from service.errors import UnknownIdError, WireError
-from service.link.events import MeasuredMatrix
+from service.tracking.events import Event
 from service.wire import (
     ChunkAssembler,
     Keys,
@@ -28,6 +31,19 @@ LIMIT_BYTES: Final = 1_000_000_000
 
 REMEMBERED_IDS: Final = 4096
 """Ids whose acknowledgements are recognised."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MeasuredMatrix:
+    """An interaction matrix the RTC has measured, or why it could not."""
+
+    manifest: MeasuredManifest
+    matrix: NDArray[np.float32] | None
+    """``(n_slopes, n_modes_measured)``, slope per metre OPD; None: see the manifest's reason."""
+
+
+LinkEvent = Event | MeasuredMatrix
+"""What the RTC sends besides frames; a matrix is an event for the tracker once it is archived."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -42,9 +42,9 @@ from service.tracking.events import (
     StartDither,
     StopDither,
 )
-from service.tracking.loop import DitherKind, Pointing
 from service.tracking.products import ModeSet
 from service.tracking.state import Mode
+from service.wire import DitherKind, Pointing
 
 router = APIRouter(
     prefix="/v1",
@@ -332,7 +332,7 @@ async def dither(
     state = service.snapshot().tracker
     if state.dither is None:
         return answer
-    cost = f"{1e9 * total_m(state.dither):.3g} nm RMS in all"
+    cost = f"{1e9 * total_m(state.dither.request):.3g} nm RMS in all"
     budget = f"budget {1e9 * state.dithering.budget_m:.3g} nm"
     return answer.model_copy(update={"text": f"{answer.text}: {cost}, {budget}"})
 

@@ -22,10 +22,11 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.routes.problems import problem, problem_response
 from service.routes.views import ServiceDep
 from service.snapshot import Pace, Snapshot
-from service.tracking.products import MatrixState, MeasurePattern
+from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
 from service.tracking.stages import DitherPhase
 from service.tracking.state import Mode, TrackerState
+from service.wire import Pattern
 
 router = APIRouter(tags=["how it is doing"])
 
@@ -237,8 +238,7 @@ def _of_reconstructors(tracker: TrackerState) -> Iterator[Metric]:
 def _of_measurement(snapshot: Snapshot) -> Iterator[Metric]:
     current = snapshot.tracker.measuring
     patterns = {
-        str(pattern): current is not None and current.pattern is pattern
-        for pattern in MeasurePattern
+        str(pattern): current is not None and current.pattern is pattern for pattern in Pattern
     }
     text = "1 for the pattern of the interaction matrix being measured"
     yield _labelled_gauge("measuring", text, "pattern", patterns)

@@ -31,7 +31,8 @@ from service.routes.views import ServiceDep, answer, known, shows
 from service.snapshot import Snapshot
 from service.tracking.dither_plan import NOISY_DITHER
 from service.tracking.events import GiveUp, GiveUpNoisy, Measure, MeasureNoisy
-from service.tracking.products import MeasurePattern, ModeSet
+from service.tracking.products import ModeSet
+from service.wire import Pattern
 
 router = APIRouter(
     prefix="/v1", tags=["interaction matrices it has measured"], responses={**INVALID}
@@ -52,7 +53,7 @@ class MeasureBody(Request):
     All patterns but "sine" open the loop meanwhile.
     """
 
-    pattern: MeasurePattern = Field(default=MeasurePattern.PUSH_PULL_MODAL, strict=False)
+    pattern: Pattern = Field(default=Pattern.PUSH_PULL_MODAL, strict=False)
     """"push-pull-modal", "push-pull-zonal", "hadamard" or "sine"."""
 
     modes: list[BasisMode] | None = Field(default=None, min_length=1, max_length=MOST_MODES)
@@ -74,10 +75,10 @@ class MeasureBody(Request):
     def _consistent(self) -> MeasureBody:
         if self.modes is not None and len(set(self.modes)) < len(self.modes):
             raise ValueError("modes without any of them twice")
-        if self.pattern is MeasurePattern.SINE and self.n_average is not None:
+        if self.pattern is Pattern.SINE and self.n_average is not None:
             raise ValueError("no n_average with a sine: its duration_s does the averaging")
         given = self.frequency_hz is not None or self.duration_s is not None
-        if self.pattern is not MeasurePattern.SINE and given:
+        if self.pattern is not Pattern.SINE and given:
             raise ValueError(f"no frequency_hz and no duration_s with {self.pattern}")
         n_modes = len(self.modes or ())
         if self.frequency_hz is not None and len(self.frequency_hz) != n_modes:

@@ -37,7 +37,7 @@ from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 from service.snapshot import Alpha, Pace, Rtc, Snapshot
 from service.tracking.events import GainGroup
-from service.tracking.loop import DitherView, LoopCommand, Pointing
+from service.tracking.loop import Dither, LoopCommand
 from service.tracking.products import (
     Assessment,
     MeasurementRecord,
@@ -49,6 +49,7 @@ from service.tracking.products import (
 from service.tracking.registration import HistoryEntry, ModeGain, Watchdog
 from service.tracking.stages import Acquisition, Dithering, DitherPlan
 from service.tracking.state import Alarm, LogEntry, TrackerState, Waiting
+from service.wire import Pointing
 
 Record = TypeVar("Record")
 
@@ -351,13 +352,14 @@ view(
     Rtc,
     "known.session known.loop known.frame_rate_hz known.delay_frames known.leak gains "
     "known.n_controlled known.n_modes known.n_slopes known.cm_id known.basis_id known.config_id "
-    "known.magnitude known.max_dither_m known.max_dither_modes known.t_ns_utc",
+    "known.magnitude known.max_dither_m known.max_dither_modes t_ns_utc=known.t_ns",
 )
 view("LoopCommandView", LoopCommand, "id text state reason asked_ns_utc lasts_s")
 view(
     "DitherView",
-    DitherView,
-    "id modes amplitude_m kind frequency_hz seed duration_s start_seq",
+    Dither,
+    "id request.modes request.amplitude_m request.kind frequency_hz request.seed "
+    "request.duration_s start_seq",
 )
 view("DitherPlanView", DitherPlan)
 view(

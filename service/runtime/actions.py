@@ -15,22 +15,41 @@ from service import __version__
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.errors import CommandError, LinkError, UnknownIdError
-from service.link.events import MeasuredMatrix
+from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
-from service.runtime import translate
-from service.runtime.asking import Question, ask
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.runtime.estimates import NoisySums
 from service.runtime.ports import RtcPort, StorePort, WorkerPort
 from service.tracking import events as ev
 from service.tracking.alarms import Act, forbidding
 from service.tracking.events import Effect, Event
-from service.tracking.loop import RtcView, same_gains
+from service.tracking.loop import CommandState, same_gains
 from service.tracking.loop_commands import table_of
-from service.tracking.products import Judged, MatrixState, ReconstructorRecord
+from service.tracking.products import (
+    Judged,
+    MatrixState,
+    MeasurementRecord,
+    MeasureState,
+    ReconstructorRecord,
+)
 from service.tracking.reconstructors import commanded_gains, extended_gains
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
-from service.wire import LoopRequest, checksum, layout_of
+from service.wire import Command as Request
+from service.wire import (
+    DitherStop,
+    LoopRequest,
+    Manifest,
+    MatrixLayout,
+    MeasuredManifest,
+    MeasureRequest,
+    Pattern,
+    RampRequest,
+    Reply,
+    Status,
+    checksum,
+    layout_of,
+)
 from service.worker import InUse, OpticsWorker
 
 UNKNOWN_PARENT = "unknown"
@@ -75,7 +94,9 @@ class Actions:
         self.noisy = NoisySums(workers=workers, archive=archive, instrument=instrument)
         """Sums of the noisy interaction matrix under way."""
 
-    async def perform(self, effect: Effect, state: TrackerState) -> Event | None:
+    async def perform(  # noqa: C901 - one line for each effect
+        self, effect: Effect, state: TrackerState
+    ) -> Event | None:
         """Do it and return what came of it; None when the answer comes over the link.
 
         Raises
@@ -96,10 +117,10 @@ class Actions:
                 return await self._send(effect, state)
             case ev.FinishNoisy(record=record):
                 return await self.noisy.finish(record, state)
-            case ev.AskLoop(judged=True):
-                return await self._ask_judged(effect, state)
-            case _:
-                return await self._ask(effect)
+            case ev.Ask(request=LoopRequest() as request, judged=True):
+                return await self._ask_judged(request, state)
+            case ev.Ask(request=request):
+                return await self._ask(request)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)`` from memory or the archive.
@@ -128,7 +149,7 @@ class Actions:
         matrix = self.matrix(record.id)
         layout = layout_of(matrix, self._publishing.chunk_bytes)
         system = self._publishing.system
-        self._bridge.offer(translate.manifest_of(record, layout, state.rtc, system), matrix)
+        self._bridge.offer(manifest_of(record, layout, state.rtc, system), matrix)
         self._bridge.set_current(record.id)
 
     async def keep_measured(self, heard: MeasuredMatrix) -> Event:
@@ -139,19 +160,20 @@ class Actions:
         ArchiveError
             If it cannot be written, or another one has its id.
         """
-        record = translate.measurement_of(heard.manifest)
+        record = _measurement_of(heard.manifest)
         if heard.matrix is not None:
             instrument = self._instrument.name
             store = self._archive.measured.store
             await asyncio.to_thread(store, record, heard.matrix, instrument)
         return ev.MatrixMeasured(record=record)
 
-    async def _ask(self, question: Question) -> Event | None:
-        answer = await ask(self._bridge, question, self._clock_ns)
-        if isinstance(question, ev.AskLoop) and isinstance(answer, ev.LoopAnswered):
-            n_modes = question.n_controlled if answer.accepted else None
-            self._commanded_modes = n_modes or self._commanded_modes
-        return answer
+    async def _ask(self, request: Request) -> Event | None:
+        reply = await self._bridge.command(request)
+        if isinstance(request, LoopRequest) and reply.accepted:
+            self._commanded_modes = request.n_controlled or self._commanded_modes
+        if isinstance(request, DitherStop) and reply.accepted:
+            return None  # the next status tells
+        return ev.Answered(request=request, reply=reply)
 
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
@@ -259,21 +281,22 @@ class Actions:
             self._publishing.pole_radius_bound,
         )
 
-    async def _ask_judged(self, effect: ev.AskLoop, state: TrackerState) -> Event | None:
+    async def _ask_judged(self, request: LoopRequest, state: TrackerState) -> Event | None:
         """Ask for gains only if the gate lets the matrix in use run with them."""
-        if state.in_use is None or effect.gains is None:
+        if state.in_use is None or request.gains is None:
             raise CommandError("the reconstructor in use is not known: its gains cannot be judged")
         matrix = await asyncio.to_thread(self.matrix, state.in_use)
-        verdict = await self._verdict(matrix, effect.gains[: len(matrix)], state)
+        verdict = await self._verdict(matrix, request.gains[: len(matrix)], state)
         if not verdict.accepted:
-            return ev.LoopAnswered(id=effect.id, accepted=False, reason=verdict.reason)
-        return await self._ask(effect)
+            refused = Reply(id=request.id, accepted=False, reason=verdict.reason, start_seq=None)
+            return ev.Answered(request=request, reply=refused)
+        return await self._ask(request)
 
     async def _fetch(self, matrix_id: str | None, state: TrackerState) -> Event:
         manifest, matrix = await self._bridge.fetch_applied()
         if matrix_id not in {None, manifest.id}:
             raise LinkError(f"the RTC offers {manifest.id}, its status says it uses {matrix_id}")
-        record = translate.record_of(manifest)
+        record = record_of(manifest)
         known = state.reconstructor(record.id)
         if known is not None and known.sha256 not in {"", record.sha256}:
             return ev.MatrixFetched(record=record)  # the tracker says what that means
@@ -291,7 +314,7 @@ class Actions:
         if effect.gains is not None or commanded != effect.n_modes:
             await self._command_modes(effect)
         layout = layout_of(matrix, self._publishing.chunk_bytes)
-        manifest = translate.manifest_of(record, layout, rtc, self._publishing.system)
+        manifest = manifest_of(record, layout, rtc, self._publishing.system)
         await self._bridge.publish(manifest, matrix)
         return None
 
@@ -410,7 +433,36 @@ def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None
     return n_modes if same_gains(gains[:n_modes], rtc.gains[:n_modes]) else None
 
 
-def _there(state: TrackerState) -> RtcView:
+def why_not(effects: tuple[Effect, ...], state: TrackerState) -> Exception | None:
+    """Return what whoever gave a command should know of the RTC's answer to it, or None."""
+    for effect in effects:
+        match effect:
+            case ev.Ask(request=MeasureRequest(id=name)):
+                record = state.measurement(name)
+                if record is not None and record.state is MeasureState.REFUSED:
+                    return CommandError(f"the RTC refused: {record.reason}")
+                if record is not None and record.state is MeasureState.FAILED:
+                    return LinkError(record.reason)
+            case ev.Ask(request=LoopRequest(id=command) | RampRequest(id=command)):
+                last = state.loop_command
+                if last is not None and last.id == command:
+                    return _refusal(last.state, last.reason)
+            case _:
+                pass
+    return None
+
+
+def _refusal(outcome: CommandState, reason: str) -> Exception | None:
+    match outcome:
+        case CommandState.REFUSED:
+            return CommandError(f"the RTC refused: {reason}")
+        case CommandState.FAILED:
+            return LinkError(reason)
+        case _:
+            return None
+
+
+def _there(state: TrackerState) -> Status:
     if state.rtc is None:
         raise LinkError("no RTC is there")
     return state.rtc
@@ -420,3 +472,59 @@ def _registered(state: TrackerState) -> Registration:
     if state.registration is None:
         raise CommandError("α is not known")
     return state.registration
+
+
+def manifest_of(
+    record: ReconstructorRecord, layout: MatrixLayout, rtc: Status, system: str
+) -> Manifest:
+    """Return the manifest a reconstructor travels with."""
+    return Manifest(
+        id=record.id,
+        layout=layout,
+        alpha=None if record.alpha is None else record.alpha.to_boundary(),
+        sigma=None
+        if record.sigma is None
+        else dict(zip(PARAMETERS, (record.sigma * BOUNDARY_SCALE).tolist(), strict=True)),
+        im_id=None,
+        parent=record.parent,
+        basis_id=rtc.basis_id,
+        config_id=rtc.config_id,
+        system=system,
+        created_ns=record.created_ns_utc,
+    )
+
+
+def record_of(manifest: Manifest) -> ReconstructorRecord:
+    """Return what is known of a matrix the RTC brought with it.
+
+    Its manifest may name an α, but nobody here can vouch for it.
+    """
+    return ReconstructorRecord(
+        id=manifest.id,
+        state=MatrixState.APPLIED,
+        n_modes=manifest.layout.shape[0],
+        created_ns_utc=manifest.created_ns,
+        sha256=manifest.layout.sha256,
+        reason="brought by the RTC",
+    )
+
+
+def _measurement_of(manifest: MeasuredManifest) -> MeasurementRecord:
+    """Return what is known of an interaction matrix the RTC sends, or of why there is none."""
+    there = manifest.reason is None
+    return MeasurementRecord(
+        id=manifest.id,
+        state=MeasureState.STORED if there else MeasureState.FAILED,
+        pattern=manifest.pattern,
+        modes=manifest.modes,
+        amplitude_m=manifest.amplitude_m,
+        n_average=None if manifest.pattern is Pattern.SINE else manifest.n_average,
+        reason=manifest.reason or "",
+        created_ns_utc=manifest.created_ns,
+        n_slopes=manifest.layout.shape[0],
+        double_pass=manifest.double_pass,
+        session=manifest.session,
+        basis_id=manifest.basis_id,
+        config_id=manifest.config_id,
+        sha256=manifest.layout.sha256,
+    )

@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.link.events import LinkEvent
-from service.runtime import translate
 from service.runtime.streams import (
     VERDICTS,
     Streams,
@@ -45,9 +43,9 @@ from service.tracking.alarms import (
 )
 from service.tracking.dither import SILENT_S
 from service.tracking.events import Effect, Event
-from service.tracking.loop import RtcView
 from service.tracking.policy import Policy
 from service.tracking.state import Level, TrackerState
+from service.wire import Status
 from service.worker import Description
 
 Step = Callable[[TrackerState, Event, Policy, int], tuple[TrackerState, tuple[Effect, ...]]]
@@ -131,11 +129,8 @@ class Engine:
             self._driver.swapped(self.state.in_use)
         return effects
 
-    def hear(self, heard: LinkEvent) -> None:
+    def hear(self, event: Event) -> None:
         """Take in what came over the link besides frames."""
-        event = translate.event_of(heard)
-        if event is None:
-            return
         self.post(event)
         if self.streams is not None:
             mismatch = shape_news(self.streams, self.state)
@@ -248,7 +243,7 @@ def shape_news(streams: Streams, state: TrackerState) -> Event | None:
     return ev.Trouble(name=OTHER_INSTRUMENT, text=text, over=known)
 
 
-def shape_mismatch(description: Description, rtc: RtcView) -> str | None:
+def shape_mismatch(description: Description, rtc: Status) -> str | None:
     """Return why this RTC's telemetry is not of the instrument in the file, or None."""
     if (rtc.n_slopes, rtc.n_modes) == (description.n_slopes, description.n_modes):
         return None

@@ -25,6 +25,7 @@ from service.telemetry.random_dither import Correlated, RandomEstimate, noisy_ma
 from service.tracking import events as ev
 from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
 from service.tracking.events import Event
+from service.tracking.loop import loop_numbers
 from service.tracking.products import NoisyFinding, NoisyRecord, NoisyState, ReconstructorRecord
 from service.tracking.state import Level, TrackerState
 from service.tracking.windows import fit_begins_at
@@ -166,8 +167,12 @@ async def watched(
         return ev.Noted(name="watchdog.failed", text=str(error), level=Level.WARNING)
     if estimate is None:
         return None
-    loop = () if state.rtc is None else state.rtc.loop_numbers
-    return ev.Watched(estimate=estimate, t_ns_utc=end_ns, began_ns_utc=sums.since_ns_utc, loop=loop)
+    return ev.Watched(
+        estimate=estimate,
+        t_ns_utc=end_ns,
+        began_ns_utc=sums.since_ns_utc,
+        loop=loop_numbers(state.rtc),
+    )
 
 
 async def listened(

@@ -21,6 +21,7 @@ from service.tracking.products import ReconstructorRecord
 from service.tracking.resume import resumed, saved_of, with_orders
 from service.tracking.state import Level, LogEntry, TrackerState
 from service.tracking.turn import logged
+from service.wire import DitherRequest, MeasureRequest, RampRequest
 
 RETRY_S = 2.0
 """Between two attempts while the disk refuses."""
@@ -28,7 +29,7 @@ RETRY_S = 2.0
 MOST_WAITING = 10_000
 """Lines of the audit trail that wait for a disk; newer ones are counted and dropped."""
 
-BEGINNINGS = (ev.SendMatrix, ev.AskDither, ev.AskMeasurement, ev.AskRamp)
+BEGINNINGS = (DitherRequest, MeasureRequest, RampRequest)
 """What is not done unless why it is done is on the disk. What ends something never waits."""
 
 
@@ -117,7 +118,8 @@ class Recorder:
         StorageError
             If it cannot be: nothing is begun that cannot be recorded.
         """
-        if isinstance(effect, BEGINNINGS):
+        begins = isinstance(effect, ev.Ask) and isinstance(effect.request, BEGINNINGS)
+        if begins or isinstance(effect, ev.SendMatrix):
             await self.flush()
 
     async def flush(self) -> None:

@@ -25,7 +25,8 @@ from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, measured
 from service.telemetry.random_dither import Correlated, RandomDither
 from service.tracking.dither_plan import SETTLING_S, asked_of, lock_in_plan, random_plan
-from service.tracking.loop import DitherKind, DitherView, RtcView, same_rate
+from service.tracking.loop import Dither, last_seq, same_loop, same_rate, why_open
+from service.wire import DitherKind, Status
 from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0
@@ -50,13 +51,13 @@ class Streams:
     description: Description
     """What telemetry must look like."""
 
-    rtc: RtcView | None = None
+    rtc: Status | None = None
     """The loop the frames come from."""
 
     heard_ns_utc: int = 0
     """End of the last frame that came, the RTC's clock; 0: none has."""
 
-    loop: RtcView | None = None
+    loop: Status | None = None
     """As it was when the open window, or the sums of ordinary telemetry, began."""
 
     in_loop: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
@@ -68,7 +69,7 @@ class Streams:
     cutter: LockIn | RandomDither | None = None
     """Windows of the dither; None while there is none, or none that can be read."""
 
-    dither: DitherView | None = None
+    dither: Dither | None = None
     """The one whose windows are under way, or cannot be."""
 
     meter: Meter | None = None
@@ -110,7 +111,7 @@ class Streams:
 Window = Spectra | Correlated | WindowRefused
 
 
-def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
+def with_rtc(streams: Streams, rtc: Status | None) -> Streams:
     """Follow the RTC: another loop makes the open window and the passive sums void."""
     before = streams.rtc
     streams = replace(streams, rtc=rtc)
@@ -131,7 +132,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     if before is not None and before.session != rtc.session:
         streams = replace(streams, health=LoopHealth())
     streams = _lawful(streams, before, rtc)
-    if streams.loop is not None and before is not None and streams.loop.same_loop(rtc):
+    if streams.loop is not None and before is not None and same_loop(streams.loop, rtc):
         return streams if before.seq == rtc.seq else _confirmed(streams, rtc)
     streams = replace(streams, loop=rtc)
     in_loop = np.array(rtc.in_loop, dtype=np.intp)
@@ -141,7 +142,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     streams = replace(streams, in_loop=known, still=still)
     streams = _watching_the_edge(streams, rtc)
     # frames that are on their way may have been made by the loop as it was
-    streams = replace(streams, check=LoopCheck(from_seq=rtc.seq + 1), off=None, obeyed_seq=0)
+    streams = replace(streams, check=LoopCheck(from_seq=last_seq(rtc) + 1), off=None, obeyed_seq=0)
     memory = Passive(
         n_modes=rtc.n_controlled,
         memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz,
@@ -155,7 +156,7 @@ def with_rtc(streams: Streams, rtc: RtcView | None) -> Streams:
     return _cut(replace(streams, passive=memory), rtc)
 
 
-def _watching_the_edge(streams: Streams, rtc: RtcView) -> Streams:
+def _watching_the_edge(streams: Streams, rtc: Status) -> Streams:
     """Watch the ring that this loop drives; what is closed, or watched, anew has a clean slate."""
     known = streams.description
     if not rtc.in_loop or known.actuators is None:
@@ -166,13 +167,13 @@ def _watching_the_edge(streams: Streams, rtc: RtcView) -> Streams:
     return replace(streams, edge_watch=watch, edge=edge)
 
 
-def _cut(streams: Streams, rtc: RtcView) -> Streams:
+def _cut(streams: Streams, rtc: Status) -> Streams:
     """Give up the open window; the next begins when the changed loop has settled.
 
     Counted from the status' own frame, not from when it was read, so that a recorded night is cut
     at the same frames again.
     """
-    settled_seq = rtc.seq + round(SETTLING_S * rtc.frame_rate_hz)
+    settled_seq = last_seq(rtc) + round(SETTLING_S * rtc.frame_rate_hz)
     if streams.cutter is None:
         return streams
     return replace(streams, cutter=streams.cutter.begun_anew(settled_seq))
@@ -202,17 +203,17 @@ def _terms(streams: Streams, cm_id: str | None) -> ClosedLoop | None:
     )
 
 
-def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:
+def _lawful(streams: Streams, before: Status | None, rtc: Status) -> Streams:
     """Judge the loop's law by the frames up to a status, or begin anew with another loop.
 
     Gains may follow the seeing meanwhile.
     """
-    if before is None or not before.same_loop(rtc):
-        return replace(streams, law=LoopLaw(from_seq=rtc.seq + 1), unlawful=())
+    if before is None or not same_loop(before, rtc):
+        return replace(streams, law=LoopLaw(from_seq=last_seq(rtc) + 1), unlawful=())
     terms = _terms(streams, rtc.cm_id)
     if terms is None or streams.law.cm_id != rtc.cm_id:
         return streams
-    law, found = loopcheck.judged(streams.law, terms, rtc.seq)
+    law, found = loopcheck.judged(streams.law, terms, last_seq(rtc))
     if found is None:
         return replace(streams, law=law)
     if found.wrong:
@@ -222,20 +223,21 @@ def _lawful(streams: Streams, before: RtcView | None, rtc: RtcView) -> Streams:
     return replace(streams, law=law, unlawful=())
 
 
-def _confirmed(streams: Streams, rtc: RtcView) -> Streams:
+def _confirmed(streams: Streams, rtc: Status) -> Streams:
     """Judge the frames up to a status that shows the same loop as the one before."""
-    if streams.off is None and rtc.seq < streams.obeyed_seq + AT_EASE_S * rtc.frame_rate_hz:
+    seq = last_seq(rtc)
+    if streams.off is None and seq < streams.obeyed_seq + AT_EASE_S * rtc.frame_rate_hz:
         return streams
-    span, terms = loopcheck.last_samples(streams.check, rtc.seq), _terms(streams, rtc.cm_id)
+    span, terms = loopcheck.last_samples(streams.check, seq), _terms(streams, rtc.cm_id)
     if span is None or terms is None:
         return streams
     check, found = loopcheck.obedience(streams.check, terms, *span)
     if found is None or found.holds:
-        return replace(streams, check=check, off=None, obeyed_seq=rtc.seq)
+        return replace(streams, check=check, off=None, obeyed_seq=seq)
     return replace(streams, check=check, off=found)
 
 
-def with_dither(streams: Streams, dither: DitherView | None, window_s: float) -> Streams:
+def with_dither(streams: Streams, dither: Dither | None, window_s: float) -> Streams:
     """Follow the dither: a new one that has begun starts a new series of windows.
 
     Raises
@@ -252,9 +254,9 @@ def with_dither(streams: Streams, dither: DitherView | None, window_s: float) ->
     if dither == streams.dither:
         return streams
     # a status may announce a dither that began long ago
-    seen_seq = max(dither.start_seq or 0, rtc.seq)
+    seen_seq = max(dither.start_seq or 0, last_seq(rtc))
     cutter: LockIn | RandomDither
-    if dither.kind is DitherKind.BINARY:
+    if dither.request.kind is DitherKind.BINARY:
         cutter = RandomDither(plan=random_plan(dither, rtc, window_s))
     else:
         cutter = LockIn(plan=lock_in_plan(dither, rtc, window_s))
@@ -314,9 +316,7 @@ def _moving(streams: Streams, block: FrameBlock) -> FrameBlock:
     return replace(block, commands_m=commands)
 
 
-def _dithered(
-    streams: Streams, rtc: RtcView, block: FrameBlock
-) -> tuple[Streams, Sequence[Window]]:
+def _dithered(streams: Streams, rtc: Status, block: FrameBlock) -> tuple[Streams, Sequence[Window]]:
     """Feed the estimator that reads the dither which runs."""
     if streams.cutter is None:
         return streams, ()
@@ -335,7 +335,7 @@ def taken(streams: Streams) -> tuple[Streams, Passive | str]:
     if rtc is None or sums is None:
         return streams, "no passive estimate: there is no telemetry that could be used"
     if not rtc.in_loop:
-        return streams, f"no passive estimate: {rtc.why_open}"
+        return streams, f"no passive estimate: {why_open(rtc)}"
     if sums.why_unusable is not None:
         return streams, sums.why_unusable
     least = passive.MIN_FRAMES_PER_MODE * sums.n_modes
@@ -358,16 +358,16 @@ def taken(streams: Streams) -> tuple[Streams, Passive | str]:
     return replace(streams, passive=begun, loop=loop), sums
 
 
-def _beyond_the_dither(streams: Streams, rtc: RtcView, reading: LockIn | RandomDither) -> bool:
+def _beyond_the_dither(streams: Streams, rtc: Status, reading: LockIn | RandomDither) -> bool:
     """Return whether the end of the dither would cut the window that has begun."""
     dither, window = streams.dither, reading.window
     if dither is None or window is None:
         return False
-    stop_seq = (dither.start_seq or 0) + round(dither.duration_s * rtc.frame_rate_hz)
+    stop_seq = (dither.start_seq or 0) + round(dither.request.duration_s * rtc.frame_rate_hz)
     return window.first_seq + reading.plan.n_frames > stop_seq
 
 
-def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:
+def _listening(streams: Streams, rtc: Status, block: FrameBlock) -> Streams:
     """Note whether a block holds the dither that should be there."""
     dither, next_seq = streams.dither, block.next_seq
     if streams.meter is not None:
@@ -378,7 +378,7 @@ def _listening(streams: Streams, rtc: RtcView, block: FrameBlock) -> Streams:
         return replace(streams, dither_seen_seq=next_seq, dither_silent_s=0.0)
     if dither is None:
         return streams
-    stop_seq = (dither.start_seq or 0) + round(dither.duration_s * rtc.frame_rate_hz)
+    stop_seq = (dither.start_seq or 0) + round(dither.request.duration_s * rtc.frame_rate_hz)
     silent = max(min(next_seq, stop_seq) - streams.dither_seen_seq, 0)
     return replace(streams, dither_silent_s=silent / rtc.frame_rate_hz)
 
@@ -397,6 +397,6 @@ def _obeying(streams: Streams, window: Window) -> Window:
     return WindowRefused(reason=found.text, t_ns_utc=window.t_end_ns_utc)
 
 
-def _fits(rtc: RtcView, block: FrameBlock) -> bool:
+def _fits(rtc: Status, block: FrameBlock) -> bool:
     """Return whether a block has as many slopes and modes as the RTC's status says."""
     return (block.slopes.shape[1], block.commands_m.shape[1]) == (rtc.n_slopes, rtc.n_modes)

@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 
 from service.archive import Archive
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
-from service.link.events import MeasuredMatrix
+from service.link.matrices import MeasuredMatrix
 from service.rtc_bridge import Bridge
-from service.runtime import translate
-from service.runtime.actions import Actions
-from service.runtime.asking import why_not
+from service.runtime.actions import Actions, why_not
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.recording import Recorder
-from service.runtime.waiting import Facts, Revival, Told, news_of_link, waiting_for
+from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
 from service.snapshot import Snapshot
 from service.telemetry.lockin import Spectra
@@ -196,6 +194,7 @@ class Supervisor:
             for heard in self._bridge.events():
                 if isinstance(heard, MeasuredMatrix):
                     self._start(self._keep_measured(heard))
+                    continue
                 with self._surviving("an event of the link"):
                     self._engine.hear(heard)
             self._feed()
@@ -254,7 +253,7 @@ class Supervisor:
             waiting = self._waiting()
             for text in told.news(waiting, self._engine.state.alarms, now_ns):
                 self._note("waiting", text, Level.INFO)
-            self._bridge.publish_state(translate.state_message(self._engine.state, now_ns, waiting))
+            self._bridge.publish_state(state_message(self._engine.state, now_ns, waiting))
             raised = frozenset((a.name, a.text) for a in self._engine.state.alarms)
             for name, text in raised ^ alarms:
                 self._bridge.publish_alarm(

@@ -9,6 +9,7 @@ from typing import Final
 
 from service.link.intake import SPARED
 from service.link.statistics import MALFORMED, RECENT_S, USED, Fate, LinkStatistics
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.alarms import Act, forbids
@@ -17,6 +18,7 @@ from service.tracking.products import MatrixState
 from service.tracking.reconstructors import why_unread
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Alarm, Mode, Party, TrackerState, Waiting
+from service.wire import TEXT_LIMIT, StateMessage
 
 SILENT_S: Final = 3.0
 """What has not come for so long is waited for."""
@@ -357,3 +359,21 @@ class Told:
         if now_ns - since_ns < TOLD_AFTER_NS:
             return False
         return told_ns is None or (told_ns < since_ns and now_ns - told_ns >= TOLD_EVERY_NS)
+
+
+def state_message(
+    state: TrackerState, now_ns: int, waiting: tuple[Waiting, ...] = ()
+) -> StateMessage:
+    """Return the short account of the state for whoever listens on the network."""
+    known = state.registration
+    sigma = None if known is None else known.sigma * BOUNDARY_SCALE
+    return StateMessage(
+        system=state.system,
+        t_ns=now_ns,
+        mode=state.mode.value,
+        alpha=None if known is None else known.alpha.to_boundary(),
+        sigma=None if sigma is None else dict(zip(PARAMETERS, sigma.tolist(), strict=True)),
+        in_use=state.in_use,
+        validity=None if known is None else known.standing.validity.value,
+        waiting_for=tuple(f"{w.party}: {w.text}"[:TEXT_LIMIT] for w in waiting),
+    )

@@ -39,7 +39,6 @@ from service.tracking.acquisition_stages import (
 from service.tracking.activity import ramping
 from service.tracking.alarms import ACQUISITION, Act
 from service.tracking.dither import allow, choose_dither, make_way
-from service.tracking.loop import RtcView
 from service.tracking.measuring import cut_off
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
@@ -54,6 +53,7 @@ from service.tracking.stages import Acquisition, AcquisitionStage, Interruption
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.worth import fewer_than, half_of, limit_modes, moved
+from service.wire import DitherRequest, LoopRequest, Reply, Status
 
 ENOUGH_WINDOWS = 2
 """Ordinary windows that must have held with the last reconstructor."""
@@ -142,7 +142,7 @@ def inherit(turn: Turn, left: Acquisition) -> None:
         _wait(turn, NO_RTC)
 
 
-def _begin(turn: Turn, rtc: RtcView, why: str, *, commanded: bool) -> None:
+def _begin(turn: Turn, rtc: Status, why: str, *, commanded: bool) -> None:
     turn.calm(ACQUISITION)
     make_way(turn)
     cut_off(turn, "an acquisition has begun")
@@ -209,9 +209,11 @@ def _end_by_event(turn: Turn) -> bool:
 def _end_by_answer(turn: Turn) -> bool:
     acquisition = turn.acquisition
     match turn.event:
-        case ev.LoopAnswered(id=acquisition.command, accepted=False, reason=reason):
+        case ev.Answered(
+            request=LoopRequest(id=acquisition.command), reply=Reply(accepted=False, reason=reason)
+        ):
             give_up(turn, f"the RTC will not change its loop: {reason}")
-        case ev.JobFailed(effect=ev.AskLoop(id=acquisition.command), text=text):
+        case ev.JobFailed(effect=ev.Ask(request=LoopRequest(id=acquisition.command)), text=text):
             restart(turn, text)
         case _:
             return False
@@ -224,7 +226,7 @@ def _take_in(turn: Turn) -> None:
             on_far(turn, turn.event)
         case ev.WindowLost(refused=refused) if refused.reason.startswith(NOT_FOUND):
             on_missed(turn, refused.reason)
-        case ev.DitherAnswered(accepted=False, reason=reason):
+        case ev.Answered(request=DitherRequest(), reply=Reply(accepted=False, reason=reason)):
             on_missed(turn, f"the RTC refused the dither: {reason}")
         case ev.MatrixMade():
             _on_made(turn, turn.event)
@@ -232,7 +234,7 @@ def _take_in(turn: Turn) -> None:
             pass
 
 
-def _closed_stage(turn: Turn, rtc: RtcView) -> None:
+def _closed_stage(turn: Turn, rtc: Status) -> None:
     """Make, send, close; then let ordinary windows sharpen α and go on to more modes."""
     acquisition = turn.acquisition
     record = turn.state.reconstructor(acquisition.matrix) if acquisition.matrix else None
@@ -300,7 +302,7 @@ def _on_refused(turn: Turn, record: ReconstructorRecord) -> None:
         give_up(turn, f"no number of modes passes the gate: {reason}")
 
 
-def _widen(turn: Turn, rtc: RtcView, record: ReconstructorRecord | None) -> None:
+def _widen(turn: Turn, rtc: Status, record: ReconstructorRecord | None) -> None:
     acquisition, known = turn.acquisition, turn.known
     slipped = turn.forbidden(Act.HOLD)
     if slipped is not None:
@@ -326,7 +328,7 @@ def _widen(turn: Turn, rtc: RtcView, record: ReconstructorRecord | None) -> None
     choose_dither(turn, rtc)
 
 
-def _make(turn: Turn, n_modes: int, rtc: RtcView, *, at_least: int = 0) -> None:
+def _make(turn: Turn, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:
     """Ask for a reconstructor of so many modes, or fewer but more than ``at_least``."""
     found, state = turn.acquisition.found, turn.state
     if state.making_since_ns_utc is not None or found is None:
@@ -421,7 +423,7 @@ def _take_up(turn: Turn) -> None:
     restart(turn, cause)
 
 
-def _why_not_by_itself(turn: Turn, rtc: RtcView) -> str | None:
+def _why_not_by_itself(turn: Turn, rtc: Status) -> str | None:
     state = turn.state
     if left_open(state, rtc) is None:
         return "the RTC has begun another session since, and who left its loop open is not known"
@@ -445,7 +447,7 @@ def _wait(turn: Turn, what: str, do: str = "") -> None:
     turn.alarm(ACQUISITION, text)
 
 
-def _note_closed(turn: Turn, rtc: RtcView) -> None:
+def _note_closed(turn: Turn, rtc: Status) -> None:
     """End it after somebody, or the acquisition itself, has closed the loop."""
     matrix, told = rtc.cm_id or "an unknown matrix", "which it has not judged"
     if rtc.cm_id is not None and rtc.cm_id == turn.acquisition.matrix:

@@ -18,9 +18,9 @@ from service.control.dither import (
 from service.model.misregistration import Misregistration
 from service.tracking import events as ev
 from service.tracking.alarms import ACQUISITION, Act, forbidding, forbids
-from service.tracking.dither import ask_for, make_way
+from service.tracking.dither import ask_for, ask_to_stop, make_way
 from service.tracking.dither_plan import ACQUIRING_DITHER
-from service.tracking.loop import DitherView, RtcView
+from service.tracking.loop import Dither
 from service.tracking.loop_commands import set_loop
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.reconstructors import forget_verdict
@@ -30,6 +30,7 @@ from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.validity import forget, hold, taken, void, why_void
 from service.tracking.worth import half_of, limit_modes
+from service.wire import DitherKind, DitherRequest, Status
 
 WINDOW_S = 2.0
 """Of telemetry in one far estimate."""
@@ -83,9 +84,7 @@ def reach_of(stage: AcquisitionStage) -> Band:
     return SMOOTH if stage is AcquisitionStage.COARSE else FINER
 
 
-def far_dither(
-    stage: AcquisitionStage, rtc: RtcView, policy: Policy, now_ns: int
-) -> DitherView | str:
+def far_dither(stage: AcquisitionStage, rtc: Status, policy: Policy, now_ns: int) -> Dither | str:
     """Return the dither of a stage with the loop open, or why there is none.
 
     It is strong: an open loop leaves the pyramid little response, and nothing is observed
@@ -99,19 +98,18 @@ def far_dither(
             f"RTC plays {rtc.max_dither_modes} at once, at {rtc.frame_rate_hz:g} Hz, and its basis "
             f"has {rtc.n_modes}"
         )
-    return DitherView(
+    request = DitherRequest(
         id=f"{ACQUIRING_DITHER}{now_ns}",
+        kind=DitherKind.SINE,
         modes=modes,
         amplitude_m=(min(policy.acquisition_amplitude_m, rtc.max_dither_m),) * len(modes),
         frequency_hz=lines[: len(modes)],
         duration_s=DITHER_S,
-        start_seq=None,
-        asked_ns_utc=now_ns,
-        window_s=WINDOW_S,
     )
+    return Dither(request=request, asked_ns_utc=now_ns, window_s=WINDOW_S)
 
 
-def loop_found(state: TrackerState, rtc: RtcView, policy: Policy) -> LoopFound:
+def loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
     """Return the loop as it is, and as it shall be closed again."""
     closed = rtc.loop != "open"
     out_of_hand = forbidding(state, Act.HOLD) is not None
@@ -126,7 +124,7 @@ def loop_found(state: TrackerState, rtc: RtcView, policy: Policy) -> LoopFound:
     )
 
 
-def left_open(state: TrackerState, rtc: RtcView) -> Acquisition | None:
+def left_open(state: TrackerState, rtc: Status) -> Acquisition | None:
     """Return the acquisition that was cut off, if the loop is as it left it.
 
     Opening a loop begins a session: the same one means that nobody has closed it in between.
@@ -142,7 +140,7 @@ def gains_for(found: LoopFound, n_modes: int, of_basis: int) -> tuple[float, ...
     return (*found.gains[:n_modes], *(0.0,) * (of_basis - n_modes))
 
 
-def begin(turn: Turn, rtc: RtcView, *, why: str, commanded: bool) -> None:
+def begin(turn: Turn, rtc: Status, *, why: str, commanded: bool) -> None:
     """Begin one: nothing is known of α any more."""
     left = left_open(turn.state, rtc)
     found = left.found if left is not None else None
@@ -298,7 +296,7 @@ def abort(turn: Turn, why: str, *, held_off: bool = False) -> None:
     enter_stage(turn, AcquisitionStage.ABORTED, text)
 
 
-def far_stage(turn: Turn, rtc: RtcView) -> None:
+def far_stage(turn: Turn, rtc: Status) -> None:
     """Open the loop, then keep the dither of the stage running."""
     acquisition = turn.acquisition
     if acquisition.stage is AcquisitionStage.OPENING:
@@ -364,7 +362,7 @@ def on_missed(turn: Turn, reason: str) -> None:
         turn.acquisition = replace(turn.acquisition, misses=misses)
 
 
-def _keep_dithering(turn: Turn, rtc: RtcView) -> None:
+def _keep_dithering(turn: Turn, rtc: Status) -> None:
     """Ask for the dither of the stage once no other one runs."""
     if turn.dither is not None or turn.now_ns < turn.state.retries.dither_ns_utc:
         return
@@ -373,7 +371,7 @@ def _keep_dithering(turn: Turn, rtc: RtcView) -> None:
         since_s = (turn.now_ns - turn.acquisition.since_ns_utc) / SECOND_NS
         if not (stopping and since_s < STOPS_WITHIN_S):
             turn.put_off(dither_s=STOPS_WITHIN_S)
-            turn.ask(ev.AskNoDither())
+            ask_to_stop(turn)
         return
     dither = far_dither(turn.acquisition.stage, rtc, turn.policy, turn.now_ns)
     if isinstance(dither, str):
@@ -393,10 +391,10 @@ def _to_give_back(state: TrackerState) -> LoopFound | None:
     return found
 
 
-def _of_stage(turn: Turn, rtc: RtcView, modes: tuple[int, ...]) -> bool:
+def _of_stage(turn: Turn, rtc: Status, modes: tuple[int, ...]) -> bool:
     """Return whether these are the modes of the present stage."""
     dither = far_dither(turn.acquisition.stage, rtc, turn.policy, 0)
-    return not isinstance(dither, str) and dither.modes == modes
+    return not isinstance(dither, str) and dither.request.modes == modes
 
 
 def _said(alpha: Misregistration) -> str:

@@ -37,10 +37,11 @@ from service.tracking.dither_plan import (
     why_unusable,
     window_lengths_s,
 )
-from service.tracking.loop import DitherKind, DitherView, RtcView
+from service.tracking.loop import Dither, why_open
 from service.tracking.policy import SECOND_NS
 from service.tracking.stages import DitherPhase, Precision
 from service.tracking.turn import Turn
+from service.wire import DitherKind, DitherRequest, DitherStatus, DitherStop, Reply, Status
 
 MEASURED = 1.1
 """What a second of frames may hold more than is allowed, before it is too strong."""
@@ -79,17 +80,17 @@ _ON_ITS_WAY_S = 2.0
 _SAME_LINE_HZ = 2.5
 
 
-def own_sine(dither: DitherView) -> bool:
+def own_sine(request: DitherRequest) -> bool:
     """Return whether a dither is one that the service has chosen by itself."""
-    return dither.id.startswith(OWN_DITHER) and dither.kind is DitherKind.SINE
+    return request.id.startswith(OWN_DITHER) and request.kind is DitherKind.SINE
 
 
-def choose_dither(turn: Turn, rtc: RtcView) -> None:
+def choose_dither(turn: Turn, rtc: Status) -> None:
     """Dither as much and as often as the policy asks while the loop is closed, its matrix known."""
     _account(turn, rtc)
     stop_unwanted(turn, rtc)
     dither = turn.dither
-    if dither is not None and not own_sine(dither):
+    if dither is not None and not own_sine(dither.request):
         _show(turn, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
     forbidden = _why_none(turn, rtc)
@@ -110,10 +111,15 @@ def choose_dither(turn: Turn, rtc: RtcView) -> None:
         _begin(turn, rtc, wish)
 
 
-def ask_for(turn: Turn, dither: DitherView) -> None:
+def ask_for(turn: Turn, dither: Dither) -> None:
     """Ask for a dither and follow it."""
     turn.dither = dither
-    turn.ask(ev.AskDither(dither=dither))
+    turn.ask(ev.Ask(request=dither.request))
+
+
+def ask_to_stop(turn: Turn) -> None:
+    """Ask the RTC to play no dither."""
+    turn.ask(ev.Ask(request=DitherStop(id=f"stop-{turn.now_ns}")))
 
 
 def drop(turn: Turn) -> None:
@@ -130,7 +136,7 @@ def make_way(turn: Turn) -> bool:
         return False
     turn.dithering = replace(turn.dithering, stopped_id=running)
     turn.dither = None
-    turn.ask(ev.AskNoDither())
+    ask_to_stop(turn)
     return True
 
 
@@ -140,7 +146,7 @@ def make_way_for_noisy(turn: Turn) -> None:
     if own is not None:
         turn.dithering = replace(turn.dithering, stopped_id=own.id, ended_ns_utc=None)
         turn.dither = None
-    turn.ask(ev.AskNoDither())
+    ask_to_stop(turn)
 
 
 def allow(turn: Turn, *, allowed: bool = True) -> None:
@@ -160,21 +166,27 @@ def stop_by_operator(turn: Turn) -> None:
 def tell_to_stop(turn: Turn) -> None:
     """Ask the RTC to play no dither."""
     turn.dithering = replace(turn.dithering, told_ns_utc=turn.now_ns)
-    turn.ask(ev.AskNoDither())
+    ask_to_stop(turn)
 
 
-def on_answer(turn: Turn, event: ev.DitherAnswered) -> None:
+def on_answer(turn: Turn, request: DitherRequest, reply: Reply) -> None:
     """Note when the dither starts, or why it does not."""
-    if turn.dither is None or turn.dither.id != event.id:
+    if turn.dither is None or turn.dither.id != request.id:
         return
-    if event.accepted:
-        turn.dither = replace(turn.dither, start_seq=event.start_seq, asked_ns_utc=turn.now_ns)
+    if reply.accepted:
+        turn.dither = replace(turn.dither, start_seq=reply.start_seq, asked_ns_utc=turn.now_ns)
         turn.calm(NO_DITHER)
-        turn.log("dither.started", f"{event.id} starts at frame {event.start_seq}")
+        turn.log("dither.started", f"{request.id} starts at frame {reply.start_seq}")
         return
     turn.put_off(dither_s=10.0)
     turn.dither = None
-    turn.alarm(NO_DITHER, f"the RTC refused the dither: {event.reason}")
+    turn.alarm(NO_DITHER, f"the RTC refused the dither: {reply.reason}")
+
+
+def on_stop_answer(turn: Turn, reply: Reply) -> None:
+    """Put on record that the RTC goes on; it is asked again for as long as it must be."""
+    if not reply.accepted:
+        turn.warn("job.failed", f"the RTC did not stop the dither: {reply.reason}")
 
 
 def hear_vibrations(turn: Turn, event: ev.Vibrations) -> None:
@@ -186,21 +198,25 @@ def hear_vibrations(turn: Turn, event: ev.Vibrations) -> None:
         turn.log("vibrations", f"vibrations at {', '.join(f'{f:.0f}' for f in lines)} Hz")
 
 
-def follow_status(turn: Turn, rtc: RtcView) -> None:
+def follow_status(turn: Turn, rtc: Status) -> None:
     """Compare the dither that should run with the one the RTC's status shows."""
     dither = turn.dither
     if dither is None or dither.start_seq is None:
         return
-    if rtc.dither_id == dither.id:
+    if rtc.dither is not None and rtc.dither_id == dither.id:
         _correct(turn, dither, rtc.dither)
         return
     elapsed_s = (turn.now_ns - dither.asked_ns_utc) / SECOND_NS
-    if rtc.seq < dither.start_seq if rtc.seq >= 0 else elapsed_s <= _ON_ITS_WAY_S:
+    if rtc.seq is None:
+        begun, played_s = elapsed_s > _ON_ITS_WAY_S, elapsed_s
+    else:
+        begun = rtc.seq >= dither.start_seq
+        played_s = (rtc.seq - dither.start_seq) / rtc.frame_rate_hz
+    if not begun:
         return
-    played_s = (rtc.seq - dither.start_seq) / rtc.frame_rate_hz if rtc.seq >= 0 else elapsed_s
     asked_to_stop = dither.id == turn.dithering.stopped_id
     # a status a second old may be the first to show the end
-    if asked_to_stop or played_s >= dither.duration_s - SILENT_S:
+    if asked_to_stop or played_s >= dither.request.duration_s - SILENT_S:
         turn.dithering = replace(turn.dithering, ended_ns_utc=turn.now_ns)
         turn.dither = None
         turn.calm(DITHER_LOST)
@@ -282,7 +298,7 @@ def stop_too_strong(turn: Turn, dither_id: str, loud: str) -> None:
     tell_to_stop(turn)
 
 
-def stop_unwanted(turn: Turn, rtc: RtcView) -> None:
+def stop_unwanted(turn: Turn, rtc: Status) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
     running, loud = rtc.dither_id, _too_strong(turn, rtc)
     why = loud or _why_unwanted(turn, rtc)
@@ -311,7 +327,7 @@ def forget_unwanted(turn: Turn) -> None:
         turn.calm(NOT_STOPPED)
 
 
-def _begin(turn: Turn, rtc: RtcView, wish: Wish) -> None:
+def _begin(turn: Turn, rtc: Status, wish: Wish) -> None:
     """Ask for a dither if it is time, and nothing left behind is in its way."""
     loud_ns = turn.dithering.loud_ns_utc
     if loud_ns and turn.now_ns < loud_ns + round(CALM_S * SECOND_NS):
@@ -323,12 +339,12 @@ def _begin(turn: Turn, rtc: RtcView, wish: Wish) -> None:
         # left behind by this service: its window of another length, or to stop
         turn.put_off(dither_s=2.0)
         _note_stop(turn, rtc.dither_id)
-        turn.ask(ev.AskNoDither())
+        ask_to_stop(turn)
     elif turn.now_ns >= wish.next_ns_utc and not _awaits_a_result(turn, wish):
         _ask(turn, rtc, wish)
 
 
-def _ask(turn: Turn, rtc: RtcView, wish: Wish) -> None:
+def _ask(turn: Turn, rtc: Status, wish: Wish) -> None:
     dither = plan_dither(rtc, turn.policy, turn.now_ns, choice=wish.choice)
     reason = why_unusable(dither, rtc, turn.policy)
     if reason is not None:
@@ -362,16 +378,16 @@ def _awaits_a_result(turn: Turn, wish: Wish) -> bool:
     return not late and turn.state.windows_accepted < dithering.results_due
 
 
-def _end_when_done(turn: Turn, dither: DitherView, wish: Wish) -> None:
+def _end_when_done(turn: Turn, dither: Dither, wish: Wish) -> None:
     """Stop a dither that has done its work, or is too weak for what has come up meanwhile."""
-    left_s = dither.duration_s - (turn.now_ns - dither.asked_ns_utc) / SECOND_NS
+    left_s = dither.request.duration_s - (turn.now_ns - dither.asked_ns_utc) / SECOND_NS
     deaf = dither.id == turn.dithering.stopped_id
     if dither.start_seq is None or left_s < SOON_OVER_S or deaf:
         return
     seen = turn.known is not None and turn.known.window_ns_utc > dither.asked_ns_utc
     pause_s = (wish.next_ns_utc - turn.now_ns) / SECOND_NS
     done = seen and wish.phase is DitherPhase.SPARSE and pause_s >= SHORTEST_PAUSE_S
-    weak = wish.phase is DitherPhase.ACQUIRE and 2.0 * total_m(dither) < wish.choice.total_m
+    weak = wish.phase is DitherPhase.ACQUIRE and 2.0 * total_m(dither.request) < wish.choice.total_m
     if done or weak:
         _note_stop(turn, dither.id)
         turn.dither = None
@@ -379,14 +395,14 @@ def _end_when_done(turn: Turn, dither: DitherView, wish: Wish) -> None:
         turn.put_off(dither_s=1.0)
         weakness = "" if done else " is too weak"
         turn.log("dither.stopped", f"{dither.id}{weakness}: {wish.reason}")
-        turn.ask(ev.AskNoDither())
+        ask_to_stop(turn)
 
 
-def _adopt(turn: Turn, rtc: RtcView) -> bool:
+def _adopt(turn: Turn, rtc: Status) -> bool:
     """Take over a dither that runs, if it can be read; return whether there is one."""
-    running, dithering = rtc.dither, turn.dithering
-    if running is None or running.id == turn.state.dither_lost:
+    if rtc.dither is None or rtc.dither_id == turn.state.dither_lost:
         return False
+    running, dithering = rtc.dither.request, turn.dithering
     over = own_sine(running) and total_m(running) > ROUNDING * dithering.budget_m
     asked_to_stop = running.id == dithering.stopped_id
     # a recorded night stops nothing: what it goes on playing is read all the same
@@ -394,22 +410,27 @@ def _adopt(turn: Turn, rtc: RtcView) -> bool:
     if turn.now_ns < heard_ns if asked_to_stop else over:
         return False
     for window_s in window_lengths_s(turn.policy):
-        dither = replace(running, asked_ns_utc=turn.now_ns, window_s=window_s)
+        dither = Dither(
+            request=running,
+            start_seq=rtc.dither.start_seq,
+            asked_ns_utc=turn.now_ns,
+            window_s=window_s,
+        )
         if why_unusable(dither, rtc, turn.policy) is None:
             turn.dither = dither
             turn.calm(NO_DITHER)
-            turn.log("dither.adopted", f"{running.id} runs since frame {running.start_seq}")
+            turn.log("dither.adopted", f"{running.id} runs since frame {dither.start_seq}")
             return True
     return False
 
 
-def _account(turn: Turn, rtc: RtcView) -> None:
+def _account(turn: Turn, rtc: Status) -> None:
     """Keep count of what the dither costs, and of who has looked at α last."""
     dithering, known, dither = turn.dithering, turn.known, turn.dither
-    on = dither is not None and dither.start_seq is not None
+    followed = dither is not None and dither.start_seq is not None
     # what nobody has asked for costs as much
-    playing = dither if on else rtc.dither
-    power = 0.0 if playing is None else total_m(playing) ** 2
+    playing = dither if followed else rtc.dither
+    power = 0.0 if playing is None else total_m(playing.request) ** 2
     since_ns = turn.now_ns if dithering.seen_ns_utc is None else dithering.seen_ns_utc
     share = -np.expm1(-max(turn.now_ns - since_ns, 0) / (MEMORY_S * SECOND_NS))
     passive_ns = dithering.passive_ns_utc
@@ -430,7 +451,7 @@ def _show(turn: Turn, phase: DitherPhase, reason: str) -> None:
         turn.dithering = replace(turn.dithering, next_ns_utc=None)
 
 
-def _why_none(turn: Turn, rtc: RtcView) -> str | None:
+def _why_none(turn: Turn, rtc: Status) -> str | None:
     state, still = turn.state, turn.dithering.unwanted_id
     left = "" if still is None else f"; the RTC still plays {still}"
     if state.dither_stopped:
@@ -438,7 +459,7 @@ def _why_none(turn: Turn, rtc: RtcView) -> str | None:
     if not turn.policy.dither_enabled and turn.dither is None:
         return f"the settings forbid it{left}"
     if not rtc.in_loop:
-        return rtc.why_open
+        return why_open(rtc)
     unnamed = rtc.cm_id is None or state.unfetched
     if state.in_use is None and not unnamed and turn.dither is None and rtc.dither is None:
         return "the reconstructor in use is not known yet"
@@ -446,28 +467,27 @@ def _why_none(turn: Turn, rtc: RtcView) -> str | None:
     return None if alarm is None else f"nothing would be measured under {alarm.name}"
 
 
-def _correct(turn: Turn, asked: DitherView, running: DitherView | None) -> None:
+def _correct(turn: Turn, asked: Dither, shown: DitherStatus) -> None:
     """Take the RTC's word on what it plays, where that is not what was asked for.
 
     It is true, and not for that tolerated: one too strong is stopped.
     """
-    if running is None:
-        return
-    running = replace(running, asked_ns_utc=asked.asked_ns_utc, window_s=asked.window_s)
+    running = replace(asked, request=shown.request, start_seq=shown.start_seq)
     if running == asked:
         return
-    if total_m(running) > ROUNDING * max(total_m(asked), turn.dithering.budget_m):
+    plays, wanted = running.request, asked.request
+    if total_m(plays) > ROUNDING * max(total_m(wanted), turn.dithering.budget_m):
         turn.dithering = replace(turn.dithering, loud_id=running.id, loud_text="")
     text = (
-        f"{asked.id}: the RTC plays modes {running.modes}, {running.frequency_hz} Hz, "
-        f"{running.amplitude_m} m from frame {running.start_seq}; asked for were modes "
-        f"{asked.modes}, {asked.frequency_hz} Hz, {asked.amplitude_m} m from {asked.start_seq}"
+        f"{asked.id}: the RTC plays modes {plays.modes}, {running.frequency_hz} Hz, "
+        f"{plays.amplitude_m} m from frame {running.start_seq}; asked for were modes "
+        f"{wanted.modes}, {asked.frequency_hz} Hz, {wanted.amplitude_m} m from {asked.start_seq}"
     )
     turn.dither = running
     turn.warn("dither.other", text)
 
 
-def _lose(turn: Turn, dither: DitherView, text: str) -> None:
+def _lose(turn: Turn, dither: Dither, text: str) -> None:
     turn.alarm(DITHER_LOST, text)
     turn.warn("dither.lost", text)
     turn.dither = None
@@ -504,11 +524,11 @@ def _blame(turn: Turn, running: str, loud: str) -> None:
     turn.alarm(OVER_BUDGET, text)
 
 
-def _forgive(turn: Turn, rtc: RtcView) -> None:
+def _forgive(turn: Turn, rtc: Status) -> None:
     """End the alarm of a dither too strong once one is played as it may, or none is wanted."""
-    own, played = turn.dither, rtc.dither
+    own = turn.dither
     by_frames = bool(turn.dithering.loud_text)
-    fine = not by_frames and own is not None and played is not None and played.id == own.id
+    fine = not by_frames and own is not None and rtc.dither_id == own.id
     given_up = turn.state.dither_stopped or not turn.policy.dither_enabled
     if given_up:
         turn.calm(NOT_AS_ASKED)
@@ -516,14 +536,14 @@ def _forgive(turn: Turn, rtc: RtcView) -> None:
         turn.calm(OVER_BUDGET)
 
 
-def _too_strong(turn: Turn, rtc: RtcView) -> str | None:
+def _too_strong(turn: Turn, rtc: Status) -> str | None:
     """Return why a dither that is played costs more than it may, or None.
 
     An operator's own may cost more than the budget, but not more than was asked for.
     """
-    running, dithering = rtc.dither, turn.dithering
-    if running is None:
+    if rtc.dither is None:
         return None
+    running, dithering = rtc.dither.request, turn.dithering
     found_m, most_m = total_m(running), budget_m(rtc, turn.policy)
     over = own_sine(running) and found_m > ROUNDING * most_m
     if not over and running.id != dithering.loud_id:
@@ -536,7 +556,7 @@ def _too_strong(turn: Turn, rtc: RtcView) -> str | None:
     )
 
 
-def _why_unwanted(turn: Turn, rtc: RtcView) -> str | None:
+def _why_unwanted(turn: Turn, rtc: Status) -> str | None:
     running = rtc.dither_id
     if running is None or not running.startswith(OUR_DITHERS):
         return None

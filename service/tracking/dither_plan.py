@@ -21,12 +21,13 @@ from service.errors import CommandError, ModelError
 from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan
 from service.telemetry.played import Asked
 from service.telemetry.random_dither import FRAMES_PER_MODE, RandomPlan
-from service.tracking.loop import DitherKind, DitherView, RtcView
+from service.tracking.loop import Dither
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import ModeSet
 from service.tracking.registration import Registration
 from service.tracking.stages import DitherPhase, DitherPlan
 from service.tracking.state import TrackerState
+from service.wire import DitherKind, DitherRequest, Status
 
 LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
 """Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""
@@ -76,10 +77,11 @@ class Choice:
     """Lines it need not leave without reason."""
 
 
-def why_unusable(dither: DitherView, rtc: RtcView, policy: Policy) -> str | None:
+def why_unusable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
     """Return why the lines of a dither cannot be told apart in its windows, or None."""
-    if dither.kind is not DitherKind.SINE:
-        return f"{dither.id} is {dither.kind}, not a sine"
+    kind = dither.request.kind
+    if kind is not DitherKind.SINE:
+        return f"{dither.id} is {kind}, not a sine"
     try:
         lock_in_plan(dither, rtc, policy.window_s)
     except ModelError as error:
@@ -88,7 +90,7 @@ def why_unusable(dither: DitherView, rtc: RtcView, policy: Policy) -> str | None
 
 
 def plan_dither(
-    rtc: RtcView,
+    rtc: Status,
     policy: Policy,
     now_ns: int,
     *,
@@ -97,7 +99,7 @@ def plan_dither(
     amplitude_m: float | None = None,
     frequency_hz: tuple[float, ...] | None = None,
     duration_s: float | None = None,
-) -> DitherView:
+) -> Dither:
     """Return the dither to ask for: what is not given is the policy's own choice.
 
     The lines are rounded to whole periods in a window. The modes are ones the loop does not and
@@ -118,24 +120,23 @@ def plan_dither(
     amplitude = amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))
     lasting_s = SETTLING_S + choice.n_windows * choice.window_s + SPARE_S
     step_hz = _step_hz(rtc, choice.window_s)
-    return DitherView(
+    request = DitherRequest(
         id=f"{ASKED_DITHER if asked else OWN_DITHER}{now_ns}",
+        kind=DitherKind.SINE,
         modes=chosen,
         amplitude_m=(float(min(amplitude, rtc.max_dither_m)),) * len(chosen),
         frequency_hz=tuple(round(f / step_hz) * step_hz for f in lines),
         duration_s=duration_s or lasting_s,
-        start_seq=None,
-        asked_ns_utc=now_ns,
-        window_s=choice.window_s,
     )
+    return Dither(request=request, asked_ns_utc=now_ns, window_s=choice.window_s)
 
 
-def total_m(dither: DitherView) -> float:
+def total_m(request: DitherRequest) -> float:
     """Return the RMS of all lines of a dither together, metres OPD."""
-    return float(np.sqrt(np.sum(np.square(dither.amplitude_m))))
+    return float(np.sqrt(np.sum(np.square(request.amplitude_m))))
 
 
-def lock_in_plan(dither: DitherView, rtc: RtcView, window_s: float) -> LockInPlan:
+def lock_in_plan(dither: Dither, rtc: Status, window_s: float) -> LockInPlan:
     """Return how a dither is demodulated, from where the loop has settled.
 
     Its own window counts; ``window_s`` is for a dither that was planned without one.
@@ -146,30 +147,30 @@ def lock_in_plan(dither: DitherView, rtc: RtcView, window_s: float) -> LockInPla
         If its lines cannot be told apart in a window.
     """
     return LockInPlan(
-        modes=dither.modes,
+        modes=dither.request.modes,
         frequencies_hz=dither.frequency_hz,
-        amplitude_m=dither.amplitude_m,
+        amplitude_m=dither.request.amplitude_m,
         frame_rate_hz=rtc.frame_rate_hz,
         n_frames=round((dither.window_s or window_s) * rtc.frame_rate_hz),
         first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
     )
 
 
-def asked_of(dither: DitherView, rtc: RtcView) -> Asked:
+def asked_of(dither: Dither, rtc: Status) -> Asked:
     """Return a dither as the frames should hold it."""
-    first_seq = dither.start_seq or 0
+    first_seq, request = dither.start_seq or 0, dither.request
     return Asked(
-        modes=dither.modes,
-        amplitude_m=dither.amplitude_m,
+        modes=request.modes,
+        amplitude_m=request.amplitude_m,
         frequency_hz=dither.frequency_hz,
         frame_rate_hz=rtc.frame_rate_hz,
         first_seq=first_seq,
-        stop_seq=first_seq + round(dither.duration_s * rtc.frame_rate_hz),
-        own=tuple(mode not in rtc.in_loop for mode in dither.modes),
+        stop_seq=first_seq + round(request.duration_s * rtc.frame_rate_hz),
+        own=tuple(mode not in rtc.in_loop for mode in request.modes),
     )
 
 
-def clear_lines(rtc: RtcView, n_lines: int, choice: Choice) -> tuple[float, ...]:
+def clear_lines(rtc: Status, n_lines: int, choice: Choice) -> tuple[float, ...]:
     """Return lines in the band that wind leaves alone, as clear of vibrations as these allow.
 
     Those of the last dither stay while none of them is on a vibration.
@@ -194,23 +195,23 @@ def clear_lines(rtc: RtcView, n_lines: int, choice: Choice) -> tuple[float, ...]
     return wanted
 
 
-def on_vibrations(dither: DitherView, avoid_hz: tuple[float, ...]) -> tuple[float, ...]:
+def on_vibrations(dither: Dither, avoid_hz: tuple[float, ...]) -> tuple[float, ...]:
     """Return the lines of a dither that are not clear of vibrations."""
     near = CLEARANCES_HZ[-1] - 1e-6
     return tuple(f for f in dither.frequency_hz if any(abs(f - v) < near for v in avoid_hz))
 
 
-def n_lines(rtc: RtcView, policy: Policy) -> int:
+def n_lines(rtc: Status, policy: Policy) -> int:
     """Return how many modes the service dithers by itself."""
     return min(len(policy.dither_modes or range(_N_LINES)), rtc.max_dither_modes)
 
 
-def _step_hz(rtc: RtcView, window_s: float) -> float:
+def _step_hz(rtc: Status, window_s: float) -> float:
     """Return the frequency of one period in a window."""
     return rtc.frame_rate_hz / max(round(window_s * rtc.frame_rate_hz), 1)
 
 
-def _uncontrolled_modes(rtc: RtcView, policy: Policy) -> tuple[int, ...]:
+def _uncontrolled_modes(rtc: Status, policy: Policy) -> tuple[int, ...]:
     """Return the four most telling modes above the controlled ones, or the highest four there are.
 
     Until the model is known they are spread evenly.
@@ -246,7 +247,7 @@ class RandomChoice:
     """Of telemetry, settling not included."""
 
 
-def plan_random(asked: RandomChoice, rtc: RtcView, policy: Policy, now_ns: int) -> DitherView:
+def plan_random(asked: RandomChoice, rtc: Status, policy: Policy, now_ns: int) -> Dither:
     """Return the dither to ask for; its windows, all alike, fill its whole length.
 
     Raises
@@ -268,21 +269,18 @@ def plan_random(asked: RandomChoice, rtc: RtcView, policy: Policy, now_ns: int) 
             f"dither: found {asked.duration_s:g} s; {len(modes)} modes need windows of "
             f"{least_s:.3g} s"
         )
-    return DitherView(
+    request = DitherRequest(
         id=asked.id,
         kind=DitherKind.BINARY,
         modes=modes,
         amplitude_m=(amplitude_m,) * len(modes),
-        frequency_hz=(),
         seed=now_ns % (1 << 31),
         duration_s=SETTLING_S + asked.duration_s + SPARE_S,
-        start_seq=None,
-        asked_ns_utc=now_ns,
-        window_s=asked.duration_s / n_windows,
     )
+    return Dither(request=request, asked_ns_utc=now_ns, window_s=asked.duration_s / n_windows)
 
 
-def random_plan(dither: DitherView, rtc: RtcView, window_s: float) -> RandomPlan:
+def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:
     """Return how a random dither is correlated, from where the loop has settled.
 
     Raises
@@ -291,14 +289,14 @@ def random_plan(dither: DitherView, rtc: RtcView, window_s: float) -> RandomPlan
         If its windows are too short for its modes.
     """
     return RandomPlan(
-        modes=dither.modes,
-        amplitude_m=dither.amplitude_m,
+        modes=dither.request.modes,
+        amplitude_m=dither.request.amplitude_m,
         n_frames=int((dither.window_s or window_s) * rtc.frame_rate_hz * (1.0 + 1e-12)),
         first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
     )
 
 
-def _modes(asked: tuple[int, ...] | ModeSet, rtc: RtcView) -> tuple[int, ...]:
+def _modes(asked: tuple[int, ...] | ModeSet, rtc: Status) -> tuple[int, ...]:
     if isinstance(asked, ModeSet):
         modes = tuple(range(rtc.n_modes if asked is ModeSet.ALL else rtc.n_controlled))
     else:
@@ -365,7 +363,7 @@ class Wish:
 
 
 def wanted(
-    state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
+    state: TrackerState, rtc: Status, policy: Policy, now_ns: int
 ) -> tuple[Wish, DitherPlan]:
     """Return the dither that is wanted in this state, and the plan behind it."""
     kappa = precision(state, rtc)
@@ -388,7 +386,7 @@ def wanted(
     return Wish(phase=phase, reason=reason, choice=choice, next_ns_utc=next_ns), plan
 
 
-def by_hand(state: TrackerState, rtc: RtcView, policy: Policy) -> Choice:
+def by_hand(state: TrackerState, rtc: Status, policy: Policy) -> Choice:
     """Return what an operator's dither is like where the operator does not say."""
     plan = state.dithering.plan
     window_s = policy.window_s if plan is None else plan.window_s
@@ -422,13 +420,13 @@ def _plan(
     )
 
 
-def precision(state: TrackerState, rtc: RtcView) -> NDArray[np.float64]:
+def precision(state: TrackerState, rtc: Status) -> NDArray[np.float64]:
     """Return κ ``(4,)`` of ``σ = κ / (A sqrt(T))`` as far as it has been learnt."""
     table, known = tabulated(rtc.magnitude), state.dithering.precision
     return table if known is None else table * known.ratio
 
 
-def budget_m(rtc: RtcView, policy: Policy) -> float:
+def budget_m(rtc: Status, policy: Policy) -> float:
     """Return the largest RMS of all lines together that policy, settings and RTC allow, metres."""
     n = n_lines(rtc, policy)
     largest = min(rtc.max_dither_m, policy.dither_amplitude_m or np.inf)
@@ -442,7 +440,7 @@ def window_lengths_s(policy: Policy) -> tuple[float, ...]:
 
 
 def _demand(
-    kappa: NDArray[np.float64], state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int
+    kappa: NDArray[np.float64], state: TrackerState, rtc: Status, policy: Policy, now_ns: int
 ) -> Demand:
     demand = Demand(
         sigma=policy.dither_sigma,

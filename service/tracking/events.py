@@ -12,17 +12,16 @@ from service.telemetry.lockin import WindowEstimate
 from service.telemetry.openloop import FarEstimate
 from service.telemetry.passive import PassiveEstimate
 from service.telemetry.random_dither import RandomEstimate
-from service.tracking.loop import DitherKind, DitherView, Pointing, RtcView
 from service.tracking.products import (
     Judged,
-    MatrixState,
     MeasurementRecord,
-    MeasurePattern,
     ModeSet,
     NoisyRecord,
     ReconstructorRecord,
 )
 from service.tracking.state import Level, Mode
+from service.wire import Acknowledgement, DitherKind, Pattern, Pointing, Reply, Status
+from service.wire import Command as Request
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,7 +100,7 @@ class Measure:
     id: str
     """Of the matrix to come; never used before."""
 
-    pattern: MeasurePattern
+    pattern: Pattern
     modes: tuple[int, ...] | None = None
     """0-based basis indices."""
 
@@ -299,49 +298,12 @@ class FetchMatrix:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AskDither:
-    """Ask the RTC for a dither."""
+class Ask:
+    """Ask something of the RTC."""
 
-    dither: DitherView
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskNoDither:
-    """Ask the RTC to stop its dither."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskMeasurement:
-    """Ask the RTC to measure an interaction matrix."""
-
-    record: MeasurementRecord
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskLoop:
-    """Ask the RTC to change its loop; None leaves a value as it is."""
-
-    id: str
-    closed: bool | None = None
-    gains: tuple[float, ...] | None = None
-    """One for each mode of the basis."""
-
-    leak: float | None = None
-    n_controlled: int | None = None
+    request: Request
     judged: bool = False
-    """Only if the gate lets the matrix in use run with these gains."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AskRamp:
-    """Ask the RTC to try gains on groups of modes."""
-
-    id: str
-    groups: tuple[tuple[int, int], ...]
-    """First and last mode of each, both included."""
-
-    gains: tuple[float, ...]
-    frames_per_gain: int
+    """Only if the gate lets the matrix in use run with the gains of the request."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -358,11 +320,7 @@ Effect = (
     | JudgeProposal
     | SendMatrix
     | FetchMatrix
-    | AskDither
-    | AskNoDither
-    | AskMeasurement
-    | AskLoop
-    | AskRamp
+    | Ask
     | FinishNoisy
 )
 
@@ -370,13 +328,6 @@ Effect = (
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tick:
     """Time has passed."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusSeen:
-    """The RTC said how it is."""
-
-    rtc: RtcView
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -461,7 +412,7 @@ class Watched:
     """Begin of it, the RTC's clock; 0: not told."""
 
     loop: tuple[float, ...] = ()
-    """``RtcView.loop_numbers`` of the loop it is of; empty: not known."""
+    """``tracking.loop.loop_numbers`` of the loop it is of; empty: not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -522,31 +473,11 @@ class ProposalJudged:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Acknowledged:
-    """The RTC answered to a reconstructor."""
+class Answered:
+    """The RTC answered what was asked of it."""
 
-    id: str | None
-    """None: it could not read which one it rejects."""
-
-    sha256: str | None = None
-    """Of the matrix it means; None: not told."""
-
-    session: str | None = None
-    """Of the RTC that answers; None: not known."""
-
-    state: MatrixState
-    reason: str
-    frame_seq: int | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DitherAnswered:
-    """The RTC accepted or refused a dither."""
-
-    id: str
-    accepted: bool
-    reason: str
-    start_seq: int | None
+    request: Request
+    reply: Reply
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -580,15 +511,6 @@ class Vibrations:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LoopAnswered:
-    """The RTC accepted or refused a change of its loop, or a gain ramp."""
-
-    id: str
-    accepted: bool
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class MatrixMeasured:
     """A measured interaction matrix is one step further: begun, refused, failed or stored."""
 
@@ -613,7 +535,7 @@ class JobFailed:
 Event = (
     Command
     | Tick
-    | StatusSeen
+    | Status
     | SessionStarted
     | RtcVanished
     | ServicesMet
@@ -628,12 +550,11 @@ Event = (
     | MatrixFetched
     | MarginJudged
     | ProposalJudged
-    | Acknowledged
-    | DitherAnswered
+    | Acknowledgement
+    | Answered
     | DitherSilent
     | DitherMeasured
     | Vibrations
-    | LoopAnswered
     | MatrixMeasured
     | NoisyMade
     | JobFailed

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from service.model.misregistration import Misregistration
 from service.telemetry.kalman import JUMP_THRESHOLD, Joint
 from service.telemetry.passive import BIAS_FLOOR
-from service.tracking.loop import Pointing
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Earlier, Registration, Seen
 from service.tracking.validity import CLOCK_SET_BACK_S, flexure
+from service.wire import Pointing
 
 STEADY_S = 60.0
 """The drift of a minute is what the settings tell: over less it is that share of it."""

@@ -1,38 +1,15 @@
-"""The RTC as its own status shows it: its loop, its dither, where its telescope looks."""
+"""The RTC's loop and its dither as a status shows them: what makes two of them the same loop."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pointing:
-    """A direction of the telescope."""
-
-    elevation_deg: float
-    """Above the horizon, degrees."""
-
-    azimuth_deg: float
-    """From north over east, degrees; only differences count."""
-
-    def separation_deg(self, other: Pointing) -> float:
-        """Return the angle on the sky between two directions, degrees."""
-        return float(np.rad2deg(np.arccos(np.clip(self._unit() @ other._unit(), -1.0, 1.0))))
-
-    def _unit(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        elevation, azimuth = np.deg2rad([self.elevation_deg, self.azimuth_deg])
-        return np.array(
-            [
-                np.cos(elevation) * np.cos(azimuth),
-                np.cos(elevation) * np.sin(azimuth),
-                np.sin(elevation),
-            ]
-        )
-
+from service.wire import DitherRequest, Loop, Pointing, Status
 
 SAME_GAIN = 0.05
 """Relative: an RTC may follow the seeing with its gains once a second, and the gate judges with the
@@ -59,8 +36,15 @@ def same_rate(one_hz: float, other_hz: float) -> bool:
     return abs(one_hz - other_hz) <= SAME_RATE * one_hz
 
 
+def loop_numbers(rtc: Status | None) -> tuple[float, ...]:
+    """Return all of the loop that the bias of its passive estimate depends on; empty: no RTC."""
+    if rtc is None:
+        return ()
+    return (float(rtc.n_controlled), rtc.leak, rtc.delay_frames, rtc.frame_rate_hz, *rtc.gains)
+
+
 def same_numbers(some: tuple[float, ...], others: tuple[float, ...]) -> bool:
-    """Return whether two ``RtcView.loop_numbers`` are of one loop: the only definition of it."""
+    """Return whether two :func:`loop_numbers` are of one loop: the only definition of it."""
     if len(some) != len(others) or not some:
         return some == others
     modes, leak, delay, rate, *gains = some
@@ -74,121 +58,64 @@ def same_numbers(some: tuple[float, ...], others: tuple[float, ...]) -> bool:
     )
 
 
-class DitherKind(StrEnum):
-    """Shape of a dither in time."""
+def same_loop(one: Status, other: Status) -> bool:
+    """Return whether telemetry and verdicts of one loop are of the other as well.
 
-    SINE = "sine"
-    """One line for each mode."""
+    Its gains may follow the seeing; one that enters or leaves 0 makes it another.
+    """
+    return (
+        one.session == other.session
+        and one.loop == other.loop
+        and same_numbers(loop_numbers(one), loop_numbers(other))
+    )
 
-    BINARY = "binary"
-    """Plus or minus the amplitude in every frame, at random."""
+
+def why_open(rtc: Status) -> str:
+    """Return what to tell of a loop with no mode in it."""
+    return "the loop is open" if rtc.loop == Loop.OPEN else "all gains of the loop are 0"
+
+
+def last_seq(rtc: Status) -> int:
+    """Return the last frame processed when a status was made; -1: there had been none."""
+    return -1 if rtc.seq is None else rtc.seq
+
+
+def separation_deg(one: Pointing, other: Pointing) -> float:
+    """Return the angle on the sky between two directions, degrees."""
+    return float(np.rad2deg(np.arccos(np.clip(_unit(one) @ _unit(other), -1.0, 1.0))))
+
+
+def _unit(pointing: Pointing) -> NDArray[np.float64]:
+    elevation, azimuth = np.deg2rad([pointing.elevation_deg, pointing.azimuth_deg])
+    across = np.cos(elevation)
+    return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DitherView:
-    """A dither, asked for or running."""
+class Dither:
+    """A dither that the service follows, asked for or running."""
 
-    id: str
-    modes: tuple[int, ...]
-    amplitude_m: tuple[float, ...]
-    """RMS of each mode, metres OPD."""
+    request: DitherRequest
+    """What is played."""
 
-    frequency_hz: tuple[float, ...]
-    """One for each mode of a sine; a binary dither has none."""
-
-    duration_s: float
-    start_seq: int | None
+    start_seq: int | None = None
     """First frame that contains it; None until the RTC has accepted."""
 
     asked_ns_utc: int
-    """When it was asked for, then when it was accepted or adopted; 0: none of these."""
-
-    kind: DitherKind = DitherKind.SINE
-    seed: int | None = None
-    """Of a binary dither's signs; None: a sine has none."""
+    """When it was asked for, then when it was accepted or adopted."""
 
     window_s: float | None = None
     """Of telemetry in one estimate, where it was planned with the dither."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RtcView:
-    """The RTC as its last status message shows it."""
-
-    session: str
-    loop: str
-    """"open", "closed" or "partial"."""
-
-    frame_rate_hz: float
-    delay_frames: float
-    leak: float
-    gains: tuple[float, ...]
-    """One per mode of the basis; 0 where uncontrolled."""
-
-    n_controlled: int
-    n_modes: int
-    n_slopes: int
-    cm_id: str | None
-    basis_id: str
-    config_id: str
-    magnitude: float | None
-    max_dither_m: float
-    max_dither_modes: int
-    dither_id: str | None
-    """The dither now running; None: none."""
-
-    t_ns_utc: int
-    """The RTC's own timestamp of this status."""
-
-    seq: int = -1
-    """Last frame processed when it was made; -1: not known."""
-
-    flux: bytes | None = field(default=None, repr=False, compare=False)
-    """``<f4`` ``[4, n_subapertures, n_subapertures]`` mean counts of the pupil images; None: not
-    told."""
-
-    dither: DitherView | None = None
-    """What is running, where it has been announced to the frame; else None."""
-
-    pointing: Pointing | None = None
-    """Of the telescope; None: the RTC does not know."""
+    @property
+    def id(self) -> str:
+        """The request's."""
+        return self.request.id
 
     @property
-    def in_loop(self) -> tuple[int, ...]:
-        """Modes the loop moves, the controlled ones with a gain; none: it is open.
-
-        Some gains of 0 ("partial") make it a loop of the other modes, no less closed.
-        """
-        if self.loop == "open":
-            return ()
-        return tuple(i for i, gain in enumerate(self.gains[: self.n_controlled]) if gain)
-
-    @property
-    def why_open(self) -> str:
-        """What to tell of a loop with no mode in it."""
-        return "the loop is open" if self.loop == "open" else "all gains of the loop are 0"
-
-    def same_loop(self, other: RtcView) -> bool:
-        """Return whether telemetry and verdicts of the other are of this loop as well.
-
-        Its gains may follow the seeing; one that enters or leaves 0 makes it another.
-        """
-        return (
-            self.session == other.session
-            and self.loop == other.loop
-            and same_numbers(self.loop_numbers, other.loop_numbers)
-        )
-
-    @property
-    def loop_numbers(self) -> tuple[float, ...]:
-        """Return all of the loop that the bias of its passive estimate depends on."""
-        return (
-            float(self.n_controlled),
-            self.leak,
-            self.delay_frames,
-            self.frame_rate_hz,
-            *self.gains,
-        )
+    def frequency_hz(self) -> tuple[float, ...]:
+        """One for each mode of a sine; a binary dither has none."""
+        return self.request.frequency_hz or ()
 
 
 class CommandState(StrEnum):

@@ -10,12 +10,13 @@ import numpy as np
 from service.control.gains import GainTable, gain_table
 from service.errors import CommandError
 from service.tracking import events as ev
-from service.tracking.loop import CommandState, LoopCommand, RtcView
+from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
 from service.tracking.reconstructors import extended_gains
 from service.tracking.registration import ModeGain
 from service.tracking.state import Level
 from service.tracking.turn import Turn
+from service.wire import Loop, LoopRequest, RampRequest, Status
 
 RAMP_GROUPS = ((0, 1), (2, 99), (100, None))
 """Tip and tilt, to mode 100, the rest: the paper's groups (Heritier et al. 2018, section 5)."""
@@ -29,6 +30,9 @@ CLOSE_AGAIN_EVERY_S = 5.0
 
 CLOSE_AGAIN_FOR_S = 3600.0
 """Then somebody wants the loop open."""
+
+
+_LOOP = {None: None, True: Loop.CLOSED, False: Loop.OPEN}
 
 
 def table_of(measured: tuple[ModeGain, ...], n_modes: int) -> GainTable:
@@ -61,15 +65,15 @@ def set_loop(turn: Turn, command: ev.SetLoop) -> None:
         turn.state = replace(turn.state, close_since_ns_utc=None)
     _ask(
         turn,
-        ev.AskLoop(
+        LoopRequest(
             id=f"loop-{turn.now_ns}",
-            closed=command.closed,
+            loop=_LOOP[command.closed],
             gains=gains,
-            judged=command.effective_gain is not None,
             leak=command.leak,
             n_controlled=n_controlled,
         ),
         _said(command),
+        judged=command.effective_gain is not None,
     )
 
 
@@ -92,8 +96,8 @@ def ramp(turn: Turn, command: ev.Ramp) -> None:
     spans = ", ".join(f"{first} to {last}" for first, last in groups)
     text = f"{len(gains)} gains on modes {spans}: {lasts_s:.0f} s"
     name = f"ramp-{turn.now_ns}"
-    effect = ev.AskRamp(id=name, groups=groups, gains=gains, frames_per_gain=n_frames)
-    _ask(turn, effect, text, lasts_s)
+    request = RampRequest(id=name, groups=groups, gains=gains, frames_per_gain=n_frames)
+    _ask(turn, request, text, lasts_s)
 
 
 def on_answer(turn: Turn, command: str, outcome: CommandState, reason: str) -> None:
@@ -134,11 +138,11 @@ def close_again(turn: Turn) -> None:
     last = turn.state.loop_command
     recent = last is not None and turn.now_ns - last.asked_ns_utc < CLOSE_AGAIN_EVERY_S * SECOND_NS
     if not closed and not recent:
-        effect = ev.AskLoop(id=f"loop-{turn.now_ns}", closed=True)
-        _ask(turn, effect, "close again after a measurement given up")
+        request = LoopRequest(id=f"loop-{turn.now_ns}", loop=Loop.CLOSED)
+        _ask(turn, request, "close again after a measurement given up")
 
 
-def _gains(rtc: RtcView, groups: tuple[ev.GainGroup, ...], n_modes: int) -> tuple[float, ...]:
+def _gains(rtc: Status, groups: tuple[ev.GainGroup, ...], n_modes: int) -> tuple[float, ...]:
     """Return a gain for each mode of the basis: those in force, but for the groups.
 
     The status of an open loop does not tell the gains it will close with.
@@ -157,7 +161,7 @@ def _gains(rtc: RtcView, groups: tuple[ev.GainGroup, ...], n_modes: int) -> tupl
     return tuple(gains)
 
 
-def _compensated(turn: Turn, rtc: RtcView, in_effect: float, n_modes: int) -> tuple[float, ...]:
+def _compensated(turn: Turn, rtc: Status, in_effect: float, n_modes: int) -> tuple[float, ...]:
     """Return the gains that act alike on every controlled mode; the others stay at 0."""
     known = turn.known
     if known is None or not known.optical_gains:
@@ -201,9 +205,16 @@ def _said(command: ev.SetLoop) -> str:
     return ", ".join(said) or "no change"
 
 
-def _ask(turn: Turn, effect: ev.AskLoop | ev.AskRamp, text: str, lasts_s: float = 0.0) -> None:
+def _ask(
+    turn: Turn,
+    request: LoopRequest | RampRequest,
+    text: str,
+    lasts_s: float = 0.0,
+    *,
+    judged: bool = False,
+) -> None:
     asked = LoopCommand(
-        id=effect.id,
+        id=request.id,
         text=text,
         state=CommandState.ASKED,
         asked_ns_utc=turn.now_ns,
@@ -211,10 +222,10 @@ def _ask(turn: Turn, effect: ev.AskLoop | ev.AskRamp, text: str, lasts_s: float 
     )
     turn.state = replace(turn.state, loop_command=asked)
     turn.log("loop.asked", text)
-    turn.ask(effect)
+    turn.ask(ev.Ask(request=request, judged=judged))
 
 
-def _there(turn: Turn, what: str) -> RtcView:
+def _there(turn: Turn, what: str) -> Status:
     if turn.rtc is None:
         raise CommandError(f"{what}: no RTC is there")
     return turn.rtc

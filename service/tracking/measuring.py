@@ -11,20 +11,19 @@ import numpy as np
 
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
-from service.tracking.dither import ask_for, drop, make_way_for_noisy
+from service.tracking.dither import ask_for, ask_to_stop, drop, make_way_for_noisy
 from service.tracking.dither_plan import RANDOM_TOTAL_M, RandomChoice, plan_random, total_m
-from service.tracking.loop import DitherView, RtcView
 from service.tracking.loop_commands import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import (
     MeasurementRecord,
-    MeasurePattern,
     MeasureState,
     NoisyRecord,
     NoisyState,
 )
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
+from service.wire import DitherRequest, MeasureRequest, Pattern, Reply, Status
 
 NOISY_KEPT = 100
 
@@ -90,7 +89,19 @@ def measure(turn: Turn, command: ev.Measure) -> None:
         )
     _keep(turn, record)
     turn.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
-    turn.ask(ev.AskMeasurement(record=record))
+    turn.ask(
+        ev.Ask(
+            request=MeasureRequest(
+                id=record.id,
+                pattern=record.pattern,
+                modes=record.modes,
+                amplitude_m=record.amplitude_m,
+                n_average=record.n_average,
+                frequency_hz=record.frequency_hz,
+                duration_s=record.duration_s,
+            )
+        )
+    )
 
 
 def give_up_measuring(turn: Turn, measurement_id: str) -> None:
@@ -128,10 +139,19 @@ def watch_measurement(turn: Turn) -> None:
     if record is None:
         return
     if isinstance(turn.event, ev.RtcVanished):
-        measurement_failed(turn, record, "the RTC vanished")
+        _fail(turn, record, "the RTC vanished")
     elif isinstance(turn.event, ev.Tick):
         closed = rtc is not None and rtc.loop != "open"
         _give_up_overdue(turn, record, closed=closed)
+
+
+def on_answer(turn: Turn, request: MeasureRequest, reply: Reply) -> None:
+    """Note that the RTC has begun to measure, or why it would not."""
+    record = turn.state.measurement(request.id)
+    if record is not None:
+        state = MeasureState.RUNNING if reply.accepted else MeasureState.REFUSED
+        answered = replace(record, state=state, reason=reply.reason, start_seq=reply.start_seq)
+        on_measured(turn, answered)
 
 
 def on_measured(turn: Turn, record: MeasurementRecord) -> None:
@@ -150,7 +170,7 @@ def on_measured(turn: Turn, record: MeasurementRecord) -> None:
             start_seq=known.start_seq if record.start_seq is None else record.start_seq,
         )
     if record.state is MeasureState.FAILED:
-        measurement_failed(turn, record, record.reason)
+        _fail(turn, record, record.reason)
         return
     _keep(turn, record)
     name = f"measurement.{record.state}"
@@ -166,8 +186,14 @@ def on_measured(turn: Turn, record: MeasurementRecord) -> None:
             turn.log(name, record.id)
 
 
-def measurement_failed(turn: Turn, record: MeasurementRecord, text: str) -> None:
+def measurement_failed(turn: Turn, measurement_id: str, text: str) -> None:
     """Note why there is no matrix, unless nobody waits for it any more."""
+    record = turn.state.measurement(measurement_id)
+    if record is not None:
+        _fail(turn, record, text)
+
+
+def _fail(turn: Turn, record: MeasurementRecord, text: str) -> None:
     known = turn.state.measurement(record.id)
     if known is None or known.state is not MeasureState.GIVEN_UP:
         _keep(turn, replace(record, state=MeasureState.FAILED, reason=text))
@@ -178,20 +204,20 @@ def _give_up_overdue(turn: Turn, record: MeasurementRecord, *, closed: bool) -> 
     """Give up a matrix that does not come although everything looks as if it were over."""
     asked_ns = record.asked_ns_utc or turn.now_ns
     if turn.now_ns - asked_ns > LONGEST_S * SECOND_NS:
-        measurement_failed(turn, record, f"no matrix came within {LONGEST_S:.0f} s")
+        _fail(turn, record, f"no matrix came within {LONGEST_S:.0f} s")
     elif not (record.opens_loop and closed and record.start_seq is not None):
         _keep(turn, replace(record, overdue_since_ns_utc=None))
     else:
         since_ns = record.overdue_since_ns_utc or turn.now_ns
         if turn.now_ns - since_ns > OVERDUE_S * SECOND_NS:
             text = f"the loop has been closed for {OVERDUE_S:.0f} s and no matrix came"
-            measurement_failed(turn, record, text)
+            _fail(turn, record, text)
         else:
             _keep(turn, replace(record, overdue_since_ns_utc=since_ns))
 
 
-def _planned(command: ev.Measure, rtc: RtcView, policy: Policy, now_ns: int) -> MeasurementRecord:
-    sine = command.pattern is MeasurePattern.SINE
+def _planned(command: ev.Measure, rtc: Status, policy: Policy, now_ns: int) -> MeasurementRecord:
+    sine = command.pattern is Pattern.SINE
     modes = command.modes or tuple(range(rtc.n_controlled))
     if sine and command.modes is None:
         modes = modes[:: -(-len(modes) // N_TONES)]
@@ -247,11 +273,11 @@ def measure_noisy(turn: Turn, command: ev.MeasureNoisy) -> None:
     record = NoisyRecord(
         id=command.id,
         state=NoisyState.WAITING,
-        modes=dither.modes,
-        total_m=total_m(dither),
+        modes=dither.request.modes,
+        total_m=total_m(dither.request),
         duration_s=duration_s,
         window_s=dither.window_s or duration_s,
-        seed=dither.seed or 0,
+        seed=dither.request.seed or 0,
         asked_ns_utc=turn.now_ns,
         basis_id=rtc.basis_id,
         config_id=rtc.config_id,
@@ -287,7 +313,7 @@ def give_up_noisy(turn: Turn, noisy_id: str) -> None:
     turn.log("noisy-matrix.given-up", noisy_id)
     if turn.dither is not None and turn.dither.id == noisy_id:
         drop(turn)
-        turn.ask(ev.AskNoDither())
+        ask_to_stop(turn)
 
 
 def follow_noisy(turn: Turn) -> None:
@@ -343,7 +369,7 @@ def noisy_failed(turn: Turn, record: NoisyRecord, text: str) -> None:
         turn.warn("noisy-matrix.failed", f"{record.id}: {text}")
 
 
-def _begin_noisy(turn: Turn, record: NoisyRecord, rtc: RtcView) -> None:
+def _begin_noisy(turn: Turn, record: NoisyRecord, rtc: Status) -> None:
     choice = RandomChoice(
         id=record.id, modes=record.modes, total_m=record.total_m, duration_s=record.duration_s
     )
@@ -356,7 +382,7 @@ def _begin_noisy(turn: Turn, record: NoisyRecord, rtc: RtcView) -> None:
         record,
         state=NoisyState.ASKED,
         window_s=dither.window_s or record.duration_s,
-        seed=dither.seed or 0,
+        seed=dither.request.seed or 0,
     )
     _keep_noisy(turn, asked)
     ask_for(turn, dither)
@@ -364,10 +390,12 @@ def _begin_noisy(turn: Turn, record: NoisyRecord, rtc: RtcView) -> None:
 
 def _follow_playing(turn: Turn, record: NoisyRecord) -> None:
     match turn.event:
-        case ev.DitherAnswered(id=record.id, accepted=False, reason=reason):
+        case ev.Answered(
+            request=DitherRequest(id=record.id), reply=Reply(accepted=False, reason=reason)
+        ):
             noisy_failed(turn, record, f"the RTC refused the dither: {reason}")
             return
-        case ev.JobFailed(effect=ev.AskDither(dither=DitherView(id=record.id)), text=text):
+        case ev.JobFailed(effect=ev.Ask(request=DitherRequest(id=record.id)), text=text):
             noisy_failed(turn, record, text)
             return
         case _:

@@ -18,13 +18,14 @@ from service.tracking.dither_plan import (
     total_m,
     why_unusable,
 )
-from service.tracking.loop import DitherKind, DitherView, RtcView
+from service.tracking.loop import Dither
 from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, ModeSet
 from service.tracking.reconstructors import change_state, known_record, make, send_once_judged
 from service.tracking.state import Mode, Orders, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.worth import outdated
+from service.wire import DitherKind, Status
 
 
 def set_mode(turn: Turn, mode: Mode) -> None:
@@ -163,21 +164,22 @@ def start_dither(turn: Turn, command: ev.StartDither) -> None:
         raise CommandError("a dither needs an RTC with its loop closed")
     choice = by_hand(turn.state, rtc, turn.policy)
     dither = _planned(command, choice, rtc, turn.policy, turn.now_ns)
-    found_nm, budget_nm = 1e9 * total_m(dither), 1e9 * turn.policy.dither_budget_m
+    found_nm, budget_nm = 1e9 * total_m(dither.request), 1e9 * turn.policy.dither_budget_m
     cost = f"{found_nm:.3g} nm RMS in all, budget {budget_nm:.3g} nm"
     over = found_nm > budget_nm * (1.0 + 1e-9)
     if over and not command.over_budget:
         raise CommandError(f"dither: {cost}; say over_budget if that is meant")
     allow(turn)
-    modes = f"modes {dither.modes}" if len(dither.modes) < 10 else f"{len(dither.modes)} modes"
-    text = f"{dither.kind}, {modes}, {cost}" + (": over budget, as asked" if over else "")
+    modes = dither.request.modes
+    which = f"modes {modes}" if len(modes) < 10 else f"{len(modes)} modes"
+    text = f"{dither.request.kind}, {which}, {cost}" + (": over budget, as asked" if over else "")
     turn.log("dither.asked", text)
     ask_for(turn, dither)
 
 
 def _planned(
-    command: ev.StartDither, choice: Choice, rtc: RtcView, policy: Policy, now_ns: int
-) -> DitherView:
+    command: ev.StartDither, choice: Choice, rtc: Status, policy: Policy, now_ns: int
+) -> Dither:
     """Return the dither to ask for.
 
     Raises
@@ -203,9 +205,9 @@ def _planned(
         frequency_hz=command.frequency_hz,
         duration_s=command.duration_s,
     )
-    if max(dither.modes) >= rtc.n_modes:
+    if max(dither.request.modes) >= rtc.n_modes:
         raise CommandError(
-            f"dither: found mode {max(dither.modes)}; expected 0 to {rtc.n_modes - 1}"
+            f"dither: found mode {max(dither.request.modes)}; expected 0 to {rtc.n_modes - 1}"
         )
     reason = why_unusable(dither, rtc, policy)
     if reason is not None:

@@ -12,6 +12,7 @@ from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
 from service.tracking.registration import ModeGain
+from service.wire import Pattern
 
 
 class MatrixState(StrEnum):
@@ -145,25 +146,6 @@ class ModeLimit:
     """What was said of more: the words of the gate, the RTC or the operator."""
 
 
-class MeasurePattern(StrEnum):
-    """How the RTC measures an interaction matrix."""
-
-    PUSH_PULL_MODAL = "push-pull-modal"
-    """One mode after the other, loop open."""
-
-    PUSH_PULL_ZONAL = "push-pull-zonal"
-    """One actuator after the other, loop open."""
-
-    HADAMARD = "hadamard"
-    """All modes at once with the signs of a Hadamard matrix, loop open."""
-
-    SYSTEM_MODES = "system-modes"
-    """One eigenmode of the reconstructor in use after the other, loop open."""
-
-    SINE = "sine"
-    """All modes at once, each at its own frequency, loop closed."""
-
-
 class MeasureState(StrEnum):
     """Where a measurement of an interaction matrix is."""
 
@@ -194,7 +176,7 @@ class MeasurementRecord:
     """Never reused."""
 
     state: MeasureState
-    pattern: MeasurePattern
+    pattern: Pattern
     modes: tuple[int, ...]
     """0-based basis indices, one for each column."""
 
@@ -243,7 +225,7 @@ class MeasurementRecord:
     @property
     def opens_loop(self) -> bool:
         """Whether the loop is open while it is measured."""
-        return self.pattern is not MeasurePattern.SINE
+        return self.pattern is not Pattern.SINE
 
     @property
     def under_way(self) -> bool:

@@ -9,12 +9,13 @@ import numpy as np
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking.alarms import NOT_ACKNOWLEDGED, OTHER_SUM, SHORT_MARGIN, Act, forbidding
-from service.tracking.loop import SAME_DELAY, SAME_LEAK, RtcView, same_gains
+from service.tracking.loop import SAME_DELAY, SAME_LEAK, same_gains
 from service.tracking.products import Assessment, Judged, MatrixState, ReconstructorRecord
 from service.tracking.registration import Registration
 from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.worth import note_limit, outdated
+from service.wire import Acknowledgement, AckState, Status
 
 RECONSTRUCTORS_KEPT = 200
 
@@ -132,7 +133,7 @@ def forget_session(turn: Turn) -> None:
     )
 
 
-def fetch(turn: Turn, rtc: RtcView) -> None:
+def fetch(turn: Turn, rtc: Status) -> None:
     """Ask the RTC for the matrix it uses."""
     turn.state = replace(turn.state, applied_asked_ns_utc=turn.now_ns)
     turn.ask(ev.FetchMatrix(id=rtc.cm_id))
@@ -277,7 +278,7 @@ def send_with(turn: Turn, matrix_id: str, gains: tuple[float, ...] | None) -> No
     turn.ask(ev.SendMatrix(id=matrix_id, n_modes=record.n_modes, gains=gains))
 
 
-def on_acknowledgement(turn: Turn, event: ev.Acknowledged) -> None:
+def on_acknowledgement(turn: Turn, event: Acknowledgement) -> None:
     """Fold the RTC's answer to a reconstructor back in; a late one is accepted."""
     record = _meant(turn.state, event)
     if record is None:
@@ -287,12 +288,12 @@ def on_acknowledgement(turn: Turn, event: ev.Acknowledged) -> None:
     if _is_old(turn.state, record, event):
         return
     if record.sha256 and event.sha256 not in {None, record.sha256}:
-        _distrust(turn, record, event.state, event.sha256)
+        _distrust(turn, record, MatrixState(event.state.value), event.sha256)
         return
-    reason = event.reason
-    if event.state in {MatrixState.APPLIED, MatrixState.STAGED}:
+    reason, state = event.reason, MatrixState(event.state.value)
+    if state in {MatrixState.APPLIED, MatrixState.STAGED}:
         reason = reason or _why_unjudged(record)
-    if event.state is MatrixState.APPLIED:
+    if state is MatrixState.APPLIED:
         _trust(turn, record.id)
         record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
         change(turn, record)
@@ -308,8 +309,8 @@ def on_acknowledgement(turn: Turn, event: ev.Acknowledged) -> None:
         )
         turn.log("reconstructor.applied", f"{record.id} applied from frame {event.frame_seq}")
         return
-    change_state(turn, record.id, event.state, reason)
-    if event.state is MatrixState.REJECTED:
+    change_state(turn, record.id, state, reason)
+    if state is MatrixState.REJECTED:
         turn.warn("reconstructor.rejected", f"the RTC rejected {record.id}: {event.reason}")
 
 
@@ -387,7 +388,7 @@ def on_margin(turn: Turn, event: ev.MarginJudged) -> None:
         turn.alarm(SHORT_MARGIN, f"{event.id}: {verdict.reason}")
 
 
-def _sendable(turn: Turn, matrix_id: str) -> tuple[ReconstructorRecord, RtcView]:
+def _sendable(turn: Turn, matrix_id: str) -> tuple[ReconstructorRecord, Status]:
     """Return a reconstructor that may be sent, and to whom.
 
     Raises
@@ -512,12 +513,12 @@ def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
     return bool(record.sha256) and any(same)
 
 
-def commanded_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:
+def commanded_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
     """Return the gains of the modes that a reconstructor of ``n_modes`` would command."""
     return extended_gains(rtc, n_modes)[:n_modes]
 
 
-def extended_gains(rtc: RtcView, n_modes: int) -> tuple[float, ...]:
+def extended_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
     """Return gains for ``n_modes`` controlled modes: those in force, the last one for new modes."""
     last = rtc.gains[rtc.n_controlled - 1]
     kept = rtc.gains[: min(rtc.n_controlled, n_modes)]
@@ -554,7 +555,7 @@ def _why_unjudged(record: ReconstructorRecord) -> str:
     return record.reason if record.gate is None and record.state in on_its_way else ""
 
 
-def _meant(state: TrackerState, event: ev.Acknowledged) -> ReconstructorRecord | None:
+def _meant(state: TrackerState, event: Acknowledgement) -> ReconstructorRecord | None:
     """Return which reconstructor is acknowledged: a commit nobody could read was the last one."""
     if event.id is not None:
         return state.reconstructor(event.id)
@@ -562,11 +563,11 @@ def _meant(state: TrackerState, event: ev.Acknowledged) -> ReconstructorRecord |
     return next((r for r in reversed(state.reconstructors) if r.state in sent), None)
 
 
-def _is_old(state: TrackerState, record: ReconstructorRecord, event: ev.Acknowledged) -> bool:
+def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledgement) -> bool:
     """Return whether an acknowledgement tells of something that has been overtaken."""
-    if state.rtc is not None and event.session not in {None, state.rtc.session}:
+    if state.rtc is not None and event.session != state.rtc.session:
         return True
-    if event.state is MatrixState.STAGED:
+    if event.state is AckState.STAGED:
         return record.state is not MatrixState.PUBLISHED
     repeated = record.applied_frame_seq == event.frame_seq
     return record.state is MatrixState.SUPERSEDED and repeated

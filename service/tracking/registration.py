@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
-from service.tracking.loop import Pointing
+from service.wire import Pointing
 
 Array = NDArray[np.float64]
 
@@ -129,7 +129,7 @@ class PassiveBias:
     """``(4,)`` variance beyond the least that the scatter of passive estimates has told of."""
 
     loop: tuple[float, ...] = ()
-    """``RtcView.loop_numbers`` of the loop it is the bias of; empty: not known."""
+    """``tracking.loop.loop_numbers`` of the loop it is the bias of; empty: not known."""
 
     earlier: Earlier | None = None
     """α and bias together before that one; None: it was the first, or has been doubted."""

@@ -17,7 +17,7 @@ from service.tracking.alarms import (
 )
 from service.tracking.dither import drop, follow_status, forget_unwanted, found_again
 from service.tracking.events import Effect
-from service.tracking.loop import RtcView, same_numbers
+from service.tracking.loop import loop_numbers, same_loop, same_numbers, why_open
 from service.tracking.loop_commands import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
@@ -32,6 +32,7 @@ from service.tracking.reconstructors import (
 from service.tracking.stages import AcquisitionStage
 from service.tracking.turn import Turn, tell_bursts
 from service.tracking.validity import end_alarm, forget, forget_bias, point, unconfirm, void
+from service.wire import DitherRequest, DitherStop, Status
 
 ACKNOWLEDGE_WITHIN_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
@@ -70,15 +71,15 @@ def on_tick(turn: Turn) -> None:
     tell_bursts(turn)
 
 
-def on_status(turn: Turn, rtc: RtcView) -> None:
+def on_status(turn: Turn, rtc: Status) -> None:
     """Take over what the RTC says of itself."""
     before, known = turn.rtc, turn.known
     turn.calm(VANISHED)
-    if before is not None and not before.same_loop(rtc):
+    if before is not None and not same_loop(before, rtc):
         # the margin is not what it was
         judge_again(turn)
     bias = None if known is None else known.bias
-    if bias is not None and bias.looked_ns_utc and not same_numbers(bias.loop, rtc.loop_numbers):
+    if bias is not None and bias.looked_ns_utc and not same_numbers(bias.loop, loop_numbers(rtc)):
         # it was learnt in another loop, in whichever session
         forget_bias(turn)
     turn.state = replace(
@@ -97,13 +98,13 @@ def on_status(turn: Turn, rtc: RtcView) -> None:
     # its alarm tells more, and not to close the loop on any matrix
     opened = opened or acquisition.stage is AcquisitionStage.INTERRUPTED
     if not rtc.in_loop and not opened:
-        turn.alarm(LOOP_OPEN, f"{rtc.why_open}: close it to calibrate")
+        turn.alarm(LOOP_OPEN, f"{why_open(rtc)}: close it to calibrate")
     else:
         turn.calm(LOOP_OPEN)
     follow_status(turn, rtc)
 
 
-def _tell_of_gains(turn: Turn, before: RtcView | None, rtc: RtcView) -> None:
+def _tell_of_gains(turn: Turn, before: Status | None, rtc: Status) -> None:
     """Say how many modes are in the loop where it is not all that are controlled."""
     n_before = rtc.n_controlled if before is None else len(before.in_loop)
     n_now = len(rtc.in_loop)
@@ -187,10 +188,10 @@ def on_failure(turn: Turn, effect: Effect, text: str) -> None:
         case ev.MakeMatrix() | ev.CopyMatrix():
             turn.put_off(make_s=5.0)
             made_none(turn)
-        case ev.AskDither():
+        case ev.Ask(request=DitherRequest()):
             turn.put_off(dither_s=5.0)
             drop(turn)
-        case ev.AskNoDither():
+        case ev.Ask(request=DitherStop()):
             pass  # it is asked again while it must be; nothing else has to wait for that
         case ev.FetchMatrix():
             not_fetched(turn, text)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from service.control.gate import GateVerdict
-from service.tracking.loop import DitherView, LoopCommand, Pointing, RtcView
+from service.tracking.loop import Dither, LoopCommand
 from service.tracking.products import (
     Assessment,
     MeasurementRecord,
@@ -16,6 +16,7 @@ from service.tracking.products import (
 )
 from service.tracking.registration import HistoryEntry, Registration, Watchdog
 from service.tracking.stages import Acquisition, Dithering
+from service.wire import Pointing, Status
 
 
 class Level(StrEnum):
@@ -174,7 +175,7 @@ class TrackerState:
     mode_limit: ModeLimit | None = None
     """How many modes the gate lets be controlled; None: as many as are wanted."""
 
-    rtc: RtcView | None = None
+    rtc: Status | None = None
     """None until the first status, and again when the RTC has vanished."""
 
     basis_id: str | None = None
@@ -183,7 +184,7 @@ class TrackerState:
     config_id: str | None = None
     """Pinned or adopted; frames of another configuration are refused."""
 
-    dither: DitherView | None = None
+    dither: Dither | None = None
     """Requested or running; None: none, and a new one may be asked for."""
 
     dither_stopped: bool = False

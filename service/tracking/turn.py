@@ -7,11 +7,12 @@ from dataclasses import replace
 
 from service.tracking.alarms import Act, forbidding
 from service.tracking.events import Effect, Event
-from service.tracking.loop import DitherView, RtcView
+from service.tracking.loop import Dither
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
 from service.tracking.stages import Acquisition, Dithering
 from service.tracking.state import Alarm, Level, LogEntry, Retries, TrackerState
+from service.wire import Status
 
 LOG_LENGTH = 500
 
@@ -60,7 +61,7 @@ class Turn:
         self.effects: list[Effect] = []
 
     @property
-    def rtc(self) -> RtcView | None:
+    def rtc(self) -> Status | None:
         """The RTC by its last status; None: none is there."""
         return self.state.rtc
 
@@ -74,12 +75,12 @@ class Turn:
         self.state = replace(self.state, registration=registration)
 
     @property
-    def dither(self) -> DitherView | None:
+    def dither(self) -> Dither | None:
         """The dither that was asked for or runs; None: none."""
         return self.state.dither
 
     @dither.setter
-    def dither(self, dither: DitherView | None) -> None:
+    def dither(self, dither: Dither | None) -> None:
         self.state = replace(self.state, dither=dither)
 
     @property
@@ -131,7 +132,7 @@ class Turn:
     def alarm(self, name: str, text: str) -> None:
         """Raise an alarm; one already raised keeps its beginning."""
         before = next((alarm for alarm in self.state.alarms if alarm.name == name), None)
-        t_ns = 0 if self.rtc is None else self.rtc.t_ns_utc
+        t_ns = 0 if self.rtc is None else self.rtc.t_ns
         first = before or Alarm(name=name, since_ns_utc=self.now_ns, text=text, t_ns_utc=t_ns)
         others = tuple(alarm for alarm in self.state.alarms if alarm.name != name)
         raised = replace(first, text=text, seen_ns_utc=self.now_ns)

@@ -8,7 +8,6 @@ from service.tracking.activity import ramping
 from service.tracking.alarms import Act
 from service.tracking.dither import choose_dither, stop_unwanted
 from service.tracking.events import MakeMatrix
-from service.tracking.loop import RtcView
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import fetch, judge, make, settled
@@ -16,6 +15,7 @@ from service.tracking.registration import Registration
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.worth import fewer_than, more_to_try, outdated, why_worthwhile
+from service.wire import Status
 
 ASK_FIRST_S = 3.0
 """For the RTC's matrix to come before it is asked for again."""
@@ -84,7 +84,7 @@ def _judgement_due(state: TrackerState, known: Registration, now_ns: int) -> boo
     return waited_s > JUDGE_AGAIN_S and bool(np.any(moved > np.maximum(NOTICED, noise)))
 
 
-def _choose_update(turn: Turn, rtc: RtcView) -> None:
+def _choose_update(turn: Turn, rtc: Status) -> None:
     """Compute a reconstructor when it is worthwhile, or could command more modes."""
     state, known, now_ns = turn.state, turn.known, turn.now_ns
     if state.mode is Mode.HOLD or known is None or not settled(known):
@@ -123,7 +123,7 @@ def _busy(state: TrackerState) -> bool:
     )
 
 
-def _next_attempt_ns(state: TrackerState, rtc: RtcView, policy: Policy) -> int:
+def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:
     """Return before when no reconstructor is computed by itself.
 
     One refused for another α, or for more modes than are controlled, holds back no other.

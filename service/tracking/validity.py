@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.tracking.alarms import ALARMS, STALE, Act, forbids
-from service.tracking.loop import Pointing
+from service.tracking.loop import separation_deg
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration, Standing, Validity
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
+from service.wire import Pointing
 
 CLOCK_SET_BACK_S = 60.0
 """Telemetry is never so much older than what is known: the RTC's clock has gone back."""
@@ -63,7 +64,7 @@ def taken(began_ns_utc: int, ended_ns_utc: int) -> Taken:
 
 def precedes(state: TrackerState, when: Taken, since_ns_utc: int) -> bool:
     """Return whether telemetry began before a time, and so cannot tell of what is since then."""
-    if state.rtc is not None and since_ns_utc - state.rtc.t_ns_utc > CLOCK_SET_BACK_S * SECOND_NS:
+    if state.rtc is not None and since_ns_utc - state.rtc.t_ns > CLOCK_SET_BACK_S * SECOND_NS:
         return False
     return when.began_ns_utc < since_ns_utc - _ROUNDING_NS
 
@@ -83,7 +84,7 @@ def void(turn: Turn, because: str, t_ns_utc: int = 0) -> None:
 
     ``t_ns_utc`` is the RTC's clock now, where it is known better than by its status.
     """
-    before_ns = max(t_ns_utc, 0 if turn.rtc is None else turn.rtc.t_ns_utc)
+    before_ns = max(t_ns_utc, 0 if turn.rtc is None else turn.rtc.t_ns)
     turn.state = replace(turn.state, void_before_ns_utc=before_ns, void_because=because)
 
 
@@ -105,8 +106,8 @@ def point(turn: Turn, pointing: Pointing | None) -> None:
     """Note where the telescope looks, and remember its way; None: nobody tells."""
     if pointing is None:
         return
-    way, t_ns = turn.state.pointings, 0 if turn.rtc is None else turn.rtc.t_ns_utc
-    if not way or way[-1][1].separation_deg(pointing) >= _TURNED_DEG:
+    way, t_ns = turn.state.pointings, 0 if turn.rtc is None else turn.rtc.t_ns
+    if not way or separation_deg(way[-1][1], pointing) >= _TURNED_DEG:
         way = (*way, (t_ns, pointing))[-_POINTINGS_KEPT:]
     turn.state = replace(turn.state, pointing=pointing, pointings=way)
 
@@ -189,7 +190,7 @@ def slewed_deg(state: TrackerState, known: Registration) -> float:
     """Return how far the telescope has moved since the last dithered window, degrees."""
     if state.pointing is None or known.window_pointing is None:
         return 0.0
-    return state.pointing.separation_deg(known.window_pointing)
+    return separation_deg(state.pointing, known.window_pointing)
 
 
 def elapsed_s(state: TrackerState, known: Registration, now_ns: int) -> float:
@@ -197,8 +198,8 @@ def elapsed_s(state: TrackerState, known: Registration, now_ns: int) -> float:
 
     A simulated RTC may be slower than its timestamps, and the mirror drifts by its time.
     """
-    if state.rtc is not None and state.rtc.t_ns_utc >= known.t_ns_utc:
-        return (state.rtc.t_ns_utc - known.t_ns_utc) / SECOND_NS
+    if state.rtc is not None and state.rtc.t_ns >= known.t_ns_utc:
+        return (state.rtc.t_ns - known.t_ns_utc) / SECOND_NS
     return max(now_ns - known.arrived_ns_utc, 0) / SECOND_NS
 
 

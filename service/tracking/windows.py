@@ -65,7 +65,7 @@ from service.tracking.jumps import (
     window_before,
     window_surprise,
 )
-from service.tracking.loop import same_numbers
+from service.tracking.loop import loop_numbers, same_numbers
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
     Candidate,
@@ -408,7 +408,7 @@ def fit_begins_at(state: TrackerState) -> Misregistration | None:
 
 def _why_no_look(state: TrackerState, event: ev.Watched) -> str | None:
     """Return why a look says nothing of the telescope as it is, or None."""
-    of_loop = () if state.rtc is None else state.rtc.loop_numbers
+    of_loop = loop_numbers(state.rtc)
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
     return why_no_measurement(state, taken(event.began_ns_utc, event.t_ns_utc))
@@ -453,7 +453,7 @@ def _expecting(known: Registration, excess: Array) -> Registration:
 def _loop(state: TrackerState, known: Registration) -> tuple[float, ...]:
     """Return the loop that is looked at; while no RTC is there, the one of the last look."""
     if state.rtc is not None:
-        return state.rtc.loop_numbers
+        return loop_numbers(state.rtc)
     return () if known.bias is None else known.bias.loop
 
 

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from service.control.expected_gain import explained_by_noise
 from service.model.misregistration import BOUNDARY_SCALE
 from service.tracking.events import Event, Reject
-from service.tracking.loop import RtcView
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import Assessment, MatrixState, ModeLimit, ReconstructorRecord
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
+from service.wire import Status
 
 CALMING_S = 60.0
 """After an update the thresholds are doubled, and come down to their own over this time."""
@@ -172,7 +172,7 @@ def fewer_than(n_modes: int) -> tuple[int, ...]:
     return tuple(rung for rung in LADDER if rung < n_modes)
 
 
-def more_to_try(state: TrackerState, rtc: RtcView, policy: Policy, now_ns: int) -> tuple[int, ...]:
+def more_to_try(state: TrackerState, rtc: Status, policy: Policy, now_ns: int) -> tuple[int, ...]:
     """Return the numbers of modes above the present one that may be tried now, largest first.
 
     New modes get the gain of the last: where that is 0 they would not be in the loop.

@@ -56,7 +56,7 @@ from service.wire.status import (
     AckState,
     AlarmMessage,
     DitherStatus,
-    PointingStatus,
+    Pointing,
     StateMessage,
     Status,
     decode_acknowledgement,

@@ -69,12 +69,20 @@ class Pattern(StrEnum):
     """How an interaction matrix is measured."""
 
     PUSH_PULL_MODAL = "push-pull-modal"
+    """One mode after the other, loop open."""
+
     PUSH_PULL_ZONAL = "push-pull-zonal"
+    """One actuator after the other, loop open."""
+
     HADAMARD = "hadamard"
+    """All modes at once with the signs of a Hadamard matrix, loop open."""
+
     SYSTEM_MODES = "system-modes"
-    """Push-pull of the modes that the loop's own reconstructor tells apart best (optional)."""
+    """Push-pull of the modes that the loop's own reconstructor tells apart best, loop open
+    (optional)."""
 
     SINE = "sine"
+    """All modes at once, each at its own frequency, loop closed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

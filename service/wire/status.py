@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from typing import Annotated, Any, Final
 
@@ -66,14 +66,14 @@ class DitherStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PointingStatus:
-    """Where the telescope looks, as far as the RTC knows."""
+class Pointing:
+    """A direction of the telescope."""
 
     elevation_deg: Annotated[float, number(-90.0, 90.0)]
     """Above the horizon."""
 
     azimuth_deg: Annotated[float, number(-720.0, 720.0)]
-    """From north over east."""
+    """From north over east; only differences count."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,11 +116,26 @@ class Status:
     magnitude: Finite | None
     """Of the guide star."""
 
-    flux: bytes | None
+    flux: bytes | None = field(default=None, repr=False)
     """``<f4`` ``[4, n_subapertures, n_subapertures]``, counts per frame averaged over a second."""
 
-    pointing: PointingStatus | None = None
+    pointing: Pointing | None = None
     """An extension: an RTC that does not know it may leave the key out."""
+
+    @property
+    def dither_id(self) -> str | None:
+        """The dither now running; None: none."""
+        return None if self.dither is None else self.dither.request.id
+
+    @property
+    def in_loop(self) -> tuple[int, ...]:
+        """Modes the loop moves, the controlled ones with a gain; none: it is open.
+
+        Some gains of 0 ("partial") make it a loop of the other modes, no less closed.
+        """
+        if self.loop == Loop.OPEN:
+            return ()
+        return tuple(i for i, gain in enumerate(self.gains[: self.n_controlled]) if gain)
 
     @property
     def flux_images(self) -> NDArray[np.float32] | None:

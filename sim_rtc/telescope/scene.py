@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.model.pupil import PupilGrid
-from service.wire import PointingStatus
+from service.wire import Pointing
 from sim_rtc.telescope.atmosphere import PhaseResponse
 
 Array = NDArray[np.float64]
@@ -134,12 +134,12 @@ class Elevation:
 
     azimuth_deg: float = 180.0
 
-    def at(self, time_s: float) -> PointingStatus:
+    def at(self, time_s: float) -> Pointing:
         """Return where the telescope looks at this time; it goes no further than the zenith."""
         elevation = self.start_deg + self.rate_deg_per_minute * time_s / 60.0
         for begin_s, by_deg in self.slews:
             done_deg = min(max(time_s - begin_s, 0.0) * SLEW_DEG_PER_S, abs(by_deg))
             elevation += done_deg if by_deg > 0.0 else -done_deg
-        return PointingStatus(
+        return Pointing(
             elevation_deg=min(max(elevation, 0.0), _HIGHEST_DEG), azimuth_deg=self.azimuth_deg
         )

@@ -30,7 +30,8 @@ from service.tracking.reconstructors import restored
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import new_lines
-from studies.campaign.golden_codec import Json, decoded, encoded, renewed
+from studies.campaign.golden_changes import Renewal
+from studies.campaign.golden_codec import Json, decoded, encoded
 
 FOLDER = Path("tests/data/golden")
 
@@ -127,16 +128,17 @@ def replayed(night: Sequence[Entry], instrument: Entry) -> str | None:
     begin, *expected = night
     policy = with_instrument(policy_of(load_settings(None, {}, begin["settings"])), instrument)
     teller = Teller(TrackerState(system=begin["system"], mode=Mode(begin["mode"])), policy)
-    for k, entry in enumerate(expected):
+    renewal = Renewal()
+    for k, entry in enumerate(map(renewal.entry, expected)):
         now_ns = entry["t"]
         if "restart" in entry:
             teller.restart(Mode(entry["restart"]), now_ns)
         else:
             # the refusal is in the entry
             with suppress(PyrcalError):
-                teller.tell(decoded(Event, renewed(entry["event"])), now_ns)
+                teller.tell(decoded(Event, entry["event"]), now_ns)
         found = {name: teller.entries[-1].get(name) for name in COMPARED}
-        told = {name: renewed(entry.get(name)) for name in COMPARED}
+        told = {name: entry.get(name) for name in COMPARED}
         difference = first_difference(found, told)
         if difference is not None:
             what = entry["event"]["is"] if "event" in entry else "restart"

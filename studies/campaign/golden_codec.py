@@ -1,14 +1,13 @@
 """Frozen records as JSON and back, guided by the type hints of their fields.
 
 A record is ``{"is": class name, field: value}`` with the fields that are not at their defaults. Of
-a class only its name is written, so that it may move to another module. What has changed since
-something was written is put right in ``CHANGED``, the one place for it.
+a class only its name is written, so that it may move to another module. What has changed since a
+night was recorded is put right in ``studies.campaign.golden_changes``.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -23,11 +22,8 @@ Json = Any
 Value = Any
 """Of whatever type is asked for."""
 
-LEFT_OUT = frozenset({("RtcView", "flux")})
+LEFT_OUT = frozenset({("Status", "flux")})
 """Fields that the tracker carries and does not read: class and field."""
-
-CHANGED: Mapping[str, Callable[[dict[str, Json]], dict[str, Json]]] = {}
-"""By class name as it was written: what makes the record of today of it."""
 
 
 def encoded(value: object) -> Json:
@@ -87,17 +83,6 @@ def decoded(hint: object, value: Json) -> Value:
     if hint in (bool, int, str) and isinstance(value, hint):
         return value
     raise TypeError(f"found {value!r}; expected {hint}")
-
-
-def renewed(value: Json) -> Json:
-    """Return JSON that was written earlier as it would be written today."""
-    if isinstance(value, list):
-        return [renewed(item) for item in value]
-    if not isinstance(value, dict):
-        return value
-    renewal = CHANGED.get(value.get("is", ""))
-    whole = value if renewal is None else renewal(value)
-    return {name: renewed(item) for name, item in whole.items()}
 
 
 def _left_out(record: object, field: Field[Any]) -> bool:

@@ -6,11 +6,9 @@ from collections.abc import Callable
 
 from service.tracking import events as ev
 from service.tracking.events import Command, Event
-from service.tracking.loop import Pointing
-from service.tracking.products import MatrixState, MeasurePattern
 from service.tracking.state import Mode
+from service.wire import Acknowledgement, AckState, DitherKind, DitherRequest, Pattern, Pointing
 from service.wire import Command as Order
-from service.wire import DitherKind, DitherRequest
 from studies.campaign.golden_night import GoldenNight
 from studies.campaign.strange_rtc import Mischief
 
@@ -120,12 +118,23 @@ def measured(night: GoldenNight) -> None:
     night.measured()
 
 
-def acknowledged(state: MatrixState, reason: str) -> Do:
-    """Return an answer of the RTC's to the last reconstructor."""
+LAST = "last"
+
+
+def acknowledged(state: AckState, reason: str, name: str | None = LAST) -> Do:
+    """Return an answer of the RTC's to the last reconstructor, or another one."""
 
     def answer(night: GoldenNight) -> None:
-        last = night.state.reconstructors[-1].id
-        night.post(ev.Acknowledged(id=last, state=state, reason=reason, frame_seq=None))
+        rtc, last = night.state.rtc, night.state.reconstructors[-1].id
+        said = Acknowledgement(
+            session="" if rtc is None else rtc.session,
+            id=last if name == LAST else name,
+            sha256=None,
+            state=state,
+            reason=reason,
+            frame_seq=3 if state is AckState.APPLIED else None,
+        )
+        night.post(said)
 
     return answer
 
@@ -156,8 +165,8 @@ CLOSE, OPEN = ev.SetLoop(closed=True), ev.SetLoop(closed=False)
 STOP, START = ev.StopDither(), ev.StartDither()
 ACQUIRE, ABORT, REFIT = ev.Acquire(), ev.AbortAcquisition(), ev.Refit()
 RAMP = ev.Ramp(groups=((0, 1), (2, 44)), gains=(0.3, 0.4), step_s=0.5)
-MEASURE = ev.Measure(id="im-1", pattern=MeasurePattern.PUSH_PULL_MODAL, n_average=1)
-SINE = ev.Measure(id="im-2", pattern=MeasurePattern.SINE, modes=(50, 52), duration_s=2.0)
+MEASURE = ev.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL, n_average=1)
+SINE = ev.Measure(id="im-2", pattern=Pattern.SINE, modes=(50, 52), duration_s=2.0)
 EVERYTHING: tuple[Command, ...] = (
     REFIT,
     ev.Rollback(),

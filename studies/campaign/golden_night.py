@@ -11,7 +11,6 @@ from typing_extensions import override
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import LinkError, PyrcalError
-from service.link.events import LinkEvent
 from service.tracking import events as ev
 from service.tracking.events import Command, Effect, Event
 from service.tracking.policy import Policy
@@ -249,7 +248,7 @@ class GoldenNight(Observatory):
             super()._hear_status()
 
     @override
-    def _hear(self, event: LinkEvent) -> None:
+    def _hear(self, event: Event) -> None:
         told = isinstance(event, Acknowledgement)
         if not (told and Mischief.NO_ACK in self.dome.mischief):
             super()._hear(event)

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from service.tracking import events as ev
-from service.tracking.loop import DitherKind
-from service.tracking.products import MeasurePattern, ModeSet
+from service.tracking.products import ModeSet
 from service.tracking.state import Mode
-from service.wire import DitherRequest, Loop, LoopRequest, MeasureRequest, RampRequest
+from service.wire import (
+    DitherKind,
+    DitherRequest,
+    Loop,
+    LoopRequest,
+    MeasureRequest,
+    Pattern,
+    RampRequest,
+)
 from studies.campaign.golden_deeds import (
     ACQUIRE,
     CLOSE,
@@ -185,12 +192,12 @@ MEASURING = (
             (21.0, measured),
             (24.0, ask(START)),
             (26.0, ask(STOP)),
-            (28.0, ask(ev.Measure(id="im-3", pattern=MeasurePattern.HADAMARD))),
+            (28.0, ask(ev.Measure(id="im-3", pattern=Pattern.HADAMARD))),
             (29.0, ask(ev.GiveUp(id="im-3"))),
             (36.0, refuse(MeasureRequest)),
-            (37.0, ask(ev.Measure(id="im-4", pattern=MeasurePattern.SYSTEM_MODES))),
+            (37.0, ask(ev.Measure(id="im-4", pattern=Pattern.SYSTEM_MODES))),
             (39.0, refuse()),
-            (40.0, ask(ev.Measure(id="im-5", pattern=MeasurePattern.PUSH_PULL_ZONAL))),
+            (40.0, ask(ev.Measure(id="im-5", pattern=Pattern.PUSH_PULL_ZONAL))),
             (41.0, restart_rtc),
         ),
     ),
@@ -202,7 +209,7 @@ MEASURING = (
             (7.0, cut()),
             (7.5, ask(MEASURE)),
             (9.0, cut(off=False)),
-            (12.0, ask(ev.Measure(id="im-6", pattern=MeasurePattern.PUSH_PULL_MODAL))),
+            (12.0, ask(ev.Measure(id="im-6", pattern=Pattern.PUSH_PULL_MODAL))),
             (14.0, vanish),
             (17.0, appear),
             (20.0, ask(START)),

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from service.tracking import events as ev
-from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
-from service.wire import DitherRequest, Loop, LoopRequest
+from service.wire import AckState, DitherRequest, Loop, LoopRequest
 from studies.campaign.golden_deeds import (
     ABORT,
     ACQUIRE,
@@ -210,22 +209,16 @@ FAULTS = (
         seconds=26.0,
         words=("--jump=13.0:0.1,0,0,0",),
         deeds=(
-            (6.0, acknowledged(MatrixState.REJECTED, "range: it says")),
+            (6.0, acknowledged(AckState.REJECTED, "range: it says")),
             (9.0, restart_rtc),
-            (15.0, acknowledged(MatrixState.FAILED, "it says")),
+            (15.0, acknowledged(AckState.REJECTED, "it says")),
             (
                 17.0,
-                hear(
-                    ev.Acknowledged(
-                        id=None, state=MatrixState.REJECTED, reason="what?", frame_seq=None
-                    )
-                ),
+                acknowledged(AckState.REJECTED, "what?", None),
             ),
             (
                 18.0,
-                hear(
-                    ev.Acknowledged(id="unknown", state=MatrixState.APPLIED, reason="", frame_seq=3)
-                ),
+                acknowledged(AckState.APPLIED, "", "unknown"),
             ),
         ),
     ),

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import PyrcalError
-from service.link.events import LinkEvent
 from service.runtime.actions import Actions, Publishing
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
@@ -32,7 +31,7 @@ from service.tracking import events as ev
 from service.tracking.events import Command, Effect, Event
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.state import Mode, TrackerState
-from service.wire import CHUNK_LIMIT, Manifest
+from service.wire import CHUNK_LIMIT, Manifest, Status
 from service.worker import OpticsWorker
 from studies.campaign.observatory_checks import Publication, Swap, published, true_radius
 from studies.campaign.observatory_dome import Dome
@@ -254,7 +253,7 @@ class Observatory:
         while self._agenda and self._agenda[0].t_ns <= self.dome.now_ns:
             heapq.heappop(self._agenda).happen()
 
-    def _hear(self, event: LinkEvent) -> None:
+    def _hear(self, event: Event) -> None:
         self._engine.hear(event)
 
     def _hear_status(self) -> None:
@@ -344,7 +343,7 @@ class Observatory:
 
     def stepped(self, before: TrackerState, event: Event) -> None:
         """Keep what the tracker heard."""
-        if not isinstance(event, ev.Tick | ev.StatusSeen):
+        if not isinstance(event, ev.Tick | Status):
             self.events.append((self.time_s, event))
 
     def perform(self, effect: Effect) -> None:
@@ -407,15 +406,7 @@ class Observatory:
                 return "judge", wait.judge_s
             case ev.FetchMatrix():
                 return "", wait.fetch_s
-            case (
-                ev.SendMatrix()
-                | ev.AskDither()
-                | ev.AskNoDither()
-                | ev.AskLoop()
-                | ev.AskRamp()
-                | ev.AskMeasurement()
-                | ev.FinishNoisy()
-            ):
+            case ev.SendMatrix() | ev.Ask() | ev.FinishNoisy():
                 return "", wait.command_s
             case _:
                 raise TypeError(

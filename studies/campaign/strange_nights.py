@@ -24,11 +24,11 @@ from typing_extensions import override
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import PyrcalError
-from service.link.events import LinkEvent
 from service.tracking import events as ev
-from service.tracking.products import MatrixState, MeasurePattern
+from service.tracking.events import Event
+from service.tracking.products import MatrixState
 from service.tracking.state import Mode
-from service.wire import Acknowledgement, Loop, LoopRequest
+from service.wire import Acknowledgement, Loop, LoopRequest, Pattern
 from studies.campaign.observatory import Latencies, Observatory
 from studies.campaign.observatory_dome import Moment
 from studies.campaign.rows import Row, RowFile, range_of, tell
@@ -119,7 +119,7 @@ class StrangeNight(Observatory):
             super()._hear_status()
 
     @override
-    def _hear(self, event: LinkEvent) -> None:
+    def _hear(self, event: Event) -> None:
         told = isinstance(event, Acknowledgement)
         if not (told and Mischief.NO_ACK in self.dome.mischief):
             super()._hear(event)
@@ -172,7 +172,7 @@ def _order(time_s: float, rng: np.random.Generator) -> Deed:
         ev.StopDither(),
         ev.Ramp(),
         ev.MeasureNoisy(id=f"noisy-{number}", duration_s=5.0),
-        ev.Measure(id=f"im-{number}", pattern=MeasurePattern.PUSH_PULL_MODAL),
+        ev.Measure(id=f"im-{number}", pattern=Pattern.PUSH_PULL_MODAL),
         ev.SetLoop(closed=False),
         ev.SetLoop(closed=True),
         *(ev.SetMode(mode=mode) for mode in Mode),

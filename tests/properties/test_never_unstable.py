@@ -49,7 +49,7 @@ more_commands = st.one_of(
     st.builds(ev.SetLoop, effective_gain=st.sampled_from([0.3, 1.5])),
 )
 retuned = st.builds(
-    lambda gain, leak: ev.StatusSeen(rtc=rtc(gains=(gain,) * 400 + (0.0,) * 194, leak=leak)),
+    lambda gain, leak: rtc(gains=(gain,) * 400 + (0.0,) * 194, leak=leak),
     st.sampled_from([0.4, 0.8]),
     st.sampled_from([0.999, 0.99]),
 )

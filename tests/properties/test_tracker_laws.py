@@ -13,21 +13,34 @@ from service.tracking import events as ev
 from service.tracking.dither_plan import total_m
 from service.tracking.estimate import HISTORY_LENGTH
 from service.tracking.measuring import MEASUREMENTS_KEPT
-from service.tracking.products import MatrixState, MeasurementRecord, MeasurePattern, MeasureState
+from service.tracking.products import MatrixState, MeasurementRecord, MeasureState
 from service.tracking.reconstructors import RECONSTRUCTORS_KEPT
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import LOG_LENGTH
+from service.wire import (
+    DitherRequest,
+    LoopRequest,
+    MeasureRequest,
+    Pattern,
+    RampRequest,
+    Reply,
+    Status,
+)
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
     START_NS,
+    acknowledged,
+    dither_answered,
     estimate,
     foreign,
     judged,
+    loop_answered,
     moved,
     of_kind,
     record,
     rtc,
+    stopping,
     verdict,
 )
 
@@ -60,8 +73,8 @@ COMMANDS = (
 
 ids = st.sampled_from(IDS)
 statuses = st.builds(
-    lambda n, **changes: ev.StatusSeen(rtc=rtc(n, **changes)),
-    n=st.sampled_from([300, 400, 500, 594]),
+    rtc,
+    n_controlled=st.sampled_from([300, 400, 500, 594]),
     session=st.sampled_from(SESSIONS),
     loop=st.sampled_from(["open", "closed", "closed", "closed", "partial"]),
     cm_id=st.one_of(st.none(), ids),
@@ -99,7 +112,7 @@ commands = st.one_of(
     st.builds(
         ev.Measure,
         id=st.sampled_from(MEASURED),
-        pattern=st.sampled_from([MeasurePattern.PUSH_PULL_MODAL, MeasurePattern.SINE]),
+        pattern=st.sampled_from([Pattern.PUSH_PULL_MODAL, Pattern.SINE]),
         modes=st.sampled_from([None, (3, 9), (594,)]),
     ),
     st.builds(ev.GiveUp, id=st.sampled_from(MEASURED)),
@@ -130,8 +143,8 @@ heard = st.one_of(
         st.booleans(),
     ),
     st.builds(
-        ev.Acknowledged,
-        id=st.sampled_from([*IDS, "never-sent"]),
+        acknowledged,
+        name=st.sampled_from([*IDS, "never-sent"]),
         state=st.sampled_from([MatrixState.STAGED, MatrixState.APPLIED, MatrixState.REJECTED]),
         reason=st.just("r"),
         frame_seq=st.none() | st.integers(0, 10**6),
@@ -147,7 +160,7 @@ heard = st.one_of(
             record=MeasurementRecord(
                 id=name,
                 state=state,
-                pattern=MeasurePattern.PUSH_PULL_MODAL,
+                pattern=Pattern.PUSH_PULL_MODAL,
                 modes=(0, 1),
                 amplitude_m=(1e-8, 1e-8),
                 n_average=1,
@@ -184,7 +197,7 @@ class Night:
         self.n_made = 0
         self.last = ()
         self.tell(ev.SessionStarted(session="s1"), 0.0)
-        self.tell(ev.StatusSeen(rtc=rtc()), 0.0)
+        self.tell(rtc(), 0.0)
         self.tell("done", 0.1)
         for _ in range(2):
             self.tell(ev.WindowFitted(estimate=estimate(t_ns=self.now_ns)), 4.0)
@@ -215,15 +228,15 @@ class Night:
     def of_the_rtc(self, effect, how):
         accepted = how == "done"
         match effect:
-            case ev.AskDither(dither=dither):
-                return ev.DitherAnswered(
-                    id=dither.id, accepted=accepted, reason="r", start_seq=5 if accepted else None
+            case ev.Ask(request=DitherRequest(id=name)):
+                return dither_answered(
+                    name, accepted=accepted, reason="r", start_seq=5 if accepted else None
                 )
-            case ev.AskMeasurement(record=asked):
-                state = MeasureState.RUNNING if accepted else MeasureState.REFUSED
-                return ev.MatrixMeasured(record=replace(asked, state=state, start_seq=9))
-            case ev.AskLoop(id=command) | ev.AskRamp(id=command):
-                return ev.LoopAnswered(id=command, accepted=accepted, reason="r")
+            case ev.Ask(request=MeasureRequest() as asked):
+                reply = Reply(id=asked.id, accepted=accepted, reason="", start_seq=9)
+                return ev.Answered(request=asked, reply=reply)
+            case ev.Ask(request=LoopRequest(id=command) | RampRequest(id=command)):
+                return loop_answered(command, accepted=accepted, reason="r")
             case _:
                 return None
 
@@ -258,7 +271,8 @@ class Night:
                 return ev.ProposalJudged(id=matrix_id, verdict=passed, judged=found)
             case ev.SendMatrix(id=matrix_id):
                 done = MatrixState.APPLIED if how == "done" else MatrixState.REJECTED
-                return ev.Acknowledged(id=matrix_id, state=done, reason="r", frame_seq=1)
+                session = "s1" if self.state.rtc is None else self.state.rtc.session
+                return acknowledged(matrix_id, state=done, reason="r", frame_seq=1, session=session)
             case _:
                 return None
 
@@ -316,7 +330,7 @@ def while_a_matrix_is_measured_nothing_else_is_asked_of_the_rtc_or_learnt(before
     assert night.state.windows_accepted == before.windows_accepted
     sent_before = {r.id for r in night.state.reconstructors if r.id.startswith("made")}
     for effect in night.last:
-        assert isinstance(effect, ev.AskNoDither | ev.SendMatrix)
+        assert isinstance(effect, ev.SendMatrix) or effect == stopping(night)
         if isinstance(effect, ev.SendMatrix):
             assert effect.id in sent_before
 
@@ -334,12 +348,12 @@ def a_measurement_that_is_over_stays_over_and_given_up_stays_given_up(before, ev
 
 def no_dither_is_over_budget_unless_an_operator_means_it(before, event, night):
     if not getattr(event, "over_budget", False):
-        for effect in of_kind(night.last, ev.AskDither):
-            assert total_m(effect.dither) <= POLICY.dither_budget_m * (1.0 + 1e-9)
+        for request in of_kind(night.last, DitherRequest):
+            assert total_m(request) <= POLICY.dither_budget_m * (1.0 + 1e-9)
 
 
 def an_open_loop_is_an_alarm_unless_a_measurement_has_opened_it(before, event, night):
-    if isinstance(event, ev.StatusSeen) and night.state.rtc.loop == "open":
+    if isinstance(event, Status) and night.state.rtc.loop == "open":
         measuring = night.state.measuring
         expected = measuring is None or not measuring.opens_loop
         assert ("loop-open" in {a.name for a in night.state.alarms}) is expected

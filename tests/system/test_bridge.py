@@ -14,7 +14,7 @@ import pytest
 import zenoh.ext
 
 from service.errors import LinkError, UnknownIdError, WireError
-from service.link.events import MeasuredMatrix
+from service.link.matrices import MeasuredMatrix
 from service.rtc_bridge import Bridge, Endpoint
 from service.tracking.events import Noted, RtcVanished, ServicesMet, SessionStarted, Trouble
 from service.wire import (

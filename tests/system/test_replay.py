@@ -12,18 +12,19 @@ from service.config import load_instrument
 from service.link.endpoint import Endpoint
 from service.link.intake import Intake
 from service.model.misregistration import PARAMETERS, Misregistration
-from service.runtime import translate
+from service.runtime.actions import record_of
 from service.runtime.engine import Engine
 from service.telemetry.frames import ClosedLoop as FitLoop
 from service.telemetry.lockin import WindowEstimate
 from service.tracking import events as ev
 from service.tracking.policy import Policy
 from service.tracking.state import Mode, TrackerState
-from service.wire import decode_manifest
+from service.wire import DitherRequest, decode_manifest
 from service.worker import Compute, OpticsWorker
 from sim_rtc.link.record import Kind, Recording
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
+from tests.unit.tracking.situations import dither_answered
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 
@@ -66,7 +67,7 @@ class Tracker:
         manifest = decode_manifest(message.attachment)
         matrix = np.frombuffer(message.payload, "<f4").reshape(manifest.layout.shape)
         self.matrices[manifest.id] = matrix
-        self.engine.post(ev.MatrixFetched(record=translate.record_of(manifest)))
+        self.engine.post(ev.MatrixFetched(record=record_of(manifest)))
 
     def look(self):
         for heard in self.intake.events():
@@ -98,10 +99,10 @@ class Tracker:
         pass
 
     def perform(self, effect):
-        if isinstance(effect, ev.AskDither):
+        if isinstance(effect, ev.Ask) and isinstance(effect.request, DitherRequest):
             self.engine.post(
-                ev.DitherAnswered(
-                    id=effect.dither.id,
+                dither_answered(
+                    effect.request.id,
                     accepted=False,
                     reason="unsupported: a replay",
                     start_seq=None,

@@ -40,11 +40,10 @@ from service.tracking.events import (
     StartDither,
     StopDither,
 )
-from service.tracking.loop import CommandState, DitherView, LoopCommand, Pointing, RtcView
+from service.tracking.loop import CommandState, Dither, LoopCommand
 from service.tracking.products import (
     MatrixState,
     MeasurementRecord,
-    MeasurePattern,
     MeasureState,
     ReconstructorRecord,
 )
@@ -61,6 +60,7 @@ from service.tracking.registration import (
 )
 from service.tracking.stages import Dithering, DitherPhase, DitherPlan
 from service.tracking.state import Alarm, Level, LogEntry, Mode, TrackerState
+from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status
 
 SECOND = 1_000_000_000
 ALPHA = Misregistration(
@@ -113,6 +113,14 @@ def entry(k):
     )
 
 
+REQUEST = DitherRequest(
+    id="d-1",
+    kind=DitherKind.SINE,
+    modes=(501, 450),
+    amplitude_m=(5e-9, 5e-9),
+    frequency_hz=(210.0, 250.0),
+    duration_s=60.0,
+)
 STATE = TrackerState(
     system="flao-lbt",
     mode=Mode.PROPOSE,
@@ -144,9 +152,10 @@ STATE = TrackerState(
     ),
     in_use="rtc-0",
     margin=VERDICT,
-    rtc=RtcView(
+    rtc=Status(
         session="s-1",
-        loop="closed",
+        seq=None,
+        loop=Loop.CLOSED,
         frame_rate_hz=1000.0,
         delay_frames=2.0,
         leak=1.0,
@@ -160,8 +169,8 @@ STATE = TrackerState(
         magnitude=None,
         max_dither_m=1e-7,
         max_dither_modes=4,
-        dither_id="d-1",
-        t_ns_utc=99 * SECOND,
+        dither=DitherStatus(request=REQUEST, start_seq=17),
+        t_ns=99 * SECOND,
     ),
     basis_id="kl",
     config_id="b1",
@@ -180,15 +189,7 @@ STATE = TrackerState(
         mean_square_m2=9e-18,
     ),
     vibrations_hz=(61.0,),
-    dither=DitherView(
-        id="d-1",
-        modes=(501, 450),
-        amplitude_m=(5e-9, 5e-9),
-        frequency_hz=(210.0, 250.0),
-        duration_s=60.0,
-        start_seq=17,
-        asked_ns_utc=5,
-    ),
+    dither=Dither(request=REQUEST, start_seq=17, asked_ns_utc=5),
     watchdog=Watchdog(
         alpha=ALPHA,
         sigma=10 * SIGMA,
@@ -749,7 +750,7 @@ async def test_metrics_show_what_the_service_knows(client):
 MEASURING = MeasurementRecord(
     id="im-1",
     state=MeasureState.RUNNING,
-    pattern=MeasurePattern.HADAMARD,
+    pattern=Pattern.HADAMARD,
     modes=(0, 1),
     amplitude_m=(2e-8, 2e-8),
     n_average=3,
@@ -760,7 +761,7 @@ MEASURING = MeasurementRecord(
 async def test_a_measurement_under_way_is_seen_in_the_state_and_the_metrics(client, service):
     assert (await body_of(client, "/v1/state"))["measuring"] is None
     found = await metrics_of(client)
-    assert {found["measuring", pattern] for pattern in MeasurePattern} == {0}
+    assert {found["measuring", pattern] for pattern in Pattern} == {0}
     service.change(measurements=(MEASURING,))
     assert (await body_of(client, "/v1/state"))["measuring"] == {
         "id": "im-1",

@@ -13,15 +13,16 @@ from service.api import create_app
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.snapshot import Snapshot
 from service.tracking.events import GiveUp, Measure
-from service.tracking.products import MeasurementRecord, MeasurePattern, MeasureState
+from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import TrackerState
+from service.wire import Pattern
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3)
 FILE = b"\x89HDF the product"
 STORED = MeasurementRecord(
     id="im-1",
     state=MeasureState.STORED,
-    pattern=MeasurePattern.PUSH_PULL_MODAL,
+    pattern=Pattern.PUSH_PULL_MODAL,
     modes=(0, 7, 3),
     amplitude_m=(1e-8, 2e-8, 2e-8),
     n_average=5,
@@ -102,7 +103,7 @@ async def test_a_bare_request_measures_push_pull_modal(client, service):
     body = response.json()
     assert body["id"] == "im-20251121T034000.250000"
     assert body["links"]["measurement"] == f"/v1/measurements/{body['id']}"
-    assert service.commands == [Measure(id=body["id"], pattern=MeasurePattern.PUSH_PULL_MODAL)]
+    assert service.commands == [Measure(id=body["id"], pattern=Pattern.PUSH_PULL_MODAL)]
 
 
 async def test_every_choice_reaches_the_command(client, service):
@@ -118,7 +119,7 @@ async def test_every_choice_reaches_the_command(client, service):
     (command,) = service.commands
     assert command == Measure(
         id=response.json()["id"],
-        pattern=MeasurePattern.SINE,
+        pattern=Pattern.SINE,
         modes=(3, 9),
         amplitude_m=5e-9,
         frequency_hz=(60.0, 80.0),

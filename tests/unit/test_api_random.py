@@ -6,9 +6,9 @@ import pytest
 from service.api import create_app
 from service.snapshot import Snapshot
 from service.tracking.events import StartDither
-from service.tracking.loop import DitherKind
 from service.tracking.products import ModeSet
 from service.tracking.state import TrackerState
+from service.wire import DitherKind
 
 
 class FakeService:

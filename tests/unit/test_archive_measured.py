@@ -9,9 +9,9 @@ import pytest
 
 from service.archive import Archive
 from service.errors import ArchiveError, UnknownIdError, WireError
-from service.tracking.products import MatrixState, MeasurementRecord, MeasurePattern, MeasureState
+from service.tracking.products import MatrixState, MeasurementRecord, MeasureState
 from service.tracking.products import ReconstructorRecord as Reconstructor
-from service.wire import checksum
+from service.wire import Pattern, checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3) * 1e6
 
@@ -20,7 +20,7 @@ def record_of(name="im-1", matrix=MATRIX, **changes):
     record = MeasurementRecord(
         id=name,
         state=MeasureState.STORED,
-        pattern=MeasurePattern.HADAMARD,
+        pattern=Pattern.HADAMARD,
         modes=(0, 7, 3),
         amplitude_m=(1e-8, 2e-8, 2e-8),
         n_average=5,
@@ -81,7 +81,7 @@ def test_records_come_back_after_a_restart_oldest_first(tmp_path):
     with_lines = record_of(
         "b",
         created_ns_utc=2,
-        pattern=MeasurePattern.SINE,
+        pattern=Pattern.SINE,
         n_average=None,
         frequency_hz=(50.0, 60.0, 70.0),
         duration_s=10.0,

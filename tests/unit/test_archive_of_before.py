@@ -8,10 +8,11 @@ import pytest
 
 from service.archive import Archive, AuditEntry
 from service.archive.records import TrackingFile
-from service.tracking.products import MatrixState, MeasurePattern, MeasureState, NoisyState
+from service.tracking.products import MatrixState, MeasureState, NoisyState
 from service.tracking.registration import ModeGain
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode, Orders
+from service.wire import Pattern
 
 WRITTEN = Path(__file__).parents[1] / "data" / "archive"
 
@@ -61,9 +62,9 @@ def test_they_are_what_they_were_without_the_index_too(archive, folder):
 
 def test_measured_matrices_are_what_they_were(archive):
     first, second = archive.measured.records()
-    assert (first.id, first.pattern, first.modes) == ("im-1", MeasurePattern.HADAMARD, (0, 7, 3))
+    assert (first.id, first.pattern, first.modes) == ("im-1", Pattern.HADAMARD, (0, 7, 3))
     assert (first.state, first.n_average, first.double_pass) == (MeasureState.STORED, 5, True)
-    assert (second.pattern, second.frequency_hz) == (MeasurePattern.SINE, (50.0, 60.0, 70.0))
+    assert (second.pattern, second.frequency_hz) == (Pattern.SINE, (50.0, 60.0, 70.0))
     assert archive.measured.matrix("im-1").shape == (4, 3)
     assert archive.measured.file("im-2").startswith(b"\x89HDF")
 

@@ -10,10 +10,11 @@ from service.archive import Archive
 from service.archive.records import TrackingFile
 from service.errors import ArchiveError
 from service.tracking import events as ev
-from service.tracking.loop import Pointing
+from service.tracking.loop import loop_numbers
 from service.tracking.registration import Registration
 from service.tracking.resume import saved_of
 from service.tracking.state import Mode, Orders
+from service.wire import Pointing
 from tests.unit.tracking.situations import START_NS, Story, moved, rtc
 from tests.unit.tracking.test_acquisition import Acquiring
 from tests.unit.tracking.test_watchdog import learnt, watch
@@ -46,7 +47,7 @@ def same(one, other):
 def test_a_file_of_before_the_scatter_told_of_the_wind_is_read(file, saved):
     """Of which loop the bias was is not in it either: it will be forgotten."""
     assert saved.registration.bias.excess[0] > 0.0
-    assert saved.registration.bias.loop == rtc().loop_numbers
+    assert saved.registration.bias.loop == loop_numbers(rtc())
     file.write(saved)
     values = json.loads(file._path.read_text(encoding="utf-8"))
     del values["registration"]["bias"]["excess"], values["registration"]["bias"]["loop"]

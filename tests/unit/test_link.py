@@ -5,8 +5,7 @@ import pytest
 
 from service.errors import UnknownIdError, WireError
 from service.link.endpoint import Endpoint
-from service.link.events import EventQueue
-from service.link.intake import Intake
+from service.link.intake import EventQueue, Intake
 from service.link.matrices import OFFERS, MeasuredIntake, Offer, Outbox
 from service.link.ring import ROOM
 from service.link.rivals import Order, SessionWatch

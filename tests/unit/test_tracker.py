@@ -8,11 +8,13 @@ from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode, TrackerState
+from service.wire import DitherRequest
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
     START_NS,
     Story,
+    dither_answered,
     moved,
     of_kind,
     rtc,
@@ -26,14 +28,14 @@ def apply_what_is_sent(story, effects, n_modes):
     story.acknowledge(sent.id, MatrixState.STAGED)
     story.acknowledge(sent.id)
     playing = story.state.dither and story.state.dither.id
-    story.tell(ev.StatusSeen(rtc=rtc(n_modes, cm_id=sent.id, dither_id=playing)))
+    story.tell(rtc(n_modes, cm_id=sent.id, dither_id=playing))
 
 
 def test_the_main_job_in_auto():
     story = Story(Mode.AUTO)
     story.meet()
-    dither = story.asked(ev.AskDither)[0].dither
-    story.tell(ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=10))
+    dither = story.asked(DitherRequest)[0]
+    story.tell(dither_answered(dither.id, accepted=True, reason="", start_seq=10))
     story.see(n_windows=2)
     assert [effect.n_modes for effect in story.asked(ev.MakeMatrix)] == [400]
     apply_what_is_sent(story, story.make("cm-1"), 400)
@@ -85,8 +87,8 @@ def test_a_restarted_rtc_gets_its_reconstructors_again():
     story.meet(session="s2")
     assert story.state.in_use == "initial"
     assert story.state.registration.alpha == ALPHA
-    dithers = story.asked(ev.AskDither)
-    assert dithers[-1].dither.id != dithers[0].dither.id
+    dithers = story.asked(DitherRequest)
+    assert dithers[-1].id != dithers[0].id
     (made,) = of_kind(story.see(n_windows=2), ev.MakeMatrix)
     assert made.n_modes == 400
     (sent,) = of_kind(story.make("cm-2"), ev.SendMatrix)
@@ -97,7 +99,7 @@ def test_a_restarted_service_knows_the_matrix_it_once_made():
     shelf = Story(Mode.AUTO).meet().use("cm-1").state.reconstructors
     again = Story(Mode.AUTO, state=TrackerState(system="flao", reconstructors=shelf[1:]))
     again.tell(ev.SessionStarted(session="s1"))
-    again.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    again.tell(rtc(cm_id="cm-1"))
     assert again.state.in_use == "cm-1"
     assert not again.asked(ev.FetchMatrix)
 

@@ -25,7 +25,7 @@ from service.wire import (
     MeasuredManifest,
     MeasureRequest,
     Pattern,
-    PointingStatus,
+    Pointing,
     RampRequest,
     Role,
     StateMessage,
@@ -253,7 +253,7 @@ def test_the_state_says_what_alpha_is_worth_and_one_of_before_that_is_read_too()
 
 
 def test_an_rtc_may_say_where_the_telescope_looks_or_know_nothing_of_it():
-    looking = replace(STATUS, pointing=PointingStatus(elevation_deg=61.5, azimuth_deg=-20.0))
+    looking = replace(STATUS, pointing=Pointing(elevation_deg=61.5, azimuth_deg=-20.0))
     assert decode_status(encode_status(looking)) == looking
     for unknown in (..., None):
         assert decode_status(changed(encode_status(looking), pointing=unknown)) == STATUS

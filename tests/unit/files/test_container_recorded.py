@@ -7,8 +7,8 @@ import pytest
 from service.archive import Archive
 from service.errors import MatrixError
 from service.files.container import read_recorded
-from service.tracking.products import MeasurementRecord, MeasurePattern, MeasureState
-from service.wire import checksum
+from service.tracking.products import MeasurementRecord, MeasureState
+from service.wire import Pattern, checksum
 
 MATRIX = np.random.default_rng(1).normal(size=(8, 3))
 
@@ -52,7 +52,7 @@ def test_what_our_archive_writes_is_understood(tmp_path):
     record = MeasurementRecord(
         id="im-1",
         state=MeasureState.STORED,
-        pattern=MeasurePattern.HADAMARD,
+        pattern=Pattern.HADAMARD,
         modes=(4, 2, 9),
         amplitude_m=(1e-8,) * 3,
         n_average=5,

@@ -8,18 +8,31 @@ import pytest
 from service.archive import Archive
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.model.misregistration import Misregistration
-from service.runtime.actions import Actions, Publishing
-from service.runtime.translate import manifest_of
+from service.runtime.actions import Actions, Publishing, manifest_of, record_of
 from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
-from service.tracking.loop import DitherView
 from service.tracking.products import MatrixState
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
-from service.wire import DitherStop, Loop, LoopRequest, RampRequest, Reply, checksum, layout_of
+from service.wire import (
+    DitherKind,
+    DitherRequest,
+    DitherStop,
+    Loop,
+    LoopRequest,
+    RampRequest,
+    Reply,
+    checksum,
+    layout_of,
+)
 from service.worker import start_worker
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
-from tests.unit.tracking.situations import START_NS, foreign, record, rtc
+from tests.unit.tracking.situations import (
+    START_NS,
+    foreign,
+    record,
+    rtc,
+)
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -313,50 +326,62 @@ async def test_nothing_is_offered_while_none_is_in_use(actions, bridge):
 
 
 async def test_the_loop_is_changed_as_asked_and_the_answer_is_the_event(actions, bridge):
-    asked = ev.AskLoop(id="loop-1", closed=False, gains=(0.1,) * N_MODES, leak=0.9)
-    event = await actions.perform(asked, STATE)
-    assert event == ev.LoopAnswered(id="loop-1", accepted=True, reason="")
-    assert bridge.commands == [
-        LoopRequest(id="loop-1", loop=Loop.OPEN, gains=(0.1,) * N_MODES, leak=0.9)
-    ]
+    asked = LoopRequest(id="loop-1", loop=Loop.OPEN, gains=(0.1,) * N_MODES, leak=0.9)
+    event = await actions.perform(ev.Ask(request=asked), STATE)
+    assert (event.request, event.reply.accepted) == (asked, True)
+    assert bridge.commands == [asked]
     bridge.refusal = "busy: im-1"
-    event = await actions.perform(ev.AskLoop(id="loop-2", closed=True), STATE)
-    assert (event.accepted, event.reason) == (False, "busy: im-1")
+    event = await actions.perform(ev.Ask(request=LoopRequest(id="loop-2", loop=Loop.CLOSED)), STATE)
+    assert (event.reply.accepted, event.reply.reason) == (False, "busy: im-1")
 
 
 async def test_a_ramp_is_asked_for_as_it_is(actions, bridge):
-    ramp = ev.AskRamp(id="ramp-1", groups=((0, 1), (2, 9)), gains=(0.2, 0.4), frames_per_gain=50)
-    event = await actions.perform(ramp, STATE)
-    assert event == ev.LoopAnswered(id="ramp-1", accepted=True, reason="")
-    assert bridge.commands == [
-        RampRequest(id="ramp-1", groups=((0, 1), (2, 9)), gains=(0.2, 0.4), frames_per_gain=50)
-    ]
+    ramp = RampRequest(id="ramp-1", groups=((0, 1), (2, 9)), gains=(0.2, 0.4), frames_per_gain=50)
+    event = await actions.perform(ev.Ask(request=ramp), STATE)
+    assert (event.request, event.reply.accepted) == (ramp, True)
+    assert bridge.commands == [ramp]
 
 
 class TestDither:
-    DITHER = DitherView(
+    DITHER = DitherRequest(
         id="dither-1",
+        kind=DitherKind.SINE,
         modes=(63, 69),
         amplitude_m=(5e-9, 5e-9),
         frequency_hz=(211.0, 239.0),
         duration_s=120.0,
-        start_seq=None,
-        asked_ns_utc=START_NS,
     )
 
     async def test_the_answer_of_the_rtc_is_the_event(self, actions, bridge):
-        event = await actions.perform(ev.AskDither(dither=self.DITHER), STATE)
-        assert event == ev.DitherAnswered(id="dither-1", accepted=True, reason="", start_seq=77)
-        (request,) = bridge.commands
-        assert request.modes == (63, 69)
-        assert request.frequency_hz == (211.0, 239.0)
+        event = await actions.perform(ev.Ask(request=self.DITHER), STATE)
+        assert event.request == self.DITHER
+        assert (event.reply.accepted, event.reply.start_seq) == (True, 77)
+        assert bridge.commands == [self.DITHER]
 
     async def test_a_refusal_is_an_answer_too(self, actions, bridge):
         bridge.refusal = "busy: measuring"
-        event = await actions.perform(ev.AskDither(dither=self.DITHER), STATE)
-        assert (event.accepted, event.reason) == (False, "busy: measuring")
+        event = await actions.perform(ev.Ask(request=self.DITHER), STATE)
+        assert (event.reply.accepted, event.reply.reason) == (False, "busy: measuring")
 
     async def test_stopping_needs_only_an_id(self, actions, bridge):
-        assert await actions.perform(ev.AskNoDither(), STATE) is None
-        (request,) = bridge.commands
-        assert isinstance(request, DitherStop)
+        stop = DitherStop(id="stop-1")
+        assert await actions.perform(ev.Ask(request=stop), STATE) is None
+        assert bridge.commands == [stop]
+
+
+def test_a_manifest_carries_the_registration_in_boundary_units():
+    matrix = np.zeros((400, 6), np.float32)
+    manifest = manifest_of(record("cm-1"), layout_of(matrix, 4096), rtc(), "flao")
+    assert manifest.alpha["rotation_deg"] == pytest.approx(0.2)
+    assert manifest.sigma["rotation_deg"] == pytest.approx(np.rad2deg(9e-5))
+    assert (manifest.basis_id, manifest.system, manifest.parent) == ("kl-594", "flao", "initial")
+
+
+def test_a_matrix_of_the_rtc_is_for_no_registration_we_can_vouch_for():
+    matrix = np.zeros((3, 6), np.float32)
+    sent = manifest_of(record("cm-1"), layout_of(matrix, 4096), rtc(), "flao")
+    brought = record_of(sent)
+    assert (brought.alpha, brought.parent, brought.n_modes) == (None, None, 3)
+    assert brought.state is MatrixState.APPLIED
+    manifest = manifest_of(foreign(), layout_of(matrix, 4096), rtc(), "flao")
+    assert (manifest.alpha, manifest.sigma) == (None, None)

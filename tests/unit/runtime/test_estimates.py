@@ -8,6 +8,7 @@ import pytest
 from service.runtime.estimates import Backlog, watched
 from service.telemetry import passive
 from service.tracking import events as ev
+from service.tracking.loop import loop_numbers
 from service.tracking.state import Mode
 from service.worker import OpticsWorker
 from tests.numerics import block_of
@@ -39,7 +40,7 @@ async def test_a_look_is_taken_though_alpha_is_not_known(sums):
     worker, story = Worker(), Story(Mode.HOLD).meet()
     event = await watched(sums, story.state, worker)
     assert worker.begun_at == [None]
-    assert event.loop == story.state.rtc.loop_numbers
+    assert event.loop == loop_numbers(story.state.rtc)
     assert event.t_ns_utc == sums.tail.t0_ns_utc + 39 * sums.tail.dt_ns
     story.tell(event)
     await watched(sums, story.state, worker)

@@ -83,7 +83,7 @@ async def test_the_running_service_has_it_from_the_instrument_file(turned, tmp_p
         )
         async with running(supervisor):
             supervisor._post(ev.SessionStarted(session="s1"))
-            supervisor._post(ev.StatusSeen(rtc=rtc()))
+            supervisor._post(rtc())
             near = Misregistration(rotation_rad=np.deg2rad(NOMINAL_DEG + 0.2))
             supervisor._post(ev.WindowFitted(estimate=estimate(near)))
             known = supervisor.snapshot().tracker.registration

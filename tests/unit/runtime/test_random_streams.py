@@ -11,8 +11,9 @@ from service.telemetry.frames import FrameBlock, WindowRefused
 from service.telemetry.lockin import LockIn
 from service.telemetry.random_dither import Correlated
 from service.tracking.dither_plan import RandomChoice, plan_random
-from service.tracking.loop import DitherKind, DitherView
+from service.tracking.loop import Dither
 from service.tracking.products import ModeSet
+from service.wire import DitherKind, DitherRequest
 from service.worker import Description
 from tests.unit.tracking.situations import POLICY, rtc
 
@@ -21,18 +22,15 @@ DESCRIPTION = Description(
     n_slopes=N_SLOPES, n_modes=N_MODES, mode_variance_m2=np.full(N_MODES, 1e-16)
 )
 RTC = rtc(4, n_modes=N_MODES, n_slopes=N_SLOPES, gains=(0.4,) * 4 + (0.0,) * 4)
-DITHER = DitherView(
+REQUEST = DitherRequest(
     id="noisy-1",
     kind=DitherKind.BINARY,
     modes=(1, 6),
     amplitude_m=(2e-9, 2e-9),
-    frequency_hz=(),
     seed=5,
     duration_s=1.2,
-    window_s=0.4,
-    start_seq=0,
-    asked_ns_utc=0,
 )
+DITHER = Dither(request=REQUEST, window_s=0.4, start_seq=0, asked_ns_utc=0)
 
 
 def block(first_seq, n=100, *, dither=True, cm_id="initial"):
@@ -81,10 +79,15 @@ def test_another_loop_makes_the_open_window_void(streams):
 
 
 def test_a_sine_after_random_signs_is_read_as_a_sine(streams):
-    sine = replace(
-        DITHER, id="d-2", kind=DitherKind.SINE, modes=(6,), amplitude_m=(5e-9,), seed=None
+    request = DitherRequest(
+        id="d-2",
+        kind=DitherKind.SINE,
+        modes=(6,),
+        amplitude_m=(5e-9,),
+        frequency_hz=(240.0,),
+        duration_s=60.0,
     )
-    sine = replace(sine, frequency_hz=(240.0,), window_s=0.5, duration_s=60.0)
+    sine = Dither(request=request, start_seq=0, window_s=0.5, asked_ns_utc=0)
     streams = with_dither(streams, sine, 2.0)
     assert isinstance(streams.cutter, LockIn)
     assert streams.cutter.plan.modes == (6,)
@@ -92,7 +95,7 @@ def test_a_sine_after_random_signs_is_read_as_a_sine(streams):
 
 def test_a_window_too_short_for_its_modes_is_refused_with_how_long_it_must_be(streams):
     with pytest.raises(ModelError, match="found windows of 100 frames, expected at least 192"):
-        with_dither(streams, replace(DITHER, id="d-3", window_s=0.1), 2.0)
+        with_dither(streams, replace(DITHER, request=replace(REQUEST, id="d-3"), window_s=0.1), 2.0)
 
 
 def test_a_new_reconstructor_inside_a_window_cuts_it_short(streams):
@@ -110,16 +113,17 @@ def test_all_modes_of_a_basis_may_share_a_few_nanometres():
         POLICY,
         77,
     )
-    assert dither.modes == tuple(range(594))
-    assert np.sqrt(np.sum(np.square(dither.amplitude_m))) == pytest.approx(5e-9)
-    assert (dither.kind, dither.seed, dither.frequency_hz) == (DitherKind.BINARY, 77, ())
+    request = dither.request
+    assert request.modes == tuple(range(594))
+    assert np.sqrt(np.sum(np.square(request.amplitude_m))) == pytest.approx(5e-9)
+    assert (request.kind, request.seed, dither.frequency_hz) == (DitherKind.BINARY, 77, ())
     assert dither.window_s == pytest.approx(5.0)
-    assert dither.duration_s >= 30.0
+    assert request.duration_s >= 30.0
 
 
 def test_the_controlled_modes_are_those_in_the_loop():
     asked = RandomChoice(id="n", modes=ModeSet.CONTROLLED, total_m=5e-9, duration_s=30.0)
-    assert plan_random(asked, rtc(), POLICY, 0).modes == tuple(range(400))
+    assert plan_random(asked, rtc(), POLICY, 0).request.modes == tuple(range(400))
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,9 @@ from service.telemetry.frames import FrameBlock, WindowRefused
 from service.telemetry.health import LOW_MODES, Actuators
 from service.telemetry.lockin import Spectra
 from service.tracking import events as ev
-from service.tracking.loop import DitherView
+from service.tracking.loop import Dither
 from service.tracking.state import TrackerState
+from service.wire import DitherKind, DitherRequest
 from service.worker import Description
 from tests.unit.telemetry import test_loopcheck as loops
 from tests.unit.tracking.situations import rtc
@@ -29,15 +30,20 @@ DESCRIPTION = Description(
 )
 RTC = rtc(4, n_modes=N_MODES, n_slopes=N_SLOPES, gains=(0.4,) * 4 + (0.0,) * 4)
 WINDOW_S = 0.5
-DITHER = DitherView(
+REQUEST = DitherRequest(
     id="dither-1",
+    kind=DitherKind.SINE,
     modes=(6,),
     amplitude_m=(5e-9,),
     frequency_hz=(240.0,),
     duration_s=60.0,
-    start_seq=0,
-    asked_ns_utc=0,
 )
+DITHER = Dither(request=REQUEST, start_seq=0, asked_ns_utc=0)
+
+
+def played(start_seq=0, window_s=None, **changes):
+    request = replace(REQUEST, **changes)
+    return Dither(request=request, start_seq=start_seq, asked_ns_utc=0, window_s=window_s)
 
 
 def block(first_seq, n=100, *, session="s1", cm_id="initial", dither=True, scale=1e-9):
@@ -84,7 +90,7 @@ def test_without_a_dither_there_are_no_windows(streams):
 
 
 def test_a_dither_the_rtc_has_not_accepted_yet_opens_nothing(streams):
-    waiting = replace(DITHER, id="dither-2", start_seq=None)
+    waiting = played(id="dither-2", start_seq=None)
     assert with_dither(streams, waiting, WINDOW_S).cutter is None
 
 
@@ -96,7 +102,7 @@ def test_the_same_dither_keeps_its_open_window(streams):
 
 def test_another_dither_starts_another_series(streams):
     streams, _ = play(streams, 0, 5)
-    streams = with_dither(streams, replace(DITHER, id="dither-2", start_seq=5000), WINDOW_S)
+    streams = with_dither(streams, played(id="dither-2", start_seq=5000), WINDOW_S)
     assert streams.cutter.window is None
     assert streams.cutter.plan.first_seq == 5300
 
@@ -125,7 +131,7 @@ def test_the_next_window_is_counted_from_the_status_not_from_when_it_was_read(
 
 def test_the_same_loop_seen_again_keeps_everything(streams):
     streams, _ = play(streams, 0, 6)
-    again = with_rtc(streams, replace(RTC, t_ns_utc=5, magnitude=9.0, cm_id="cm-1"))
+    again = with_rtc(streams, replace(RTC, t_ns=5, magnitude=9.0, cm_id="cm-1"))
     assert again.cutter is streams.cutter
     assert again.passive is streams.passive
 
@@ -180,9 +186,7 @@ def test_a_loop_whose_high_modes_run_away_is_diverging_and_calms_down_again(stre
 
 
 def test_lines_that_cannot_be_told_apart_are_an_error(streams):
-    close = replace(
-        DITHER, id="d2", modes=(6, 7), amplitude_m=(1e-9,) * 2, frequency_hz=(240.0, 242.0)
-    )
+    close = played(id="d2", modes=(6, 7), amplitude_m=(1e-9,) * 2, frequency_hz=(240.0, 242.0))
     with pytest.raises(ModelError, match="closer than 4 bins"):
         with_dither(streams, close, WINDOW_S)
 
@@ -265,7 +269,7 @@ class TestCommandsOffTheLoop:
 
 class TestADitherThatIsNotThere:
     def test_frames_without_it_are_counted_from_where_it_should_have_begun(self, streams):
-        streams = with_dither(streams, replace(DITHER, start_seq=250), WINDOW_S)
+        streams = with_dither(streams, played(start_seq=250), WINDOW_S)
         streams, _ = play(streams, 0, 10, dither=False)
         assert streams.dither_silent_s == pytest.approx(0.75)
 
@@ -279,23 +283,23 @@ class TestADitherThatIsNotThere:
         assert windows[0].first_seq == 800
 
     def test_nobody_misses_it_after_its_time(self, streams):
-        short = replace(DITHER, duration_s=0.3)
+        short = played(duration_s=0.3)
         streams, _ = play(with_dither(streams, short, WINDOW_S), 0, 20, dither=False)
         assert streams.dither_silent_s == pytest.approx(0.3)
 
     def test_one_of_another_frequency_than_told_gives_no_window(self, streams):
-        other = replace(DITHER, frequency_hz=(300.0,))
+        other = played(frequency_hz=(300.0,))
         _, windows = play(with_dither(streams, other, WINDOW_S), 0, 9)
         assert isinstance(windows[0], WindowRefused)
         assert "mode 6 carries 0.00 nm of dither at 300.0 Hz" in windows[0].reason
 
     def test_a_correction_of_its_first_frame_moves_the_windows(self, streams):
-        streams = with_dither(streams, replace(DITHER, start_seq=400), WINDOW_S)
+        streams = with_dither(streams, played(start_seq=400), WINDOW_S)
         _, windows = play(streams, 0, 14)
         assert [w.first_seq for w in windows] == [700]
 
     def test_the_columns_have_the_last_word_on_the_amplitude(self, streams):
-        half = replace(DITHER, amplitude_m=(9e-9,))
+        half = played(amplitude_m=(9e-9,))
         _, windows = play(with_dither(streams, half, WINDOW_S), 0, 9)
         (window,) = windows
         found = np.abs(window.dither[0, 6]) / (0.25 * window.plan.n_frames) / np.sqrt(2)
@@ -373,7 +377,7 @@ def told(streams):
 
 
 def test_no_window_is_begun_that_the_end_of_the_dither_would_cut(streams):
-    streams = with_dither(streams, replace(DITHER, duration_s=1.1), WINDOW_S)
+    streams = with_dither(streams, played(duration_s=1.1), WINDOW_S)
     streams, windows = play(streams, 0, 9)
     assert [w.first_seq for w in windows] == [300]
     assert streams.cutter is None
@@ -382,7 +386,7 @@ def test_no_window_is_begun_that_the_end_of_the_dither_would_cut(streams):
 
 
 def test_the_window_a_dither_was_planned_with_counts(streams):
-    planned = replace(DITHER, id="dither-2", window_s=0.25)
+    planned = played(id="dither-2", window_s=0.25)
     _, windows = play(with_dither(streams, planned, WINDOW_S), 0, 9)
     assert [w.first_seq for w in windows] == [300, 550]
 
@@ -505,7 +509,7 @@ class TestStrengthOfTheDither:
     """By the frames, whatever the status says."""
 
     def test_windows_of_one_that_is_twenty_times_too_strong_are_refused(self, streams):
-        asked = replace(DITHER, amplitude_m=(5e-9 / 20,))
+        asked = played(amplitude_m=(5e-9 / 20,))
         streams = with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), asked, WINDOW_S)
         _, windows = play(streams, 0, 20)
         assert windows
@@ -514,7 +518,7 @@ class TestStrengthOfTheDither:
 
     def test_it_is_news_once_and_again_when_it_is_over(self, streams):
         state = TrackerState(system="s", rtc=RTC)
-        asked = replace(DITHER, amplitude_m=(5e-9 / 20,))
+        asked = played(amplitude_m=(5e-9 / 20,))
         streams = with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), asked, WINDOW_S)
         streams, _ = play(streams, 0, 12)
         (told,) = [e for e in news(0.0, streams, state) if isinstance(e, ev.DitherMeasured)]

@@ -26,6 +26,7 @@ from service.tracking.products import MatrixState
 from service.tracking.registration import ModeGain
 from service.tracking.state import Alarm
 from service.tracking.worth import fewer_than
+from service.wire import LoopRequest
 from service.worker import OpticsWorker, start_worker
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
 from tests.unit.runtime.test_actions import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
@@ -232,22 +233,23 @@ class TestGains:
         made = await make(actions, STATE)
         state = replace(STATE, reconstructors=(made.record,), in_use=made.record.id)
         gains = tuple(np.linspace(0.5, 0.4, N_CONTROLLED)) + (0.0,) * (N_MODES - N_CONTROLLED)
-        asked = ev.AskLoop(id="loop-1", gains=gains, judged=True)
+        asked = ev.Ask(request=LoopRequest(id="loop-1", gains=gains), judged=True)
         answer = await actions.perform(asked, state)
-        assert answer.accepted
+        assert answer.reply.accepted
         assert bridge.commands[-1].gains == gains
 
     async def test_and_never_reach_the_rtc_when_it_does_not(self, actions, bridge):
         made = await make(actions, STATE)
         state = replace(STATE, reconstructors=(made.record,), in_use=made.record.id)
         gains = (2.5,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED)
-        answer = await actions.perform(ev.AskLoop(id="loop-1", gains=gains, judged=True), state)
-        assert not answer.accepted
-        assert "unstable" in answer.reason
+        asked = ev.Ask(request=LoopRequest(id="loop-1", gains=gains), judged=True)
+        answer = await actions.perform(asked, state)
+        assert not answer.reply.accepted
+        assert "unstable" in answer.reply.reason
         assert not bridge.commands
 
     async def test_nothing_is_judged_for_a_matrix_nobody_knows(self, actions):
-        asked = ev.AskLoop(id="loop-1", gains=(0.1,) * N_MODES, judged=True)
+        asked = ev.Ask(request=LoopRequest(id="loop-1", gains=(0.1,) * N_MODES), judged=True)
         with pytest.raises(CommandError, match="cannot be judged"):
             await actions.perform(asked, replace(STATE, in_use=None))
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from service.link.statistics import Fate, LinkStatistics, Tally
@@ -12,11 +13,12 @@ from service.runtime.waiting import (
     Told,
     complaints,
     news_of_link,
+    state_message,
     waiting_for,
 )
 from service.tracking.products import MatrixState
 from service.tracking.state import Alarm, Mode, Party, TrackerState, Waiting
-from tests.unit.tracking.situations import START_NS, record, rtc
+from tests.unit.tracking.situations import ALPHA, START_NS, Story, record, rtc
 
 SECOND = 1_000_000_000
 
@@ -265,3 +267,15 @@ def test_a_token_that_came_back_is_given_its_time():
     assert not revival.due(link(rtc_alive=False), 9.0)
     assert not any(revival.due(silent, float(t)) for t in range(10, 20))
     assert revival.due(silent, 20.0)
+
+
+def test_the_state_on_the_network_is_short_and_in_boundary_units():
+    story = Story(Mode.HOLD).meet()
+    nothing = state_message(story.state, 5)
+    assert nothing.alpha is nothing.validity is None
+    story.see()
+    message = state_message(story.state, 5)
+    assert message.validity == story.state.registration.standing.validity
+    assert (message.mode, message.in_use, message.t_ns) == ("hold", "initial", 5)
+    assert message.alpha == pytest.approx(ALPHA.to_boundary())
+    assert message.sigma["shift_x_subap"] == pytest.approx(np.hypot(0.002, 0.003))

@@ -7,7 +7,7 @@ from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
 from service.tracking.state import Mode, TrackerState
 from studies.campaign.golden import INSTRUMENT, Teller, first_difference, nights_in, read, written
-from studies.campaign.golden_codec import decoded, encoded, renewed
+from studies.campaign.golden_codec import decoded, encoded
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
@@ -21,7 +21,7 @@ from tests.unit.tracking.situations import (
 
 EVENTS = [
     ev.Tick(),
-    ev.StatusSeen(rtc=rtc(cm_id=None)),
+    rtc(cm_id=None),
     ev.SetMode(mode=Mode.HOLD),
     ev.StartDither(modes=(3, 4), frequency_hz=(100.0, 120.5)),
     ev.StartDither(modes="controlled"),
@@ -35,7 +35,7 @@ EVENTS = [
 
 @pytest.mark.parametrize("event", EVENTS, ids=lambda event: type(event).__name__)
 def test_an_event_comes_back_as_it_was(event):
-    again = decoded(ev.Event, renewed(encoded(event)))
+    again = decoded(ev.Event, encoded(event))
     assert type(again) is type(event)
     assert encoded(again) == encoded(event)
 
@@ -72,7 +72,7 @@ def test_numbers_may_differ_as_much_as_processors_do():
 
 def test_the_same_entries_make_the_same_file(tmp_path):
     teller = Teller(TrackerState(system="flao", mode=Mode.AUTO), POLICY)
-    for event in (ev.SessionStarted(session="s1"), ev.StatusSeen(rtc=rtc()), ev.Tick()):
+    for event in (ev.SessionStarted(session="s1"), rtc(), ev.Tick()):
         teller.tell(event, START_NS)
     for name in ("one.jsonl.xz", INSTRUMENT):
         written(teller.entries, tmp_path / name)

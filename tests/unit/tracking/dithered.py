@@ -9,7 +9,8 @@ from service.telemetry.passive import PassiveEstimate
 from service.tracking import events as ev
 from service.tracking.dither_plan import SETTLING_S, total_m
 from service.tracking.state import Mode
-from tests.unit.tracking.situations import ALPHA, Story, estimate, moved, rtc
+from service.wire import DitherRequest, DitherStatus, DitherStop
+from tests.unit.tracking.situations import ALPHA, Story, dither_answered, estimate, moved, rtc
 
 STEP_S = 0.5
 LOOK_S = 10.0
@@ -33,8 +34,9 @@ class DitheredNight(Story):
         self.done_s = 0.0
         self.lived = []
         self.requests = []
+        self.windows_s = []
         self.tell(ev.SessionStarted(session="s1"))
-        self.pass_on(self.tell(ev.StatusSeen(rtc=self.view)))
+        self.pass_on(self.tell(self.view))
         self.pass_on(self.meet(magnitude=magnitude, **changes).effects)
 
     @property
@@ -44,15 +46,16 @@ class DitheredNight(Story):
     def pass_on(self, effects):
         for effect in effects:
             match effect:
-                case ev.AskDither(dither=dither):
-                    self.requests.append(dither)
-                    self.playing = replace(dither, start_seq=self.seq, asked_ns_utc=0)
+                case ev.Ask(request=DitherRequest() as request):
+                    self.requests.append(request)
+                    self.windows_s.append(self.state.dither.window_s)
+                    self.playing = replace(self.state.dither, start_seq=self.seq)
                     self.done_s = self.t_s + SETTLING_S
-                    answer = ev.DitherAnswered(
-                        id=dither.id, accepted=True, reason="", start_seq=self.seq
+                    answer = dither_answered(
+                        request.id, accepted=True, reason="", start_seq=self.seq
                     )
                     self.pass_on(self.tell(answer))
-                case ev.AskNoDither() if not self.deaf:
+                case ev.Ask(request=DitherStop()) if not self.deaf:
                     self.playing = None
                 case _:
                     pass
@@ -66,14 +69,13 @@ class DitheredNight(Story):
             status = replace(
                 self.view,
                 seq=self.seq,
-                t_ns_utc=self.now_ns,
-                dither_id=shown and shown.id,
-                dither=shown and replace(shown, window_s=None),
+                t_ns=self.now_ns,
+                dither=shown and DitherStatus(request=shown.request, start_seq=shown.start_seq),
             )
-            self.pass_on(self.tell(ev.StatusSeen(rtc=status)))
+            self.pass_on(self.tell(status))
             if self.looks and round(self.t_s / STEP_S) % round(LOOK_S / STEP_S) == 0:
                 self.pass_on(self.tell(self.look()))
-            self.lived.append(0.0 if self.playing is None else total_m(self.playing))
+            self.lived.append(0.0 if self.playing is None else total_m(self.playing.request))
         return self
 
     def play(self):
@@ -86,17 +88,17 @@ class DitheredNight(Story):
             self.window(playing, window_s)
             if self.playing is not playing:
                 return
-        ended_s = (playing.start_seq / self.view.frame_rate_hz) + playing.duration_s
+        ended_s = (playing.start_seq / self.view.frame_rate_hz) + playing.request.duration_s
         if self.t_s >= ended_s:
             self.playing = None
 
     def window(self, playing, window_s):
-        sigma = self.kappa / (total_m(playing) * np.sqrt(window_s))
+        sigma = self.kappa / (total_m(playing.request) * np.sqrt(window_s))
         found = estimate(
             self.alpha(self.t_s),
             t_ns=self.now_ns,
             covariance=np.diag(sigma**2),
-            dither_m=total_m(playing),
+            dither_m=total_m(playing.request),
             window_s=window_s,
         )
         self.pass_on(self.tell(ev.WindowFitted(estimate=found)))

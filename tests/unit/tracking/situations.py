@@ -9,12 +9,24 @@ from service.model.misregistration import Misregistration
 from service.telemetry.lockin import WindowEstimate
 from service.tracker import step
 from service.tracking import events as ev
-from service.tracking.loop import RtcView
+from service.tracking.loop import Dither
 from service.tracking.policy import Policy
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import commanded_gains
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
+from service.wire import (
+    Acknowledgement,
+    AckState,
+    DitherKind,
+    DitherRequest,
+    DitherStatus,
+    DitherStop,
+    Loop,
+    LoopRequest,
+    Reply,
+    Status,
+)
 
 SECOND = 1_000_000_000
 START_NS = 1_800_000_000 * SECOND
@@ -33,7 +45,8 @@ ALPHA = Misregistration(
 def rtc(n_controlled=400, **changes):
     values = {
         "session": "s1",
-        "loop": "closed",
+        "seq": None,
+        "loop": Loop.CLOSED,
         "frame_rate_hz": 1000.0,
         "delay_frames": 2.0,
         "leak": 0.999,
@@ -47,10 +60,51 @@ def rtc(n_controlled=400, **changes):
         "magnitude": 8.0,
         "max_dither_m": 5e-8,
         "max_dither_modes": 594,
-        "dither_id": None,
-        "t_ns_utc": START_NS,
-    }
-    return RtcView(**(values | changes))
+        "dither": None,
+        "t_ns": START_NS,
+    } | changes
+    if values.get("dither_id") is not None:
+        values["dither"] = DitherStatus(request=dither_request(values["dither_id"]), start_seq=0)
+    values.pop("dither_id", None)
+    if isinstance(values["dither"], Dither):
+        dither = values["dither"]
+        values["dither"] = DitherStatus(request=dither.request, start_seq=dither.start_seq)
+    return Status(**(values | {"loop": Loop(values["loop"])}))
+
+
+def dither_request(name, **changes):
+    """A dither that nobody can read: of its id alone it is somebody's."""
+    values = {"kind": DitherKind.BINARY, "modes": (3,), "amplitude_m": (1e-9,), "duration_s": 60.0}
+    return DitherRequest(id=name, **(values | {"seed": 1} | changes))
+
+
+def dither_answered(name, *, accepted, reason="", start_seq=None):
+    """What the RTC says to a dither."""
+    reply = Reply(id=name, accepted=accepted, reason=reason, start_seq=start_seq)
+    return ev.Answered(request=dither_request(name), reply=reply)
+
+
+def loop_answered(name, *, accepted, reason=""):
+    """What the RTC says to a change of its loop."""
+    reply = Reply(id=name, accepted=accepted, reason=reason, start_seq=None)
+    return ev.Answered(request=LoopRequest(id=name), reply=reply)
+
+
+def acknowledged(name, *, state, reason="", frame_seq=None, sha256=None, session="s1"):
+    """The RTC's word on a reconstructor."""
+    return Acknowledgement(
+        id=name,
+        state=AckState(state),
+        reason=reason,
+        frame_seq=frame_seq,
+        sha256=sha256,
+        session=session,
+    )
+
+
+def stopping(story):
+    """The wish that no dither plays, at this time of a story."""
+    return ev.Ask(request=DitherStop(id=f"stop-{story.now_ns}"))
 
 
 def verdict(*, accepted=True, radius=0.7):
@@ -161,7 +215,7 @@ class Story:
     def meet(self, **changes):
         """Meet an RTC whose matrix is then known."""
         self.tell(ev.SessionStarted(session=changes.get("session", "s1")))
-        self.tell(ev.StatusSeen(rtc=rtc(**changes)))
+        self.tell(rtc(**changes))
         view = self.state.rtc
         if view.cm_id is not None and self.state.reconstructor(view.cm_id) is None:
             self.tell(ev.MatrixFetched(record=foreign(view.cm_id, view.n_controlled)))
@@ -188,20 +242,23 @@ class Story:
         return self.tell(ev.MatrixMade(record=made, wanted=wanted))
 
     def acknowledge(self, matrix_id, state=MatrixState.APPLIED, reason="", frame_seq=1000):
+        session = "s1" if self.state.rtc is None else self.state.rtc.session
         return self.tell(
-            ev.Acknowledged(id=matrix_id, state=state, reason=reason, frame_seq=frame_seq)
+            acknowledged(
+                matrix_id, state=state, reason=reason, frame_seq=frame_seq, session=session
+            )
         )
 
     def use(self, matrix_id, n_modes=400):
         """Make, send and apply a reconstructor; the RTC's status follows."""
         self.make(matrix_id, wanted=True, n_modes=n_modes)
         self.acknowledge(matrix_id)
-        self.tell(ev.StatusSeen(rtc=replace(rtc(n_modes), cm_id=matrix_id)))
+        self.tell(replace(rtc(n_modes), cm_id=matrix_id))
         return self
 
     def asked(self, kind):
-        """Return all effects of one kind so far."""
-        return [effect for effect in self.effects if isinstance(effect, kind)]
+        """Return all effects, or requests to the RTC, of one kind so far."""
+        return of_kind(self.effects, kind)
 
     def matrix_state(self, matrix_id):
         return self.state.reconstructor(matrix_id).state
@@ -216,4 +273,6 @@ class Story:
 
 
 def of_kind(effects, kind):
-    return [effect for effect in effects if isinstance(effect, kind)]
+    """Effects, or requests to the RTC, of one kind."""
+    wanted = [effect.request if isinstance(effect, ev.Ask) else effect for effect in effects]
+    return [effect for effect in wanted if isinstance(effect, kind)]

@@ -24,7 +24,17 @@ from service.tracking.products import MatrixState
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode
 from service.tracking.worth import fewer_than
-from tests.unit.tracking.situations import POLICY, Story, estimate, moved, rtc, verdict
+from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
+from tests.unit.tracking.situations import (
+    POLICY,
+    Story,
+    dither_answered,
+    estimate,
+    loop_answered,
+    moved,
+    rtc,
+    verdict,
+)
 
 ACQUIRES = replace(POLICY, acquires=True)
 FAR = Misregistration(
@@ -52,18 +62,17 @@ class Acquiring(Story):
 
     @property
     def far_dithers(self):
-        asked = [effect.dither for effect in self.asked(ev.AskDither)]
-        return [dither for dither in asked if dither.id.startswith("acquire-")]
+        return [dither for dither in self.asked(DitherRequest) if dither.id.startswith("acquire-")]
 
     def status(self, after_s=0.2, **changes):
         seen = {"session": f"s{self.session}", "cm_id": self.state.in_use} | changes
-        return self.tell(ev.StatusSeen(rtc=rtc(**seen)), after_s)
+        return self.tell(rtc(**seen), after_s)
 
     def open(self):
         """The RTC opens the loop, which begins a new session."""
-        command = self.asked(ev.AskLoop)[-1]
-        assert command.closed is False
-        self.tell(ev.LoopAnswered(id=command.id, accepted=True, reason=""), 0.1)
+        command = self.asked(LoopRequest)[-1]
+        assert command.loop is Loop.OPEN
+        self.tell(loop_answered(command.id, accepted=True, reason=""), 0.1)
         self.session += 1
         self.tell(ev.SessionStarted(session=f"s{self.session}"))
         self.tell(CALM)
@@ -76,17 +85,17 @@ class Acquiring(Story):
     def see_afar(self, alpha=FAR, sigma=0.01):
         """A window with the dither of this stage puts the mirror there."""
         dither = self.state.dither
-        self.tell(ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=5000), 0.1)
+        self.tell(dither_answered(dither.id, accepted=True, reason="", start_seq=5000), 0.1)
         fitted = estimate(
             alpha,
             t_ns=self.now_ns,
             session=f"s{self.session}",
-            modes=dither.modes,
+            modes=dither.request.modes,
             covariance=np.diag([sigma, sigma, sigma / 30, sigma / 10]) ** 2,
         )
         found = FarEstimate(estimate=fitted, unexplained=0.05, n_starts=1)
         effects = self.tell(ev.FarFitted(found=found), 3.0)
-        self.still_open(dither_id=dither.id)
+        self.still_open(dither=replace(dither, start_seq=5000))
         self.still_open()
         return effects
 
@@ -100,9 +109,9 @@ class Acquiring(Story):
         self.make(name, n_modes=n_modes)
         self.acknowledge(name)
         self.still_open(cm_id=name)
-        command = self.asked(ev.AskLoop)[-1]
-        assert command.closed is True
-        self.tell(ev.LoopAnswered(id=command.id, accepted=True, reason=""), 0.1)
+        command = self.asked(LoopRequest)[-1]
+        assert command.loop is Loop.CLOSED
+        self.tell(loop_answered(command.id, accepted=True, reason=""), 0.1)
         return self.closed(n_modes)
 
     def closed(self, n_modes):
@@ -155,7 +164,7 @@ def test_the_two_dithers_have_no_mode_in_common_and_are_stopped_in_between():
     far = story.far_dithers
     assert len(far) == 2
     assert not set(far[0].modes) & set(far[1].modes)
-    assert len(story.asked(ev.AskNoDither)) >= 2
+    assert len(story.asked(DitherStop)) >= 2
 
 
 def test_reconstructors_are_judged_and_sent_with_the_gains_the_loop_was_found_with():
@@ -172,7 +181,7 @@ def test_a_loop_found_open_is_closed_with_a_low_gain_and_not_opened_first():
     story.status(loop="open", gains=(0.0,) * 594)
     story.tell(ev.Acquire())
     assert story.stage is AcquisitionStage.COARSE
-    assert not story.asked(ev.AskLoop)
+    assert not story.asked(LoopRequest)
     story.see_afar()
     story.see_afar()
     (made,) = story.asked(ev.MakeMatrix)
@@ -186,27 +195,27 @@ class TestByItself:
         assert not story.wait(OUT_OF_HAND_S - 1)
         story.wait(2)
         assert story.stage is AcquisitionStage.OPENING
-        assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
+        assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
 
     @pytest.mark.parametrize("mode", [Mode.PROPOSE, Mode.HOLD])
     def test_only_in_auto(self, mode):
         story = Acquiring(mode)
         story.tell(DIVERGING)
         story.wait(60)
-        assert not story.asked(ev.AskLoop)
+        assert not story.asked(LoopRequest)
 
     def test_not_where_the_settings_forbid_it(self):
         story = Acquiring(policy=POLICY)
         story.tell(DIVERGING)
         story.wait(60)
-        assert not story.asked(ev.AskLoop)
+        assert not story.asked(LoopRequest)
 
     def test_not_when_an_operator_stopped_the_dither(self):
         story = Acquiring()
         story.tell(ev.StopDither())
         story.tell(DIVERGING)
         story.wait(60)
-        assert not story.asked(ev.AskLoop)
+        assert not story.asked(LoopRequest)
 
     def test_it_begins_when_windows_find_no_registration(self):
         story = Acquiring()
@@ -241,12 +250,12 @@ class TestByItself:
     def test_it_does_not_begin_again_after_it_has_failed(self):
         story = Acquiring()
         story.tell(ev.Acquire())
-        command = story.asked(ev.AskLoop)[-1]
-        story.tell(ev.LoopAnswered(id=command.id, accepted=False, reason="busy"))
+        command = story.asked(LoopRequest)[-1]
+        story.tell(loop_answered(command.id, accepted=False, reason="busy"))
         story.tell(DIVERGING)
-        n_before = len(story.asked(ev.AskLoop))
+        n_before = len(story.asked(LoopRequest))
         story.wait(60)
-        assert len(story.asked(ev.AskLoop)) == n_before
+        assert len(story.asked(LoopRequest)) == n_before
         assert "acquisition" in story.alarms
 
     def test_it_begins_again_when_an_rtc_that_vanished_is_back_and_diverges(self):
@@ -275,7 +284,7 @@ class TestNothingWrong:
         story = Acquiring()
         story.tell(ev.Acquire())
         story.open()
-        late = estimate(FAR, session="s1", modes=story.state.dither.modes)
+        late = estimate(FAR, session="s1", modes=story.state.dither.request.modes)
         story.tell(ev.FarFitted(found=FarEstimate(estimate=late, unexplained=0.0, n_starts=1)))
         assert story.stage is AcquisitionStage.COARSE
 
@@ -306,16 +315,16 @@ class TestNothingWrong:
         story.make("cm-150", MatrixState.REFUSED, n_modes=150)
         assert story.stage is AcquisitionStage.FAILED
         assert not story.asked(ev.SendMatrix)
-        assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
+        assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
         assert story.state.registration is None
 
     def test_where_the_edge_would_slip_with_any_modes_a_leak_is_asked_for_first(self):
         story = Acquiring().to_partial()
         slips = replace(verdict(accepted=False), edge_motion_m=5e-7)
         story.make("cm-150", MatrixState.REFUSED, n_modes=150, gate=slips)
-        asked = story.asked(ev.AskLoop)[-1]
-        assert (asked.closed, asked.leak) == (None, 0.99)
-        story.tell(ev.LoopAnswered(id=asked.id, accepted=True, reason=""))
+        asked = story.asked(LoopRequest)[-1]
+        assert (asked.loop, asked.leak) == (None, 0.99)
+        story.tell(loop_answered(asked.id, accepted=True, reason=""))
         story.still_open()
         assert len(story.asked(ev.MakeMatrix)) == 1
         story.still_open(leak=0.99)
@@ -358,7 +367,7 @@ class TestTrouble:
         story = Acquiring().to_widening()
         story.tell(ev.Trouble(name="edge-slip", text="found"))
         assert story.stage is AcquisitionStage.OPENING
-        assert story.asked(ev.AskLoop)[-1].closed is False
+        assert story.asked(LoopRequest)[-1].loop is Loop.OPEN
         story.tell(ev.Trouble(name="edge-slip", text="gone", over=True))
         story.open()
         story.see_afar()
@@ -418,8 +427,8 @@ class TestTrouble:
     def test_an_rtc_that_will_not_open_its_loop_ends_it(self):
         story = Acquiring()
         story.tell(ev.Acquire())
-        command = story.asked(ev.AskLoop)[-1]
-        story.tell(ev.LoopAnswered(id=command.id, accepted=False, reason="busy"))
+        command = story.asked(LoopRequest)[-1]
+        story.tell(loop_answered(command.id, accepted=False, reason="busy"))
         assert story.stage is AcquisitionStage.FAILED
         assert "busy" in story.text
 
@@ -435,7 +444,7 @@ class TestTrouble:
         story.tell(ev.Acquire())
         story.open()
         dither = story.state.dither
-        refused = ev.DitherAnswered(id=dither.id, accepted=False, reason="busy", start_seq=None)
+        refused = dither_answered(dither.id, accepted=False, reason="busy", start_seq=None)
         story.tell(refused)
         for _ in range(12):
             story.still_open()
@@ -456,7 +465,7 @@ class TestTrouble:
         story.open()
         story.closed(400)
         assert story.stage is AcquisitionStage.OPENING
-        assert len(story.asked(ev.AskLoop)) == 2
+        assert len(story.asked(LoopRequest)) == 2
 
     def test_too_few_modes_to_dither_are_named_at_once(self):
         story = Acquiring()
@@ -492,9 +501,9 @@ class TestOperator:
         story.open()
         story.tell(ev.AbortAcquisition())
         assert story.stage is AcquisitionStage.ABORTED
-        last = story.asked(ev.AskLoop)[-1]
-        assert (last.closed, last.gains, last.leak) == (True, None, 0.999)
-        assert story.asked(ev.AskNoDither)
+        last = story.asked(LoopRequest)[-1]
+        assert (last.loop, last.gains, last.leak) == (Loop.CLOSED, None, 0.999)
+        assert story.asked(DitherStop)
 
     def test_who_aborts_gets_a_diverging_loop_open(self):
         story = Acquiring()
@@ -502,13 +511,13 @@ class TestOperator:
         story.tell(ev.Acquire())
         story.open()
         story.tell(ev.AbortAcquisition())
-        assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
+        assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
 
     def test_who_aborts_late_keeps_the_loop_on_its_judged_matrix(self):
         story = Acquiring().to_widening()
-        n_asked = len(story.asked(ev.AskLoop))
+        n_asked = len(story.asked(LoopRequest))
         story.tell(ev.AbortAcquisition())
-        assert len(story.asked(ev.AskLoop)) == n_asked
+        assert len(story.asked(LoopRequest)) == n_asked
         assert story.state.registration is not None
 
     def test_stopping_the_dither_aborts_it(self):
@@ -552,9 +561,9 @@ def test_the_loop_open_alarm_is_kept_quiet_meanwhile():
 
 def test_the_far_dither_is_as_strong_as_settings_and_rtc_allow():
     dither = far_dither(AcquisitionStage.COARSE, rtc(max_dither_m=2e-8), ACQUIRES, 0)
-    assert set(dither.amplitude_m) == {2e-8}
+    assert set(dither.request.amplitude_m) == {2e-8}
     dither = far_dither(AcquisitionStage.COARSE, rtc(), ACQUIRES, 0)
-    assert set(dither.amplitude_m) == {5e-8}
+    assert set(dither.request.amplitude_m) == {5e-8}
 
 
 @pytest.mark.parametrize("rate_hz", [300.0, 300.00003, 499.99, 999.9993, 1000.0, 2000.017])
@@ -590,9 +599,7 @@ def test_one_in_whose_dithers_no_window_ever_ends_comes_to_an_end():
         if story.stage is AcquisitionStage.OPENING:
             story.still_open()
         if dither is not None and dither.start_seq is None:
-            story.tell(
-                ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=story.now_ns)
-            )
+            story.tell(dither_answered(dither.id, accepted=True, reason="", start_seq=story.now_ns))
         story.still_open()
         story.tell(ev.Tick(), 1.0)
     assert story.stage is AcquisitionStage.FAILED

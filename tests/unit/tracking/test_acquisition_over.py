@@ -8,6 +8,7 @@ from service.tracking.acquisition_stages import MISSES_DESPITE
 from service.tracking.products import MatrixState
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode
+from service.wire import Loop, LoopRequest
 from tests.unit.tracking.situations import foreign, moved
 from tests.unit.tracking.test_acquisition import CALM, DIVERGING, FAR, Acquiring
 from tests.unit.tracking.test_acquisition_restart import Again
@@ -58,7 +59,7 @@ def test_the_next_trouble_is_met_as_the_first_was():
     story.wait(4)
     assert story.stage is AcquisitionStage.OPENING
     assert story.state.acquisition.attempt == 1
-    assert story.asked(ev.AskLoop)[-1].closed is False
+    assert story.asked(LoopRequest)[-1].loop is Loop.OPEN
 
 
 def test_but_nothing_is_over_while_the_loop_does_not_hold():
@@ -122,7 +123,7 @@ def test_what_an_operator_ended_does_not_begin_again_while_its_alarm_lasts(troub
     story.wait(600, every_s=10)
     assert story.stage is AcquisitionStage.ABORTED
     assert story.began == 1
-    assert [asked.closed for asked in story.asked(ev.AskLoop)] == [False]
+    assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
     assert "ended by the operator" in story.text
     assert "none begins by itself until" in story.text
 
@@ -187,7 +188,7 @@ def test_a_restarted_service_does_not_begin_what_an_operator_ended():
     again.tell(DIVERGING)
     again.wait(60)
     assert again.stage is AcquisitionStage.ABORTED
-    assert not again.asked(ev.AskLoop)
+    assert not again.asked(LoopRequest)
 
 
 def test_one_that_hold_ended_is_not_held_off():

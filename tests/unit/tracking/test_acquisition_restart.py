@@ -10,6 +10,7 @@ from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode, TrackerState
+from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
 from tests.unit.tracking.situations import POLICY, SECOND, foreign
 from tests.unit.tracking.test_acquisition import ACQUIRES, DIVERGING, FAR, Acquiring
 
@@ -39,7 +40,7 @@ class Again(Acquiring):
 
     @property
     def loop_orders(self):
-        return [asked.closed for asked in self.asked(ev.AskLoop)]
+        return [asked.loop is Loop.CLOSED for asked in self.asked(LoopRequest)]
 
 
 @pytest.fixture
@@ -82,8 +83,8 @@ def test_in_other_modes_it_waits_and_says_what_to_do(opened, mode):
     again = Again(opened, mode).find()
     again.wait(60)
     assert again.stage is AcquisitionStage.INTERRUPTED
-    assert not again.asked(ev.AskLoop)
-    assert not again.asked(ev.AskDither)
+    assert not again.asked(LoopRequest)
+    assert not again.asked(DitherRequest)
     (alarm,) = [alarm for alarm in again.state.alarms if alarm.name == "acquisition"]
     assert "looking for the registration" in alarm.text
     assert f"the mode is {mode}" in alarm.text
@@ -124,8 +125,8 @@ def test_a_loop_that_is_open_in_another_session_is_not_touched(opened):
     again = Again(opened).find(session="s9")
     again.wait(60)
     assert again.stage is AcquisitionStage.INTERRUPTED
-    assert not again.asked(ev.AskLoop)
-    assert not again.asked(ev.AskDither)
+    assert not again.asked(LoopRequest)
+    assert not again.asked(DitherRequest)
     assert "another session" in again.text
     again.tell(ev.Acquire())
     assert again.state.acquisition.found.closed is False
@@ -135,15 +136,15 @@ def test_who_aborts_gets_a_healthy_loop_back_as_it_was(opened):
     again = Again(opened, Mode.PROPOSE).find()
     again.tell(ev.AbortAcquisition())
     assert again.stage is AcquisitionStage.ABORTED
-    (asked,) = again.asked(ev.AskLoop)
-    assert (asked.closed, asked.leak) == (True, 0.999)
+    (asked,) = again.asked(LoopRequest)
+    assert (asked.loop, asked.leak) == (Loop.CLOSED, 0.999)
     assert "acquisition" not in again.alarms
 
 
 def test_who_aborts_in_another_session_closes_nothing(opened):
     again = Again(opened, Mode.PROPOSE).find(session="s9")
     again.tell(ev.AbortAcquisition())
-    assert not again.asked(ev.AskLoop)
+    assert not again.asked(LoopRequest)
     assert "left as it is" in again.text
 
 
@@ -154,7 +155,7 @@ def test_who_aborts_after_a_matrix_was_sent_closes_nothing():
     again = Again(story, Mode.PROPOSE).find(cm_id="cm-150")
     again.tell(ev.Acquire())
     again.tell(ev.AbortAcquisition())
-    assert not again.asked(ev.AskLoop)
+    assert not again.asked(LoopRequest)
 
 
 def test_a_loop_that_diverged_is_not_given_back():
@@ -164,7 +165,7 @@ def test_a_loop_that_diverged_is_not_given_back():
     story.open()
     again = Again(story, Mode.PROPOSE).find()
     again.tell(ev.AbortAcquisition())
-    assert not again.asked(ev.AskLoop)
+    assert not again.asked(LoopRequest)
 
 
 def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there():
@@ -176,7 +177,7 @@ def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there():
     assert again.stage is AcquisitionStage.ABORTED
     assert f"closed on {matrix}, which had passed the gate" in again.text
     assert "acquisition" not in again.alarms
-    assert not again.asked(ev.AskLoop)
+    assert not again.asked(LoopRequest)
 
 
 def test_a_loop_the_operator_closes_meanwhile_is_the_operators(opened):
@@ -195,7 +196,7 @@ def test_a_loop_that_had_not_been_opened_yet_is_left_closed():
     again = Again(story)
     again.find(loop="closed", gains=(0.4,) * 400 + (0.0,) * 194)
     assert again.stage is AcquisitionStage.ABORTED
-    assert not again.asked(ev.AskLoop)
+    assert not again.asked(LoopRequest)
 
 
 def test_it_is_not_begun_anew_for_ever(opened):
@@ -206,7 +207,7 @@ def test_it_is_not_begun_anew_for_ever(opened):
     last = Again(opened).find()
     assert last.stage is AcquisitionStage.FAILED
     assert "acquisition" in last.alarms
-    assert not last.asked(ev.AskDither)
+    assert not last.asked(DitherRequest)
 
 
 def test_a_service_that_only_waited_leaves_it_to_the_next(opened):
@@ -221,10 +222,10 @@ def test_a_service_that_only_waited_leaves_it_to_the_next(opened):
 
 def test_the_dither_left_behind_is_stopped_before_another_is_asked_for(opened):
     again = Again(opened, away_s=1.0).find(dither_id="acquire-1")
-    assert again.asked(ev.AskNoDither)
-    assert not again.asked(ev.AskDither)
+    assert again.asked(DitherStop)
+    assert not again.asked(DitherRequest)
     again.still_open()
-    assert again.asked(ev.AskDither)
+    assert again.asked(DitherRequest)
 
 
 def test_one_that_had_failed_has_still_failed():
@@ -237,7 +238,7 @@ def test_one_that_had_failed_has_still_failed():
     again.find()
     again.tell(DIVERGING)
     again.wait(60)
-    assert not again.asked(ev.AskLoop)
+    assert not again.asked(LoopRequest)
 
 
 def test_one_that_was_aborted_leaves_no_alpha_behind(opened):
@@ -290,13 +291,13 @@ class TestGap:
         assert (one.stage, one.attempt, one.found) == (other.stage, other.attempt, other.found)
 
     def test_what_the_gap_left_playing_is_stopped_before_another_dither_is_asked_for(self, opened):
-        left, n_before = opened.state.dither.id, len(opened.asked(ev.AskDither))
+        left, n_before = opened.state.dither.id, len(opened.asked(DitherRequest))
         opened.tell(ev.RtcVanished())
         opened.still_open(dither_id=left)
-        assert opened.asked(ev.AskNoDither)
-        assert len(opened.asked(ev.AskDither)) == n_before
+        assert opened.asked(DitherStop)
+        assert len(opened.asked(DitherRequest)) == n_before
         opened.still_open()
-        assert len(opened.asked(ev.AskDither)) == n_before + 1
+        assert len(opened.asked(DitherRequest)) == n_before + 1
 
     def test_in_another_mode_it_waits_and_says_what_to_do(self):
         story = Acquiring(Mode.PROPOSE)
@@ -310,25 +311,25 @@ class TestGap:
         assert "acquisition" in story.alarms
 
     def test_in_another_session_nobody_touches_the_loop(self, opened):
-        n_asked = len(opened.asked(ev.AskLoop)), len(opened.asked(ev.AskDither))
+        n_asked = len(opened.asked(LoopRequest)), len(opened.asked(DitherRequest))
         opened.tell(ev.RtcVanished())
         opened.tell(ev.SessionStarted(session="s9"))
         opened.status(session="s9", **OPEN)
         opened.wait(60)
         assert opened.stage is AcquisitionStage.INTERRUPTED
         assert "another session" in opened.text
-        assert (len(opened.asked(ev.AskLoop)), len(opened.asked(ev.AskDither))) == n_asked
+        assert (len(opened.asked(LoopRequest)), len(opened.asked(DitherRequest))) == n_asked
 
     def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there(self):
         story = Acquiring().to_widening()
-        matrix, n_asked = story.state.in_use, len(story.asked(ev.AskLoop))
+        matrix, n_asked = story.state.in_use, len(story.asked(LoopRequest))
         story.tell(ev.RtcVanished())
         story.status(gains=(0.4,) * 150 + (0.0,) * 444, n_controlled=150, cm_id=matrix)
         assert story.stage is AcquisitionStage.ABORTED
         assert f"closed on {matrix}, which had passed the gate" in story.text
         assert "acquisition" not in story.alarms
         assert story.state.registration is not None
-        assert len(story.asked(ev.AskLoop)) == n_asked
+        assert len(story.asked(LoopRequest)) == n_asked
 
     def test_a_link_that_fails_again_and_again_ends_it(self, opened):
         for _ in range(MOST_ATTEMPTS):
@@ -354,5 +355,5 @@ class TestGap:
         story.tell(ev.RtcVanished())
         story.still_open()
         story.tell(ev.AbortAcquisition())
-        last = story.asked(ev.AskLoop)[-1]
-        assert (last.closed, last.leak) == (True, 0.999)
+        last = story.asked(LoopRequest)[-1]
+        assert (last.loop, last.leak) == (Loop.CLOSED, 0.999)

@@ -9,10 +9,10 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking.activity import under_way
-from service.tracking.loop import DitherView, Pointing
-from service.tracking.products import MatrixState, MeasurePattern, MeasureState, ModeSet, NoisyState
+from service.tracking.products import MatrixState, MeasureState, ModeSet, NoisyState
 from service.tracking.stages import AcquisitionStage
 from service.tracking.state import Mode
+from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern, Pointing
 from tests.unit.tracking.situations import POLICY, Story
 from tests.unit.tracking.world import World
 
@@ -44,13 +44,13 @@ def quiet():
 
 def measuring():
     world = idle()
-    world.tell(ev.Measure(id="im-1", pattern=MeasurePattern.PUSH_PULL_MODAL))
+    world.tell(ev.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL))
     return world.pass_(1.0)
 
 
 def measuring_sines():
     world = idle()
-    world.tell(ev.Measure(id="im-1", pattern=MeasurePattern.SINE))
+    world.tell(ev.Measure(id="im-1", pattern=Pattern.SINE))
     return world.pass_(1.0)
 
 
@@ -95,15 +95,15 @@ def operators_dither():
 
 def others_dither():
     world = idle()
-    world.playing = DitherView(
+    request = DitherRequest(
         id="of-another-program",
+        kind=DitherKind.SINE,
         modes=(501,),
         amplitude_m=(2e-9,),
         frequency_hz=(250.1234,),
         duration_s=60.0,
-        start_seq=world.seq,
-        asked_ns_utc=0,
     )
+    world.playing = DitherStatus(request=request, start_seq=world.seq)
     return world.pass_(2.0)
 
 
@@ -149,8 +149,8 @@ COMMANDS = [
     ev.Reject(id="cm-1"),
     ev.Publish(id="initial"),
     ev.Rollback(),
-    ev.Measure(id="im-9", pattern=MeasurePattern.PUSH_PULL_MODAL),
-    ev.Measure(id="im-9", pattern=MeasurePattern.SINE),
+    ev.Measure(id="im-9", pattern=Pattern.PUSH_PULL_MODAL),
+    ev.Measure(id="im-9", pattern=Pattern.SINE),
     ev.GiveUp(id="im-1"),
     ev.MeasureNoisy(id="noisy-9", duration_s=30.0),
     ev.GiveUpNoisy(id="noisy-1"),
@@ -240,7 +240,7 @@ REFUSED = [
             ev.SetLoop(closed=False),
             ev.Ramp(),
             ev.StartDither(),
-            ev.Measure(id="im-9", pattern=MeasurePattern.PUSH_PULL_MODAL),
+            ev.Measure(id="im-9", pattern=Pattern.PUSH_PULL_MODAL),
             ev.MeasureNoisy(id="noisy-9"),
         ],
     ),
@@ -252,7 +252,7 @@ REFUSED = [
             ev.SetLoop(gains=(ev.GainGroup(first=0, last=399, gain=0.3),)),
             ev.Ramp(),
             ev.StartDither(),
-            ev.Measure(id="im-9", pattern=MeasurePattern.PUSH_PULL_MODAL),
+            ev.Measure(id="im-9", pattern=Pattern.PUSH_PULL_MODAL),
             ev.MeasureNoisy(id="noisy-9"),
         ],
     ),

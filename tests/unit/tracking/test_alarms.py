@@ -11,6 +11,7 @@ from service.tracking import events as ev
 from service.tracking.alarms import ALARMS, Act, Kind
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
+from service.wire import DitherRequest, LoopRequest
 from tests.unit.tracking.situations import Story, judged, of_kind, record
 
 STRANGERS = ["second-rtc", "basis-mismatch", "instrument-mismatch"]
@@ -50,7 +51,7 @@ def test_nothing_is_made_or_sent_under_it_that_nobody_asked_for(name):
     story.wait(6)
     story.tell(ev.MatrixMade(record=made(story), wanted=False))
     story.wait(6)
-    assert not of_kind(story.effects, ev.SendMatrix | ev.MakeMatrix | ev.AskDither)
+    assert not of_kind(story.effects, ev.SendMatrix | ev.MakeMatrix | DitherRequest)
     assert story.matrix_state("cm-1") is MatrixState.PROPOSED
 
 
@@ -117,7 +118,7 @@ def test_a_name_that_is_in_no_table_forbids_nothing():
 def test_no_loop_is_opened_for_what_is_only_told_wrongly(name):
     story = settled(name)
     story.wait(60)
-    assert not of_kind(story.effects, ev.AskLoop)
+    assert not of_kind(story.effects, LoopRequest)
 
 
 @pytest.mark.parametrize("name", MISTOLD)
@@ -135,7 +136,7 @@ def test_while_slopes_are_not_as_told_nothing_is_made_or_sent_whoever_wants_it(n
 def test_no_dither_is_played_that_nothing_would_be_measured_with():
     story = settled("matrix-mismatch")
     story.wait(30)
-    assert not of_kind(story.effects, ev.AskDither)
+    assert not of_kind(story.effects, DitherRequest)
 
 
 def test_a_window_that_is_as_it_should_be_ends_the_alarm_of_one_that_was_not():

@@ -8,7 +8,8 @@ import pytest
 from service.tracking import events as ev
 from service.tracking.dither import LONGEST_PATIENCE_S, PATIENCE_S
 from service.tracking.state import Mode
-from tests.unit.tracking.situations import Story, of_kind, rtc
+from service.wire import DitherRequest, DitherStop
+from tests.unit.tracking.situations import Story, dither_answered, of_kind, rtc
 
 START = 1000
 
@@ -23,12 +24,11 @@ def story():
 
 def accept(story, start_seq=START):
     dither = story.state.dither
-    story.tell(ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=start_seq))
+    story.tell(dither_answered(dither.id, accepted=True, reason="", start_seq=start_seq))
 
 
 def status(story, seq, *, dither=None, after_s=0.5, **changes):
-    shown = {"dither_id": dither and dither.id, "dither": dither}
-    return story.tell(ev.StatusSeen(rtc=rtc(seq=seq, **shown, **changes)), after_s=after_s)
+    return story.tell(rtc(seq=seq, dither=dither, **changes), after_s=after_s)
 
 
 def silence(story, silent_s):
@@ -38,8 +38,8 @@ def silence(story, silent_s):
 class TestTheStatusShowsNone:
     def test_it_is_missed_by_the_first_status_that_should_show_it_and_asked_for_again(self, story):
         first = story.state.dither.id
-        (asked,) = of_kind(status(story, START + 500), ev.AskDither)
-        assert asked.dither.id != first
+        (asked,) = of_kind(status(story, START + 500), DitherRequest)
+        assert asked.id != first
         assert "dither-lost" in story.alarms
         assert "dither.lost" in story.logged
 
@@ -49,7 +49,7 @@ class TestTheStatusShowsNone:
         assert not story.alarms
 
     def test_one_that_has_run_its_time_has_ended(self, story):
-        stop_seq = START + round(story.state.dither.duration_s * 1000)
+        stop_seq = START + round(story.state.dither.request.duration_s * 1000)
         status(story, stop_seq - 1500)
         assert "dither-lost" in story.alarms
         story = Story(Mode.HOLD).meet(seq=900)
@@ -62,7 +62,7 @@ class TestTheStatusShowsNone:
         asked, seq = [], START
         for _ in range(40):
             seq += 1000
-            if of_kind(status(story, seq, after_s=1.0), ev.AskDither):
+            if of_kind(status(story, seq, after_s=1.0), DitherRequest):
                 asked.append(seq)
                 accept(story, start_seq=seq)
         waits = [after - before for before, after in pairwise(asked)]
@@ -85,7 +85,7 @@ class TestTheFramesHoldNone:
     @pytest.fixture
     def shown(self, story):
         """The status shows it all the same."""
-        shown = replace(story.state.dither, asked_ns_utc=0)
+        shown = story.state.dither
         status(story, START + 100, dither=shown)
         return shown
 
@@ -94,10 +94,10 @@ class TestTheFramesHoldNone:
         assert "dither-lost" in story.alarms
         assert story.state.dither is not None
         effects = silence(story, PATIENCE_S)
-        assert of_kind(effects, ev.AskNoDither), "the RTC plays no second one beside it"
+        assert of_kind(effects, DitherStop), "the RTC plays no second one beside it"
         assert story.state.dither is None
         status(story, START + 2000)
-        assert of_kind(story.wait(2), ev.AskDither)
+        assert of_kind(story.wait(2), DitherRequest)
 
     def test_what_a_status_shows_and_the_frames_do_not_is_not_adopted(self, story, shown):
         silence(story, 2 * PATIENCE_S)
@@ -137,9 +137,12 @@ class TestTheFramesHoldNone:
     ],
 )
 def test_the_rtcs_word_counts_where_it_plays_something_else(story, changes):
-    playing = replace(story.state.dither, asked_ns_utc=0, **changes)
+    changes = dict(changes)
+    dither = story.state.dither
+    playing = replace(dither, start_seq=changes.pop("start_seq", START))
+    playing = replace(playing, request=replace(dither.request, **changes))
     status(story, START + 100, dither=playing)
-    assert replace(story.state.dither, asked_ns_utc=0) == playing
+    assert story.state.dither == playing
     assert story.logged[-1] == "dither.other"
     before = story.state
     status(story, START + 200, dither=playing)

@@ -11,7 +11,8 @@ from service.tracking.dither import CALM_S, TELL_EVERY_S
 from service.tracking.dither_plan import total_m
 from service.tracking.products import NoisyState
 from service.tracking.stages import AcquisitionStage, DitherPhase
-from tests.unit.tracking.situations import POLICY, Story, of_kind, rtc
+from service.wire import DitherRequest, DitherStop
+from tests.unit.tracking.situations import POLICY, Story, dither_answered, of_kind, rtc, stopping
 
 START = 1000
 
@@ -20,10 +21,10 @@ def playing(story, dither, seconds=1, **changes):
     """Let the RTC's status show a dither once a second; return what is done about it."""
     effects = ()
     for _ in range(seconds):
-        shown = replace(dither, start_seq=START, asked_ns_utc=0, window_s=None)
+        shown = replace(dither, start_seq=START)
         seq = START + round((story.now_ns - dither.asked_ns_utc) * 1e-6)
-        status = rtc(dither_id=dither.id, dither=shown, seq=seq, **changes)
-        effects += story.tell(ev.StatusSeen(rtc=status), after_s=1.0)
+        status = rtc(dither=shown, seq=seq, **changes)
+        effects += story.tell(status, after_s=1.0)
         effects += story.tell(ev.Tick())
     return effects
 
@@ -31,13 +32,17 @@ def playing(story, dither, seconds=1, **changes):
 def silent(story, seconds=1):
     effects = ()
     for _ in range(seconds):
-        effects += story.tell(ev.StatusSeen(rtc=rtc()), after_s=1.0)
+        effects += story.tell(rtc(), after_s=1.0)
     return effects
+
+
+def named(dither, name):
+    return replace(dither, request=replace(dither.request, id=name))
 
 
 def accept(story, dither):
     return story.tell(
-        ev.DitherAnswered(id=dither.id, accepted=True, reason="", start_seq=START), after_s=0.3
+        dither_answered(dither.id, accepted=True, reason="", start_seq=START), after_s=0.3
     )
 
 
@@ -53,9 +58,9 @@ class TestOffByTheOperator:
     def test_a_stop_that_fails_is_repeated_until_the_status_shows_none(self, story):
         dither = story.state.dither
         accept(story, dither)
-        assert of_kind(story.tell(ev.StopDither()), ev.AskNoDither) == [ev.AskNoDither()]
-        story.tell(ev.JobFailed(effect=ev.AskNoDither(), text="no answer"))
-        asked = of_kind(playing(story, dither, 20), ev.AskNoDither)
+        assert story.tell(ev.StopDither()) == (stopping(story),)
+        story.tell(ev.JobFailed(effect=stopping(story), text="no answer"))
+        asked = of_kind(playing(story, dither, 20), DitherStop)
         assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
         assert NOT_STOPPED in story.alarms
         assert story.state.dithering.phase is DitherPhase.OFF
@@ -68,7 +73,7 @@ class TestOffByTheOperator:
         dither = story.state.dither
         story.tell(ev.StopDither())
         accept(story, dither)
-        assert of_kind(playing(story, dither, 4), ev.AskNoDither)
+        assert of_kind(playing(story, dither, 4), DitherStop)
         silent(story)
         assert not story.alarms
 
@@ -82,12 +87,12 @@ class TestOffByTheOperator:
 
     @pytest.mark.parametrize("name", ["operator-1", "noisy-1", "acquire-1"])
     def test_whatever_of_the_services_it_is(self, story, name):
-        dither = replace(story.state.dither, id=name)
+        dither = named(story.state.dither, name)
         story.tell(ev.StopDither())
-        assert of_kind(playing(story, dither, 4), ev.AskNoDither)
+        assert of_kind(playing(story, dither, 4), DitherStop)
 
     def test_somebody_elses_is_left_alone_and_told_as_it_is(self, story):
-        dither = replace(story.state.dither, id="engineer-1")
+        dither = named(story.state.dither, "engineer-1")
         story.tell(ev.StopDither())
         assert not playing(story, dither, 10)
         assert not story.alarms
@@ -97,7 +102,7 @@ class TestOffByTheOperator:
         accept(story, dither)
         story.tell(ev.StopDither())
         playing(story, dither, 3600)
-        expected = pytest.approx(total_m(dither), rel=0.01)
+        expected = pytest.approx(total_m(dither.request), rel=0.01)
         assert story.state.dithering.mean_cost_m == expected
 
     @pytest.mark.parametrize("alarm", ["loop-diverging", "edge-slip"])
@@ -106,7 +111,7 @@ class TestOffByTheOperator:
         accept(story, dither)
         story.tell(ev.StopDither())
         story.tell(ev.Trouble(name=alarm, text="x"))
-        assert of_kind(playing(story, dither, 4), ev.AskNoDither)
+        assert of_kind(playing(story, dither, 4), DitherStop)
 
     def test_nobody_knows_whose_it_is_while_two_rtcs_send(self, story):
         dither = story.state.dither
@@ -124,7 +129,7 @@ class TestOffByTheOperator:
 
     def test_an_rtc_that_does_not_answer_keeps_no_matrix_waiting(self, story):
         before = story.state.retries
-        story.tell(ev.JobFailed(effect=ev.AskNoDither(), text="no answer"))
+        story.tell(ev.JobFailed(effect=stopping(story), text="no answer"))
         assert story.state.retries == before
 
     def test_the_operator_may_have_it_again(self, story):
@@ -133,12 +138,13 @@ class TestOffByTheOperator:
         story.tell(ev.StopDither())
         playing(story, dither, round(GONE_WITHIN_S) + 2)
         story.tell(ev.StartDither())
-        assert not of_kind(playing(story, dither, 10), ev.AskNoDither)
+        assert not of_kind(playing(story, dither, 10), DitherStop)
         assert NOT_STOPPED not in story.alarms
 
 
 def louder(dither, by=10.0):
-    return replace(dither, amplitude_m=tuple(by * a for a in dither.amplitude_m))
+    amplitude_m = tuple(by * a for a in dither.request.amplitude_m)
+    return replace(dither, request=replace(dither.request, amplitude_m=amplitude_m))
 
 
 class TestTooStrong:
@@ -150,7 +156,7 @@ class TestTooStrong:
         return louder(dither)
 
     def test_it_is_stopped_at_once_with_an_alarm_that_tells_how_strong_it_was(self, story, loud):
-        assert playing(story, loud) == (ev.AskNoDither(),)
+        assert playing(story, loud) == (stopping(story),)
         assert story.state.dither is None
         text = next(a.text for a in story.state.alarms if a.name == OVER_BUDGET)
         assert "a dither of 80 nm RMS in all, more than the budget of 8 nm" in text
@@ -160,13 +166,13 @@ class TestTooStrong:
         self, story, loud
     ):
         playing(story, loud)
-        assert not of_kind(silent(story, round(CALM_S) - 2), ev.AskDither)
+        assert not of_kind(silent(story, round(CALM_S) - 2), DitherRequest)
         assert OVER_BUDGET in story.alarms
         assert "too strong" in story.state.dithering.reason
-        (asked,) = of_kind(silent(story, 4), ev.AskDither)
-        accept(story, asked.dither)
+        assert of_kind(silent(story, 4), DitherRequest)
+        accept(story, story.state.dither)
         assert OVER_BUDGET in story.alarms
-        playing(story, asked.dither)
+        playing(story, story.state.dither)
         assert OVER_BUDGET not in story.alarms
 
     def test_an_rtc_that_does_so_always_does_it_for_a_second_a_minute(self, story, loud):
@@ -175,10 +181,11 @@ class TestTooStrong:
             lived_s += on is not None
             for effect in playing(story, on) if on is not None else silent(story):
                 match effect:
-                    case ev.AskDither(dither=dither):
+                    case ev.Ask(request=DitherRequest()):
+                        dither = story.state.dither
                         accept(story, dither)
                         on, n_tried = louder(dither), n_tried + 1
-                    case ev.AskNoDither():
+                    case ev.Ask(request=DitherStop()):
                         on = None
         assert n_tried == pytest.approx(600 / CALM_S, abs=1)
         assert lived_s <= n_tried + 1
@@ -187,7 +194,7 @@ class TestTooStrong:
     def test_one_that_does_not_stop_is_asked_again_and_again_and_read_all_the_same(
         self, story, loud
     ):
-        asked = of_kind(playing(story, loud, 20), ev.AskNoDither)
+        asked = of_kind(playing(story, loud, 20), DitherStop)
         assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
         assert {OVER_BUDGET, NOT_STOPPED} <= story.alarms
         assert story.state.dither.id == loud.id
@@ -216,7 +223,7 @@ class TestTooStrong:
         dither = story.state.dither
         accept(story, dither)
         effects = playing(story, louder(dither, by), 3)
-        assert bool(of_kind(effects, ev.AskNoDither)) is stopped
+        assert bool(of_kind(effects, DitherStop)) is stopped
         assert (OVER_BUDGET in story.alarms) is stopped
 
     def test_an_operator_who_wants_none_has_no_alarm(self, story, loud):
@@ -229,7 +236,7 @@ class TestTooStrong:
 def test_settings_that_forbid_it_do_not_tolerate_what_an_earlier_service_has_left():
     dither = Story().meet().state.dither
     story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
-    asked = of_kind(playing(story, dither, 20), ev.AskNoDither)
+    asked = of_kind(playing(story, dither, 20), DitherStop)
     assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
     assert "the settings forbid" in next(a.text for a in story.state.alarms)
 
@@ -244,29 +251,29 @@ class TestByTheFrames:
         return story.state.dither
 
     def measured(self, story, dither, by, text="the frames hold much"):
-        asked = total_m(dither)
+        asked = total_m(dither.request)
         return story.tell(
             ev.DitherMeasured(id=dither.id, found_m=by * asked, asked_m=asked, text=text)
         )
 
     def test_too_strong_it_is_stopped_at_once_and_named(self, story, on):
-        assert of_kind(self.measured(story, on, 20.0), ev.AskNoDither)
+        assert of_kind(self.measured(story, on, 20.0), DitherStop)
         assert story.state.dither is None
         (alarm,) = [a for a in story.state.alarms if a.name == OVER_BUDGET]
         assert "the frames hold much; the budget is 8 nm" in alarm.text
 
     def test_a_status_that_goes_on_saying_all_is_well_ends_no_alarm(self, story, on):
         self.measured(story, on, 20.0)
-        (asked,) = of_kind(silent(story, round(CALM_S) + 3), ev.AskDither)
-        accept(story, asked.dither)
-        playing(story, asked.dither, 2)
+        assert of_kind(silent(story, round(CALM_S) + 3), DitherRequest)
+        accept(story, story.state.dither)
+        playing(story, story.state.dither, 2)
         assert OVER_BUDGET in story.alarms
-        self.measured(story, asked.dither, 1.0, text="")
+        self.measured(story, story.state.dither, 1.0, text="")
         assert OVER_BUDGET not in story.alarms
 
     def test_one_that_is_not_stopped_is_told_again_and_again(self, story, on):
         self.measured(story, on, 20.0)
-        asked = of_kind(playing(story, on, 20), ev.AskNoDither)
+        asked = of_kind(playing(story, on, 20), DitherStop)
         assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
         assert {OVER_BUDGET, NOT_STOPPED} <= story.alarms
 
@@ -279,7 +286,7 @@ class TestByTheFrames:
 
     def test_what_an_operator_asked_for_may_cost_more_than_the_budget(self, story):
         story.tell(ev.StopDither())
-        story.tell(ev.StatusSeen(rtc=rtc()), after_s=1.0)
+        story.tell(rtc(), after_s=1.0)
         meant = ev.StartDither(
             modes=(501,), frequency_hz=(250.0,), amplitude_m=15e-9, over_budget=True
         )
@@ -288,14 +295,14 @@ class TestByTheFrames:
         accept(story, dither)
         playing(story, dither)
         assert not self.measured(story, dither, 1.05)
-        assert of_kind(self.measured(story, dither, 2.0), ev.AskNoDither)
+        assert of_kind(self.measured(story, dither, 2.0), DitherStop)
 
     def test_an_acquisition_ends_and_says_why(self):
         story = Story(policy=replace(POLICY, acquires=True)).meet()
         story.tell(ev.Acquire())
         story.tell(ev.SessionStarted(session="s2"))
         view = rtc(session="s2", loop="open", gains=(0.0,) * 594)
-        story.tell(ev.StatusSeen(rtc=view))
+        story.tell(view)
         dither = story.state.dither
         accept(story, dither)
         self.measured(story, dither, 5.0)
@@ -304,7 +311,7 @@ class TestByTheFrames:
 
     def test_a_noisy_matrix_ends_and_says_why(self, story):
         story.tell(ev.StopDither())
-        story.tell(ev.StatusSeen(rtc=rtc()), after_s=1.0)
+        story.tell(rtc(), after_s=1.0)
         story.tell(ev.MeasureNoisy(id="noisy-1"))
         dither = story.state.dither
         accept(story, dither)

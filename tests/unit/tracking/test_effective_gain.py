@@ -10,6 +10,7 @@ from service.tracking import events as ev
 from service.tracking.loop_commands import table_of
 from service.tracking.registration import ModeGain
 from service.tracking.state import Mode
+from service.wire import LoopRequest
 from tests.unit.tracking.situations import N_MODES, START_NS, Story, of_kind
 
 MEASURED = tuple(
@@ -28,8 +29,9 @@ def story():
 
 
 def test_they_act_alike_on_every_controlled_mode_and_the_gate_is_asked(story):
-    (asked,) = of_kind(story.tell(ev.SetLoop(effective_gain=0.3)), ev.AskLoop)
-    assert asked.judged
+    (effect,) = story.tell(ev.SetLoop(effective_gain=0.3))
+    assert effect.judged
+    asked = effect.request
     assert len(asked.gains) == N_MODES
     in_effect = np.array(asked.gains[:400]) * table_of(MEASURED, 400).optical_gain
     np.testing.assert_allclose(in_effect, 0.3, rtol=1e-12)
@@ -38,15 +40,15 @@ def test_they_act_alike_on_every_controlled_mode_and_the_gate_is_asked(story):
 
 
 def test_asked_twice_they_are_the_same(story):
-    (first,) = of_kind(story.tell(ev.SetLoop(effective_gain=0.3)), ev.AskLoop)
+    (first,) = of_kind(story.tell(ev.SetLoop(effective_gain=0.3)), LoopRequest)
     story.now_ns += 1
-    (second,) = of_kind(story.tell(ev.SetLoop(effective_gain=0.3)), ev.AskLoop)
+    (second,) = of_kind(story.tell(ev.SetLoop(effective_gain=0.3)), LoopRequest)
     assert first.gains == second.gains
 
 
 def test_gains_an_operator_names_are_his_own_business(story):
     groups = (ev.GainGroup(first=0, last=1, gain=0.5),)
-    (asked,) = of_kind(story.tell(ev.SetLoop(gains=groups)), ev.AskLoop)
+    (asked,) = story.tell(ev.SetLoop(gains=groups))
     assert not asked.judged
 
 
@@ -59,4 +61,4 @@ def test_the_service_never_sets_them_by_itself():
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=30)
     story.wait(60)
-    assert not story.asked(ev.AskLoop)
+    assert not story.asked(LoopRequest)

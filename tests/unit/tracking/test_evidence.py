@@ -10,14 +10,15 @@ from hypothesis import given, settings
 from service.errors import CommandError
 from service.telemetry.openloop import FarEstimate
 from service.tracking import events as ev
-from service.tracking.loop import Pointing
 from service.tracking.products import MatrixState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode
+from service.wire import Pointing
 from tests.unit.tracking.situations import (
     ALPHA,
     SECOND,
     Story,
+    dither_answered,
     estimate,
     judged,
     moved,
@@ -50,7 +51,7 @@ class Late(Story):
     def at(self, s):
         """The service's and the RTC's clock are there."""
         self.now_ns = max(self.now_ns, self.zero_ns + round(s * SECOND))
-        return self.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=self.now_ns)))
+        return self.tell(rtc(t_ns=self.now_ns))
 
     def window(self, end_s, alpha=ALPHA, *, fitted_s=None, **began):
         """A window that ended then, fitted at once or later."""
@@ -111,7 +112,7 @@ class TestLookThatBarks:
         night.look(3600, ELSEWHERE)
         assert night.doubted
         night.now_ns = night.zero_ns + 100 * SECOND
-        night.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=night.now_ns)))
+        night.tell(rtc(t_ns=night.now_ns))
         for end_s in (102, 104, 106):
             night.window(end_s)
         assert not night.doubted
@@ -193,7 +194,7 @@ class TestLoopOutOfHand:
 def test_a_look_at_a_session_that_is_over_counts_for_nothing(night):
     night.at(10)
     night.tell(ev.SessionStarted(session="s2"))
-    night.tell(ev.StatusSeen(rtc=rtc(session="s2", t_ns_utc=night.now_ns)))
+    night.tell(rtc(session="s2", t_ns=night.now_ns))
     end_ns = night.zero_ns + 9 * SECOND
     night.tell(ev.Watched(estimate=watched(ELSEWHERE), t_ns_utc=end_ns), 1.0)
     assert not night.state.registration.doubt
@@ -277,7 +278,7 @@ class TestVerdicts:
 def test_a_window_from_before_a_dither_was_lost_has_not_found_it_again(night):
     night.at(10)
     asked = night.state.dither
-    night.tell(ev.DitherAnswered(id=asked.id, accepted=True, reason="", start_seq=10))
+    night.tell(dither_answered(asked.id, accepted=True, reason="", start_seq=10))
     night.tell(ev.DitherSilent(id=asked.id, silent_s=1.0))
     assert "dither-lost" in night.alarms
     night.window(9, fitted_s=11)
@@ -289,10 +290,10 @@ def test_a_window_from_before_a_dither_was_lost_has_not_found_it_again(night):
 def test_what_was_seen_from_afar_before_an_acquisition_began_anew_counts_for_nothing(night):
     open_loop = {"loop": "open", "gains": (0.0,) * 594}
     night.at(10)
-    night.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=night.now_ns, **open_loop)))
+    night.tell(rtc(t_ns=night.now_ns, **open_loop))
     night.tell(ev.Acquire())
     dither = night.state.dither
-    found = estimate(ALPHA, t_ns=night.zero_ns + 9 * SECOND, modes=dither.modes)
+    found = estimate(ALPHA, t_ns=night.zero_ns + 9 * SECOND, modes=dither.request.modes)
     found = replace(found, covariance=np.diag([0.01, 0.01, 3e-4, 1e-3]) ** 2)
     far = FarEstimate(estimate=found, unexplained=0.05, n_starts=1)
     night.tell(ev.FarFitted(found=far))

@@ -60,7 +60,7 @@ class Sky:
             misfit=1.0,
             step=np.zeros(4),
         )
-        self.story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=self.story.now_ns)))
+        self.story.tell(rtc(t_ns=self.story.now_ns))
         self.story.tell(ev.Watched(estimate=found, t_ns_utc=self.story.now_ns))
 
     def flagged_s(self):

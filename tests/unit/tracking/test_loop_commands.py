@@ -6,9 +6,9 @@ from service.errors import CommandError
 from service.tracking import events as ev
 from service.tracking.loop import CommandState
 from service.tracking.loop_commands import CLOSE_AGAIN_EVERY_S
-from service.tracking.products import MeasurePattern
 from service.tracking.state import Mode
-from tests.unit.tracking.situations import Story, judged, of_kind, rtc, verdict
+from service.wire import Loop, LoopRequest, Pattern, RampRequest
+from tests.unit.tracking.situations import Story, judged, loop_answered, of_kind, rtc, verdict
 
 
 @pytest.fixture
@@ -24,13 +24,18 @@ def group(first, last, gain):
 
 
 def ask(story, **changes):
-    (asked,) = of_kind(story.tell(ev.SetLoop(**changes)), ev.AskLoop)
+    (asked,) = of_kind(story.tell(ev.SetLoop(**changes)), LoopRequest)
     return asked
 
 
 def test_opening_says_nothing_of_the_rest(story):
     asked = ask(story, closed=False)
-    assert (asked.closed, asked.gains, asked.leak, asked.n_controlled) == (False, None, None, None)
+    assert (asked.loop, asked.gains, asked.leak, asked.n_controlled) == (
+        Loop.OPEN,
+        None,
+        None,
+        None,
+    )
     assert story.state.loop_command.state is CommandState.ASKED
     assert story.state.loop_command.text == "open"
 
@@ -47,7 +52,7 @@ def test_more_modes_may_be_given_gains_with_their_number(story):
 
 
 def test_an_open_loop_does_not_tell_its_gains_so_all_must_be_named(story):
-    story.tell(ev.StatusSeen(rtc=rtc(loop="open", gains=(0.0,) * 594)))
+    story.tell(rtc(loop="open", gains=(0.0,) * 594))
     with pytest.raises(CommandError, match="found gains for 2 modes; expected all 400"):
         ask(story, gains=(group(0, 1, 0.5),))
     asked = ask(story, closed=True, gains=(group(0, 1, 0.5), group(2, 399, 0.3)))
@@ -76,7 +81,7 @@ def test_nobody_changes_the_loop_of_nobody():
 
 def test_the_rtcs_answer_is_kept_with_the_command(story):
     asked = ask(story, leak=0.99)
-    story.tell(ev.LoopAnswered(id=asked.id, accepted=False, reason="range: leak 0.99"))
+    story.tell(loop_answered(asked.id, accepted=False, reason="range: leak 0.99"))
     last = story.state.loop_command
     assert (last.state, last.reason) == (CommandState.REFUSED, "range: leak 0.99")
     assert story.logged[-1] == "loop.refused"
@@ -84,7 +89,7 @@ def test_the_rtcs_answer_is_kept_with_the_command(story):
 
 def test_no_answer_is_told_as_not_known(story):
     asked = ask(story, leak=0.99)
-    story.tell(ev.JobFailed(effect=asked, text="no answer from the RTC"))
+    story.tell(ev.JobFailed(effect=ev.Ask(request=asked), text="no answer from the RTC"))
     assert story.state.loop_command.state is CommandState.FAILED
 
 
@@ -92,7 +97,7 @@ def test_a_late_answer_does_not_settle_a_later_command(story):
     first = ask(story, leak=0.99)
     story.now_ns += 1
     ask(story, leak=0.98)
-    story.tell(ev.LoopAnswered(id=first.id, accepted=True, reason=""))
+    story.tell(loop_answered(first.id, accepted=True, reason=""))
     assert story.state.loop_command.state is CommandState.ASKED
 
 
@@ -102,10 +107,10 @@ def test_other_gains_have_another_margin():
     story.wait(3)
     before = len(story.asked(ev.JudgeMatrix))
     asked = ask(story, gains=(group(0, 1, 0.5),))
-    story.tell(ev.LoopAnswered(id=asked.id, accepted=True, reason=""))
+    story.tell(loop_answered(asked.id, accepted=True, reason=""))
     assert len(story.asked(ev.JudgeMatrix)) == before
     gains = (0.5, 0.5, *rtc().gains[2:])
-    story.tell(ev.StatusSeen(rtc=replace(rtc(), gains=gains, cm_id="initial")))
+    story.tell(replace(rtc(), gains=gains, cm_id="initial"))
     assert len(story.asked(ev.JudgeMatrix)) == before + 1
 
 
@@ -116,7 +121,7 @@ def test_a_verdict_on_the_gains_before_is_dropped_and_asked_for_again():
     before = ev.MarginJudged(
         id="initial", verdict=verdict(accepted=False), judged=judged(known, rtc())
     )
-    story.tell(ev.StatusSeen(rtc=replace(rtc(), leak=0.99)))
+    story.tell(replace(rtc(), leak=0.99))
     assert of_kind(story.tell(before), ev.JudgeMatrix)
     assert "margin" not in story.alarms
     now = replace(before, judged=judged(known, rtc(), leak=0.99))
@@ -125,22 +130,22 @@ def test_a_verdict_on_the_gains_before_is_dropped_and_asked_for_again():
 
 
 def test_a_ramp_tries_the_papers_groups(story):
-    (asked,) = of_kind(story.tell(ev.Ramp(gains=(0.2, 0.4))), ev.AskRamp)
+    (asked,) = of_kind(story.tell(ev.Ramp(gains=(0.2, 0.4))), RampRequest)
     assert asked.groups == ((0, 1), (2, 99), (100, 399))
     assert (asked.gains, asked.frames_per_gain) == ((0.2, 0.4), 1000)
     assert story.state.loop_command.lasts_s == 6.0
 
 
 def test_a_ramp_of_few_modes_has_fewer_groups(story):
-    story.tell(ev.StatusSeen(rtc=rtc(60)))
-    (asked,) = of_kind(story.tell(ev.Ramp()), ev.AskRamp)
+    story.tell(rtc(60))
+    (asked,) = of_kind(story.tell(ev.Ramp()), RampRequest)
     assert asked.groups == ((0, 1), (2, 59))
 
 
 def test_a_ramp_needs_a_closed_loop_and_modes_it_controls(story):
     with pytest.raises(CommandError, match=r"found modes 100 to 400; expected .* 0 to 399"):
         story.tell(ev.Ramp(groups=((100, 400),)))
-    story.tell(ev.StatusSeen(rtc=rtc(loop="open")))
+    story.tell(rtc(loop="open"))
     with pytest.raises(CommandError, match="found the loop open"):
         story.tell(ev.Ramp())
 
@@ -148,7 +153,7 @@ def test_a_ramp_needs_a_closed_loop_and_modes_it_controls(story):
 def test_nothing_is_made_while_gains_are_only_tried():
     story = Story(Mode.AUTO).meet()
     story.tell(ev.Ramp(gains=(0.2, 0.4)))
-    story.tell(ev.LoopAnswered(id=story.state.loop_command.id, accepted=True, reason=""))
+    story.tell(loop_answered(story.state.loop_command.id, accepted=True, reason=""))
     story.see(n_windows=2, every_s=2.0)
     assert not story.asked(ev.MakeMatrix)
     story.wait(3)
@@ -156,37 +161,37 @@ def test_nothing_is_made_while_gains_are_only_tried():
 
 
 class TestAMeasurementGivenUp:
-    def begin(self, story, pattern=MeasurePattern.PUSH_PULL_MODAL, *, loop="open"):
+    def begin(self, story, pattern=Pattern.PUSH_PULL_MODAL, *, loop="open"):
         story.tell(ev.Measure(id="im-1", pattern=pattern))
-        story.tell(ev.StatusSeen(rtc=rtc(loop=loop)))
+        story.tell(rtc(loop=loop))
 
     def test_the_loop_is_closed_again_as_often_as_it_takes(self, story):
         self.begin(story)
-        (asked,) = of_kind(story.tell(ev.GiveUp(id="im-1")), ev.AskLoop)
-        assert asked.closed is True
-        story.tell(ev.LoopAnswered(id=asked.id, accepted=False, reason="busy: im-1"))
-        assert len(of_kind(story.wait(2.2 * CLOSE_AGAIN_EVERY_S), ev.AskLoop)) == 2
-        story.tell(ev.StatusSeen(rtc=rtc()))
-        assert not of_kind(story.wait(60), ev.AskLoop)
+        (asked,) = of_kind(story.tell(ev.GiveUp(id="im-1")), LoopRequest)
+        assert asked.loop is Loop.CLOSED
+        story.tell(loop_answered(asked.id, accepted=False, reason="busy: im-1"))
+        assert len(of_kind(story.wait(2.2 * CLOSE_AGAIN_EVERY_S), LoopRequest)) == 2
+        story.tell(rtc())
+        assert not of_kind(story.wait(60), LoopRequest)
         assert story.state.close_since_ns_utc is None
 
     def test_a_loop_that_opens_only_then_is_closed_too(self, story):
         self.begin(story, loop="closed")
-        assert not of_kind(story.tell(ev.GiveUp(id="im-1")), ev.AskLoop)
-        story.tell(ev.StatusSeen(rtc=rtc(loop="open")), after_s=1)
-        assert of_kind(story.tell(ev.Tick()), ev.AskLoop)
+        assert not of_kind(story.tell(ev.GiveUp(id="im-1")), LoopRequest)
+        story.tell(rtc(loop="open"), after_s=1)
+        assert of_kind(story.tell(ev.Tick()), LoopRequest)
 
     def test_a_loop_that_was_open_before_stays_open(self, story):
-        story.tell(ev.StatusSeen(rtc=rtc(loop="open")))
+        story.tell(rtc(loop="open"))
         self.begin(story)
-        assert not of_kind(story.tell(ev.GiveUp(id="im-1")), ev.AskLoop)
-        assert not of_kind(story.wait(20), ev.AskLoop)
+        assert not of_kind(story.tell(ev.GiveUp(id="im-1")), LoopRequest)
+        assert not of_kind(story.wait(20), LoopRequest)
 
     def test_an_operator_who_opens_the_loop_is_obeyed(self, story):
         self.begin(story)
         story.tell(ev.GiveUp(id="im-1"))
         story.tell(ev.SetLoop(closed=False), after_s=1)
-        assert not of_kind(story.wait(20), ev.AskLoop)
+        assert not of_kind(story.wait(20), LoopRequest)
 
     def test_a_loop_nobody_closes_is_not_asked_about_for_ever(self, story):
         self.begin(story)

@@ -6,8 +6,9 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking.measuring import LONGEST_S, OVERDUE_S
-from service.tracking.products import MatrixState, MeasurePattern, MeasureState
+from service.tracking.products import MatrixState, MeasureState
 from service.tracking.state import Mode
+from service.wire import DitherRequest, MeasureRequest, Pattern
 from tests.unit.tracking.situations import Story, of_kind, rtc
 
 
@@ -21,7 +22,7 @@ def story():
 
 
 def ask(story, **changes):
-    command = ev.Measure(id="im-1", pattern=MeasurePattern.PUSH_PULL_MODAL)
+    command = ev.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL)
     return story.tell(replace(command, **changes))
 
 
@@ -34,26 +35,26 @@ def begin(story, **changes):
     ask(story, **changes)
     answer(story, start_seq=40)
     story.tell(ev.SessionStarted(session="s2"))
-    story.tell(ev.StatusSeen(rtc=rtc(session="s2", loop="open")))
+    story.tell(rtc(session="s2", loop="open"))
     return story
 
 
 def close(story):
-    story.tell(ev.StatusSeen(rtc=rtc(session="s2")))
+    story.tell(rtc(session="s2"))
 
 
 def test_what_is_not_given_the_service_chooses(story):
-    (asked,) = of_kind(ask(story), ev.AskMeasurement)
-    assert asked.record.modes == tuple(range(400))
-    assert asked.record.amplitude_m == (20e-9,) * 400
-    assert asked.record.n_average == 10
-    assert asked.record.frequency_hz is asked.record.duration_s is None
+    (asked,) = of_kind(ask(story), MeasureRequest)
+    assert asked.modes == tuple(range(400))
+    assert asked.amplitude_m == (20e-9,) * 400
+    assert asked.n_average == 10
+    assert asked.frequency_hz is asked.duration_s is None
     assert story.state.measuring.state is MeasureState.ASKED
 
 
 def test_sines_get_lines_of_their_own_between_the_loop_and_half_the_rate(story):
-    (asked,) = of_kind(ask(story, pattern=MeasurePattern.SINE), ev.AskMeasurement)
-    record = asked.record
+    (asked,) = of_kind(ask(story, pattern=Pattern.SINE), MeasureRequest)
+    record = asked
     assert record.modes == tuple(range(0, 400, 10))
     assert record.n_average is None
     lines = np.array(record.frequency_hz)
@@ -65,9 +66,9 @@ def test_sines_get_lines_of_their_own_between_the_loop_and_half_the_rate(story):
 
 def test_the_operators_choice_stands(story):
     given = {"modes": (3, 9), "amplitude_m": 1e-8, "n_average": 3}
-    (asked,) = of_kind(ask(story, **given), ev.AskMeasurement)
-    assert (asked.record.modes, asked.record.n_average) == ((3, 9), 3)
-    assert asked.record.amplitude_m == (1e-8, 1e-8)
+    (asked,) = of_kind(ask(story, **given), MeasureRequest)
+    assert (asked.modes, asked.n_average) == ((3, 9), 3)
+    assert asked.amplitude_m == (1e-8, 1e-8)
 
 
 def test_nobody_measures_without_an_rtc():
@@ -130,7 +131,7 @@ def test_a_mode_can_be_chosen_and_a_dither_stopped_meanwhile(story):
     assert story.state.measuring is not None
 
 
-@pytest.mark.parametrize("pattern", list(MeasurePattern))
+@pytest.mark.parametrize("pattern", list(Pattern))
 def test_the_service_does_nothing_by_itself_meanwhile(story, pattern):
     begin(story, pattern=pattern)
     story.tell(ev.SetMode(mode=Mode.AUTO))
@@ -178,8 +179,8 @@ def test_a_late_answer_does_not_begin_again_what_is_over(story):
 
 
 def test_a_silent_rtc_leaves_no_measurement_behind(story):
-    (asked,) = of_kind(ask(story), ev.AskMeasurement)
-    story.tell(ev.JobFailed(effect=asked, text="no answer from the RTC"))
+    (asked,) = of_kind(ask(story), MeasureRequest)
+    story.tell(ev.JobFailed(effect=ev.Ask(request=asked), text="no answer from the RTC"))
     assert story.state.measurement("im-1").state is MeasureState.FAILED
     assert story.state.measurement("im-1").reason == "no answer from the RTC"
     ask(story, id="im-2")
@@ -204,7 +205,7 @@ def test_a_matrix_that_does_not_come_after_the_loop_has_closed_is_given_up(story
 
 
 def test_nothing_is_measured_for_ever(story):
-    begin(story, pattern=MeasurePattern.SINE, duration_s=5.0)
+    begin(story, pattern=Pattern.SINE, duration_s=5.0)
     story.wait(LONGEST_S + 60, every_s=60)
     assert story.state.measurement("im-1").state is MeasureState.FAILED
 
@@ -228,24 +229,25 @@ def test_an_open_loop_is_no_alarm_while_the_service_has_asked_for_it(story):
     begin(story)
     assert "loop-open" not in story.alarms
     answer(story, MeasureState.STORED)
-    story.tell(ev.StatusSeen(rtc=rtc(session="s2", loop="open")))
+    story.tell(rtc(session="s2", loop="open"))
     assert "loop-open" in story.alarms, "the measurement is over"
 
 
 def test_a_loop_that_opens_under_a_measurement_with_sines_is_an_alarm(story):
-    begin(story, pattern=MeasurePattern.SINE)
+    begin(story, pattern=Pattern.SINE)
     assert "loop-open" in story.alarms
 
 
 def test_what_is_given_up_is_over_whatever_comes(story):
     begin(story)
-    late = story.state.measurement("im-1")
+    late, (request,) = story.state.measurement("im-1"), story.asked(MeasureRequest)
+    lost = ev.Ask(request=request)
     story.tell(ev.GiveUp(id="im-1"))
     assert story.state.measuring is None
     for state in (MeasureState.RUNNING, MeasureState.STORED, MeasureState.FAILED):
         story.tell(ev.MatrixMeasured(record=replace(late, state=state)))
         assert story.state.measurement("im-1").state is MeasureState.GIVEN_UP
-    story.tell(ev.JobFailed(effect=ev.AskMeasurement(record=late), text="no answer"))
+    story.tell(ev.JobFailed(effect=lost, text="no answer"))
     assert story.state.measurement("im-1").state is MeasureState.GIVEN_UP
 
 
@@ -259,10 +261,10 @@ def test_only_what_is_under_way_can_be_given_up(story):
 
 
 def test_nothing_is_asked_while_tones_given_up_still_play(story):
-    begin(story, pattern=MeasurePattern.SINE, duration_s=30.0)
+    begin(story, pattern=Pattern.SINE, duration_s=30.0)
     close(story)
     story.tell(ev.GiveUp(id="im-1"))
     story.tell(ev.SetMode(mode=Mode.AUTO))
     story.state = replace(story.state, dither_stopped=False, in_use="initial")
-    assert not of_kind(story.wait(20), ev.AskDither)
-    assert of_kind(story.wait(15), ev.AskDither)
+    assert not of_kind(story.wait(20), DitherRequest)
+    assert of_kind(story.wait(15), DitherRequest)

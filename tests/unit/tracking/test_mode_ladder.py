@@ -54,7 +54,7 @@ class Night(Story):
         )
         if of_kind(effects, ev.SendMatrix):
             self.acknowledge(name)
-            self.tell(ev.StatusSeen(rtc=replace(rtc(n_modes), cm_id=name)))
+            self.tell(replace(rtc(n_modes), cm_id=name))
         return effects
 
     def lowered(self, n_modes=300):

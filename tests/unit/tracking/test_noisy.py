@@ -7,10 +7,19 @@ import pytest
 
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
-from service.tracking.loop import DitherKind
 from service.tracking.measuring import FREE_WITHIN_S
 from service.tracking.products import ModeSet, NoisyFinding, NoisyState
-from tests.unit.tracking.situations import ALPHA, POLICY, PRECISE, START_NS, Story, of_kind, rtc
+from service.wire import DitherKind, DitherRequest, DitherStop
+from tests.unit.tracking.situations import (
+    ALPHA,
+    POLICY,
+    PRECISE,
+    START_NS,
+    Story,
+    dither_answered,
+    of_kind,
+    rtc,
+)
 
 ASK = ev.MeasureNoisy(id="noisy-1", modes=ModeSet.CONTROLLED, total_m=5e-9, duration_s=30.0)
 STILL = replace(POLICY, dither_enabled=False)
@@ -41,14 +50,14 @@ def dithering():
     """A loop in which the service's own dither runs."""
     story = Story().meet()
     own = story.state.dither
-    answer = ev.DitherAnswered(id=own.id, accepted=True, reason="", start_seq=500)
+    answer = dither_answered(own.id, accepted=True, reason="", start_seq=500)
     story.tell(answer)
-    status(story, dither_id=own.id)
+    status(story, dither=replace(own, start_seq=500))
     return story
 
 
 def status(story, **changes):
-    return story.tell(ev.StatusSeen(rtc=rtc(**changes)))
+    return story.tell(rtc(**changes))
 
 
 def state_of(story, noisy_id="noisy-1"):
@@ -57,14 +66,13 @@ def state_of(story, noisy_id="noisy-1"):
 
 def begun(story):
     story.tell(ASK)
-    story.tell(ev.DitherAnswered(id="noisy-1", accepted=True, reason="", start_seq=1000))
-    status(story, dither_id="noisy-1", seq=1100)
+    story.tell(dither_answered("noisy-1", accepted=True, reason="", start_seq=1000))
+    status(story, dither=story.state.dither, seq=1100)
     return story
 
 
 def test_random_signs_on_all_controlled_modes_are_asked_for(story):
-    (asked,) = of_kind(story.tell(ASK), ev.AskDither)
-    dither = asked.dither
+    (dither,) = of_kind(story.tell(ASK), DitherRequest)
     assert (dither.id, dither.kind, dither.modes) == (
         "noisy-1",
         DitherKind.BINARY,
@@ -77,18 +85,18 @@ def test_random_signs_on_all_controlled_modes_are_asked_for(story):
 
 def test_the_services_own_dither_makes_way_and_none_of_its_own_follows(dithering):
     effects = dithering.tell(ASK)
-    assert of_kind(effects, ev.AskNoDither)
-    assert not of_kind(effects, ev.AskDither)
+    assert of_kind(effects, DitherStop)
+    assert not of_kind(effects, DitherRequest)
     assert state_of(dithering) is NoisyState.WAITING
     assert not dithering.wait(2.0)
-    (asked,) = of_kind(status(dithering, dither_id=None), ev.AskDither)
-    assert asked.dither.id == "noisy-1"
+    (asked,) = of_kind(status(dithering, dither_id=None), DitherRequest)
+    assert asked.id == "noisy-1"
 
 
 def test_a_dither_that_does_not_make_way_ends_the_wait(dithering):
-    own = dithering.state.dither.id
+    own = dithering.state.dither
     dithering.tell(ASK)
-    status(dithering, dither_id=own)
+    status(dithering, dither=own)
     dithering.wait(FREE_WITHIN_S + 2.0)
     assert state_of(dithering) is NoisyState.FAILED
     assert "did not end within" in dithering.state.noisy_matrix("noisy-1").reason
@@ -134,16 +142,16 @@ def test_a_session_that_ends_in_the_middle_is_finished_with_what_there_is(story)
     ("event", "words"),
     [
         (
-            ev.DitherAnswered(id="noisy-1", accepted=False, reason="busy: ramp", start_seq=None),
+            dither_answered("noisy-1", accepted=False, reason="busy: ramp", start_seq=None),
             "the RTC refused the dither: busy: ramp",
         ),
         ("silence", "no answer from the RTC"),
     ],
 )
 def test_a_dither_that_never_begins_is_a_failure_with_its_reason(story, event, words):
-    (asked,) = of_kind(story.tell(ASK), ev.AskDither)
+    (asked,) = of_kind(story.tell(ASK), DitherRequest)
     if event == "silence":
-        event = ev.JobFailed(effect=asked, text=words)
+        event = ev.JobFailed(effect=ev.Ask(request=asked), text=words)
     story.tell(event)
     assert state_of(story) is NoisyState.FAILED
     assert story.state.noisy_matrix("noisy-1").reason == words
@@ -159,7 +167,7 @@ def test_a_fit_that_fails_is_a_failure_with_its_reason(story):
 def test_one_given_up_ends_its_dither_and_stays_given_up(story):
     begun(story)
     effects = story.tell(ev.GiveUpNoisy(id="noisy-1"))
-    assert of_kind(effects, ev.AskNoDither)
+    assert of_kind(effects, DitherStop)
     assert story.state.dither is None
     record = replace(story.state.noisy[-1], state=NoisyState.STORED, finding=FINDING)
     story.tell(ev.NoisyMade(record=record))
@@ -217,11 +225,11 @@ def test_an_open_loop_has_no_noisy_matrix():
 def test_a_dither_left_by_the_service_before_this_one_is_stopped():
     """Nobody sums it any more, and the service's own cannot begin beside it."""
     story = Story().meet(dither_id="noisy-0")
-    assert story.asked(ev.AskNoDither)
+    assert story.asked(DitherStop)
     story.effects.clear()
     status(story, dither_id=None)
     story.wait(5.0)
-    assert story.asked(ev.AskDither)
+    assert story.asked(DitherRequest)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,8 @@ from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
-from tests.unit.tracking.situations import Story, of_kind, rtc
+from service.wire import DitherRequest
+from tests.unit.tracking.situations import Story, of_kind, rtc, stopping
 
 
 @pytest.fixture
@@ -178,15 +179,16 @@ class TestGoingBack:
 class TestDither:
     def test_stopped_it_stays_stopped_until_started(self):
         story = Story().meet()
-        assert story.tell(ev.StopDither()) == (ev.AskNoDither(),)
+        assert story.tell(ev.StopDither()) == (stopping(story),)
         story.wait(30)
         assert story.state.dither is None
-        assert len(story.asked(ev.AskDither)) == 1
+        assert len(story.asked(DitherRequest)) == 1
         story.tell(ev.StartDither())
-        assert len(story.asked(ev.AskDither)) == 2
+        assert len(story.asked(DitherRequest)) == 2
 
     def test_stopping_needs_nothing(self):
-        assert Story().tell(ev.StopDither()) == (ev.AskNoDither(),)
+        story = Story()
+        assert story.tell(ev.StopDither()) == (stopping(story),)
 
     def test_what_is_asked_for_is_what_the_rtc_is_asked(self):
         story = Story().meet()
@@ -196,7 +198,7 @@ class TestDither:
                 modes=(3, 5), amplitude_m=2e-9, frequency_hz=(220.0, 260.0), duration_s=10.0
             )
         )
-        dither = story.asked(ev.AskDither)[-1].dither
+        dither = story.asked(DitherRequest)[-1]
         assert dither.modes == (3, 5)
         assert dither.amplitude_m == (2e-9, 2e-9)
         assert dither.frequency_hz == (220.0, 260.0)
@@ -231,5 +233,5 @@ class TestDither:
 
 
 def test_a_status_of_500_modes_makes_refit_compute_500(story):
-    story.tell(ev.StatusSeen(rtc=rtc(500)))
+    story.tell(rtc(500))
     assert story.tell(ev.Refit())[0].n_modes == 500

@@ -7,6 +7,7 @@ import pytest
 from service.tracking import events as ev
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Level, Mode, TrackerState
+from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
@@ -85,10 +86,10 @@ class TestTheDither:
         again = restarted(story)
         again.meet()
         again.wait(60)
-        assert not again.asked(ev.AskDither)
+        assert not again.asked(DitherRequest)
         assert again.state.dithering.reason == "stopped by the operator"
         assert "before the restart; POST /v1/dither" in again.state.log[0].text
-        assert of_kind(again.tell(ev.StartDither()), ev.AskDither)
+        assert of_kind(again.tell(ev.StartDither()), DitherRequest)
         assert not restarted(again).state.dither_stopped
 
     def test_what_the_dead_service_left_on_the_mirror_is_stopped(self):
@@ -96,7 +97,7 @@ class TestTheDither:
         dither = replace(story.state.dither, start_seq=1000, asked_ns_utc=0)
         story.tell(ev.StopDither())
         again = restarted(story).meet(dither_id=dither.id, dither=dither)
-        assert again.asked(ev.AskNoDither)
+        assert again.asked(DitherStop)
         assert again.state.dither is None
 
 
@@ -117,5 +118,5 @@ def test_those_for_another_system_are_none(rolled_back):
 def test_a_new_session_of_the_rtc_undoes_none(rolled_back):
     rolled_back.tell(ev.StopDither())
     rolled_back.tell(ev.SessionStarted(session="s2"))
-    rolled_back.tell(ev.StatusSeen(rtc=rtc(session="s2")))
+    rolled_back.tell(rtc(session="s2"))
     assert (rolled_back.state.mode, rolled_back.state.dither_stopped) == (Mode.HOLD, True)

@@ -9,6 +9,7 @@ from service.tracking.reconstructors import extended_gains
 from service.tracking.registration import Validity
 from service.tracking.state import Mode
 from service.tracking.worth import more_to_try
+from service.wire import LoopRequest
 from tests.unit.tracking.dithered import DitheredNight
 from tests.unit.tracking.situations import ALPHA, N_MODES, POLICY, Story, moved, of_kind, rtc
 
@@ -39,7 +40,7 @@ def test_another_matrix_is_made_and_sent_when_the_mirror_has_moved():
     story = Story(Mode.AUTO).meet(loop="partial", gains=ONE_STILL)
     story.see(n_windows=4)
     story.use("cm-1")
-    story.tell(ev.StatusSeen(rtc=partial(cm_id="cm-1")))
+    story.tell(partial(cm_id="cm-1"))
     story.see(moved(ALPHA, shift_x_subap=0.1), n_windows=4)
     assert story.asked(ev.MakeMatrix)
 
@@ -47,7 +48,7 @@ def test_another_matrix_is_made_and_sent_when_the_mirror_has_moved():
 def test_it_is_logged_once_how_many_modes_are_in_the_loop():
     story = Story().meet()
     for _ in range(3):
-        story.tell(ev.StatusSeen(rtc=partial()), after_s=1.0)
+        story.tell(partial(), after_s=1.0)
     said = [entry.text for entry in story.state.log if entry.name == "loop.partial"]
     assert said == ["399 of 400 controlled modes have a gain: the others are let be"]
     assert "loop-open" not in story.alarms
@@ -55,10 +56,10 @@ def test_it_is_logged_once_how_many_modes_are_in_the_loop():
 
 def test_a_loop_without_any_gain_is_an_open_one_and_says_why():
     story = Story().meet()
-    story.tell(ev.StatusSeen(rtc=partial(NONE)))
+    story.tell(partial(NONE))
     (alarm,) = [alarm for alarm in story.state.alarms if alarm.name == "loop-open"]
     assert alarm.text == "all gains of the loop are 0: close it to calibrate"
-    story.tell(ev.StatusSeen(rtc=partial()))
+    story.tell(partial())
     assert "loop-open" not in story.alarms
 
 
@@ -79,7 +80,7 @@ def test_a_measurement_that_found_it_partial_is_over_when_it_is_partial_again():
     asked = story.state.measuring
     record = replace(asked, state="running", start_seq=10)
     story.tell(ev.MatrixMeasured(record=record))
-    story.tell(ev.StatusSeen(rtc=partial()))
+    story.tell(partial())
     story.wait(20)
     assert story.state.measuring is None
-    assert not of_kind(story.effects, ev.AskLoop)
+    assert not of_kind(story.effects, LoopRequest)

@@ -7,6 +7,7 @@ from service.tracking import events as ev
 from service.tracking.dither_plan import lock_in_plan, plan_dither
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
+from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import N_MODES, POLICY, START_NS, Story, moved, of_kind, rtc
 
 PARALYSING = [
@@ -37,29 +38,29 @@ class TestDither:
 
     @pytest.mark.parametrize("mode", list(Mode))
     def test_it_is_asked_for_once_the_loop_is_closed_and_its_matrix_known(self, mode):
-        assert len(Story(mode).meet().asked(ev.AskDither)) == 1
+        assert len(Story(mode).meet().asked(DitherRequest)) == 1
 
     @pytest.mark.parametrize("loop", OPEN)
     def test_not_while_the_loop_is_not_closed(self, loop):
         story = Story().meet(**loop)
         story.wait(10)
-        assert not story.asked(ev.AskDither)
+        assert not story.asked(DitherRequest)
 
     def test_not_while_the_matrix_is_unknown(self):
         story = Story()
         story.tell(ev.SessionStarted(session="s1"))
-        story.tell(ev.StatusSeen(rtc=rtc()))
+        story.tell(rtc())
         story.wait(10)
-        assert not story.asked(ev.AskDither)
+        assert not story.asked(DitherRequest)
 
     def test_not_when_the_settings_forbid_it(self):
         story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
         story.wait(10)
-        assert not story.asked(ev.AskDither)
+        assert not story.asked(DitherRequest)
 
     def test_not_again_while_one_runs(self, story):
         story.wait(30)
-        assert len(story.asked(ev.AskDither)) == 1
+        assert len(story.asked(DitherRequest)) == 1
 
     @pytest.mark.parametrize("name", PARALYSING)
     def test_not_while_an_alarm_forbids_everything(self, name):
@@ -70,22 +71,22 @@ class TestDither:
         story.wait(10)
         assert set(map(type, story.effects)) <= {ev.FetchMatrix}
         story.tell(ev.Trouble(name=name, text="gone", over=True))
-        assert story.asked(ev.FetchMatrix) or story.asked(ev.AskDither)
+        assert story.asked(ev.FetchMatrix) or story.asked(DitherRequest)
 
     def test_one_left_behind_before_a_restart_is_stopped_first(self):
         story = Story().meet(dither_id="dither-1")
-        assert story.asked(ev.AskNoDither)
-        assert not story.asked(ev.AskDither)
-        story.tell(ev.StatusSeen(rtc=rtc()), after_s=3)
-        assert story.asked(ev.AskDither)
+        assert story.asked(DitherStop)
+        assert not story.asked(DitherRequest)
+        story.tell(rtc(), after_s=3)
+        assert story.asked(DitherRequest)
 
     def test_its_modes_are_above_those_the_loop_will_control(self):
-        dither = plan_dither(rtc(), POLICY, START_NS)
+        dither = plan_dither(rtc(), POLICY, START_NS).request
         assert len(dither.modes) == len(set(dither.modes)) == 4
         assert all(500 <= mode < N_MODES for mode in dither.modes)
 
     def test_with_every_mode_controlled_it_takes_the_highest(self):
-        dither = plan_dither(rtc(N_MODES), POLICY, START_NS)
+        dither = plan_dither(rtc(N_MODES), POLICY, START_NS).request
         assert dither.modes == (590, 591, 592, 593)
 
     def test_its_lines_lie_above_a_fifth_of_the_frame_rate_and_fit_a_window(self):
@@ -97,17 +98,17 @@ class TestDither:
         assert not (sums | differences) & set(dither.frequency_hz)
 
     def test_it_respects_the_limits_of_the_rtc(self):
-        dither = plan_dither(rtc(max_dither_m=1e-9, max_dither_modes=2), POLICY, START_NS)
+        dither = plan_dither(rtc(max_dither_m=1e-9, max_dither_modes=2), POLICY, START_NS).request
         assert dither.amplitude_m == (1e-9, 1e-9)
         assert len(dither.modes) == len(dither.frequency_hz) == 2
 
     def test_settings_overrule_the_services_choice_and_a_request_overrules_both(self):
         policy = replace(POLICY, dither_modes=(7, 9), dither_frequencies_hz=(210.0, 260.0))
-        chosen = plan_dither(rtc(), policy, START_NS)
+        chosen = plan_dither(rtc(), policy, START_NS).request
         assert (chosen.modes, chosen.frequency_hz) == ((7, 9), (210.0, 260.0))
         asked = plan_dither(
             rtc(), policy, START_NS, modes=(3,), frequency_hz=(300.0,), amplitude_m=2e-9
-        )
+        ).request
         assert (asked.modes, asked.frequency_hz, asked.amplitude_m) == ((3,), (300.0,), (2e-9,))
 
     def test_the_first_window_waits_until_the_loop_has_settled(self):
@@ -194,7 +195,7 @@ class TestUpdate:
     @pytest.mark.parametrize("loop", OPEN)
     def test_nothing_is_made_while_the_loop_is_not_closed(self, loop):
         story = Story().meet()
-        story.tell(ev.StatusSeen(rtc=rtc(**loop)))
+        story.tell(rtc(**loop))
         assert not of_kind(story.see(n_windows=5), ev.MakeMatrix)
 
     @pytest.mark.parametrize("name", PARALYSING)
@@ -215,9 +216,12 @@ class TestUpdate:
         story.see(n_windows=2)
         if outcome is MatrixState.REFUSED:
             story.make("cm-1", outcome)
-        else:
+        elif outcome is MatrixState.REJECTED:
             story.make("cm-1")
             story.acknowledge("cm-1", outcome, "no")
+        else:
+            (sent,) = story.make("cm-1")
+            story.tell(ev.JobFailed(effect=sent, text="no"))
         assert not of_kind(story.wait(29), ev.MakeMatrix)
         assert of_kind(story.wait(1), ev.MakeMatrix)
 

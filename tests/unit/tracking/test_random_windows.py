@@ -9,9 +9,9 @@ from service.errors import CommandError
 from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
 from service.tracking.dither_plan import total_m
-from service.tracking.loop import DitherKind
 from service.tracking.products import ModeSet
 from service.tracking.registration import Source
+from service.wire import DitherKind, DitherRequest
 from tests.unit.tracking.situations import ALPHA, POLICY, PRECISE, Story, moved, of_kind
 
 
@@ -93,9 +93,9 @@ def test_an_operator_may_dither_every_mode_of_the_basis():
     command = ev.StartDither(
         kind=DitherKind.BINARY, modes=ModeSet.ALL, total_m=5e-9, duration_s=60.0
     )
-    (asked,) = of_kind(story.tell(command), ev.AskDither)
-    assert asked.dither.modes == tuple(range(594))
-    assert total_m(asked.dither) == pytest.approx(5e-9)
+    (asked,) = of_kind(story.tell(command), DitherRequest)
+    assert asked.modes == tuple(range(594))
+    assert total_m(asked) == pytest.approx(5e-9)
     assert "binary, 594 modes, 5 nm RMS in all" in story.state.log[-1].text
 
 
@@ -104,4 +104,4 @@ def test_random_signs_over_the_budget_must_be_meant():
     command = ev.StartDither(kind=DitherKind.BINARY, total_m=20e-9, duration_s=60.0)
     with pytest.raises(CommandError, match="20 nm RMS in all, budget 8 nm"):
         story.tell(command)
-    assert of_kind(story.tell(replace(command, over_budget=True)), ev.AskDither)
+    assert of_kind(story.tell(replace(command, over_budget=True)), DitherRequest)

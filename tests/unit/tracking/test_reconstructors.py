@@ -11,6 +11,7 @@ from tests.unit.tracking.situations import (
     POLICY,
     START_NS,
     Story,
+    acknowledged,
     foreign,
     of_kind,
     record,
@@ -117,7 +118,7 @@ def test_an_acknowledgement_repeated_for_an_earlier_matrix_does_not_bring_it_bac
     story.use("cm-1")
     story.use("cm-2")
     story.acknowledge("cm-1")
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-2")))
+    story.tell(rtc(cm_id="cm-2"))
     assert story.state.in_use == "cm-2"
     assert story.matrix_state("cm-1") is MatrixState.SUPERSEDED
 
@@ -181,9 +182,7 @@ class TestOldAcknowledgements:
         state = TrackerState(
             system="flao", rtc=rtc(), reconstructors=(record("cm-1", MatrixState.PUBLISHED),)
         )
-        told = ev.Acknowledged(
-            id="cm-1", session="s0", state=MatrixState.APPLIED, reason="", frame_seq=5
-        )
+        told = acknowledged("cm-1", session="s0", state=MatrixState.APPLIED, reason="", frame_seq=5)
         after, _ = step(state, told, POLICY, START_NS)
         assert after.reconstructor("cm-1").state is MatrixState.PUBLISHED
 
@@ -197,8 +196,6 @@ class TestOldAcknowledgements:
                 record("cm-2", MatrixState.APPLIED, applied_frame_seq=9),
             ),
         )
-        told = ev.Acknowledged(
-            id="cm-1", session="s1", state=MatrixState.APPLIED, reason="", frame_seq=5
-        )
+        told = acknowledged("cm-1", session="s1", state=MatrixState.APPLIED, reason="", frame_seq=5)
         after, _ = step(state, told, POLICY, START_NS)
         assert after.in_use == "cm-2"

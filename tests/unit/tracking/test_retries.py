@@ -6,7 +6,8 @@ import pytest
 
 from service.tracking import events as ev
 from service.tracking.state import Mode
-from tests.unit.tracking.situations import POLICY, Story, of_kind, rtc
+from service.wire import DitherRequest
+from tests.unit.tracking.situations import POLICY, Story, dither_answered, of_kind, rtc
 
 
 def tracked(rate_hz=1000.0, **policy):
@@ -16,8 +17,8 @@ def tracked(rate_hz=1000.0, **policy):
     story.see(n_windows=4)
     story.effects.clear()
     for _ in range(90):
-        seen = rtc(frame_rate_hz=rate_hz, t_ns_utc=story.now_ns)
-        story.tell(ev.StatusSeen(rtc=seen), 1.0)
+        seen = rtc(frame_rate_hz=rate_hz, t_ns=story.now_ns)
+        story.tell(seen, 1.0)
         story.tell(ev.Tick(), 1.0)
     return story
 
@@ -38,23 +39,21 @@ def test_a_dither_that_the_rtc_refuses_keeps_no_matrix_waiting():
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=1)
     dither = story.state.dither
-    story.tell(ev.DitherAnswered(id=dither.id, accepted=False, reason="busy", start_seq=None))
+    story.tell(dither_answered(dither.id, accepted=False, reason="busy", start_seq=None))
     assert of_kind(story.see(n_windows=1), ev.MakeMatrix)
-    assert not story.asked(ev.AskDither)[1:]
+    assert not story.asked(DitherRequest)[1:]
 
 
 def test_a_matrix_that_cannot_be_fetched_keeps_no_dither_waiting():
     story = Story(Mode.AUTO).meet()
     story.see()
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="foreign")))
+    story.tell(rtc(cm_id="foreign"))
     (fetch,) = story.asked(ev.FetchMatrix)[1:]
     story.effects.clear()
     story.tell(ev.JobFailed(effect=fetch, text="no answer"))
-    story.tell(
-        ev.DitherAnswered(id=story.state.dither.id, accepted=True, reason="", start_seq=5), 0.1
-    )
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="foreign", seq=500_000)), 1.0)
-    assert story.asked(ev.AskDither)
+    story.tell(dither_answered(story.state.dither.id, accepted=True, reason="", start_seq=5), 0.1)
+    story.tell(rtc(cm_id="foreign", seq=500_000), 1.0)
+    assert story.asked(DitherRequest)
 
 
 def test_a_matrix_that_could_not_be_made_keeps_no_dither_waiting():
@@ -63,7 +62,7 @@ def test_a_matrix_that_could_not_be_made_keeps_no_dither_waiting():
     (made,) = story.asked(ev.MakeMatrix)
     story.policy = POLICY
     story.tell(ev.JobFailed(effect=made, text="no memory"))
-    assert story.asked(ev.AskDither)
+    assert story.asked(DitherRequest)
     assert len(story.asked(ev.MakeMatrix)) == 1
     story.wait(6)
     assert len(story.asked(ev.MakeMatrix)) == 2

@@ -7,7 +7,16 @@ from service.errors import CommandError
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
-from tests.unit.tracking.situations import POLICY, Story, estimate, of_kind, rtc
+from service.wire import DitherRequest
+from tests.unit.tracking.situations import (
+    POLICY,
+    Story,
+    dither_answered,
+    estimate,
+    of_kind,
+    rtc,
+    stopping,
+)
 
 
 @pytest.fixture
@@ -28,7 +37,7 @@ def test_the_first_basis_seen_is_adopted_and_a_pinned_one_stays():
 def test_a_matrix_nobody_knows_is_fetched_and_asked_for_again_only_after_three_seconds():
     story = Story()
     story.tell(ev.SessionStarted(session="s1"))
-    assert story.tell(ev.StatusSeen(rtc=rtc())) == (ev.FetchMatrix(id="initial"),)
+    assert story.tell(rtc()) == (ev.FetchMatrix(id="initial"),)
     assert not of_kind(story.wait(2), ev.FetchMatrix)
     assert of_kind(story.wait(1), ev.FetchMatrix)
 
@@ -43,7 +52,7 @@ def test_a_service_that_is_not_the_first_stands_by_until_the_first_has_gone(stor
     story.tell(ev.ServicesMet(drives=False, others=("abc",)))
     assert {"second-service", "standing-by"} <= story.alarms
     story.effects.clear()
-    story.tell(ev.StatusSeen(rtc=rtc()))
+    story.tell(rtc())
     story.see(n_windows=3)
     story.wait(120.0)
     assert not story.effects
@@ -54,26 +63,26 @@ def test_a_service_that_is_not_the_first_stands_by_until_the_first_has_gone(stor
     assert not {"second-service", "standing-by"} & story.alarms
     assert "service.takes-over" in story.logged
     story.wait(10.0)
-    assert story.asked(ev.AskDither)
+    assert story.asked(DitherRequest)
 
 
 def test_the_first_of_two_services_drives_on_and_says_so(story):
     story.tell(ev.ServicesMet(drives=True, others=("abc",)))
     assert "second-service" in story.alarms
     assert "standing-by" not in story.alarms
-    assert story.tell(ev.StopDither()) == (ev.AskNoDither(),)
+    assert story.tell(ev.StopDither()) == (stopping(story),)
 
 
 def test_an_open_loop_is_an_alarm_until_it_is_closed(story):
-    story.tell(ev.StatusSeen(rtc=rtc(loop="open")))
+    story.tell(rtc(loop="open"))
     assert "loop-open" in story.alarms
-    story.tell(ev.StatusSeen(rtc=rtc()))
+    story.tell(rtc())
     assert "loop-open" not in story.alarms
 
 
 def test_a_status_tells_which_matrix_is_in_use_even_when_its_acknowledgement_was_lost(story):
     story.make("cm-1", wanted=True)
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    story.tell(rtc(cm_id="cm-1"))
     assert story.state.in_use == "cm-1"
     assert story.matrix_state("cm-1") is MatrixState.APPLIED
     assert story.matrix_state("initial") is MatrixState.SUPERSEDED
@@ -84,9 +93,9 @@ def test_a_status_that_shows_a_reconstructor_in_use_ends_the_alarm_that_it_was_n
     story.wait(5)
     assert story.matrix_state("cm-1") is MatrixState.FAILED
     assert "no-acknowledgement" in story.alarms
-    story.tell(ev.StatusSeen(rtc=rtc()))
+    story.tell(rtc())
     assert "no-acknowledgement" in story.alarms
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    story.tell(rtc(cm_id="cm-1"))
     assert story.matrix_state("cm-1") is MatrixState.APPLIED
     assert "no-acknowledgement" not in story.alarms
     assert "in use after all" in story.state.reconstructor("cm-1").reason
@@ -98,7 +107,7 @@ def test_so_does_one_that_shows_the_next_in_use(story):
     story.wait(5)
     story.make("cm-2", wanted=True)
     assert "no-acknowledgement" in story.alarms
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-2")))
+    story.tell(rtc(cm_id="cm-2"))
     assert "no-acknowledgement" not in story.alarms
     assert story.matrix_state("cm-1") is MatrixState.FAILED
 
@@ -107,7 +116,7 @@ def test_but_not_one_that_shows_an_old_one(story):
     story.use("cm-0")
     story.make("cm-1", wanted=True)
     story.wait(5)
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="initial")))
+    story.tell(rtc(cm_id="initial"))
     assert "no-acknowledgement" in story.alarms
 
 
@@ -150,7 +159,7 @@ def test_a_restarted_rtc_has_lost_what_was_sent_to_it(story):
 
 def test_a_window_of_the_session_before_is_not_used(story):
     story.tell(ev.SessionStarted(session="s2"))
-    story.tell(ev.StatusSeen(rtc=rtc(session="s2")))
+    story.tell(rtc(session="s2"))
     story.tell(ev.WindowFitted(estimate=estimate(session="s1")))
     assert story.state.registration.n_windows == 0
 
@@ -217,8 +226,8 @@ class TestDither:
 
     def answer(self, story, *, accepted=True, reason="", dither_id=None):
         return story.tell(
-            ev.DitherAnswered(
-                id=dither_id or story.state.dither.id,
+            dither_answered(
+                dither_id or story.state.dither.id,
                 accepted=accepted,
                 reason=reason,
                 start_seq=777 if accepted else None,
@@ -233,8 +242,8 @@ class TestDither:
         self.answer(story, accepted=False, reason="busy: measuring")
         assert story.state.dither is None
         assert "busy: measuring" in story.state.alarms[0].text
-        assert not of_kind(story.wait(9), ev.AskDither)
-        assert of_kind(story.wait(1), ev.AskDither)
+        assert not of_kind(story.wait(9), DitherRequest)
+        assert of_kind(story.wait(1), DitherRequest)
         self.answer(story)
         assert not story.alarms
 
@@ -245,16 +254,16 @@ class TestDither:
     def test_a_dither_that_ended_is_replaced_by_the_next(self, story):
         self.answer(story)
         first = story.state.dither.id
-        story.tell(ev.StatusSeen(rtc=rtc(dither_id=first)), after_s=5)
+        story.tell(rtc(dither=story.state.dither), after_s=5)
         assert story.state.dither.id == first
-        story.tell(ev.StatusSeen(rtc=rtc()), after_s=POLICY.dither_duration_s - 5)
+        story.tell(rtc(), after_s=POLICY.dither_duration_s - 5)
         assert "dither.ended" in story.logged
         assert not story.alarms
         assert story.state.dither.id != first
 
     def test_a_status_older_than_the_dither_does_not_end_it(self, story):
         self.answer(story)
-        story.tell(ev.StatusSeen(rtc=rtc()), after_s=2)
+        story.tell(rtc(), after_s=2)
         assert story.state.dither is not None
         assert "dither.ended" not in story.logged
 
@@ -277,11 +286,11 @@ class TestFailures:
         assert story.state.reconstructor("cm-1").reason == "the link is not open"
 
     def test_a_dither_the_rtc_did_not_answer_is_asked_for_after_five_seconds(self, story):
-        effect = ev.AskDither(dither=story.state.dither)
+        effect = ev.Ask(request=story.state.dither.request)
         story.tell(ev.JobFailed(effect=effect, text="no answer"))
         assert story.state.dither is None
-        assert not of_kind(story.wait(4), ev.AskDither)
-        assert of_kind(story.wait(1), ev.AskDither)
+        assert not of_kind(story.wait(4), DitherRequest)
+        assert of_kind(story.wait(1), DitherRequest)
 
     def test_a_margin_that_could_not_be_judged_leaves_the_state_as_it_was(self, story):
         before = story.state

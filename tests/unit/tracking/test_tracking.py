@@ -251,6 +251,6 @@ class TestTime:
     def test_an_alpha_of_another_basis_is_dropped_when_the_rtc_names_its_own(self, story):
         known = replace(story.state.registration, basis_id="kl-300")
         story.state = replace(story.state, registration=known)
-        story.tell(ev.StatusSeen(rtc=rtc()))
+        story.tell(rtc())
         assert story.state.registration is None
         assert "kl-300" in next(e.text for e in story.state.log if e.name == "registration.void")

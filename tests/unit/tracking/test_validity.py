@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from service.tracking import events as ev
-from service.tracking.loop import Pointing
+from service.tracking.loop import separation_deg
 from service.tracking.products import MatrixState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode, TrackerState
+from service.wire import Pointing
 from tests.unit.tracking.situations import (
     POLICY,
     PRECISE,
@@ -57,7 +58,7 @@ class TestTime:
     def test_the_rtcs_clock_counts_while_it_tells_the_time(self, story):
         """A simulated RTC that needs 30 s for one second of its own."""
         before = story.state.registration
-        story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=before.t_ns_utc + SECOND)))
+        story.tell(rtc(t_ns=before.t_ns_utc + SECOND))
         story.wait(30)
         expected = np.sqrt(before.sigma**2 + 1.0 * POLICY.drift_rate**2)
         np.testing.assert_allclose(story.state.registration.sigma, expected)
@@ -107,7 +108,7 @@ class TestTime:
         assert len(texts) == 1
 
     def test_an_open_loop_needs_no_alpha(self, story):
-        story.tell(ev.StatusSeen(rtc=rtc(loop="open")))
+        story.tell(rtc(loop="open"))
         story.wait(80)
         assert worth(story) is Validity.STALE
         assert "estimate-stale" not in story.alarms
@@ -178,9 +179,9 @@ class TestPointing:
 
     def test_a_status_that_knows_it_overrules_what_was_told(self, story):
         there = Pointing(elevation_deg=30.0, azimuth_deg=0.0)
-        story.tell(ev.StatusSeen(rtc=rtc(pointing=there)))
+        story.tell(rtc(pointing=there))
         assert story.state.pointing == there
-        story.tell(ev.StatusSeen(rtc=rtc()))
+        story.tell(rtc())
         assert story.state.pointing == there
 
     def test_before_anybody_has_told_nothing_bends(self):
@@ -201,7 +202,7 @@ class TestPointing:
     )
     def test_the_angle_between_two_directions_is_that_on_the_sky(self, other, angle_deg):
         """Across the zenith: 2 x 30 deg."""
-        assert HERE.separation_deg(other) == pytest.approx(angle_deg, abs=1e-5)
+        assert separation_deg(HERE, other) == pytest.approx(angle_deg, abs=1e-5)
 
 
 def test_nothing_is_due_while_nothing_is_known():

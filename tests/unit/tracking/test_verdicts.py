@@ -52,7 +52,7 @@ def test_a_proposal_judged_for_this_loop_and_alpha_is_sent_at_once(waiting):
     ],
 )
 def test_one_judged_for_another_loop_is_judged_again_with_the_gains_of_now(waiting, changes, words):
-    waiting.tell(ev.StatusSeen(rtc=rtc(**changes)))
+    waiting.tell(rtc(**changes))
     effects = waiting.tell(ev.Approve(id="cm-1"))
     assert not of_kind(effects, ev.SendMatrix)
     (asked,) = of_kind(effects, ev.JudgeProposal)
@@ -64,7 +64,7 @@ def test_gains_that_follow_the_seeing_by_a_few_percent_change_no_verdict(waiting
     before = len(waiting.asked(ev.JudgeMatrix))
     for gain in (0.405, 0.41, 0.415, 0.41):
         gains = (gain,) * 400 + (0.0,) * (N_MODES - 400)
-        waiting.tell(ev.StatusSeen(rtc=rtc(gains=gains)), after_s=1.0)
+        waiting.tell(rtc(gains=gains), after_s=1.0)
     assert len(waiting.asked(ev.JudgeMatrix)) == before
     assert of_kind(waiting.tell(ev.Approve(id="cm-1")), ev.SendMatrix)
 
@@ -78,7 +78,7 @@ def test_so_is_one_whose_alpha_is_known_much_worse_by_now(waiting):
 
 
 def test_it_is_sent_when_it_passes_anew(waiting):
-    waiting.tell(ev.StatusSeen(rtc=rtc(gains=HIGH)))
+    waiting.tell(rtc(gains=HIGH))
     waiting.tell(ev.Approve(id="cm-1"))
     assert of_kind(judge(waiting), ev.SendMatrix)
     assert waiting.matrix_state("cm-1") is MatrixState.PUBLISHED
@@ -87,7 +87,7 @@ def test_it_is_sent_when_it_passes_anew(waiting):
 
 
 def test_and_refused_with_the_gates_words_when_it_does_not(waiting):
-    waiting.tell(ev.StatusSeen(rtc=rtc(gains=HIGH)))
+    waiting.tell(rtc(gains=HIGH))
     waiting.tell(ev.Approve(id="cm-1"))
     assert not of_kind(judge(waiting, accepted=False), ev.SendMatrix)
     assert waiting.matrix_state("cm-1") is MatrixState.REFUSED
@@ -95,16 +95,16 @@ def test_and_refused_with_the_gates_words_when_it_does_not(waiting):
 
 
 def test_what_changes_while_it_is_judged_keeps_it_from_being_sent(waiting):
-    waiting.tell(ev.StatusSeen(rtc=rtc(gains=HIGH)))
+    waiting.tell(rtc(gains=HIGH))
     waiting.tell(ev.Approve(id="cm-1"))
-    waiting.tell(ev.StatusSeen(rtc=rtc(leak=0.99, gains=HIGH)))
+    waiting.tell(rtc(leak=0.99, gains=HIGH))
     assert not of_kind(judge(waiting, leak=0.999), ev.SendMatrix)
     assert waiting.matrix_state("cm-1") is MatrixState.PROPOSED
     assert "approve it again" in waiting.state.log[-1].text
 
 
 def test_approved_twice_it_is_sent_once(waiting):
-    waiting.tell(ev.StatusSeen(rtc=rtc(gains=HIGH)))
+    waiting.tell(rtc(gains=HIGH))
     waiting.tell(ev.Approve(id="cm-1"))
     waiting.tell(ev.Approve(id="cm-1"))
     assert of_kind(judge(waiting), ev.SendMatrix)
@@ -112,25 +112,25 @@ def test_approved_twice_it_is_sent_once(waiting):
 
 
 def test_an_open_loop_does_not_tell_its_gains_so_the_verdict_stands(waiting):
-    waiting.tell(ev.StatusSeen(rtc=rtc(loop="open", gains=(0.0,) * N_MODES)))
+    waiting.tell(rtc(loop="open", gains=(0.0,) * N_MODES))
     assert of_kind(waiting.tell(ev.Approve(id="cm-1")), ev.SendMatrix)
 
 
 def test_nor_can_one_be_judged_there_that_was_made_before_the_service_restarted(waiting):
     waiting.make("cm-1", judged=None)
-    waiting.tell(ev.StatusSeen(rtc=rtc(loop="open", gains=(0.0,) * N_MODES)))
+    waiting.tell(rtc(loop="open", gains=(0.0,) * N_MODES))
     with pytest.raises(CommandError, match="close it first"):
         waiting.tell(ev.Approve(id="cm-1"))
 
 
 def test_one_must_be_able_to_go_back_with_the_loop_open(waiting):
-    waiting.tell(ev.StatusSeen(rtc=rtc(loop="open", gains=(0.0,) * N_MODES)))
+    waiting.tell(rtc(loop="open", gains=(0.0,) * N_MODES))
     effects = waiting.make("cm-1", judged=None, gate=None, wanted=True)
     assert of_kind(effects, ev.SendMatrix)
 
 
 def test_but_not_with_one_of_whose_verdict_nobody_knows_the_gains(waiting):
-    waiting.tell(ev.StatusSeen(rtc=rtc(loop="open", gains=(0.0,) * N_MODES)))
+    waiting.tell(rtc(loop="open", gains=(0.0,) * N_MODES))
     assert not of_kind(waiting.make("cm-1", judged=None, wanted=True), ev.SendMatrix)
     assert waiting.matrix_state("cm-1") is MatrixState.PROPOSED
 
@@ -158,7 +158,7 @@ class TestAuto:
         return story.make("cm-1", judged=then, alpha=ALPHA)
 
     def test_other_gains_and_it_is_judged_again(self, story):
-        effects = self.made_before(story, lambda s: s.tell(ev.StatusSeen(rtc=rtc(gains=HIGH))))
+        effects = self.made_before(story, lambda s: s.tell(rtc(gains=HIGH)))
         assert not of_kind(effects, ev.SendMatrix)
         assert of_kind(effects, ev.JudgeProposal)
         assert of_kind(judge(story), ev.SendMatrix)
@@ -166,7 +166,7 @@ class TestAuto:
     @pytest.mark.parametrize(
         "change",
         [
-            lambda s: s.tell(ev.StatusSeen(rtc=rtc(loop="open"))),
+            lambda s: s.tell(rtc(loop="open")),
             lambda s: s.tell(ev.Trouble(name="edge-slip", text="the outer ring slips")),
             lambda s: s.meet(session="s2"),
         ],
@@ -192,7 +192,7 @@ def test_a_matrix_an_operator_wants_back_is_judged_again_after_a_jump():
 
 def test_an_acknowledgement_of_a_matrix_judged_for_another_loop_is_no_margin(waiting):
     waiting.tell(ev.Approve(id="cm-1"))
-    waiting.tell(ev.StatusSeen(rtc=rtc(gains=HIGH)))
+    waiting.tell(rtc(gains=HIGH))
     waiting.acknowledge("cm-1")
     assert waiting.state.margin is None
     assert waiting.asked(ev.JudgeMatrix)[-1].id == "cm-1"

@@ -8,6 +8,7 @@ import pytest
 from service.model.misregistration import Misregistration
 from service.telemetry.passive import PassiveEstimate
 from service.tracking import events as ev
+from service.tracking.loop import loop_numbers
 from service.tracking.registration import Source, Validity
 from service.tracking.state import Mode, TrackerState
 from service.tracking.windows import fit_begins_at
@@ -37,7 +38,7 @@ def watched(alpha, scatter=SCATTER):
 def watch(story, alpha, after_s=10.0, scatter=SCATTER):
     """A look of the watchdog; the RTC's clock tells when."""
     now_ns = story.now_ns + round(after_s * SECOND)
-    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=now_ns)))
+    story.tell(rtc(t_ns=now_ns))
     return story.tell(ev.Watched(estimate=watched(alpha, scatter), t_ns_utc=now_ns), after_s)
 
 
@@ -254,9 +255,9 @@ def test_a_registration_without_a_bias_knows_nothing_of_it(story):
 )
 def test_another_loop_has_another_bias(story, changes):
     learnt(story)
-    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns)))
+    story.tell(rtc(t_ns=story.now_ns))
     assert story.state.registration.bias is not None
-    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns, **changes)))
+    story.tell(rtc(t_ns=story.now_ns, **changes))
     assert story.state.registration.bias is None
     assert story.state.registration.usable
 
@@ -265,7 +266,7 @@ def test_another_loop_has_another_bias(story, changes):
 def test_so_it_has_when_the_rtc_was_restarted_in_between(story, n_controlled, kept):
     learnt(story)
     story.tell(ev.SessionStarted(session="s2"))
-    story.tell(ev.StatusSeen(rtc=rtc(n_controlled, session="s2")))
+    story.tell(rtc(n_controlled, session="s2"))
     assert (story.state.registration.bias is not None) is kept
 
 
@@ -281,8 +282,8 @@ def test_so_it_has_when_the_service_was(story, n_controlled, kept):
 
 def test_a_look_that_was_under_way_when_the_loop_changed_is_not_used(story):
     learnt(story)
-    before = rtc().loop_numbers
-    story.tell(ev.StatusSeen(rtc=rtc(300, t_ns_utc=story.now_ns)))
+    before = loop_numbers(rtc())
+    story.tell(rtc(300, t_ns=story.now_ns))
     look = ev.Watched(estimate=watched(ALPHA), t_ns_utc=story.now_ns, loop=before)
     known = story.state.registration
     story.tell(look, after_s=1.0)
@@ -307,7 +308,7 @@ def test_a_look_at_a_loop_out_of_hand_moves_nothing(story, alarm):
 
 def test_a_bias_of_which_nothing_was_learnt_is_of_no_loop(story):
     before = story.state.registration.bias
-    story.tell(ev.StatusSeen(rtc=rtc(300, t_ns_utc=story.now_ns)))
+    story.tell(rtc(300, t_ns=story.now_ns))
     assert story.state.registration.bias is before
 
 
@@ -315,12 +316,12 @@ def test_gains_that_follow_the_seeing_by_a_percent_unteach_no_bias(story):
     learnt(story)
     before = story.state.registration.bias
     gains = (0.4 * 1.01,) * 400 + (0.0,) * 194
-    story.tell(ev.StatusSeen(rtc=rtc(t_ns_utc=story.now_ns, gains=gains)))
+    story.tell(rtc(t_ns=story.now_ns, gains=gains))
     assert story.state.registration.bias is before
     late = ev.Watched(
         estimate=watched(moved(shift_x_subap=0.06)),
         t_ns_utc=story.now_ns + 4 * SECOND,
-        loop=rtc().loop_numbers,
+        loop=loop_numbers(rtc()),
     )
     story.tell(late, 4.0)
     assert story.state.unwatched == ""

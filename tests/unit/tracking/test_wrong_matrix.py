@@ -8,7 +8,8 @@ from service.errors import CommandError
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
-from tests.unit.tracking.situations import Story, foreign, record, rtc
+from service.wire import DitherRequest
+from tests.unit.tracking.situations import Story, acknowledged, foreign, record, rtc
 
 SUM, OTHER = "a" * 64, "b" * 64
 
@@ -27,8 +28,8 @@ def sent(story=None):
 def answer(story, sha256, state=MatrixState.APPLIED, matrix_id="cm-1", frame_seq=1000):
     applied = state is MatrixState.APPLIED
     story.tell(
-        ev.Acknowledged(
-            id=matrix_id,
+        acknowledged(
+            matrix_id,
             sha256=sha256,
             state=state,
             reason="",
@@ -46,7 +47,7 @@ def test_another_sum_than_was_sent_is_an_alarm_and_nothing_is_published_any_more
     alarm = next(a for a in story.state.alarms if a.name == "wrong-matrix")
     assert SUM in alarm.text
     assert OTHER in alarm.text
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    story.tell(rtc(cm_id="cm-1"))
     assert story.state.in_use != "cm-1"
     story.make("cm-2", MatrixState.PROPOSED)
     with pytest.raises(CommandError, match="cm-1"):
@@ -66,7 +67,7 @@ def test_the_same_sum_is_applied():
 def test_a_wrong_matrix_is_read_back_and_is_over_when_it_is_right():
     story = sent()
     answer(story, OTHER)
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1")))
+    story.tell(rtc(cm_id="cm-1"))
     story.wait(11.0)
     assert ev.FetchMatrix(id="cm-1") in story.asked(ev.FetchMatrix)
     story.tell(ev.MatrixFetched(record=record("cm-1", sha256=OTHER)))
@@ -93,7 +94,7 @@ def test_a_commit_the_rtc_could_not_read_is_rejected_though_it_names_none():
     story = sent()
     answer(story, None, MatrixState.REJECTED, matrix_id=None)
     assert story.matrix_state("cm-1") is MatrixState.REJECTED
-    story.tell(ev.Acknowledged(id=None, state=MatrixState.REJECTED, reason="x", frame_seq=None))
+    story.tell(acknowledged(None, state=MatrixState.REJECTED, reason="x", frame_seq=None))
     assert "acknowledgement.unknown" in story.logged
 
 
@@ -106,7 +107,7 @@ def restarted(story=None):
     answer(story, SUM)
     story.tell(ev.SessionStarted(session="s2"))
     story.effects.clear()
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1", session="s2")))
+    story.tell(rtc(cm_id="cm-1", session="s2"))
     return story
 
 
@@ -118,7 +119,7 @@ def test_after_a_restart_a_known_matrix_is_read_back_before_it_is_believed():
     assert story.state.in_use == "cm-1"
     assert story.matrix_state("cm-1") is MatrixState.APPLIED
     story.effects.clear()
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1", session="s2")))
+    story.tell(rtc(cm_id="cm-1", session="s2"))
     story.wait(30.0)
     assert not story.asked(ev.FetchMatrix)
 
@@ -140,7 +141,7 @@ def test_nothing_is_sent_to_an_rtc_whose_matrix_is_being_read_back(order):
 def test_other_numbers_under_a_known_id_forbid_all_sending(order):
     story = restarted()
     story.tell(ev.MatrixFetched(record=record("cm-1", sha256=OTHER)))
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1", session="s2")))
+    story.tell(rtc(cm_id="cm-1", session="s2"))
     assert "wrong-matrix" in story.alarms
     assert story.state.in_use is None
     story.tell(order)
@@ -154,7 +155,7 @@ def test_an_rtc_that_does_not_offer_its_matrix_is_believed_by_the_id():
     story = restarted()
     (fetch,) = story.asked(ev.FetchMatrix)
     story.tell(ev.JobFailed(effect=fetch, text="no answer on rtc/cm/applied"))
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="cm-1", session="s2")))
+    story.tell(rtc(cm_id="cm-1", session="s2"))
     assert story.state.in_use == "cm-1"
     story.tell(ev.Rollback())
 
@@ -164,27 +165,27 @@ def test_an_rtc_that_does_not_offer_its_matrix_is_believed_by_the_id():
 
 def test_an_rtc_that_names_no_matrix_is_dithered_all_the_same_and_asked_now_and_then():
     story = Story(Mode.AUTO)
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id=None)))
+    story.tell(rtc(cm_id=None))
     story.wait(25.0)
-    assert story.asked(ev.AskDither)
+    assert story.asked(DitherRequest)
     assert 2 <= len(story.asked(ev.FetchMatrix)) <= 4
     assert set(story.asked(ev.FetchMatrix)) == {ev.FetchMatrix(id=None)}
 
 
 def test_what_it_answers_is_the_matrix_in_use():
     story = Story(Mode.AUTO)
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id=None)))
+    story.tell(rtc(cm_id=None))
     story.tell(ev.MatrixFetched(record=foreign("theirs")))
     assert story.state.in_use == "theirs"
 
 
 def test_an_rtc_that_does_not_offer_its_matrix_is_dithered_all_the_same():
     story = Story(Mode.AUTO)
-    story.tell(ev.StatusSeen(rtc=rtc(cm_id="theirs")))
+    story.tell(rtc(cm_id="theirs"))
     (fetch,) = story.asked(ev.FetchMatrix)
-    assert not story.asked(ev.AskDither)
+    assert not story.asked(DitherRequest)
     story.tell(ev.JobFailed(effect=fetch, text="no answer on rtc/cm/applied"))
     story.wait(2.0)
     assert story.state.unfetched == "no answer on rtc/cm/applied"
-    assert story.asked(ev.AskDither)
+    assert story.asked(DitherRequest)
     assert replace(story.state, alarms=()).in_use is None

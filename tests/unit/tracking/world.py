@@ -6,6 +6,16 @@ from service.telemetry.openloop import FarEstimate
 from service.tracking import events as ev
 from service.tracking.products import MatrixState, MeasureState, NoisyFinding, NoisyState
 from service.tracking.state import Mode
+from service.wire import (
+    DitherRequest,
+    DitherStatus,
+    DitherStop,
+    Loop,
+    LoopRequest,
+    MeasureRequest,
+    RampRequest,
+    Reply,
+)
 from tests.unit.tracking.situations import (
     ALPHA,
     N_MODES,
@@ -14,9 +24,12 @@ from tests.unit.tracking.situations import (
     SECOND,
     START_NS,
     Story,
+    acknowledged,
+    dither_answered,
     estimate,
     foreign,
     judged,
+    loop_answered,
     record,
     rtc,
     verdict,
@@ -75,12 +88,11 @@ class World(Story):
             "gains": gains,
             "n_controlled": self.n_controlled,
             "cm_id": self.cm_id,
-            "dither_id": None if self.playing is None else self.playing.id,
-            "dither": None if self.playing is None else replace(self.playing, asked_ns_utc=0),
+            "dither": self.playing,
             "seq": self.seq,
-            "t_ns_utc": self.now_ns,
+            "t_ns": self.now_ns,
         }
-        return ev.StatusSeen(rtc=rtc(**(seen | self.changes)))
+        return rtc(**(seen | self.changes))
 
     def tell(self, event, after_s=0.0):
         effects = super().tell(event, after_s)
@@ -104,7 +116,7 @@ class World(Story):
         """What the RTC has begun goes on, and ends."""
         dither = self.playing
         if dither is not None:
-            over = dither.start_seq + round(dither.duration_s * RATE_HZ)
+            over = dither.start_seq + round(dither.request.duration_s * RATE_HZ)
             if self.seq >= over:
                 self.playing = None
         if self.measured is not None and self.now_ns >= self.measured[1]:
@@ -125,7 +137,7 @@ class World(Story):
         self.since_window_s = STEP_S
         fitted = estimate(ALPHA, t_ns=self.now_ns, session=f"s{self.session}")
         if self.state.acquisition.looks_afar:
-            far = replace(fitted, modes=self.playing.modes, covariance=1e2 * PRECISE)
+            far = replace(fitted, modes=self.playing.request.modes, covariance=1e2 * PRECISE)
             self.tell(ev.FarFitted(found=FarEstimate(estimate=far, unexplained=0.05, n_starts=1)))
         elif self.loop != "open":
             self.tell(ev.WindowFitted(estimate=fitted))
@@ -148,45 +160,42 @@ class World(Story):
         """The world's answers to something that was asked of it."""
         self.told.append(effect)
         match effect:
-            case ev.AskDither(dither=dither):
+            case ev.Ask(request=DitherRequest() as asked):
                 busy = self.busy or ("busy: dither" if self.playing is not None else "")
                 if not busy:
-                    self.playing = replace(dither, start_seq=self.seq + 1)
+                    self.playing = DitherStatus(request=asked, start_seq=self.seq + 1)
                 start = None if busy else self.seq + 1
-                yield ev.DitherAnswered(
-                    id=dither.id, accepted=not busy, reason=busy, start_seq=start
-                )
-            case ev.AskNoDither():
+                yield dither_answered(asked.id, accepted=not busy, reason=busy, start_seq=start)
+            case ev.Ask(request=DitherStop()):
                 self.playing = None
-            case ev.AskLoop() | ev.AskRamp():
-                yield from self.of_the_loop(effect)
-            case ev.AskMeasurement(record=asked):
+            case ev.Ask(request=LoopRequest() | RampRequest() as asked):
+                yield from self.of_the_loop(asked)
+            case ev.Ask(request=MeasureRequest() as asked):
                 busy = self.busy or ("busy: dither" if self.playing is not None else "")
-                if busy:
-                    refused = replace(asked, state=MeasureState.REFUSED, reason=busy)
-                    yield ev.MatrixMeasured(record=refused)
-                    return
-                self.measured = (asked, self.now_ns + round(MEASURES_FOR_S * SECOND))
-                if asked.opens_loop:
-                    self.loop = "open"
-                    self.begin_session()
-                running = replace(asked, state=MeasureState.RUNNING, start_seq=9)
-                yield ev.MatrixMeasured(record=running)
+                start = None if busy else 9
+                if not busy:
+                    record = self.state.measurement(asked.id)
+                    self.measured = (record, self.now_ns + round(MEASURES_FOR_S * SECOND))
+                    if record.opens_loop:
+                        self.loop = "open"
+                        self.begin_session()
+                reply = Reply(id=asked.id, accepted=not busy, reason=busy, start_seq=start)
+                yield ev.Answered(request=asked, reply=reply)
             case _:
                 yield from self.of_matrices(effect)
 
-    def of_the_loop(self, effect):
-        opens = isinstance(effect, ev.AskLoop) and effect.closed is False
+    def of_the_loop(self, asked):
+        opens = isinstance(asked, LoopRequest) and asked.loop is Loop.OPEN
         busy = "" if opens and self.measured is None else self.busy
-        if not busy and isinstance(effect, ev.AskRamp):
-            n_frames = len(effect.groups) * len(effect.gains) * effect.frames_per_gain
+        if not busy and isinstance(asked, RampRequest):
+            n_frames = len(asked.groups) * len(asked.gains) * asked.frames_per_gain
             self.ramp_until_ns = self.now_ns + n_frames * SECOND // RATE_HZ
         elif not busy:
-            self.n_controlled = effect.n_controlled or self.n_controlled
-            if effect.closed is not None and effect.closed is not (self.loop == "closed"):
-                self.loop = "closed" if effect.closed else "open"
+            self.n_controlled = asked.n_controlled or self.n_controlled
+            if asked.loop is not None and asked.loop != self.loop:
+                self.loop = asked.loop
                 self.begin_session(opens)
-        yield ev.LoopAnswered(id=effect.id, accepted=not busy, reason=busy)
+        yield loop_answered(asked.id, accepted=not busy, reason=busy)
 
     def of_matrices(self, effect):
         known, view = self.state.registration, self.state.rtc
@@ -212,8 +221,11 @@ class World(Story):
                 yield ev.ProposalJudged(id=name, verdict=verdict(), judged=at, wanted=wanted)
             case ev.SendMatrix(id=name, n_modes=n_modes):
                 self.cm_id, self.n_controlled = name, n_modes
-                yield ev.Acknowledged(
-                    id=name, state=MatrixState.APPLIED, reason="", frame_seq=self.seq
+                yield acknowledged(
+                    name,
+                    state=MatrixState.APPLIED,
+                    frame_seq=self.seq,
+                    session=f"s{self.session}",
                 )
             case ev.FinishNoisy(record=asked):
                 yield ev.NoisyMade(record=replace(asked, state=NoisyState.STORED, finding=FOUND))

@@ -73,7 +73,7 @@ def candidates(
     """Yield the reconstructors, the measured matrix's own first."""
     synthetic = model.interaction_matrix(fit.alpha)
     n_basis = synthetic.shape[1]
-    gains = CalibrationGains.of_modes(fit.gains, np.arange(N_MEASURED), n_basis, passes=PASSES)
+    gains = CalibrationGains.of_modes(fit.gains, np.arange(N_MEASURED), n_basis)
     tuned = gains.tuned(synthetic)
     prior = Prior(variance_m2=model.basis.variance_m2, slope_noise=np.full(len(synthetic), noise))
     sources = [("measured", measured, Method.SVD, N_MEASURED)]
@@ -81,9 +81,7 @@ def candidates(
     for n_modes in (N_MEASURED, 500, n_basis):
         sources += [("synthetic, tuned", tuned, method, n_modes) for method in Method]
     for name, matrix, method, n_modes in sources:
-        recipe = Recipe(
-            n_modes=n_modes, method=method, prior=prior if method is Method.MAP else None
-        )
+        recipe = Recipe(n_modes=n_modes, prior=prior if method is Method.MAP else None)
         made = reconstruct(matrix, recipe)
         yield Candidate(
             name=f"{name}, {method} {n_modes}",

@@ -19,7 +19,7 @@ from service.archive.store import write_whole
 from service.commands.arguments import say, show_progress
 from service.config import load_instrument
 from service.control.gains import CalibrationGains
-from service.control.reconstructor import Method, Prior, Provenance, Recipe, Source, reconstruct
+from service.control.reconstructor import Method, Prior, Provenance, Recipe, reconstruct
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import file_sha256
 from service.files.light import read_light
@@ -143,13 +143,10 @@ def _inverted(
     """Return the reconstructor with how it was made, and the matrix that it inverts."""
     gains = None
     if known.gains is not None and known.modes is not None and not options.no_gains:
-        gains = CalibrationGains.of_modes(
-            known.gains, known.modes, model.basis.n_modes, passes=2 if known.double_pass else 1
-        )
+        gains = CalibrationGains.of_modes(known.gains, known.modes, model.basis.n_modes)
         matrix = gains.tuned(matrix)
     recipe = _recipe(options, model)
     provenance = Provenance(
-        source=Source.SYNTHETIC,
         recipe=recipe,
         inversion=reconstruct(matrix, recipe),
         alpha=known.alpha,
@@ -163,15 +160,14 @@ def _inverted(
 
 
 def _recipe(options: argparse.Namespace, model: RtcInteractionModel) -> Recipe:
-    prior, method = None, Method(options.method)
-    if method is Method.MAP:
+    prior = None
+    if options.method == Method.MAP:
         prior = Prior(
             variance_m2=model.basis.variance_m2,
             slope_noise=np.full(model.n_slopes, options.slope_noise),
         )
     return Recipe(
         n_modes=options.modes,
-        method=method,
         max_condition=options.max_condition,
         prior=prior,
     )

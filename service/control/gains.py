@@ -40,17 +40,14 @@ class CalibrationGains:
     """How much of the model's response a measured matrix shows, for every mode of the basis."""
 
     values: Array
-    """``(n_basis,)`` measured over ``passes`` times the model's; near 1."""
+    """``(n_basis,)`` measured over the model's, passes divided out; near 1."""
 
     measured: NDArray[np.bool_]
     """``(n_basis,)`` whether the mode was measured; the others take their neighbours' median."""
 
-    passes: int
-    """How often the light met the mirror in that measurement; not part of ``values``."""
-
     @classmethod
     def of_modes(
-        cls, gains: NDArray[Any], modes: NDArray[np.intp], n_basis: int, *, passes: int
+        cls, gains: NDArray[Any], modes: NDArray[np.intp], n_basis: int
     ) -> CalibrationGains:
         """Extend the gains ``(n,)`` of the measured ``modes`` to a basis of ``n_basis``.
 
@@ -59,7 +56,7 @@ class CalibrationGains:
         Raises
         ------
         ModelError
-            If modes and gains do not match, a gain is not positive, or ``passes`` is not 1 or 2.
+            If modes and gains do not match, or a gain is not positive.
         """
         if len(gains) == 0 or len(modes) != len(gains) or len(np.unique(modes)) != len(modes):
             raise ModelError(
@@ -78,13 +75,11 @@ class CalibrationGains:
                 "calibration gains: found a gain that is not a positive number; expected the "
                 "orientation settled and dead modes left out"
             )
-        if passes not in {1, 2}:
-            raise ModelError(f"calibration gains: found {passes} passes; expected 1 or 2")
         values = np.array([_nearby_median(mode, known, given) for mode in range(n_basis)])
         values[known] = given
         measured = np.zeros(n_basis, dtype=np.bool_)
         measured[known] = True
-        return cls(values=values, measured=measured, passes=passes)
+        return cls(values=values, measured=measured)
 
     def tuned(self, interaction_matrix: NDArray[Any]) -> NDArray[Any]:
         """Return ``D diag(g)``: the model's columns with the stroke the mirror really has.

@@ -182,16 +182,6 @@ class Method(StrEnum):
     """Least squares weighted by noise, with the turbulence as prior."""
 
 
-class Source(StrEnum):
-    """Where an interaction matrix comes from."""
-
-    SYNTHETIC = "synthetic"
-    """Computed by the model for a registration."""
-
-    MEASURED = "measured"
-    """Read off a sensor, noise included."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recipe:
     """How to invert an interaction matrix."""
@@ -199,25 +189,16 @@ class Recipe:
     n_modes: int
     """Modes to control: the first ones of the basis."""
 
-    method: Method = Method.SVD
-    """How."""
-
     max_condition: float = MAX_CONDITION
     """SVD: singular values below the largest over this are left out."""
 
     prior: Prior | None = None
-    """MAP: what is known of modes and noise."""
+    """What is known of modes and noise; None: nothing."""
 
-    def __post_init__(self) -> None:
-        """Refuse a recipe that lacks an ingredient.
-
-        Raises
-        ------
-        ModelError
-            If MAP has no prior.
-        """
-        if self.method is Method.MAP and self.prior is None:
-            raise ModelError("reconstructor: found method map without a prior; expected one")
+    @property
+    def method(self) -> Method:
+        """How it is done: what is known beforehand is used."""
+        return Method.SVD if self.prior is None else Method.MAP
 
 
 def reconstruct(interaction_matrix: NDArray[Any], recipe: Recipe) -> Inversion:
@@ -228,7 +209,7 @@ def reconstruct(interaction_matrix: NDArray[Any], recipe: Recipe) -> Inversion:
     ModelError
         If the matrix cannot be inverted so: see the methods.
     """
-    if recipe.method is Method.MAP and recipe.prior is not None:
+    if recipe.prior is not None:
         return invert_with_prior(interaction_matrix, recipe.n_modes, recipe.prior)
     return invert(interaction_matrix, recipe.n_modes, max_condition=recipe.max_condition)
 
@@ -236,9 +217,6 @@ def reconstruct(interaction_matrix: NDArray[Any], recipe: Recipe) -> Inversion:
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Provenance:
     """What a reconstructor was made of."""
-
-    source: Source
-    """Of the interaction matrix."""
 
     recipe: Recipe
     """How it was inverted."""
@@ -267,7 +245,7 @@ class Provenance:
     def attributes(self) -> dict[str, str | int | float | bool]:
         """Return everything as flat, named, scalar facts: for file attributes and JSON."""
         found: dict[str, str | int | float | bool] = {
-            "source": str(self.source),
+            "source": "synthetic",
             "method": str(self.recipe.method),
             "n_modes": self.recipe.n_modes,
             "condition_number": self.inversion.condition_number,
@@ -275,14 +253,13 @@ class Provenance:
             "single_pass": True,
             "measured_illumination": self.measured_illumination,
         }
-        if self.recipe.method is Method.SVD:
+        prior = self.recipe.prior
+        if prior is None:
             found["max_condition"] = self.recipe.max_condition
-        elif self.recipe.prior is not None:
-            found["prior_n_modes"] = len(self.recipe.prior.variance_m2)
-            found["prior_wavefront_m"] = float(np.sqrt(self.recipe.prior.variance_m2.sum()))
-            found["prior_slope_noise"] = float(
-                np.sqrt(np.mean(np.square(self.recipe.prior.slope_noise)))
-            )
+        else:
+            found["prior_n_modes"] = len(prior.variance_m2)
+            found["prior_wavefront_m"] = float(np.sqrt(prior.variance_m2.sum()))
+            found["prior_slope_noise"] = float(np.sqrt(np.mean(np.square(prior.slope_noise))))
         return found | self._registration() | self._reference()
 
     def _registration(self) -> dict[str, str | int | float | bool]:

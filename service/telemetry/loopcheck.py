@@ -19,7 +19,7 @@ over (clipping, turbulence played on the mirror, another matrix) nothing is said
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any
 
@@ -353,16 +353,16 @@ class LoopLaw:
     cm_id: str | None = None
     """The matrix that made them."""
 
-    modes: NDArray[np.intp] | None = None
-    """``(n_watched,)``; None: nothing was fed yet."""
+    modes: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    """``(n_watched,)``."""
 
-    seq: NDArray[np.int64] | None = None
+    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """``(n_frames,)`` oldest first, holes where frames were lost."""
 
-    commands_m: Array | None = None
+    commands_m: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """``(n_frames, n_watched)`` the integrator's own: no dither."""
 
-    seen_m: Array | None = None
+    seen_m: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """``(n_frames, n_watched)`` R s."""
 
     judged_seq: int = -JUDGED_EVERY
@@ -386,29 +386,26 @@ def follow(law: LoopLaw, block: FrameBlock, loop: ClosedLoop) -> LoopLaw:
     """Return the law after one more block, as far as it is of this loop."""
     if block.first_seq < law.from_seq:
         return law
-    if law.cm_id != block.cm_id or law.seq is None:
+    if law.cm_id != block.cm_id or not len(law.seq):
         # the first frames of a matrix follow from slopes that another one multiplied
         law = _begun(law, block.cm_id, loop)
-    if law.modes is None or not len(law.modes):
+    if not len(law.modes):
         return law
     own = block.commands_m[:, law.modes]
     if block.dither_m is not None:
         own = own - block.dither_m[:, law.modes]
     seen = block.slopes @ loop.reconstructor[law.modes].T
-    seq = np.arange(block.first_seq, block.first_seq + block.n_frames)
+    seq = np.arange(block.first_seq, block.next_seq)
     return replace(
         law,
-        seq=_kept(law.seq, seq),
-        commands_m=_kept(law.commands_m, own),
-        seen_m=_kept(law.seen_m, seen),
+        seq=np.concatenate([law.seq, seq])[-KEPT_FRAMES:],
+        commands_m=np.concatenate([law.commands_m, own])[-KEPT_FRAMES:],
+        seen_m=np.concatenate([law.seen_m, seen])[-KEPT_FRAMES:],
     )
 
 
 def judged(law: LoopLaw, loop: ClosedLoop, last_seq: int) -> tuple[LoopLaw, FoundLaw | None]:
     """Return what the frames up to one say of the loop; None: nothing, or nothing new."""
-    modes, commands, seen = law.modes, law.commands_m, law.seen_m
-    if law.seq is None or modes is None or commands is None or seen is None:
-        return law, None
     if last_seq - law.judged_seq < JUDGED_EVERY:
         return law, None
     n_taps = int(loop.delay_frames) + MORE_TAPS
@@ -418,11 +415,11 @@ def judged(law: LoopLaw, loop: ClosedLoop, last_seq: int) -> tuple[LoopLaw, Foun
     if len(at) < ENOUGH_FRAMES:
         return law, None
     law = replace(law, judged_seq=int(law.seq[at[-1]]))
-    fits = _fitted(commands.astype(float), seen.astype(float), at, n_taps)
+    fits = _fitted(law.commands_m.astype(float), law.seen_m.astype(float), at, n_taps)
     clear = np.flatnonzero(fits.clear)
-    if 2 * len(clear) < len(modes) or not len(clear):
+    if 2 * len(clear) < len(law.modes) or not len(clear):
         return law, None
-    return law, _compared(fits, clear, loop.gains[modes].astype(float), loop)
+    return law, _compared(fits, clear, loop.gains[law.modes].astype(float), loop)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -498,10 +495,6 @@ def _hint(gain: float) -> str:
 def _begun(law: LoopLaw, cm_id: str | None, loop: ClosedLoop) -> LoopLaw:
     in_loop = np.flatnonzero(loop.gains > 0.0)
     chosen = np.unique(np.linspace(0, len(in_loop) - 1, MODES_WATCHED).round().astype(int))
-    return LoopLaw(
-        from_seq=law.from_seq, cm_id=cm_id, modes=in_loop[chosen] if len(in_loop) else in_loop
-    )
-
-
-def _kept(kept: Array | None, new: Array) -> Array:
-    return new[-KEPT_FRAMES:] if kept is None else np.concatenate([kept, new])[-KEPT_FRAMES:]
+    modes = in_loop[chosen] if len(in_loop) else in_loop
+    none = np.zeros((0, len(modes)), np.float32)
+    return LoopLaw(from_seq=law.from_seq, cm_id=cm_id, modes=modes, commands_m=none, seen_m=none)

@@ -370,7 +370,6 @@ class OpticsWorker:
             )
         return Recipe(
             n_modes=n_modes,
-            method=self._compute.method,
             max_condition=self._compute.max_condition,
             prior=prior,
         )

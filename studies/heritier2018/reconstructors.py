@@ -128,17 +128,17 @@ class FittedReconstructor:
         fit, passes = store.read(self.fit), self.fit.measurement.occasion.passes
         matrix = synthetic_matrix(fitted_alpha(fit))
         if self.tuned:
-            matrix = calibration_gains(fit, matrix.shape[1], passes).tuned(matrix)
+            matrix = calibration_gains(fit, matrix.shape[1]).tuned(matrix)
         return _record(invert(passes * matrix, self.n_modes))
 
 
 AnyReconstructor = ModelReconstructor | MeasuredReconstructor | FittedReconstructor
 
 
-def calibration_gains(fit: Record, n_basis: int, passes: int) -> CalibrationGains:
+def calibration_gains(fit: Record, n_basis: int) -> CalibrationGains:
     """Return the gains that a fit found, for every mode of the basis."""
     modes = np.arange(len(fit["gains"]))
-    return CalibrationGains.of_modes(fit["gains"], modes, n_basis, passes=passes)
+    return CalibrationGains.of_modes(fit["gains"], modes, n_basis)
 
 
 def synthetic_matrix(alpha: Misregistration) -> NDArray[np.float64]:

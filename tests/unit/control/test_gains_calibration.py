@@ -13,10 +13,10 @@ from tests.numerics import N_MODES, small_linearisation
 MATRIX = small_linearisation().matrix
 
 
-def gains_of(values, modes=None, n_basis=N_MODES, passes=1):
+def gains_of(values, modes=None, n_basis=N_MODES):
     values = np.asarray(values, dtype=float)
     modes = np.arange(len(values)) if modes is None else np.asarray(modes)
-    return CalibrationGains.of_modes(values, modes, n_basis, passes=passes)
+    return CalibrationGains.of_modes(values, modes, n_basis)
 
 
 def test_a_tuned_matrix_has_each_column_times_its_gain():
@@ -55,12 +55,6 @@ def test_modes_may_come_in_any_order_and_with_gaps():
     assert np.flatnonzero(found.measured).tolist() == [4, 6, 9]
 
 
-def test_the_second_pass_is_stated_and_stays_out_of_the_gains():
-    once, twice = gains_of(np.ones(10), passes=1), gains_of(np.ones(10), passes=2)
-    assert (once.passes, twice.passes) == (1, 2)
-    np.testing.assert_array_equal(once.tuned(MATRIX), twice.tuned(MATRIX))
-
-
 @pytest.mark.parametrize(
     ("values", "modes", "text"),
     [
@@ -75,11 +69,6 @@ def test_the_second_pass_is_stated_and_stays_out_of_the_gains():
 def test_gains_that_cannot_be_are_refused(values, modes, text):
     with pytest.raises(ModelError, match=text):
         gains_of(values, modes=np.array(modes, dtype=int))
-
-
-def test_light_meets_the_mirror_once_or_twice():
-    with pytest.raises(ModelError, match="found 3 passes; expected 1 or 2"):
-        gains_of([1.0], passes=3)
 
 
 def test_more_columns_than_the_gains_know_are_refused():

@@ -9,21 +9,18 @@ import pytest
 
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import (
-    Method,
     Prior,
     Provenance,
     Recipe,
-    Source,
     invert,
     invert_with_prior,
     reconstruct,
 )
-from service.errors import ModelError
 from tests.numerics import N_CONTROLLED, N_MODES, SOMEWHERE, small_basis, small_linearisation
 
 MATRIX = small_linearisation().matrix
 PRIOR = Prior(variance_m2=small_basis().variance_m2, slope_noise=np.full(len(MATRIX), 0.05))
-BY_MAP = Recipe(n_modes=N_CONTROLLED, method=Method.MAP, prior=PRIOR)
+BY_MAP = Recipe(n_modes=N_CONTROLLED, prior=PRIOR)
 
 
 def test_a_recipe_is_carried_out_by_its_method():
@@ -38,15 +35,9 @@ def test_the_limit_of_the_condition_is_obeyed():
     assert truncated.n_truncated > 0
 
 
-def test_a_map_recipe_needs_a_prior():
-    with pytest.raises(ModelError, match="method map without a prior"):
-        Recipe(n_modes=3, method=Method.MAP)
-
-
 def test_the_provenance_of_a_tuned_synthetic_matrix_says_what_it_was_made_of():
-    gains = CalibrationGains.of_modes(np.ones(20), np.arange(20), N_MODES, passes=2)
+    gains = CalibrationGains.of_modes(np.ones(20), np.arange(20), N_MODES)
     found = Provenance(
-        source=Source.SYNTHETIC,
         recipe=BY_MAP,
         inversion=reconstruct(gains.tuned(MATRIX), BY_MAP),
         alpha=SOMEWHERE,
@@ -68,11 +59,8 @@ def test_the_provenance_of_a_tuned_synthetic_matrix_says_what_it_was_made_of():
     assert json.loads(json.dumps(found)) == found
 
 
-def test_the_provenance_of_a_measured_matrix_claims_no_registration():
+def test_a_provenance_without_a_registration_claims_none():
     recipe = Recipe(n_modes=10)
-    found = Provenance(
-        source=Source.MEASURED, recipe=recipe, inversion=reconstruct(MATRIX, recipe)
-    ).attributes()
-    assert found["source"] == "measured"
+    found = Provenance(recipe=recipe, inversion=reconstruct(MATRIX, recipe)).attributes()
     assert found["max_condition"] == 100.0
     assert not {"rotation_deg", "prior_n_modes", "n_gains_measured"} & set(found)

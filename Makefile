@@ -6,6 +6,8 @@
 PYTHON ?= python3
 PY := .venv/bin/python
 STAMP := .venv/.installed-for
+# A hundred processes that each compile the service anew cost a minute.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(PY) -m pytest
 
 # The stamp names the folder it was made in: a copied or moved checkout gets an environment of its own.
 ifneq ($(wildcard $(PY)),)
@@ -24,10 +26,10 @@ demo: $(STAMP) ## service and simulated RTC together; ARGS="--seconds 60" and th
 	@.venv/bin/pyrcal demo $(ARGS)
 
 test: $(STAMP) ## all that a change needs, what is known soonest first; ARGS go to pytest
-	@$(PY) -m pytest -n 2 -m 'not long and not slow' $(ARGS)
+	@$(PYTEST) -n 3 -m 'not long and not slow' $(ARGS)
 
 test-long: $(STAMP) ## the other tests: what takes minutes of real time
-	@$(PY) -m pytest -n 3 -m 'long and not slow' $(ARGS)  # they wait more than they work
+	@$(PYTEST) -n 3 -m 'long and not slow' $(ARGS)  # they wait more than they work
 
 check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff check .

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from service.config.instrument_schema import (
     read_instrument_file,
 )
 from service.config.mirrors import MirrorFile, own_modes, read_mirror
-from service.config.sources import Place, in_file, read_dataset, refuse
+from service.config.sources import read_dataset, refuse
 from service.errors import ConfigurationError, ModelError
 from service.model.instrument import (
     FrameWindows,
@@ -39,13 +38,6 @@ _SEPARATION_TOLERANCE = 0.1
 _FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
 
 
-class _Source(NamedTuple):
-    folder: Path
-    """What file references are relative to."""
-
-    place: Place
-
-
 def load_instrument(name_or_path: str | Path) -> Instrument:
     """Return the instrument that a packaged name (``flao-lbt``) or a TOML file describes.
 
@@ -59,19 +51,17 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         in contradiction to another.
     """
     tables, path = read_instrument_file(name_or_path)
-    source = _Source(path.parent, in_file(path))
     about = tables.instrument
-    wfs = _pyramid(tables.wfs, source)
+    wfs = _pyramid(tables.wfs, path)
     mirror, remarks = read_mirror(
         MirrorFile(
             table=tables.mirror,
-            folder=source.folder,
-            place=source.place,
+            path=path,
             diameter_m=about.diameter_m,
             subaperture_m=about.diameter_m / wfs.pupil_diameter,
         )
     )
-    modes = _modes(tables.modes, mirror, source)
+    modes = _modes(tables.modes, mirror, path)
     return Instrument(
         name=about.name,
         diameter_m=about.diameter_m,
@@ -81,9 +71,9 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         wfs=wfs,
         mirror=mirror,
         modes=modes,
-        slopes=_slopes(tables, source),
-        frames=_frames(tables.wfs, source),
-        loop=_loop(tables.loop, modes.n_modes, source),
+        slopes=_slopes(tables, path),
+        frames=_frames(tables.wfs, path),
+        loop=_loop(tables.loop, modes.n_modes, path),
         remarks=remarks,
         basis_id=about.basis_id,
         config_id=about.config_id,
@@ -101,9 +91,9 @@ def packaged_instrument(name: str) -> Instrument:
     return load_instrument(packaged_file(name))
 
 
-def _modes(table: ModesTable, mirror: Mirror | TabulatedModes, source: _Source) -> KarhunenLoeve:
+def _modes(table: ModesTable, mirror: Mirror | TabulatedModes, path: Path) -> KarhunenLoeve:
     """Return the turbulence, and as many modes as the user's basis or ``[modes]`` has."""
-    where, own = source.place(("modes", "n_modes")), own_modes(mirror)
+    where, own = f"{path}: modes.n_modes", own_modes(mirror)
     if own is not None:
         if "n_modes" in table.model_fields_set:
             refuse(where, f"it beside a basis of its own {own} modes", "it for KL modes only")
@@ -118,11 +108,11 @@ def _modes(table: ModesTable, mirror: Mirror | TabulatedModes, source: _Source) 
     return KarhunenLoeve(**table.model_dump())
 
 
-def _slopes(tables: InstrumentFile, source: _Source) -> SlopeRecipe:
+def _slopes(tables: InstrumentFile, path: Path) -> SlopeRecipe:
     table = tables.slopes
     if tables.wfs.input == "frames" and "order" in table.model_fields_set:
         raise ConfigurationError(
-            f'{source.place(("slopes", "order"))}: has no meaning beside wfs.input = "frames", '
+            f'{path}: slopes.order: has no meaning beside wfs.input = "frames", '
             "whose slopes are made here"
         )
     orientation = None
@@ -137,46 +127,45 @@ def _slopes(tables: InstrumentFile, source: _Source) -> SlopeRecipe:
     )
 
 
-def _frames(table: WfsTable, source: _Source) -> FrameWindows | None:
+def _frames(table: WfsTable, path: Path) -> FrameWindows | None:
     if table.input == "slopes":
         for key in _FRAME_KEYS:
             if key in table.model_fields_set and getattr(table, key) != 1:
                 raise ConfigurationError(
-                    f'{source.place(("wfs", key))}: belongs to input = "frames", '
-                    'found input = "slopes"'
+                    f'{path}: wfs.{key}: belongs to input = "frames", found input = "slopes"'
                 )
         return None
     centres = None
     if table.pupil_centres_px is not None:
-        centres = _by_quadrant(table.pupil_centres_px, source).reshape(4, 2)
+        centres = _by_quadrant(table.pupil_centres_px, path).reshape(4, 2)
     return FrameWindows(centres_px=centres, pixels_per_subaperture=table.pixels_per_subaperture)
 
 
-def _by_quadrant(centres_px: Centres, source: _Source) -> NDArray[np.float64]:
+def _by_quadrant(centres_px: Centres, path: Path) -> NDArray[np.float64]:
     try:
         return by_quadrant(np.array(centres_px))
     except ModelError as error:
-        raise ConfigurationError(f"{source.place(('wfs', 'pupil_centres_px'))}: {error}") from error
+        raise ConfigurationError(f"{path}: wfs.pupil_centres_px: {error}") from error
 
 
-def _loop(table: LoopTable, n_modes: int, source: _Source) -> LoopFacts | None:
+def _loop(table: LoopTable, n_modes: int, path: Path) -> LoopFacts | None:
     if not table.model_fields_set:
         return None
     if table.n_controlled is not None and table.n_controlled > n_modes:
         refuse(
-            source.place(("loop", "n_controlled")),
+            f"{path}: loop.n_controlled",
             str(table.n_controlled),
             f"at most the {n_modes} modes of the basis",
         )
     return LoopFacts(**table.model_dump())
 
 
-def _pyramid(table: WfsTable, source: _Source) -> Pyramid:
+def _pyramid(table: WfsTable, path: Path) -> Pyramid:
     diameter = table.pupil_diameter_subap or float(table.n_subapertures)
-    separation = _separation(table, source)
+    separation = _separation(table, path)
     if separation < diameter:
         refuse(
-            source.place(("wfs", "pupil_separation_subap")),
+            f"{path}: wfs.pupil_separation_subap",
             f"{separation:g}",
             f"at least the pupil's diameter, {diameter:g} subapertures: the images would overlap",
         )
@@ -184,10 +173,10 @@ def _pyramid(table: WfsTable, source: _Source) -> Pyramid:
     if table.valid_subapertures != "auto":
         if "flux_threshold" in table.model_fields_set:
             raise ConfigurationError(
-                f"{source.place(('wfs', 'flux_threshold'))}: has no meaning beside a mask file "
+                f"{path}: wfs.flux_threshold: has no meaning beside a mask file "
                 "(wfs.valid_subapertures): remove one of the two"
             )
-        mask = _mask(table, source)
+        mask = _mask(table, path)
     return Pyramid(
         n_subapertures=table.n_subapertures,
         wavelength_m=table.wavelength_m,
@@ -199,28 +188,28 @@ def _pyramid(table: WfsTable, source: _Source) -> Pyramid:
     )
 
 
-def _separation(table: WfsTable, source: _Source) -> float:
+def _separation(table: WfsTable, path: Path) -> float:
     """Return the images' distance: as given, or as the images on the frames lie."""
     stated = table.pupil_separation_subap
     if table.pupil_centres_px is None or table.input == "slopes":
         return stated
-    centres = _by_quadrant(table.pupil_centres_px, source)
+    centres = _by_quadrant(table.pupil_centres_px, path)
     sides = (centres[1, :, 0] - centres[0, :, 0], centres[:, 1, 1] - centres[:, 0, 1])
     measured = float(np.mean(sides)) / table.pixels_per_subaperture
     if "pupil_separation_subap" not in table.model_fields_set:
         return measured
     if abs(measured / stated - 1.0) > _SEPARATION_TOLERANCE:
         refuse(
-            source.place(("wfs", "pupil_separation_subap")),
+            f"{path}: wfs.pupil_separation_subap",
             f"{stated:g}",
             f"about {measured:.1f}, the distance of wfs.pupil_centres_px",
         )
     return stated
 
 
-def _mask(table: WfsTable, source: _Source) -> NDArray[np.bool_]:
-    where = source.place(("wfs", "valid_subapertures"))
-    values = read_dataset(table.valid_subapertures, source.folder, where)
+def _mask(table: WfsTable, path: Path) -> NDArray[np.bool_]:
+    where = f"{path}: wfs.valid_subapertures"
+    values = read_dataset(table.valid_subapertures, path.parent, where)
     n = table.n_subapertures
     if values.shape != (n, n):
         refuse(where, f"shape {values.shape}", f"(n_subapertures, n_subapertures) = ({n}, {n})")

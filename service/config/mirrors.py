@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config.instrument_schema import MirrorTable
-from service.config.sources import Place, read_dataset, refuse
+from service.config.sources import read_dataset, refuse
 from service.errors import ConfigurationError
 from service.model.instrument import BasisKind, Influence, Mirror, TabulatedModes
 from service.model.tabulated import (
@@ -50,10 +50,9 @@ class MirrorFile:
     """The ``[mirror]`` table and what is needed to understand it."""
 
     table: MirrorTable
-    folder: Path
-    """What file references are relative to."""
+    path: Path
+    """Of the file; references in it are relative to where it lies."""
 
-    place: Place
     diameter_m: float
     """Of the pupil."""
 
@@ -62,11 +61,11 @@ class MirrorFile:
 
     def where(self, key: str) -> str:
         """Return the file and key, for messages."""
-        return self.place(("mirror", key))
+        return f"{self.path}: mirror.{key}"
 
     def read(self, key: str) -> NDArray[np.floating]:
         """Return the array this key refers to, as float32 where it is no finer, else float64."""
-        values = read_dataset(getattr(self.table, key), self.folder, self.where(key))
+        values = read_dataset(getattr(self.table, key), self.path.parent, self.where(key))
         single = values.dtype.kind == "f" and values.dtype.itemsize <= 4
         return values.astype(np.float32 if single else np.float64, copy=False)
 
@@ -98,9 +97,7 @@ def _check_keys(file: MirrorFile) -> None:
     table, given = file.table, file.table.model_fields_set
     kinds = [kind for kind in _KINDS if getattr(table, kind) is not None]
     if len(kinds) != 1:
-        refuse(
-            file.place(("mirror",)), " and ".join(kinds) or "none of them", f"one of {_listed()}"
-        )
+        refuse(f"{file.path}: mirror", " and ".join(kinds) or "none of them", f"one of {_listed()}")
     for key in sorted(_FOREIGN[kinds[0]] & given):
         raise ConfigurationError(f"{file.where(key)}: has no meaning beside mirror.{kinds[0]}")
     if table.mode_to_actuator is not None and "basis" in given:
@@ -137,7 +134,7 @@ def _analytic(file: MirrorFile) -> Mirror:
     pair = coincident(positions)
     if pair is not None:
         refuse(
-            file.place(("mirror",)),
+            f"{file.path}: mirror",
             f"actuators {pair[0]} and {pair[1]} in the same place",
             "every actuator in a place of its own",
         )
@@ -177,14 +174,14 @@ def _rings(file: MirrorFile) -> NDArray[np.float64]:
             f"at least first_ring = {table.first_ring}",
         )
     positions = rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
-    _check_number(len(positions), file.place(("mirror",)))
+    _check_number(len(positions), f"{file.path}: mirror")
     return positions
 
 
 def _grid(file: MirrorFile) -> NDArray[np.float64]:
     n_across, pitch_m, diameter_m = _mandatory(file, ("n_across", "pitch_m", "diameter_m"))
     positions = grid(n_across, pitch_m, diameter_m)
-    _check_number(len(positions), file.place(("mirror",)))
+    _check_number(len(positions), f"{file.path}: mirror")
     return positions
 
 

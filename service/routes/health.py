@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from enum import StrEnum
 from http import HTTPStatus
 
-import numpy as np
 from fastapi import APIRouter, Request, Response
-from numpy.typing import NDArray
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import choose_encoder
@@ -119,33 +118,32 @@ class SnapshotCollector(Collector):
     def collect(self) -> Iterator[Metric]:  # type: ignore[explicit-override]
         """Yield every metric."""
         snapshot = self._snapshot()
-        yield _labelled_gauge("build_info", "Version", "version", {__version__: 1})
+        tracker = snapshot.tracker
+        yield _gauge("build_info", "Version", {__version__: 1}, "version")
         yield _gauge("ready", "1 when the service can do its work", snapshot.ready)
         yield _gauge("uptime_seconds", "Since the service started", snapshot.uptime_s)
         refused = "Attempts to write that the disk has refused"
-        yield CounterMetricFamily(
-            "pyrcal_archive_failures", refused, value=snapshot.archive_failures
-        )
+        yield _counter("archive_failures", refused, snapshot.archive_failures)
         waiting = "Lines of the audit trail that are not on the disk yet"
         yield _gauge("archive_waiting", waiting, snapshot.archive_waiting)
         yield from _of_pace(snapshot.pace)
         yield from _of_link(snapshot.link)
         yield from _of_registration(snapshot)
-        yield from _of_the_dither(snapshot.tracker)
-        yield from _of_reconstructors(snapshot.tracker)
+        yield from _of_the_dither(tracker)
+        yield from _of_reconstructors(tracker)
         yield from _of_measurement(snapshot)
-        alarms = {alarm.name: 1 for alarm in snapshot.tracker.alarms}
-        yield _gauge("alarms", "Alarms that last", len(alarms))
+        yield _gauge("alarms", "Alarms that last", len(tracker.alarms))
         waits = {wait.name: wait.hinders + 1 for wait in snapshot.waiting_for}
         expected = "1 for what is waited for, 2 where nothing can be done meanwhile"
-        yield _labelled_gauge("waiting_for", expected, "name", waits)
-        yield _labelled_gauge("alarm", "1 for each alarm that lasts", "name", alarms)
+        yield _gauge("waiting_for", expected, waits, "name")
+        alarms = {alarm.name: 1 for alarm in tracker.alarms}
+        yield _gauge("alarm", "1 for each alarm that lasts", alarms, "name")
 
 
 def _of_pace(pace: Pace) -> Iterator[Metric]:
     text = "Processor time of the worker per second of telemetry, last minute"
     yield _gauge("worker_load_ratio", text, pace.worker_per_s)
-    yield _labelled_gauge("worker_job_load_ratio", f"{text}, by job", "job", pace.by_job)
+    yield _gauge("worker_job_load_ratio", f"{text}, by job", pace.by_job, "job")
     text = "Processor time of the service itself per second, last minute"
     yield _gauge("service_load_ratio", text, pace.service_per_s)
     busy = "Share of the last minute in which the worker had a job"
@@ -157,16 +155,11 @@ def _of_pace(pace: Pace) -> Iterator[Metric]:
 
 def _of_link(link: LinkStatistics) -> Iterator[Metric]:
     for name, text in _LINK_COUNTERS.items():
-        yield CounterMetricFamily(f"pyrcal_{name}", text, value=getattr(link, name))
-    yield _labelled_counter(
-        "frames_refused", "Frames not used, by reason", "reason", link.frames_refused
-    )
-    yield _labelled_counter(
-        "messages_malformed",
-        "Messages that broke the contract",
-        "kind",
-        link.messages_malformed,
-    )
+        yield _counter(name, text, getattr(link, name))
+    refused = "Frames not used, by reason"
+    yield _counter("frames_refused", refused, link.frames_refused, "reason")
+    malformed = "Messages that broke the contract"
+    yield _counter("messages_malformed", malformed, link.messages_malformed, "kind")
     lost = "Frames missing in the sequence; falls again when they are recovered"
     yield _gauge("frames_lost", lost, link.frames_lost)
     yield _gauge("rtc_alive", "1 while the RTC's liveliness token is there", link.rtc_alive)
@@ -181,35 +174,31 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
         "refused": tracker.windows_refused,
         "outlying": tracker.windows_outlying,
     }
-    yield _labelled_counter("windows", "Windows of telemetry, by verdict", "verdict", windows)
+    yield _counter("windows", "Windows of telemetry, by verdict", windows, "verdict")
+    # the last look of each kind
+    misfits = {str(entry.source): entry.misfit for entry in tracker.history}
+    if tracker.watchdog is not None:
+        misfits[str(Source.PASSIVE)] = tracker.watchdog.misfit
     explained = "Residual power over what noise explains, last of each kind: 1 is all explained"
-    yield _labelled_gauge("misfit_ratio", explained, "source", _misfits(tracker))
+    yield _gauge("misfit_ratio", explained, misfits, "source")
     alpha = snapshot.alpha
     if alpha is None:
         return
     registration = alpha.known
-    yield from _four("alpha", "Registration", registration.alpha.vector)
-    yield from _four("alpha_sigma", "1 sigma, floor included", registration.sigma)
+    for name, text, four in (
+        ("alpha", "Registration", registration.alpha.vector),
+        ("alpha_sigma", "1 sigma, floor included", registration.sigma),
+    ):
+        for parameter, value in zip(PARAMETERS, four * BOUNDARY_SCALE, strict=True):
+            yield _gauge(f"{name}_{parameter}", f"{text}: {parameter}", float(value))
     yield _gauge("alpha_age_seconds", "Age of the estimate", alpha.age_s)
-    valid = {str(kind): kind is registration.standing.validity for kind in Validity}
-    yield _labelled_gauge("alpha_validity", "1 for what the estimate is worth", "validity", valid)
+    worth = registration.standing.validity
+    text = "1 for what the estimate is worth"
+    yield _gauge("alpha_validity", text, _one_of(Validity, worth), "validity")
     due = tracker.dither_due_since_ns_utc is not None
     yield _gauge("dither_due", "1 while a dithered window is wanted before all else", due)
     gain = "Mean optical gain of the dithered modes"
     yield _gauge("optical_gain_ratio", gain, registration.optical_gain)
-
-
-def _misfits(tracker: TrackerState) -> dict[str, float]:
-    """Return the last goodness of fit of each way of looking at telemetry."""
-    newest_first = tuple(reversed(tracker.history))
-    found = {}
-    for source in Source:
-        last = next((entry for entry in newest_first if entry.source is source), None)
-        if last is not None:
-            found[str(source)] = last.misfit
-    if tracker.watchdog is not None:
-        found[str(Source.PASSIVE)] = tracker.watchdog.misfit
-    return found
 
 
 def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:
@@ -217,16 +206,15 @@ def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:
     mean = "Quadratic mean of the dither over ten minutes, metres OPD"
     yield _gauge("dither_mean_metres", mean, dithering.mean_cost_m)
     yield _gauge("dither_budget_metres", "Largest RMS of all modes together", dithering.budget_m)
-    phases = {str(phase): phase is dithering.phase for phase in DitherPhase}
-    yield _labelled_gauge("dither_phase", "1 for how the service dithers", "phase", phases)
+    phases = _one_of(DitherPhase, dithering.phase)
+    yield _gauge("dither_phase", "1 for how the service dithers", phases, "phase")
 
 
 def _of_reconstructors(tracker: TrackerState) -> Iterator[Metric]:
     states = Counter(record.state for record in tracker.reconstructors)
     by_state = {str(state): states[state] for state in MatrixState}
-    yield _labelled_gauge("reconstructors", "Reconstructors remembered", "state", by_state)
-    modes = {str(mode): mode is tracker.mode for mode in Mode}
-    yield _labelled_gauge("mode", "1 for the mode of the service", "mode", modes)
+    yield _gauge("reconstructors", "Reconstructors remembered", by_state, "state")
+    yield _gauge("mode", "1 for the mode of the service", _one_of(Mode, tracker.mode), "mode")
     if tracker.margin is None:
         return
     worst = tracker.margin.worst_pole_radius
@@ -237,35 +225,34 @@ def _of_reconstructors(tracker: TrackerState) -> Iterator[Metric]:
 
 def _of_measurement(snapshot: Snapshot) -> Iterator[Metric]:
     current = snapshot.tracker.measuring
-    patterns = {
-        str(pattern): current is not None and current.pattern is pattern for pattern in Pattern
-    }
+    patterns = _one_of(Pattern, None if current is None else current.pattern)
     text = "1 for the pattern of the interaction matrix being measured"
-    yield _labelled_gauge("measuring", text, "pattern", patterns)
+    yield _gauge("measuring", text, patterns, "pattern")
     if current is not None and current.asked_ns_utc is not None:
         age_s = (snapshot.now_ns - current.asked_ns_utc) / 1e9
         yield _gauge("measuring_seconds", "Since it was asked for", age_s)
 
 
-def _four(prefix: str, text: str, vector: NDArray[np.float64]) -> Iterator[Metric]:
-    for name, value in zip(PARAMETERS, vector * BOUNDARY_SCALE, strict=True):
-        yield _gauge(f"{prefix}_{name}", f"{text}: {name}", float(value))
+def _one_of(kinds: type[StrEnum], current: StrEnum | None) -> dict[str, int]:
+    """Return 1 for the kind that it is, 0 for all others."""
+    return {str(kind): int(kind is current) for kind in kinds}
 
 
-def _gauge(name: str, text: str, value: float | None) -> Metric:
-    """Return a gauge; what is not known is NaN, as Prometheus has it."""
-    return GaugeMetricFamily(f"pyrcal_{name}", text, value=math.nan if value is None else value)
+Numbers = float | None | Mapping[str, float]
+"""What is not known is NaN, as Prometheus has it."""
 
 
-def _labelled_gauge(name: str, text: str, label: str, values: Mapping[str, float]) -> Metric:
-    family = GaugeMetricFamily(f"pyrcal_{name}", text, labels=[label])
-    for key, value in values.items():
-        family.add_metric([key], value)
-    return family
+def _gauge(name: str, text: str, value: Numbers, label: str = "") -> Metric:
+    return _filled(GaugeMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value)
 
 
-def _labelled_counter(name: str, text: str, label: str, values: Mapping[str, int]) -> Metric:
-    family = CounterMetricFamily(f"pyrcal_{name}", text, labels=[label])
-    for key, value in values.items():
-        family.add_metric([key], value)
+def _counter(name: str, text: str, value: Numbers, label: str = "") -> Metric:
+    return _filled(CounterMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value)
+
+
+def _filled(family: GaugeMetricFamily | CounterMetricFamily, value: Numbers) -> Metric:
+    """Return a metric with its number, or one for each value of its label."""
+    for key, number in value.items() if isinstance(value, Mapping) else [("", value)]:
+        labels = [key] if isinstance(value, Mapping) else []
+        family.add_metric(labels, math.nan if number is None else number)
     return family

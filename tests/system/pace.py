@@ -33,6 +33,12 @@ def patience(seconds):
     return seconds * slowness()
 
 
+def in_time(began_s, seconds):
+    """Return whether since ``began_s`` of the monotonic clock no more has passed than may here."""
+    spent_s = time.monotonic() - began_s
+    return spent_s < seconds or spent_s < seconds * slowness(again=True)
+
+
 class Deadline:
     """The end of somebody's patience."""
 

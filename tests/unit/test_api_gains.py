@@ -10,7 +10,7 @@ from service.api import create_app
 from service.tracking.events import SetLoop
 from service.tracking.registration import ModeGain
 from service.tracking.state import TrackerState
-from tests.unit.runtime.test_actions import REGISTRATION
+from tests.unit.runtime.handmade import REGISTRATION
 from tests.unit.tracking.situations import START_NS, record, rtc
 
 MEASURED = (

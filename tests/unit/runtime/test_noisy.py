@@ -6,7 +6,6 @@ import h5py
 import numpy as np
 import pytest
 
-from service.archive import Archive
 from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.runtime.actions import Actions, Publishing
@@ -55,14 +54,6 @@ class NearCrew:
 @pytest.fixture(scope="module")
 def workers():
     return NearCrew()
-
-
-@pytest.fixture
-def archive(tmp_path):
-    archive = Archive(tmp_path)
-    archive.open()
-    with archive:
-        yield archive
 
 
 @pytest.fixture

@@ -7,29 +7,25 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from service.archive import Archive
 from service.control.gate import HELD_LIMIT_M, LIMIT_M
 from service.control.loop import ControlLoop
 from service.errors import CommandError
 from service.model.misregistration import Misregistration
 from service.runtime.actions import (
     GAIN_SAFETY,
-    Actions,
-    Publishing,
     expected_gains,
     loop_to_judge,
     modes_that_hold,
 )
-from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.registration import ModeGain
 from service.tracking.state import Alarm
 from service.tracking.worth import fewer_than
 from service.wire import LoopRequest
-from service.worker import OpticsWorker, start_worker
+from service.worker import OpticsWorker
+from tests.unit.runtime.handmade import N_MODES, REGISTRATION, STATE
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
-from tests.unit.runtime.test_actions import N_MODES, REGISTRATION, STATE, Clock, HandmadeBridge
 from tests.unit.tracking.situations import START_NS, rtc
 
 pytestmark = pytest.mark.timeout(60)
@@ -38,42 +34,6 @@ MEASURED = tuple(
     ModeGain(mode=mode, gain=gain, sigma=0.01, scatter=0.02, t_ns_utc=START_NS)
     for mode, gain in ((60, 0.55), (70, 0.56), (80, 0.57))
 )
-
-
-@pytest.fixture(scope="module")
-def workers():
-    workers = WorkerPool(lambda: start_worker(small_instrument(), COMPUTE))
-    yield workers
-    workers.close()
-
-
-@pytest.fixture
-def archive(tmp_path):
-    archive = Archive(tmp_path)
-    archive.open()
-    with archive:
-        yield archive
-
-
-@pytest.fixture
-def bridge():
-    return HandmadeBridge()
-
-
-@pytest.fixture
-def actions(bridge, workers, archive):
-    return deeds_with(bridge, workers, archive, 0.95)
-
-
-def deeds_with(bridge, workers, archive, bound):
-    return Actions(
-        bridge=bridge,
-        workers=workers,
-        archive=archive,
-        instrument=small_instrument(),
-        publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=bound),
-        clock_ns=Clock(),
-    )
 
 
 def loop_of(gain):

@@ -1,0 +1,42 @@
+"""A worker, an archive and an RTC written by hand, for what the service does between them."""
+
+import pytest
+
+from service.archive import Archive
+from service.runtime.actions import Actions, Publishing
+from service.runtime.workers import WorkerPool
+from service.worker import start_worker
+from tests.unit.runtime.handmade import Clock, HandmadeBridge
+from tests.unit.runtime.small import COMPUTE, small_instrument
+
+
+@pytest.fixture(scope="session")
+def workers():
+    workers = WorkerPool(lambda: start_worker(small_instrument(), COMPUTE))
+    yield workers
+    workers.close()
+
+
+@pytest.fixture
+def archive(tmp_path):
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        yield archive
+
+
+@pytest.fixture
+def bridge():
+    return HandmadeBridge()
+
+
+@pytest.fixture
+def actions(bridge, workers, archive):
+    return Actions(
+        bridge=bridge,
+        workers=workers,
+        archive=archive,
+        instrument=small_instrument(),
+        publishing=Publishing(system="small", chunk_bytes=4096, pole_radius_bound=0.95),
+        clock_ns=Clock(),
+    )

@@ -1,0 +1,77 @@
+"""An RTC written by hand, a clock that goes on when it is asked, a night on which α is known."""
+
+import numpy as np
+
+from service.model.misregistration import Misregistration
+from service.runtime.actions import manifest_of
+from service.tracking.registration import Registration
+from service.tracking.state import TrackerState
+from service.wire import Reply, layout_of
+from tests.unit.runtime.small import N_CONTROLLED, SIGMA
+from tests.unit.tracking.situations import START_NS, foreign, rtc
+
+N_SLOPES, N_MODES = 224, 90
+ALPHA = Misregistration(shift_x_subap=0.1, rotation_rad=0.003)
+RTC = rtc(
+    N_CONTROLLED,
+    n_modes=N_MODES,
+    n_slopes=N_SLOPES,
+    gains=(0.4,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED),
+)
+BROUGHT = np.full((N_CONTROLLED, N_SLOPES), 1e-6, np.float32)
+
+
+REGISTRATION = Registration(
+    alpha=ALPHA,
+    covariance=np.diag(SIGMA**2),
+    floor=SIGMA,
+    t_ns_utc=START_NS,
+    arrived_ns_utc=START_NS,
+    n_windows=2,
+    optical_gain=0.6,
+)
+STATE = TrackerState(
+    system="small",
+    rtc=RTC,
+    registration=REGISTRATION,
+    reconstructors=(foreign(),),
+    in_use="initial",
+)
+
+
+class HandmadeBridge:
+    """Keeps what it is told to send and answers as a test wants."""
+
+    def __init__(self):
+        self.published = []
+        self.commands = []
+        self.offered = []
+        self.current = None
+        self.refusal = None
+        self.applied = (manifest_of(foreign(), layout_of(BROUGHT, 4096), RTC, "small"), BROUGHT)
+
+    async def publish(self, manifest, matrix):
+        self.published.append((manifest, matrix))
+
+    async def command(self, command):
+        self.commands.append(command)
+        accepted = self.refusal is None
+        return Reply(id=command.id, accepted=accepted, reason=self.refusal or "", start_seq=77)
+
+    async def fetch_applied(self):
+        return self.applied
+
+    def offer(self, manifest, matrix):
+        self.offered.append((manifest, matrix))
+
+    def set_current(self, matrix_id):
+        self.current = matrix_id
+
+
+class Clock:
+    def __init__(self):
+        self.now_ns = START_NS
+
+    def __call__(self):
+        self.now_ns += 1_000_000
+        return self.now_ns

@@ -183,11 +183,9 @@ class RealTimeComputer:
             rows = {self._settings.n_controlled_next: None, len(self._active.matrix): None}
         return Terms(
             session=self._session,
+            identity=self.identity,
             n_slopes=self._n_slopes,
             n_controlled=tuple(rows),
-            basis_id=self.identity.basis_id,
-            config_id=self.identity.config_id,
-            system=self.identity.system,
         )
 
     @property

@@ -61,9 +61,9 @@ class LoopTerms:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, kw_only=True, eq=False)
 class LoopBlock:
-    """What a block of frames came to."""
+    """What a block of frames comes to; at first, what is added to the integrator's commands."""
 
     slopes: Array32
     """``(n_frames, n_slopes)``."""
@@ -74,8 +74,20 @@ class LoopBlock:
     dither_m: Array32 | None
     """``(n_frames, n_modes)`` its dither part: what was asked for, as the mirror follows it."""
 
-    n_clipped: int
+    n_clipped: int = 0
     """Commands that met a limit of the mirror."""
+
+    @classmethod
+    def of(
+        cls, slopes: Array32, dither_m: Array32 | None, played_m: Array32 | None, n_modes: int
+    ) -> LoopBlock:
+        """Return what dither and played commands add; the arrays become the mirror's in place."""
+        commands = np.zeros((len(slopes), n_modes), dtype=np.float32)
+        for part in (dither_m, played_m):
+            if part is not None:
+                commands += part
+        dither = None if dither_m is None else dither_m.copy()
+        return cls(slopes=slopes, commands_m=commands, dither_m=dither)
 
 
 class ModalLoop:
@@ -127,8 +139,9 @@ class ModalLoop:
             raise TypeError("loop: found no matrix of the plant; only a linear one has open slopes")
         if open_modes is None:
             open_modes = open_slopes @ terms.reconstructor.T
-        added = _Added.of(dither_m, played_m, (len(open_slopes), len(self._decided[0])))
-        moved = self._moved(added, len(terms.gains))
+        block = LoopBlock.of(open_slopes, dither_m, played_m, self._decided.shape[1])
+        added = dither_m is not None or played_m is not None
+        moved = self._moved(block.commands_m if added else None, len(terms.gains))
         response = modal_response[:, :moved]
 
         def estimate(first: int, commands: Array32) -> Array32:
@@ -136,20 +149,18 @@ class ModalLoop:
             modes += open_modes[first : first + len(modes)]
             return modes
 
-        n_clipped = self._integrate(estimate, terms, added)
-        slopes = added.applied[:, :moved] @ matrix[:, :moved].T
-        slopes += open_slopes
-        return LoopBlock(
-            slopes=slopes, commands_m=added.applied, dither_m=added.dither, n_clipped=n_clipped
-        )
+        self._integrate(estimate, terms, block)
+        block.slopes = block.commands_m[:, :moved] @ matrix[:, :moved].T
+        block.slopes += open_slopes
+        return block
 
-    def _moved(self, added: _Added, n_controlled: int) -> int:
+    def _moved(self, added_m: Array32 | None, n_controlled: int) -> int:
         """Return how many of the first modes may move: nothing corrects those beyond the loop."""
         if self._drive is not None:
-            return int(added.applied.shape[1])
+            return int(self._decided.shape[1])
         beyond = self._decided.any(axis=0)
-        if added.something:
-            beyond |= added.applied.any(axis=0)
+        if added_m is not None:
+            beyond |= added_m.any(axis=0)
         return max(n_controlled, int(np.flatnonzero(beyond)[-1]) + 1 if beyond.any() else 0)
 
     def run_frames(
@@ -168,24 +179,22 @@ class ModalLoop:
                 slopes[k] = sense(k, command)
             return np.asarray(slopes[first : first + len(commands)] @ terms.reconstructor.T)
 
-        added = _Added.of(dither_m, played_m, (n_frames, len(self._decided[0])))
-        n_clipped = self._integrate(estimate, terms, added)
-        return LoopBlock(
-            slopes=slopes, commands_m=added.applied, dither_m=added.dither, n_clipped=n_clipped
-        )
+        block = LoopBlock.of(slopes, dither_m, played_m, self._decided.shape[1])
+        self._integrate(estimate, terms, block)
+        return block
 
     def _integrate(
         self,
         estimate: Callable[[int, Array32], Array32],
         terms: LoopTerms,
-        added: _Added,
-    ) -> int:
-        """Complete the commands of ``added`` frame by frame; return how many were clipped.
+        block: LoopBlock,
+    ) -> None:
+        """Complete the commands of ``block`` frame by frame, and count the clipped ones.
 
         ``estimate`` gives the modes ``(n, n_controlled)`` that frames k, k + 1, ... show under n
         commands; a frame in which one of them is not finite corrects nothing.
         """
-        applied = added.applied
+        applied = block.commands_m
         n_frames, delay = len(applied), len(self._decided)
         integrator = np.empty((n_frames + delay, applied.shape[1]), dtype=np.float32)
         integrator[:delay] = self._decided
@@ -200,7 +209,7 @@ class ModalLoop:
             np.minimum(commands, stroke, out=commands)
             np.maximum(commands, least, out=commands)
             if self._drive is not None:
-                n_limited += self._follow(self._drive, first, added)
+                n_limited += self._follow(self._drive, first, block)
             corrections = estimate(first, commands)
             corrections *= terms.gains
             # a slope that is no number would stay in the integrator for ever, at a gain of 0, too
@@ -213,39 +222,12 @@ class ModalLoop:
                 np.minimum(decided, stroke, out=decided)
                 np.maximum(decided, least, out=decided)
         self._decided = integrator[n_frames:].copy()
-        return n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
+        block.n_clipped = n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
 
-    def _follow(self, drive: MirrorDrive, first: int, added: _Added) -> int:
+    def _follow(self, drive: MirrorDrive, first: int, block: LoopBlock) -> int:
         """Let the drive make what it can of the next commands; count its limits."""
+        commands, dither = block.commands_m, block.dither_m
         return sum(
-            drive.follow(added.applied[k], None if added.dither is None else added.dither[k])
-            for k in range(first, min(first + len(self._decided), len(added.applied)))
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Added:
-    """What is added to the integrator's commands; both arrays become the mirror's in place."""
-
-    applied: Array32
-    """``(n_frames, n_modes)`` dither and played commands together."""
-
-    dither: Array32 | None
-    """``(n_frames, n_modes)``."""
-
-    something: bool
-    """Whether anything is added at all."""
-
-    @classmethod
-    def of(
-        cls, dither_m: Array32 | None, played_m: Array32 | None, shape: tuple[int, int]
-    ) -> _Added:
-        applied = np.zeros(shape, dtype=np.float32)
-        for part in (dither_m, played_m):
-            if part is not None:
-                applied += part
-        return cls(
-            applied=applied,
-            dither=None if dither_m is None else dither_m.copy(),
-            something=dither_m is not None or played_m is not None,
+            drive.follow(commands[k], None if dither is None else dither[k])
+            for k in range(first, min(first + len(self._decided), len(commands)))
         )

@@ -47,13 +47,10 @@ class Terms:
     """What a reconstructor must fit."""
 
     session: str
+    identity: Identity
     n_slopes: int
     n_controlled: tuple[int, ...]
     """Numbers of rows the loop takes: the present one, and the one a command has asked for."""
-
-    basis_id: str
-    config_id: str
-    system: str
 
     def refusal(self, manifest: Manifest) -> str:
         """Return why the manifest does not fit; empty: it does."""
@@ -61,12 +58,8 @@ class Terms:
         if columns != self.n_slopes or rows not in self.n_controlled:
             expected = " or ".join(str([n, self.n_slopes]) for n in self.n_controlled)
             return f"range: shape {[rows, columns]}, expected {expected}"
-        pairs = {
-            "basis_id": (manifest.basis_id, self.basis_id),
-            "config_id": (manifest.config_id, self.config_id),
-            "system": (manifest.system, self.system),
-        }
-        for name, (found, expected) in pairs.items():
+        for name in ("basis_id", "config_id", "system"):
+            found, expected = getattr(manifest, name), getattr(self.identity, name)
             if found != expected:
                 return f"id: {name} {found!r}, expected {expected!r}"
         return ""

@@ -25,15 +25,13 @@ _FRAMES_TOGETHER = 100
 class TurbulentFrames:
     """Consecutive frames of turbulence: phases, or what a linear response makes of them."""
 
-    def __init__(self, parts: list[tuple[FrozenLayer, _Between]]) -> None:
-        """Take for each layer where the frames lie in it."""
+    def __init__(self, parts: list[_Between]) -> None:
+        """Take where the frames lie in each layer."""
         self._parts = parts
 
     def phases_m(self, every: int = 1) -> Array32:
         """Return the OPD of each ``every``-th frame, ``(n_frames, n_points)``."""
-        return _total(
-            [between.every(every).phases(layer, apart=every > 1) for layer, between in self._parts]
-        )
+        return _total([between.phases(every) for between in self._parts])
 
     def through(self, response: PhaseResponse) -> Array32:
         """Return ``response.matrix @ phase`` of every frame, ``(n_frames, n_outputs)``.
@@ -41,7 +39,7 @@ class TurbulentFrames:
         Whatever is linear in the phase is interpolated in time as the phase is: it is computed for
         the steps of the screens, which are fewer than the frames.
         """
-        return _total([between.through(layer, response) for layer, between in self._parts])
+        return _total([between.through(response) for between in self._parts])
 
 
 class Turbulence:
@@ -55,9 +53,7 @@ class Turbulence:
     def at(self, time_s: Array) -> TurbulentFrames:
         """Return the frames at these times; they are good until the next call."""
         strength = self._seeing.strength(time_s)
-        return TurbulentFrames(
-            [(layer, _Between.of(layer, time_s, strength)) for layer in self._layers]
-        )
+        return TurbulentFrames([_Between.of(layer, time_s, strength) for layer in self._layers])
 
     def prepare(self, response: PhaseResponse) -> None:
         """Have ready what ``through`` needs of a response: it takes a second."""
@@ -90,6 +86,7 @@ class Sky:
 class _Between:
     """Frames between the steps of a layer: four of them make one frame."""
 
+    layer: FrozenLayer
     step: NDArray[np.intp]
     """``(n_frames,)`` the step before each frame."""
 
@@ -106,20 +103,17 @@ class _Between:
         step = position.astype(np.intp)
         layer.reach(int(step[0]) - 1, int(step[-1]) + 2)
         weights = cubic_weights(position - step) * strength[:, None]
-        return cls(step=step, weights=weights.astype(np.float32))
+        return cls(layer=layer, step=step, weights=weights.astype(np.float32))
 
-    def every(self, n: int) -> _Between:
-        """Return each n-th frame."""
-        return _Between(step=self.step[::n], weights=self.weights[::n])
+    def phases(self, every: int) -> Array32:
+        """Return the phase of each ``every``-th frame ``(n_frames, n_points)``."""
+        steps = self.step[::every, None] + np.arange(-1, 3)
+        return self.layer.phases(steps, self.weights[::every], apart=every > 1)
 
-    def phases(self, layer: FrozenLayer, *, apart: bool) -> Array32:
-        """Return the phase of the frames ``(n_frames, n_points)``."""
-        return layer.phases(self.step[:, None] + np.arange(-1, 3), self.weights, apart=apart)
-
-    def through(self, layer: FrozenLayer, response: PhaseResponse) -> Array32:
+    def through(self, response: PhaseResponse) -> Array32:
         """Return what the response makes of the frames ``(n_frames, n_outputs)``."""
         first_step = int(self.step[0]) - 1
-        rows = layer.responses(first_step, response)
+        rows = self.layer.responses(first_step, response)
         out = np.empty((len(self.step), rows.shape[1]), dtype=np.float32)
         for start in range(0, len(out), _FRAMES_TOGETHER):
             piece = slice(start, start + _FRAMES_TOGETHER)

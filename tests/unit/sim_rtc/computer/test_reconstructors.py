@@ -5,14 +5,13 @@ import pytest
 
 from service.wire import AckState, Manifest, layout_of, split
 from sim_rtc.computer.reconstructors import Staging, Terms, truncated_inverse
+from sim_rtc.computer.telemetry import Identity
 
 TERMS = Terms(
     session="s1",
+    identity=Identity(system="small", basis_id="basis", config_id="sensor"),
     n_slopes=12,
     n_controlled=(8, 6),
-    basis_id="basis",
-    config_id="sensor",
-    system="small",
 )
 MATRIX = np.random.default_rng(1).standard_normal((6, 12)).astype(np.float32)
 CHUNK_BYTES = 100

@@ -166,13 +166,13 @@ def build_plant(
         If pixels are to be binned on a plant that cannot, or actuators to fail that the mirror does
         not have, or the influence functions are not of this mirror.
     """
-    file = options.influence
+    cube, pitch_m = options.influence_cube, options.influence_pitch_m
     made: Departures = {
         "rng": rng,
         "imperfections": options.imperfections,
         "scene": options.scene,
         "faults": options.mirror_faults,
-        "influence": None if file is None else read_influence(file, instrument),
+        "influence": None if cube is None else read_influence(cube, instrument, pitch_m),
     }
     if options.plant == "diffractive":
         return DiffractivePlant(instrument, basis, binning=options.binning, **made)

@@ -20,7 +20,6 @@ from sim_rtc.faults import Fault, read_fault
 from sim_rtc.telescope.atmosphere import PROFILES, Layer
 from sim_rtc.telescope.detector import Camera, preset_for
 from sim_rtc.telescope.imperfections import SETS, Imperfections
-from sim_rtc.telescope.influence import InfluenceFile
 from sim_rtc.telescope.mirror import MirrorFaults, MirrorLimits
 from sim_rtc.telescope.registration import Drift, Flexure, Jump, Walk
 from sim_rtc.telescope.scene import Elevation, Scene, SceneKind, Spiders
@@ -416,17 +415,6 @@ class Options:
         return replace(SETS[named.pop() if named else "usual"], **changes)
 
     @property
-    def influence(self) -> InfluenceFile | None:
-        """Measured influence functions; None: those of the plant."""
-        if self.influence_cube is not None:
-            return InfluenceFile(reference=self.influence_cube, pitch_m=self.influence_pitch_m)
-        if self.influence_pitch_m is not None:
-            raise ConfigurationError(
-                "--influence-pitch: found alone; expected --influence beside it"
-            )
-        return None
-
-    @property
     def mirror_faults(self) -> MirrorFaults:
         """Actuators that do not obey."""
         return MirrorFaults(dead=self.dead_actuators, stuck=self.stuck_actuators)
@@ -460,6 +448,10 @@ class Options:
         if self.replay is not None and (self.record is not None or self.faults):
             raise ConfigurationError(
                 "--replay: plays a file as it is; found --record or --fault too"
+            )
+        if self.influence_pitch_m is not None and self.influence_cube is None:
+            raise ConfigurationError(
+                "--influence-pitch: found alone; expected --influence beside it"
             )
         chosen = self
         if self.preset is not None:

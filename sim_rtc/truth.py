@@ -203,14 +203,13 @@ class TruthRecorder(Background):
 
 def setup_of(options: Options) -> dict[str, Any]:
     """Return what stays as it is for the run, as JSON can hold it."""
-    influence = options.influence
     told = (
         *("scene", "imperfections", "seeing", "layers", "vibrations"),
         *("flexure", "walk", "elevation"),
     )
     return {
         "plant": options.plant,
-        "influence": None if influence is None else influence.reference,
+        "influence": options.influence_cube,
         "instrument": options.instrument,
         "seed": options.seed,
         "magnitude": options.magnitude,

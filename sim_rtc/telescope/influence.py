@@ -27,17 +27,6 @@ _REACH = np.arange(-1, 3)
 """Knots of a cubic spline around a point, from the one below it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InfluenceFile:
-    """Where the influence functions are, as the command line says it."""
-
-    reference: str
-    """``FILE:/dataset`` of an HDF5 file."""
-
-    pitch_m: float | None = None
-    """Distance of neighbouring points in the pupil plane; None: the dataset's own ``pitch_m``."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InfluenceCube:
     """What the mirror does for each actuator, its middle in the middle of the arrays."""
@@ -120,22 +109,26 @@ class TabulatedSurface:
         return np.asarray((along_x + along_y - 4 * maps[..., 1:-1, 1:-1])[..., inside[1:-1, 1:-1]])
 
 
-def read_influence(file: InfluenceFile, instrument: Instrument) -> InfluenceCube:
-    """Return the influence functions of this file.
+def read_influence(
+    reference: str, instrument: Instrument, pitch_m: float | None = None
+) -> InfluenceCube:
+    """Return the influence functions of a dataset, ``FILE:/dataset``.
+
+    ``pitch_m`` is the distance of neighbouring points in the pupil plane; None: the dataset's own.
 
     Raises
     ------
     ConfigurationError
         If there are none, or not those of this mirror: one line that names the option.
     """
-    maps = read_dataset(file.reference, Path(), _OPTION)
+    maps = read_dataset(reference, Path(), _OPTION)
     mirror = instrument.analytic_mirror
     n_actuators = len(mirror.positions_m)
     if maps.ndim != 3 or len(maps) != n_actuators:
         _refuse(f"shape {maps.shape}", f"({n_actuators}, ny, nx): a map for each actuator")
     if not np.isfinite(maps).all():
         _refuse("values that are not finite", "a surface that goes on smoothly past the mirror")
-    pitch_m = _pitch_m(file)
+    pitch_m = _pitch_m(reference) if pitch_m is None else pitch_m
     cube = InfluenceCube(maps=maps.astype(np.float64), pitch_m=pitch_m)
     if pitch_m > mirror.pitch_m:
         _refuse(
@@ -166,11 +159,9 @@ def _refuse_holes(cube: InfluenceCube, instrument: Instrument) -> None:
         )
 
 
-def _pitch_m(file: InfluenceFile) -> float:
-    """Return the option's pitch, or else the dataset's."""
-    if file.pitch_m is not None:
-        return file.pitch_m
-    name, _, dataset = file.reference.rpartition(":/")
+def _pitch_m(reference: str) -> float:
+    """Return the dataset's own pitch."""
+    name, _, dataset = reference.rpartition(":/")
     found = None
     if h5py.is_hdf5(name):
         with h5py.File(name, "r") as opened:
@@ -178,9 +169,7 @@ def _pitch_m(file: InfluenceFile) -> float:
     try:
         pitch_m = float(np.asarray(found).item())
     except (TypeError, ValueError):
-        _refuse(
-            f"no number in the attribute pitch_m of {file.reference}", "one, or --influence-pitch"
-        )
+        _refuse(f"no number in the attribute pitch_m of {reference}", "one, or --influence-pitch")
     if not 0.0 < pitch_m < np.inf:
         _refuse(f"the attribute pitch_m = {pitch_m:g}", "metres, above 0")
     return pitch_m

@@ -10,7 +10,7 @@ from service.model.misregistration import Misregistration
 from service.model.modes import ThinPlate, karhunen_loeve_basis, mirror_surface
 from sim_rtc.assembly import build_plant
 from sim_rtc.options import parse_options
-from sim_rtc.telescope.influence import InfluenceCube, InfluenceFile, read_influence
+from sim_rtc.telescope.influence import InfluenceCube, read_influence
 from sim_rtc.telescope.mirror import MirrorFaults, TensionedPlate, disobedient
 
 TURNED = Misregistration(
@@ -173,9 +173,8 @@ def test_beyond_the_table_the_surface_goes_on_at_the_height_of_its_edge(
 
 def test_the_option_wins_over_the_files_own_pitch(small_instrument, on_file):
     reference = on_file(pitch_m=0.12)
-    assert read_influence(InfluenceFile(reference=reference), small_instrument).pitch_m == 0.12
-    given = InfluenceFile(reference=reference, pitch_m=0.1)
-    assert read_influence(given, small_instrument).pitch_m == 0.1
+    assert read_influence(reference, small_instrument).pitch_m == 0.12
+    assert read_influence(reference, small_instrument, 0.1).pitch_m == 0.1
 
 
 def holed(maps):
@@ -202,7 +201,7 @@ def test_functions_that_cannot_be_this_mirrors_are_refused_in_one_line(
 ):
     reference = on_file(change(thin_maps), **attributes)
     with pytest.raises(ConfigurationError, match="--influence: " + ".*" + text) as refused:
-        read_influence(InfluenceFile(reference=reference), small_instrument)
+        read_influence(reference, small_instrument)
     assert "\n" not in str(refused.value)
 
 
@@ -213,7 +212,7 @@ def test_a_file_that_is_not_there_or_holds_something_else_is_refused(small_instr
         (good.replace("/lab/influence", "/lab/nothing"), "/lab/nothing"),
     ):
         with pytest.raises(ConfigurationError, match=text):
-            read_influence(InfluenceFile(reference=reference), small_instrument)
+            read_influence(reference, small_instrument)
 
 
 @pytest.mark.parametrize(

@@ -41,10 +41,6 @@ _MOST_MESSAGE_FRAMES = 50
 
 _BLOCK_FRAMES = 500
 _PHASE_BLOCK_FRAMES = 200
-_MODES_FRAMES = 250
-"""Frames reconstructed at a time: for ten, the library's copy of the matrix costs four times the
-product."""
-
 _AHEAD_BLOCKS = 2
 _POLL_S = 0.2
 
@@ -88,7 +84,10 @@ class Block(ABC):
 
 
 class OpenModes:
-    """What the reconstructor makes of a block's slopes, computed for many frames at a time."""
+    """What the reconstructor makes of a block's slopes, computed for all that are left of it.
+
+    For ten frames the library's copy of the matrix costs four times the product.
+    """
 
     def __init__(self) -> None:
         self._reconstructor: Array32 | None = None
@@ -97,10 +96,9 @@ class OpenModes:
 
     def rows(self, slopes: Array32, row: int, n_frames: int, reconstructor: Array32) -> Array32:
         """Return ``(n_frames, n_controlled)`` of the block's ``slopes`` from ``row`` on."""
-        known = self._first <= row and row + n_frames <= self._first + len(self._modes)
-        if not known or self._reconstructor is not reconstructor:
+        if self._reconstructor is not reconstructor:
             self._reconstructor, self._first = reconstructor, row
-            self._modes = slopes[row : row + max(n_frames, _MODES_FRAMES)] @ reconstructor.T
+            self._modes = slopes[row:] @ reconstructor.T
         return self._modes[row - self._first : row - self._first + n_frames]
 
 

@@ -105,6 +105,8 @@ class ModalLoop:
         self._stroke_m = np.float32(stroke_m)
         self._drive = drive
         self._decided = np.zeros((delay_frames, n_modes), dtype=np.float32)
+        self._integrator = np.empty((0, n_modes), dtype=np.float32)
+        """Commands of the block under way, kept from block to block for its memory."""
 
     def limit(self, stroke_m: float) -> None:
         """Clip commands at this from now on, metres RMS of a mode."""
@@ -196,7 +198,9 @@ class ModalLoop:
         """
         applied = block.commands_m
         n_frames, delay = len(applied), len(self._decided)
-        integrator = np.empty((n_frames + delay, applied.shape[1]), dtype=np.float32)
+        if len(self._integrator) != n_frames + delay:
+            self._integrator = np.empty((n_frames + delay, applied.shape[1]), dtype=np.float32)
+        integrator = self._integrator
         integrator[:delay] = self._decided
         # Arrays of no dimension: a scalar is converted again in every frame.
         leak, stroke = np.array(terms.leak, dtype=np.float32), np.array(self._stroke_m)
@@ -221,7 +225,7 @@ class ModalLoop:
                 decided[:n_controlled] -= correction
                 np.minimum(decided, stroke, out=decided)
                 np.maximum(decided, least, out=decided)
-        self._decided = integrator[n_frames:].copy()
+        self._decided[:] = integrator[n_frames:]
         block.n_clipped = n_limited + int(np.count_nonzero(np.abs(applied) >= stroke))
 
     def _follow(self, drive: MirrorDrive, first: int, block: LoopBlock) -> int:

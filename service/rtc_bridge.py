@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from service.errors import LinkError, UnknownIdError, WireError
 from service.link import session as link
-from service.link.endpoint import Endpoint
 from service.link.intake import Intake
 from service.link.matrices import LinkEvent, MeasuredIntake, Offer, Outbox
 from service.link.rivals import Standby
+from service.link.session import Endpoint
 from service.link.statistics import LinkStatistics
 from service.telemetry.frames import FrameBlock
 from service.wire import (

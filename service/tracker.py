@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from service.tracking import (
     dither,
-    loop_commands,
     measuring,
     operator,
     reconstructors,
@@ -80,7 +79,7 @@ def _react(turn: Turn) -> None:  # noqa: C901 - one line for each event
         case ev.Tick():
             rtc.on_tick(turn)
             age(turn)
-            loop_commands.close_again(turn)
+            operator.close_again(turn)
         case Status() as status:
             rtc.on_status(turn, status)
         case ev.SessionStarted(session=session):
@@ -157,7 +156,7 @@ def _react_to_reply(turn: Turn, request: Request, reply: Reply) -> None:
             measuring.on_answer(turn, request, reply)
         case LoopRequest() | RampRequest():
             outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
-            loop_commands.on_answer(turn, request.id, outcome, reply.reason)
+            operator.on_loop_answer(turn, request.id, outcome, reply.reason)
 
 
 def _react_to_failure(turn: Turn, effect: Effect, text: str) -> None:
@@ -167,7 +166,7 @@ def _react_to_failure(turn: Turn, effect: Effect, text: str) -> None:
         case ev.FinishNoisy(record=noisy):
             measuring.noisy_failed(turn, noisy, text)
         case ev.Ask(request=LoopRequest(id=command) | RampRequest(id=command)):
-            loop_commands.on_answer(turn, command, CommandState.FAILED, text)
+            operator.on_loop_answer(turn, command, CommandState.FAILED, text)
         case _:
             rtc.on_failure(turn, effect, text)
 
@@ -179,9 +178,9 @@ def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
         case ev.SetPointing(pointing=pointing):
             point(turn, pointing)
         case ev.SetLoop() as command:
-            loop_commands.set_loop(turn, command)
+            operator.set_loop(turn, command)
         case ev.Ramp() as command:
-            loop_commands.ramp(turn, command)
+            operator.ramp(turn, command)
         case ev.Acquire():
             acquire_on_command(turn)
         case ev.AbortAcquisition():

@@ -17,7 +17,6 @@ from service.archive.store import DAMAGE, Provenance, Store
 from service.errors import ArchiveError, StorageError
 from service.files.report import put_covariance
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.tracking.loop_commands import table_of
 from service.tracking.products import (
     MatrixState,
     MeasurementRecord,
@@ -26,6 +25,7 @@ from service.tracking.products import (
     NoisyState,
     ReconstructorRecord,
 )
+from service.tracking.registration import table_of
 from service.wire import checksum
 
 

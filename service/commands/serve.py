@@ -33,7 +33,7 @@ from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
 from service.tracking.measuring import MEASUREMENTS_KEPT, NOISY_KEPT
-from service.tracking.reconstructors import restored
+from service.tracking.resume import restored
 from service.tracking.state import Mode, TrackerState
 
 END_WITHIN_S = 4.5

@@ -11,10 +11,10 @@ from statistics import median
 from typing import Final
 
 from service.errors import WireError
-from service.link.endpoint import Endpoint
 from service.link.matrices import LinkEvent
 from service.link.ring import LEAP, FrameCounts, FrameRing
 from service.link.rivals import SessionWatch
+from service.link.session import Endpoint
 from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
 from service.telemetry.frames import FrameBlock
 from service.tracking import events as ev

@@ -19,8 +19,7 @@ from service.errors import CommandError
 from service.routes import views as shown
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.routes.views import GainTableShown, MatrixId, ServiceDep, answer, known, shows
-from service.tracking.loop_commands import table_of
-from service.tracking.registration import ModeGain
+from service.tracking.registration import ModeGain, table_of
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 

@@ -23,8 +23,7 @@ from service.runtime.ports import RtcPort, StorePort, WorkerPort
 from service.tracking import events as ev
 from service.tracking.alarms import Act, forbidding
 from service.tracking.events import Effect, Event
-from service.tracking.loop import CommandState, same_gains
-from service.tracking.loop_commands import table_of
+from service.tracking.loop import CommandState, commanded_gains, extended_gains, same_gains
 from service.tracking.products import (
     Judged,
     MatrixState,
@@ -32,8 +31,7 @@ from service.tracking.products import (
     MeasureState,
     ReconstructorRecord,
 )
-from service.tracking.reconstructors import commanded_gains, extended_gains
-from service.tracking.registration import Registration
+from service.tracking.registration import Registration, table_of
 from service.tracking.state import TrackerState
 from service.wire import Command as Request
 from service.wire import (

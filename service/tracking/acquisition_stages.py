@@ -21,7 +21,7 @@ from service.tracking.alarms import ACQUISITION, Act, forbidding, forbids
 from service.tracking.dither import ask_for, ask_to_stop, make_way
 from service.tracking.dither_plan import ACQUIRING_DITHER
 from service.tracking.loop import Dither
-from service.tracking.loop_commands import set_loop
+from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.reconstructors import forget_verdict
 from service.tracking.registration import Registration

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
+from service.telemetry.estimate import DitheredEstimate, model_error
 from service.telemetry.kalman import Drift, Joint, begin_joint, predicted
-from service.tracking.alarms import DISAGREES, SUSPECTED
+from service.telemetry.lockin import MAX_LAG_FRAMES
+from service.telemetry.random_dither import RandomEstimate
+from service.tracking.alarms import ALARMS, DISAGREES, SUSPECTED, Act, forbidding
 from service.tracking.jumps import last_of
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
@@ -25,6 +29,7 @@ from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
 from service.tracking.validity import (
     CLOCK_SET_BACK_S,
+    USELESS_SIGMA,
     Taken,
     age,
     flexure,
@@ -33,6 +38,7 @@ from service.tracking.validity import (
     pointing_at,
     precedes,
     slewed_deg,
+    why_void,
 )
 
 MODES_KEPT = 64
@@ -51,6 +57,19 @@ _FARTHEST = 3.0
 """A window further out than this many σ counts as one at this distance."""
 
 Array = NDArray[np.float64]
+
+CAPTURE_RANGE = np.array([0.8, 0.8, np.deg2rad(2.0), 0.02])
+"""Beyond this, one linearised fit with high modes cannot be trusted (numeric units)."""
+
+GAIN_RANGE = (0.1, 3.0)
+"""Gains outside this are no pyramid seeing the dither: about 0.4 to 0.9 on sky, twice that when the
+mirror is seen twice."""
+
+GAIN_GROUPS = 16
+"""A random dither on more modes than this is believed on the gains of neighbours together."""
+
+MISFIT_WINDOWS = 10
+"""So many tell the model error together: the misfit of a faint star's window is mostly chance."""
 
 
 def followed_gains(
@@ -298,3 +317,64 @@ def entry_of(
         source=measured.source,
         entered=entered,
     )
+
+
+def model_error_of(known: Registration | None, estimate: DitheredEstimate, policy: Policy) -> Array:
+    """Return the model error by all windows so far: what is set, and what they do not explain.
+
+    A window weaker than what is asked of α cannot tell: the chance in its misfit, times its own σ,
+    would be more than any model error.
+    """
+    before = policy.floor if known is None else known.floor
+    if np.any(np.diag(estimate.covariance) > policy.dither_sigma**2):
+        return before
+    squared = policy.floor**2 + model_error(estimate.covariance, estimate.misfit) ** 2
+    share = 1.0 if known is None else 1.0 / min(known.n_windows + 1, MISFIT_WINDOWS)
+    return np.asarray(np.sqrt(before**2 + share * (squared - before**2)))
+
+
+def gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
+    """Return modes, moduli of their gains, and 1 σ of them where it is known."""
+    if isinstance(estimate, RandomEstimate):
+        return estimate.gains_by_group(GAIN_GROUPS)
+    return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
+
+
+def why_no_window(
+    state: TrackerState, estimate: DitheredEstimate, when: Taken, policy: Policy
+) -> str | None:
+    """Return why a window's estimate must not be used, or None."""
+    if state.rtc is None or estimate.session != state.rtc.session:
+        return "the RTC has restarted since"
+    reason = why_no_measurement(state, when)
+    if reason is not None:
+        return reason
+    lag = float(np.median(estimate.lag_frames))
+    if abs(lag) > MAX_LAG_FRAMES:
+        return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
+    _, gains, _ = gains_of(estimate)
+    if gains.min() < GAIN_RANGE[0] or gains.max() > GAIN_RANGE[1]:
+        return (
+            f"optical gains of {gains.min():.2f} to {gains.max():.2f}, expected {GAIN_RANGE[0]} "
+            f"to {GAIN_RANGE[1]}: wrong instrument file, or the dither is not on the mirror"
+        )
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    if np.any(sigma > USELESS_SIGMA):
+        return "too uncertain: raise the dither's amplitude or the window's length"
+    known = state.registration
+    near = policy.start if known is None else known.alpha
+    distance = np.abs(estimate.alpha.vector - near.vector)
+    if np.any(distance > CAPTURE_RANGE):
+        return (
+            f"outside the capture range: {estimate.alpha.to_boundary()}, "
+            f"the fit began at {near.to_boundary()}"
+        )
+    return None
+
+
+def why_no_measurement(state: TrackerState, when: Taken) -> str | None:
+    """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
+    alarm = forbidding(state, Act.MEASURE)
+    if alarm is None:
+        return why_void(state, when)
+    return f"{ALARMS[alarm.name].because}: its telemetry is no measurement"

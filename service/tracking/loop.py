@@ -70,6 +70,18 @@ def same_loop(one: Status, other: Status) -> bool:
     )
 
 
+def extended_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
+    """Return gains for ``n_modes`` controlled modes: those in force, the last one for new modes."""
+    last = rtc.gains[rtc.n_controlled - 1]
+    kept = rtc.gains[: min(rtc.n_controlled, n_modes)]
+    return (*kept, *(last,) * (n_modes - len(kept)), *(0.0,) * (rtc.n_modes - n_modes))
+
+
+def commanded_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
+    """Return the gains of the modes that a reconstructor of ``n_modes`` would command."""
+    return extended_gains(rtc, n_modes)[:n_modes]
+
+
 def why_open(rtc: Status) -> str:
     """Return what to tell of a loop with no mode in it."""
     return "the loop is open" if rtc.loop == Loop.OPEN else "all gains of the loop are 0"

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking.alarms import NOT_ACKNOWLEDGED, OTHER_SUM, SHORT_MARGIN, Act, forbidding
-from service.tracking.loop import SAME_DELAY, SAME_LEAK, same_gains
-from service.tracking.products import Assessment, Judged, MatrixState, ReconstructorRecord
-from service.tracking.registration import Registration
+from service.tracking.loop import commanded_gains, extended_gains
+from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
 from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.turn import Turn
-from service.tracking.worth import note_limit, outdated
+from service.tracking.worth import (
+    note_limit,
+    outdated,
+    settled,
+    why_stale,
+    why_worthless,
+)
 from service.wire import Acknowledgement, AckState, Status
 
 RECONSTRUCTORS_KEPT = 200
@@ -29,35 +32,6 @@ _UNSENT = frozenset({MatrixState.REFUSED, MatrixState.DISCARDED})
 _SPARE = frozenset({MatrixState.REJECTED, MatrixState.FAILED, MatrixState.SUPERSEDED})
 
 _SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
-
-_RESTARTED = {
-    MatrixState.PUBLISHED: MatrixState.FAILED,
-    MatrixState.STAGED: MatrixState.FAILED,
-    MatrixState.PROPOSED: MatrixState.DISCARDED,
-}
-
-MIN_WINDOWS = 2
-"""Windows that must agree before anything is made from them."""
-
-REACH = np.array([0.05, 0.05, np.deg2rad(0.05), 0.005])
-"""Half of what 594 modes tolerate without loss (Heritier et al. 2018): a verdict is as good so far
-beyond α ± 3σ (numeric units)."""
-
-
-def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRecord, ...]:
-    """Return what a restarted service takes over from its archive.
-
-    Only its own: what the RTC brought is fetched anew, for nobody can say it is the same as last
-    time. What was under way has failed; a proposal's verdict is of another day.
-    """
-    own = [record for record in records if record.parent is not None]
-    taken_over = [
-        replace(record, state=_RESTARTED[record.state], reason="the service restarted")
-        if record.state in _RESTARTED
-        else record
-        for record in own
-    ]
-    return _thinned(taken_over, None)
 
 
 def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
@@ -77,7 +51,7 @@ def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
 def keep(turn: Turn, record: ReconstructorRecord) -> None:
     """Keep one more reconstructor; what is needed least gives way."""
     records = [*(r for r in turn.state.reconstructors if r.id != record.id), record]
-    kept = _thinned(records, turn.state.in_use)
+    kept = thinned(records, turn.state.in_use)
     turn.state = replace(turn.state, reconstructors=kept)
 
 
@@ -437,61 +411,6 @@ def _trust(turn: Turn, matrix_id: str) -> None:
         turn.calm(OTHER_SUM)
 
 
-def settled(known: Registration) -> bool:
-    """Return whether α may be believed: windows agree, and none of them hints at a jump."""
-    return known.n_windows >= MIN_WINDOWS and known.candidate is None and known.usable
-
-
-def why_stale(state: TrackerState, judged: Judged | None, gains: tuple[float, ...]) -> str | None:
-    """Return why a verdict says nothing of a loop with these gains now; None: it does.
-
-    It was taken over α ± 3σ as they were then, which must hold all of α ± 3σ as they are now, but
-    for a small ``REACH``: σ grows between two windows, and another verdict takes as long.
-    """
-    known = state.registration
-    if known is None or judged is None:
-        return None if known is None else why_of_another_loop(state, judged, gains)
-    moved = np.abs(known.alpha.vector - judged.alpha.vector)
-    if np.any(moved + 3.0 * known.sigma > 3.0 * judged.sigma + REACH):
-        return "α ± 3σ reaches further than it was judged for"
-    return why_of_another_loop(state, judged, gains)
-
-
-def why_worthless(
-    state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
-) -> str | None:
-    """Return the same where it need not be sent: while α is in doubt no verdict is of where it is.
-
-    A reconstructor that somebody wants back is sent all the same.
-    """
-    known = state.registration
-    if known is not None and known.doubt:
-        return known.doubt
-    return why_stale(state, judged, gains)
-
-
-def why_of_another_loop(
-    state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
-) -> str | None:
-    """Return what is different in the loop since a verdict; None: nothing, or no RTC is there.
-
-    An open loop does not tell the gains it will close with.
-    """
-    rtc = state.rtc
-    if rtc is None:
-        return None
-    if judged is None:
-        return "nobody knows of which loop its verdict is"
-    if judged.session != rtc.session:
-        return "the RTC has begun a new session"
-    if abs(judged.leak - rtc.leak) > SAME_LEAK:
-        return f"the leak was {judged.leak:g}, it is {rtc.leak:g}"
-    if abs(judged.delay_frames - rtc.delay_frames) > SAME_DELAY:
-        return f"the delay was {judged.delay_frames:g} frames, it is {rtc.delay_frames:g}"
-    same = rtc.loop == "open" or same_gains(gains, judged.gains)
-    return None if same else "the gains have changed"
-
-
 def why_unsendable(state: TrackerState, record: ReconstructorRecord) -> str | None:
     """Return why a reconstructor may not be published now, whoever wants it, or None."""
     if state.rtc is None:
@@ -511,18 +430,6 @@ def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
     used = {MatrixState.APPLIED, MatrixState.SUPERSEDED}
     same = (r for r in state.reconstructors if r.sha256 == record.sha256 and r.state in used)
     return bool(record.sha256) and any(same)
-
-
-def commanded_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
-    """Return the gains of the modes that a reconstructor of ``n_modes`` would command."""
-    return extended_gains(rtc, n_modes)[:n_modes]
-
-
-def extended_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
-    """Return gains for ``n_modes`` controlled modes: those in force, the last one for new modes."""
-    last = rtc.gains[rtc.n_controlled - 1]
-    kept = rtc.gains[: min(rtc.n_controlled, n_modes)]
-    return (*kept, *(last,) * (n_modes - len(kept)), *(0.0,) * (rtc.n_modes - n_modes))
 
 
 def _may_follow(state: TrackerState) -> bool:
@@ -573,7 +480,7 @@ def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledge
     return record.state is MatrixState.SUPERSEDED and repeated
 
 
-def _thinned(
+def thinned(
     shelf: list[ReconstructorRecord], in_use: str | None
 ) -> tuple[ReconstructorRecord, ...]:
     """Return as many as are kept, oldest first.

@@ -8,6 +8,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.gains import GainTable, gain_table
 from service.model.misregistration import Misregistration
 from service.wire import Pointing
 
@@ -310,3 +311,13 @@ class Watchdog:
 
     bias: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` what is known of its bias, numeric units; 0: nothing."""
+
+
+def table_of(measured: tuple[ModeGain, ...], n_modes: int) -> GainTable:
+    """Return the table of the first ``n_modes`` modes; nothing measured: what is expected."""
+    return gain_table(
+        np.array([gain.mode for gain in measured], dtype=np.intp),
+        np.array([gain.gain for gain in measured]),
+        np.array([gain.sigma for gain in measured]),
+        n_modes,
+    )

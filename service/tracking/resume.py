@@ -8,12 +8,36 @@ from service.tracking.acquisition import inherit, left_behind
 from service.tracking.events import Tick
 from service.tracking.operator import obey, orders_of
 from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.reconstructors import thinned
 from service.tracking.state import Orders, Saved, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.validity import age, restore
 
 CLOCKS_AGREE_S = 60.0
 """A state from further in the future than this was saved under another clock."""
+
+_RESTARTED = {
+    MatrixState.PUBLISHED: MatrixState.FAILED,
+    MatrixState.STAGED: MatrixState.FAILED,
+    MatrixState.PROPOSED: MatrixState.DISCARDED,
+}
+
+
+def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRecord, ...]:
+    """Return what a restarted service takes over from its archive.
+
+    Only its own: what the RTC brought is fetched anew, for nobody can say it is the same as last
+    time. What was under way has failed; a proposal's verdict is of another day.
+    """
+    own = [record for record in records if record.parent is not None]
+    taken_over = [
+        replace(record, state=_RESTARTED[record.state], reason="the service restarted")
+        if record.state in _RESTARTED
+        else record
+        for record in own
+    ]
+    return thinned(taken_over, None)
 
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:

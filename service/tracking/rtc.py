@@ -18,7 +18,7 @@ from service.tracking.alarms import (
 from service.tracking.dither import drop, follow_status, forget_unwanted, found_again
 from service.tracking.events import Effect
 from service.tracking.loop import loop_numbers, same_loop, same_numbers, why_open
-from service.tracking.loop_commands import end_ramp
+from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
 from service.tracking.reconstructors import (

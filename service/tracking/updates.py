@@ -10,11 +10,11 @@ from service.tracking.dither import choose_dither, stop_unwanted
 from service.tracking.events import MakeMatrix
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import fetch, judge, make, settled
+from service.tracking.reconstructors import fetch, judge, make
 from service.tracking.registration import Registration
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
-from service.tracking.worth import fewer_than, more_to_try, outdated, why_worthwhile
+from service.tracking.worth import fewer_than, more_to_try, outdated, settled, why_worthwhile
 from service.wire import Status
 
 ASK_FIRST_S = 3.0

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.telemetry.estimate import DitheredEstimate, model_error
 from service.telemetry.kalman import (
     JUMP_THRESHOLD,
     Joint,
@@ -27,23 +26,20 @@ from service.telemetry.kalman import (
     with_dithered,
     with_passive,
 )
-from service.telemetry.lockin import MAX_LAG_FRAMES
 from service.telemetry.passive import PassiveEstimate
 from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import count_miss
 from service.tracking.alarms import (
-    ALARMS,
     DISAGREES,
     DITHER_LOST,
     MISALIGNED,
     SUSPECTED,
     WRONG_ANSWER,
-    Act,
-    forbidding,
 )
 from service.tracking.dither import found_again
 from service.tracking.estimate import (
+    CAPTURE_RANGE,
     Folded,
     Measured,
     accept,
@@ -52,8 +48,12 @@ from service.tracking.estimate import (
     counted,
     entry_of,
     followed_gains,
+    gains_of,
     joint_of,
+    model_error_of,
     remember,
+    why_no_measurement,
+    why_no_window,
 )
 from service.tracking.jumps import (
     Distance,
@@ -66,7 +66,7 @@ from service.tracking.jumps import (
     window_surprise,
 )
 from service.tracking.loop import loop_numbers, same_numbers
-from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.policy import SECOND_NS
 from service.tracking.registration import (
     Candidate,
     HistoryEntry,
@@ -78,8 +78,6 @@ from service.tracking.registration import (
 from service.tracking.state import Level, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.validity import (
-    USELESS_SIGMA,
-    Taken,
     age,
     hold,
     pointing_at,
@@ -87,7 +85,6 @@ from service.tracking.validity import (
     taken,
     tells_of,
     want_window,
-    why_void,
 )
 
 Array = NDArray[Any]
@@ -97,29 +94,15 @@ TOO_EARLY = (
     "can tell"
 )
 
-CAPTURE_RANGE = np.array([0.8, 0.8, np.deg2rad(2.0), 0.02])
-"""Beyond this, one linearised fit with high modes cannot be trusted (numeric units)."""
-
 EXPECTED = ("the reconstructor changed", "the dither ended")
 """What cuts a window short when all is well."""
-
-GAIN_RANGE = (0.1, 3.0)
-"""Gains outside this are no pyramid seeing the dither: about 0.4 to 0.9 on sky, twice that when the
-mirror is seen twice."""
-
-
-GAIN_GROUPS = 16
-"""A random dither on more modes than this is believed on the gains of neighbours together."""
-
-MISFIT_WINDOWS = 10
-"""So many tell the model error together: the misfit of a faint star's window is mostly chance."""
 
 
 def on_window(turn: Turn, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
     when = taken(event.began_ns_utc, estimate.t_ns_utc)
-    reason = _why_no_window(turn.state, estimate, when, turn.policy)
+    reason = why_no_window(turn.state, estimate, when, turn.policy)
     if reason is not None:
         refuse_window(turn, reason)
         return
@@ -130,7 +113,7 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
         if tells_of(turn.state, name, when):
             turn.calm(name)
     known = turn.known
-    modes, gains, gain_sigma = _gains_of(estimate)
+    modes, gains, gain_sigma = gains_of(estimate)
     measured = Measured(
         alpha=estimate.alpha,
         covariance=estimate.covariance,
@@ -144,7 +127,7 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
             gain_sigma,
             estimate.t_ns_utc,
         ),
-        floor=_floor(known, estimate, turn.policy),
+        floor=model_error_of(known, estimate, turn.policy),
         misfit=estimate.misfit,
     )
     enter(turn, measured)
@@ -279,67 +262,6 @@ def _innovation(prior: Joint, measured: Measured) -> float:
 def _step(measured: Measured | Candidate, known: Registration) -> str:
     step = (measured.alpha.vector - known.alpha.vector) * BOUNDARY_SCALE
     return f"{step[0]:+.3f}, {step[1]:+.3f} subap, {step[2]:+.3f} deg, {step[3]:+.4f}"
-
-
-def _floor(known: Registration | None, estimate: DitheredEstimate, policy: Policy) -> Array:
-    """Return the model error by all windows so far: what is set, and what they do not explain.
-
-    A window weaker than what is asked of α cannot tell: the chance in its misfit, times its own σ,
-    would be more than any model error.
-    """
-    before = policy.floor if known is None else known.floor
-    if np.any(np.diag(estimate.covariance) > policy.dither_sigma**2):
-        return before
-    squared = policy.floor**2 + model_error(estimate.covariance, estimate.misfit) ** 2
-    share = 1.0 if known is None else 1.0 / min(known.n_windows + 1, MISFIT_WINDOWS)
-    return np.asarray(np.sqrt(before**2 + share * (squared - before**2)))
-
-
-def _gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
-    """Return modes, moduli of their gains, and 1 σ of them where it is known."""
-    if isinstance(estimate, RandomEstimate):
-        return estimate.gains_by_group(GAIN_GROUPS)
-    return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
-
-
-def _why_no_window(
-    state: TrackerState, estimate: DitheredEstimate, when: Taken, policy: Policy
-) -> str | None:
-    """Return why a window's estimate must not be used, or None."""
-    if state.rtc is None or estimate.session != state.rtc.session:
-        return "the RTC has restarted since"
-    reason = why_no_measurement(state, when)
-    if reason is not None:
-        return reason
-    lag = float(np.median(estimate.lag_frames))
-    if abs(lag) > MAX_LAG_FRAMES:
-        return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
-    _, gains, _ = _gains_of(estimate)
-    if gains.min() < GAIN_RANGE[0] or gains.max() > GAIN_RANGE[1]:
-        return (
-            f"optical gains of {gains.min():.2f} to {gains.max():.2f}, expected {GAIN_RANGE[0]} "
-            f"to {GAIN_RANGE[1]}: wrong instrument file, or the dither is not on the mirror"
-        )
-    sigma = np.sqrt(np.diag(estimate.covariance))
-    if np.any(sigma > USELESS_SIGMA):
-        return "too uncertain: raise the dither's amplitude or the window's length"
-    known = state.registration
-    near = policy.start if known is None else known.alpha
-    distance = np.abs(estimate.alpha.vector - near.vector)
-    if np.any(distance > CAPTURE_RANGE):
-        return (
-            f"outside the capture range: {estimate.alpha.to_boundary()}, "
-            f"the fit began at {near.to_boundary()}"
-        )
-    return None
-
-
-def why_no_measurement(state: TrackerState, when: Taken) -> str | None:
-    """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
-    alarm = forbidding(state, Act.MEASURE)
-    if alarm is None:
-        return why_void(state, when)
-    return f"{ALARMS[alarm.name].because}: its telemetry is no measurement"
 
 
 def on_watchdog(turn: Turn, event: ev.Watched) -> None:

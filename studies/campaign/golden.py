@@ -26,8 +26,7 @@ from service.tracker import step
 from service.tracking.activity import under_way
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
-from service.tracking.reconstructors import restored
-from service.tracking.resume import resumed, saved_of
+from service.tracking.resume import restored, resumed, saved_of
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import new_lines
 from studies.campaign.golden_changes import Renewal

@@ -7,9 +7,10 @@ from hypothesis import given
 
 from service.control.expected_gain import ExpectedGain
 from service.tracking import events as ev
+from service.tracking.loop import commanded_gains
 from service.tracking.products import MatrixState
-from service.tracking.reconstructors import commanded_gains, why_stale
 from service.tracking.state import Mode
+from service.tracking.worth import why_stale
 from tests.properties.test_tracker_laws import LAWS, Night, commands, heard, ids
 from tests.unit.tracking.situations import ALPHA, moved, record, rtc, verdict
 

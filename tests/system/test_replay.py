@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
-from service.link.endpoint import Endpoint
 from service.link.intake import Intake
+from service.link.session import Endpoint
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime.actions import record_of
 from service.runtime.engine import Engine

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from service.errors import UnknownIdError, WireError
-from service.link.endpoint import Endpoint
 from service.link.intake import EventQueue, Intake
 from service.link.matrices import OFFERS, MeasuredIntake, Offer, Outbox
 from service.link.ring import ROOM
 from service.link.rivals import Order, SessionWatch
+from service.link.session import Endpoint
 from service.tracking import events as ev
 from service.wire import (
     Acknowledgement,

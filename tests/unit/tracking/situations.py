@@ -9,10 +9,9 @@ from service.model.misregistration import Misregistration
 from service.telemetry.lockin import WindowEstimate
 from service.tracker import step
 from service.tracking import events as ev
-from service.tracking.loop import Dither
+from service.tracking.loop import Dither, commanded_gains
 from service.tracking.policy import Policy
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import commanded_gains
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
 from service.wire import (

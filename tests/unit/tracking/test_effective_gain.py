@@ -7,8 +7,7 @@ import pytest
 
 from service.errors import CommandError
 from service.tracking import events as ev
-from service.tracking.loop_commands import table_of
-from service.tracking.registration import ModeGain
+from service.tracking.registration import ModeGain, table_of
 from service.tracking.state import Mode
 from service.wire import LoopRequest
 from tests.unit.tracking.situations import N_MODES, START_NS, Story, of_kind

@@ -5,7 +5,7 @@ import pytest
 from service.errors import CommandError
 from service.tracking import events as ev
 from service.tracking.loop import CommandState
-from service.tracking.loop_commands import CLOSE_AGAIN_EVERY_S
+from service.tracking.operator import CLOSE_AGAIN_EVERY_S
 from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest, Pattern, RampRequest
 from tests.unit.tracking.situations import Story, judged, loop_answered, of_kind, rtc, verdict

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service.tracking import events as ev
-from service.tracking.reconstructors import extended_gains
+from service.tracking.loop import extended_gains
 from service.tracking.registration import Validity
 from service.tracking.state import Mode
 from service.tracking.worth import more_to_try

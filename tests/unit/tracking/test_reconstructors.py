@@ -4,8 +4,8 @@ import pytest
 
 from service.tracker import step
 from service.tracking import events as ev
+from service.tracking.loop import extended_gains
 from service.tracking.products import MatrixState
-from service.tracking.reconstructors import extended_gains
 from service.tracking.state import Level, Mode, TrackerState
 from tests.unit.tracking.situations import (
     POLICY,

@@ -8,9 +8,9 @@ from service.tracking.reconstructors import (
     UNSENT_KEPT,
     change_state,
     keep,
-    restored,
     use,
 )
+from service.tracking.resume import restored
 from service.tracking.state import TrackerState
 from tests.unit.tracking.situations import foreign, record, turned
 

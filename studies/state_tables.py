@@ -19,8 +19,7 @@ from service.tracking.alarms import ALARMS, Act
 from service.tracking.events import Command
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.registration import Validity
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Mode
+from service.tracking.state import AcquisitionStage, Mode
 
 PAGE = Path(__file__).parents[1] / "docs" / "states.md"
 

@@ -24,7 +24,7 @@ from pydantic import (
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.views import MatrixId, ServiceDep
 from service.runtime.supervisor import Supervisor
-from service.tracking.dither_plan import total_m
+from service.tracking.dither_request import total_m
 from service.tracking.events import (
     AbortAcquisition,
     Acquire,

@@ -21,9 +21,9 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.routes.problems import problem, problem_response
 from service.routes.views import ServiceDep
 from service.snapshot import Pace, Snapshot
+from service.tracking.dither_request import DitherPhase
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
-from service.tracking.stages import DitherPhase
 from service.tracking.state import Mode, TrackerState
 from service.wire import Pattern
 

@@ -29,7 +29,7 @@ from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.reading import Parameters, describes_numbers, numbers_of
 from service.routes.views import ServiceDep, answer, known, shows
 from service.snapshot import Snapshot
-from service.tracking.dither_plan import NOISY_DITHER
+from service.tracking.dither_request import NOISY_DITHER
 from service.tracking.events import GiveUp, GiveUpNoisy, Measure, MeasureNoisy
 from service.tracking.products import ModeSet
 from service.wire import Pattern

@@ -36,8 +36,9 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistr
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 from service.snapshot import Alpha, Pace, Rtc, Snapshot
+from service.tracking.dither_request import Dither, Dithering, DitherPlan
 from service.tracking.events import GainGroup
-from service.tracking.loop import Dither, LoopCommand
+from service.tracking.loop import LoopCommand
 from service.tracking.products import (
     Assessment,
     MeasurementRecord,
@@ -47,8 +48,7 @@ from service.tracking.products import (
     ReconstructorRecord,
 )
 from service.tracking.registration import HistoryEntry, ModeGain, Watchdog
-from service.tracking.stages import Acquisition, Dithering, DitherPlan
-from service.tracking.state import Alarm, LogEntry, TrackerState, Waiting
+from service.tracking.state import Acquisition, Alarm, LogEntry, TrackerState, Waiting
 from service.wire import Pointing
 
 Record = TypeVar("Record")

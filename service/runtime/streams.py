@@ -24,8 +24,8 @@ from service.telemetry.loopcheck import LoopCheck, LoopLaw, Obedience
 from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, measured
 from service.telemetry.random_dither import Correlated, RandomDither
-from service.tracking.dither_plan import SETTLING_S, asked_of, lock_in_plan, random_plan
-from service.tracking.loop import Dither, last_seq, same_loop, same_rate, why_open
+from service.tracking.dither_request import SETTLING_S, Dither, asked_of, lock_in_plan, random_plan
+from service.tracking.loop import last_seq, same_loop, same_rate, why_open
 from service.wire import DitherKind, Status
 from service.worker import Description
 

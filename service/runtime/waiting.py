@@ -16,8 +16,7 @@ from service.tracking.alarms import Act, forbids
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
 from service.tracking.reconstructors import why_unread
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Alarm, Mode, Party, TrackerState, Waiting
+from service.tracking.state import AcquisitionStage, Alarm, Mode, Party, TrackerState, Waiting
 from service.wire import TEXT_LIMIT, StateMessage
 
 SILENT_S: Final = 3.0

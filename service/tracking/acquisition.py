@@ -43,8 +43,7 @@ from service.tracking.measuring import cut_off
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import change_state, make, send_with, why_unsendable
-from service.tracking.stages import Acquisition, AcquisitionStage, Interruption
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Acquisition, AcquisitionStage, Interruption, Mode, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.worth import fewer_than, half_of, limit_modes, moved, why_worthless
 from service.wire import DitherRequest, LoopRequest, Reply, Status

@@ -19,14 +19,19 @@ from service.model.misregistration import Misregistration
 from service.tracking import events as ev
 from service.tracking.alarms import ACQUISITION, Act, forbidding, forbids
 from service.tracking.dither import ask_for, ask_to_stop, make_way
-from service.tracking.dither_plan import ACQUIRING_DITHER
-from service.tracking.loop import Dither
+from service.tracking.dither_request import ACQUIRING_DITHER, Dither
 from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.reconstructors import forget_verdict
 from service.tracking.registration import Registration
-from service.tracking.stages import Acquisition, AcquisitionStage, LoopFound
-from service.tracking.state import Level, Mode, TrackerState
+from service.tracking.state import (
+    Acquisition,
+    AcquisitionStage,
+    Level,
+    LoopFound,
+    Mode,
+    TrackerState,
+)
 from service.tracking.turn import Turn
 from service.tracking.validity import forget, hold, taken, void, why_void
 from service.tracking.worth import half_of, limit_modes

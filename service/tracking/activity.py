@@ -13,7 +13,7 @@ from typing import get_args
 from service.errors import CommandError
 from service.tracking import events as ev
 from service.tracking.alarms import STANDING_BY
-from service.tracking.dither_plan import OUR_DITHERS, OWN_DITHER
+from service.tracking.dither_request import OUR_DITHERS, OWN_DITHER
 from service.tracking.events import Command, Event
 from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS

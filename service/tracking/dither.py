@@ -15,39 +15,37 @@ from service.telemetry.lockin import WindowEstimate
 from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
 from service.tracking.activity import GONE_WITHIN_S
-from service.tracking.alarms import (
-    DITHER_LOST,
-    NO_DITHER,
-    NOT_AS_ASKED,
-    NOT_STOPPED,
-    OVER_BUDGET,
-    Act,
-)
+from service.tracking.alarms import DITHER_LOST, NO_DITHER, NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
 from service.tracking.dither_plan import (
-    NOISY_DITHER,
-    OUR_DITHERS,
-    OWN_DITHER,
+    ROUNDING,
     SHORTEST_PAUSE_S,
     Wish,
+    awaits_a_result,
     budget_m,
-    on_vibrations,
-    plan_dither,
-    total_m,
+    too_strong,
     wanted,
-    why_unusable,
+    why_none,
+    why_unwanted,
     window_lengths_s,
 )
-from service.tracking.loop import Dither, why_open
+from service.tracking.dither_request import (
+    NOISY_DITHER,
+    OWN_DITHER,
+    Dither,
+    DitherPhase,
+    Precision,
+    on_vibrations,
+    own_sine,
+    plan_dither,
+    total_m,
+    why_unusable,
+)
 from service.tracking.policy import SECOND_NS
-from service.tracking.stages import DitherPhase, Precision
 from service.tracking.turn import Turn
-from service.wire import DitherKind, DitherRequest, DitherStatus, DitherStop, Reply, Status
+from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status
 
 MEASURED = 1.1
 """What a second of frames may hold more than is allowed, before it is too strong."""
-
-ROUNDING = 1.001
-"""What a dither may be stronger by than what was asked for."""
 
 CALM_S = 60.0
 """After one that was too strong, before another is tried."""
@@ -61,9 +59,6 @@ PATIENCE_S = 1.5
 """Of frames without it, before another is asked for; doubled each time, for one that is late."""
 
 LONGEST_PATIENCE_S = 60.0
-
-RESULT_WITHIN_S = 10.0
-"""For the estimate of a window whose dither has ended."""
 
 SOON_OVER_S = 2.0
 """A dither that ends by itself so soon is not worth a command."""
@@ -80,11 +75,6 @@ _ON_ITS_WAY_S = 2.0
 _SAME_LINE_HZ = 2.5
 
 
-def own_sine(request: DitherRequest) -> bool:
-    """Return whether a dither is one that the service has chosen by itself."""
-    return request.id.startswith(OWN_DITHER) and request.kind is DitherKind.SINE
-
-
 def choose_dither(turn: Turn, rtc: Status) -> None:
     """Dither as much and as often as the policy asks while the loop is closed, its matrix known."""
     _account(turn, rtc)
@@ -93,7 +83,7 @@ def choose_dither(turn: Turn, rtc: Status) -> None:
     if dither is not None and not own_sine(dither.request):
         _show(turn, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
-    forbidden = _why_none(turn, rtc)
+    forbidden = why_none(turn.state, rtc, turn.policy)
     if forbidden is not None:
         _show(turn, DitherPhase.OFF, forbidden)
         return
@@ -300,8 +290,8 @@ def stop_too_strong(turn: Turn, dither_id: str, loud: str) -> None:
 
 def stop_unwanted(turn: Turn, rtc: Status) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
-    running, loud = rtc.dither_id, _too_strong(turn, rtc)
-    why = loud or _why_unwanted(turn, rtc)
+    running, loud = rtc.dither_id, too_strong(turn.state, rtc, turn.policy)
+    why = loud or why_unwanted(turn.state, rtc, turn.policy)
     if running is None or why is None:
         forget_unwanted(turn)
         _forgive(turn, rtc)
@@ -340,7 +330,7 @@ def _begin(turn: Turn, rtc: Status, wish: Wish) -> None:
         turn.put_off(dither_s=2.0)
         _note_stop(turn, rtc.dither_id)
         ask_to_stop(turn)
-    elif turn.now_ns >= wish.next_ns_utc and not _awaits_a_result(turn, wish):
+    elif turn.now_ns >= wish.next_ns_utc and not awaits_a_result(turn.state, wish, turn.now_ns):
         _ask(turn, rtc, wish)
 
 
@@ -369,15 +359,6 @@ def _ask(turn: Turn, rtc: Status, wish: Wish) -> None:
     ask_for(turn, dither)
 
 
-def _awaits_a_result(turn: Turn, wish: Wish) -> bool:
-    """Return whether the window of the dither that ended last may still be on its way."""
-    dithering = turn.dithering
-    if wish.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
-        return False
-    late = turn.now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
-    return not late and turn.state.windows_accepted < dithering.results_due
-
-
 def _end_when_done(turn: Turn, dither: Dither, wish: Wish) -> None:
     """Stop a dither that has done its work, or is too weak for what has come up meanwhile."""
     left_s = dither.request.duration_s - (turn.now_ns - dither.asked_ns_utc) / SECOND_NS
@@ -402,7 +383,7 @@ def _adopt(turn: Turn, rtc: Status) -> bool:
     """Take over a dither that runs, if it can be read; return whether there is one."""
     if rtc.dither is None or rtc.dither_id == turn.state.dither_lost:
         return False
-    running, dithering = rtc.dither.request, turn.dithering
+    running, begun_seq, dithering = rtc.dither.request, rtc.dither.start_seq, turn.dithering
     over = own_sine(running) and total_m(running) > ROUNDING * dithering.budget_m
     asked_to_stop = running.id == dithering.stopped_id
     # a recorded night stops nothing: what it goes on playing is read all the same
@@ -411,15 +392,12 @@ def _adopt(turn: Turn, rtc: Status) -> bool:
         return False
     for window_s in window_lengths_s(turn.policy):
         dither = Dither(
-            request=running,
-            start_seq=rtc.dither.start_seq,
-            asked_ns_utc=turn.now_ns,
-            window_s=window_s,
+            request=running, start_seq=begun_seq, asked_ns_utc=turn.now_ns, window_s=window_s
         )
         if why_unusable(dither, rtc, turn.policy) is None:
             turn.dither = dither
             turn.calm(NO_DITHER)
-            turn.log("dither.adopted", f"{running.id} runs since frame {dither.start_seq}")
+            turn.log("dither.adopted", f"{running.id} runs since frame {begun_seq}")
             return True
     return False
 
@@ -446,25 +424,9 @@ def _account(turn: Turn, rtc: Status) -> None:
 
 
 def _show(turn: Turn, phase: DitherPhase, reason: str) -> None:
-    turn.dithering = replace(turn.dithering, phase=phase, reason=reason)
-    if phase in {DitherPhase.OFF, DitherPhase.OPERATOR}:
-        turn.dithering = replace(turn.dithering, next_ns_utc=None)
-
-
-def _why_none(turn: Turn, rtc: Status) -> str | None:
-    state, still = turn.state, turn.dithering.unwanted_id
-    left = "" if still is None else f"; the RTC still plays {still}"
-    if state.dither_stopped:
-        return f"stopped by the operator{left}"
-    if not turn.policy.dither_enabled and turn.dither is None:
-        return f"the settings forbid it{left}"
-    if not rtc.in_loop:
-        return why_open(rtc)
-    unnamed = rtc.cm_id is None or state.unfetched
-    if state.in_use is None and not unnamed and turn.dither is None and rtc.dither is None:
-        return "the reconstructor in use is not known yet"
-    alarm = turn.forbidden(Act.MEASURE)
-    return None if alarm is None else f"nothing would be measured under {alarm.name}"
+    none_follows = phase in {DitherPhase.OFF, DitherPhase.OPERATOR}
+    next_ns = None if none_follows else turn.dithering.next_ns_utc
+    turn.dithering = replace(turn.dithering, phase=phase, reason=reason, next_ns_utc=next_ns)
 
 
 def _correct(turn: Turn, asked: Dither, shown: DitherStatus) -> None:
@@ -475,13 +437,13 @@ def _correct(turn: Turn, asked: Dither, shown: DitherStatus) -> None:
     running = replace(asked, request=shown.request, start_seq=shown.start_seq)
     if running == asked:
         return
-    plays, wanted = running.request, asked.request
-    if total_m(plays) > ROUNDING * max(total_m(wanted), turn.dithering.budget_m):
+    plays, meant = running.request, asked.request
+    if total_m(plays) > ROUNDING * max(total_m(meant), turn.dithering.budget_m):
         turn.dithering = replace(turn.dithering, loud_id=running.id, loud_text="")
     text = (
         f"{asked.id}: the RTC plays modes {plays.modes}, {running.frequency_hz} Hz, "
         f"{plays.amplitude_m} m from frame {running.start_seq}; asked for were modes "
-        f"{wanted.modes}, {asked.frequency_hz} Hz, {wanted.amplitude_m} m from {asked.start_seq}"
+        f"{meant.modes}, {asked.frequency_hz} Hz, {meant.amplitude_m} m from {asked.start_seq}"
     )
     turn.dither = running
     turn.warn("dither.other", text)
@@ -534,35 +496,3 @@ def _forgive(turn: Turn, rtc: Status) -> None:
         turn.calm(NOT_AS_ASKED)
     if fine or given_up:
         turn.calm(OVER_BUDGET)
-
-
-def _too_strong(turn: Turn, rtc: Status) -> str | None:
-    """Return why a dither that is played costs more than it may, or None.
-
-    An operator's own may cost more than the budget, but not more than was asked for.
-    """
-    if rtc.dither is None:
-        return None
-    running, dithering = rtc.dither.request, turn.dithering
-    found_m, most_m = total_m(running), budget_m(rtc, turn.policy)
-    over = own_sine(running) and found_m > ROUNDING * most_m
-    if not over and running.id != dithering.loud_id:
-        return None
-    if running.id == dithering.loud_id and dithering.loud_text:
-        return dithering.loud_text
-    return (
-        f"the RTC plays a dither of {1e9 * found_m:.3g} nm RMS in all, more than the budget of "
-        f"{1e9 * most_m:.3g} nm"
-    )
-
-
-def _why_unwanted(turn: Turn, rtc: Status) -> str | None:
-    running = rtc.dither_id
-    if running is None or not running.startswith(OUR_DITHERS):
-        return None
-    followed = turn.dither is not None and turn.dither.id == running
-    if turn.state.dither_stopped and not followed:
-        return "the operator wants no dither"
-    if not turn.policy.dither_enabled and turn.dither is None and running.startswith(OWN_DITHER):
-        return "the settings forbid a dither"
-    return None

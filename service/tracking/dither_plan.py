@@ -1,4 +1,4 @@
-"""Which dither is wanted and when: modes, lines clear of vibrations, amplitude, windows, pauses."""
+"""Which dither is wanted and when: how strong, with which windows and pauses; which must go."""
 
 from __future__ import annotations
 
@@ -9,308 +9,29 @@ from numpy.typing import NDArray
 
 from service.control import dither
 from service.control.dither import (
-    SPAN,
     Demand,
     Schedule,
-    clear_of,
-    most_telling,
     schedule,
     tabulated,
 )
-from service.errors import CommandError, ModelError
-from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan
-from service.telemetry.played import Asked
-from service.telemetry.random_dither import FRAMES_PER_MODE, RandomPlan
-from service.tracking.loop import Dither
+from service.tracking.alarms import Act, forbidding
+from service.tracking.dither_request import (
+    OUR_DITHERS,
+    OWN_DITHER,
+    SETTLING_S,
+    SPARE_S,
+    Choice,
+    DitherPhase,
+    DitherPlan,
+    n_lines,
+    own_sine,
+    total_m,
+)
+from service.tracking.loop import why_open
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import ModeSet
 from service.tracking.registration import Registration
-from service.tracking.stages import DitherPhase, DitherPlan
 from service.tracking.state import TrackerState
-from service.wire import DitherKind, DitherRequest, Status
-
-LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
-"""Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""
-
-LINE_RANGE = (0.2, 0.35)
-"""Of the frame rate, where lines may go to keep clear of vibrations."""
-
-CLEARANCES_HZ = (21.0, 8.0)
-"""Between a line and a vibration: beyond the side bins that measure the noise, or at least beyond
-a vibration's own width."""
-
-SETTLING_S = 0.3
-"""Of the loop, after a dither has begun, before the first window."""
-
-SPARE_S = 0.3
-"""Of dither behind the last window, for one that begins late because frames were lost."""
-
-OWN_DITHER = "dither-"
-ASKED_DITHER = "operator-"
-NOISY_DITHER = "noisy-"
-ACQUIRING_DITHER = "acquire-"
-"""How the id of a dither begins that the service has chosen, an operator, one that measures a
-noisy interaction matrix, and one that finds α from nothing."""
-
-OUR_DITHERS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
-
-_N_LINES = 4
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
-    """What a dither is to be like, besides what settings or an operator fix."""
-
-    total_m: float
-    """RMS of all lines together, metres OPD."""
-
-    window_s: float
-    """Telemetry in one estimate."""
-
-    n_windows: int
-    """Windows it must last for."""
-
-    avoid_hz: tuple[float, ...] = ()
-    """Vibrations."""
-
-    last_hz: tuple[float, ...] = ()
-    """Lines it need not leave without reason."""
-
-
-def why_unusable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
-    """Return why the lines of a dither cannot be told apart in its windows, or None."""
-    kind = dither.request.kind
-    if kind is not DitherKind.SINE:
-        return f"{dither.id} is {kind}, not a sine"
-    try:
-        lock_in_plan(dither, rtc, policy.window_s)
-    except ModelError as error:
-        return str(error)
-    return None
-
-
-def plan_dither(
-    rtc: Status,
-    policy: Policy,
-    now_ns: int,
-    *,
-    choice: Choice | None = None,
-    modes: tuple[int, ...] | None = None,
-    amplitude_m: float | None = None,
-    frequency_hz: tuple[float, ...] | None = None,
-    duration_s: float | None = None,
-) -> Dither:
-    """Return the dither to ask for: what is not given is the policy's own choice.
-
-    The lines are rounded to whole periods in a window. The modes are ones the loop does not and
-    will not control: nothing there amplifies the dither or the noise. Without a ``choice`` it is
-    the whole budget for as long as the policy allows.
-    """
-    asked = any(wish is not None for wish in (modes, amplitude_m, frequency_hz, duration_s))
-    n_windows = int((policy.dither_duration_s - SETTLING_S - SPARE_S) / policy.window_s)
-    choice = choice or Choice(
-        total_m=policy.dither_budget_m, window_s=policy.window_s, n_windows=max(n_windows, 1)
-    )
-    chosen = (modes or policy.dither_modes or _uncontrolled_modes(rtc, policy))[
-        : rtc.max_dither_modes
-    ]
-    lines = frequency_hz or policy.dither_frequencies_hz
-    if lines is None:
-        lines = clear_lines(rtc, len(chosen), choice)
-    amplitude = amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))
-    lasting_s = SETTLING_S + choice.n_windows * choice.window_s + SPARE_S
-    step_hz = _step_hz(rtc, choice.window_s)
-    request = DitherRequest(
-        id=f"{ASKED_DITHER if asked else OWN_DITHER}{now_ns}",
-        kind=DitherKind.SINE,
-        modes=chosen,
-        amplitude_m=(float(min(amplitude, rtc.max_dither_m)),) * len(chosen),
-        frequency_hz=tuple(round(f / step_hz) * step_hz for f in lines),
-        duration_s=duration_s or lasting_s,
-    )
-    return Dither(request=request, asked_ns_utc=now_ns, window_s=choice.window_s)
-
-
-def total_m(request: DitherRequest) -> float:
-    """Return the RMS of all lines of a dither together, metres OPD."""
-    return float(np.sqrt(np.sum(np.square(request.amplitude_m))))
-
-
-def lock_in_plan(dither: Dither, rtc: Status, window_s: float) -> LockInPlan:
-    """Return how a dither is demodulated, from where the loop has settled.
-
-    Its own window counts; ``window_s`` is for a dither that was planned without one.
-
-    Raises
-    ------
-    ModelError
-        If its lines cannot be told apart in a window.
-    """
-    return LockInPlan(
-        modes=dither.request.modes,
-        frequencies_hz=dither.frequency_hz,
-        amplitude_m=dither.request.amplitude_m,
-        frame_rate_hz=rtc.frame_rate_hz,
-        n_frames=round((dither.window_s or window_s) * rtc.frame_rate_hz),
-        first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
-    )
-
-
-def asked_of(dither: Dither, rtc: Status) -> Asked:
-    """Return a dither as the frames should hold it."""
-    first_seq, request = dither.start_seq or 0, dither.request
-    return Asked(
-        modes=request.modes,
-        amplitude_m=request.amplitude_m,
-        frequency_hz=dither.frequency_hz,
-        frame_rate_hz=rtc.frame_rate_hz,
-        first_seq=first_seq,
-        stop_seq=first_seq + round(request.duration_s * rtc.frame_rate_hz),
-        own=tuple(mode not in rtc.in_loop for mode in request.modes),
-    )
-
-
-def clear_lines(rtc: Status, n_lines: int, choice: Choice) -> tuple[float, ...]:
-    """Return lines in the band that wind leaves alone, as clear of vibrations as these allow.
-
-    Those of the last dither stay while none of them is on a vibration.
-    """
-    last = choice.last_hz
-    near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
-    if len(last) == n_lines and min(near, default=np.inf) >= CLEARANCES_HZ[-1]:
-        return last
-    rate, step = rtc.frame_rate_hz, _step_hz(rtc, choice.window_s)
-    fractions = LINE_FRACTIONS[:n_lines]
-    if n_lines > _N_LINES:
-        fractions = tuple(np.linspace(*LINE_RANGE, n_lines).tolist())
-    wanted = tuple(fraction * rate for fraction in fractions)
-    edge = float(SIDE_OFFSETS_HZ.max()) + step
-    band = (max(LINE_RANGE[0] * rate, edge), min(LINE_RANGE[1] * rate, rate / 2 - edge))
-    for clearance_hz in (*CLEARANCES_HZ, 4.0 * step):
-        found = clear_of(
-            wanted, choice.avoid_hz, clearance_hz=clearance_hz, step_hz=step, range_hz=band
-        )
-        if found is not None:
-            return found
-    return wanted
-
-
-def on_vibrations(dither: Dither, avoid_hz: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the lines of a dither that are not clear of vibrations."""
-    near = CLEARANCES_HZ[-1] - 1e-6
-    return tuple(f for f in dither.frequency_hz if any(abs(f - v) < near for v in avoid_hz))
-
-
-def n_lines(rtc: Status, policy: Policy) -> int:
-    """Return how many modes the service dithers by itself."""
-    return min(len(policy.dither_modes or range(_N_LINES)), rtc.max_dither_modes)
-
-
-def _step_hz(rtc: Status, window_s: float) -> float:
-    """Return the frequency of one period in a window."""
-    return rtc.frame_rate_hz / max(round(window_s * rtc.frame_rate_hz), 1)
-
-
-def _uncontrolled_modes(rtc: Status, policy: Policy) -> tuple[int, ...]:
-    """Return the four most telling modes above the controlled ones, or the highest four there are.
-
-    Until the model is known they are spread evenly.
-    """
-    first = max(rtc.n_controlled, min(policy.n_modes_target, rtc.n_modes))
-    spare = rtc.n_modes - first
-    if spare < _N_LINES:
-        return tuple(range(max(rtc.n_modes - _N_LINES, 0), rtc.n_modes))
-    if policy.mode_information is not None:
-        above = range(first, min(first + SPAN, rtc.n_modes))
-        return most_telling(policy.mode_information, above, _N_LINES, policy.dither_sigma)
-    step = max(1, min(20, spare // (_N_LINES + 1)))
-    return tuple(first + step // 2 + step * line for line in range(_N_LINES))
-
-
-RANDOM_TOTAL_M = 5e-9
-"""RMS of all modes together where none is asked for, within the budget."""
-
-COMFORTABLE = 2.0
-"""Windows are longer by this than they have to be for so many modes."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RandomChoice:
-    """What a random dither is to be like."""
-
-    id: str
-    modes: tuple[int, ...] | ModeSet
-    total_m: float
-    """RMS of all modes together, metres OPD."""
-
-    duration_s: float
-    """Of telemetry, settling not included."""
-
-
-def plan_random(asked: RandomChoice, rtc: Status, policy: Policy, now_ns: int) -> Dither:
-    """Return the dither to ask for; its windows, all alike, fill its whole length.
-
-    Raises
-    ------
-    CommandError
-        If the RTC would not play it, or no window fits into it.
-    """
-    modes = _modes(asked.modes, rtc)
-    amplitude_m = float(asked.total_m / np.sqrt(len(modes)))
-    if amplitude_m > rtc.max_dither_m:
-        raise CommandError(
-            f"dither: found {1e9 * amplitude_m:.3g} nm on each of {len(modes)} modes, the RTC "
-            f"takes at most {1e9 * rtc.max_dither_m:.3g} nm"
-        )
-    least_s = max(policy.window_s, COMFORTABLE * FRAMES_PER_MODE * len(modes) / rtc.frame_rate_hz)
-    n_windows = int(asked.duration_s / least_s * (1.0 + 1e-9))
-    if n_windows < 1:
-        raise CommandError(
-            f"dither: found {asked.duration_s:g} s; {len(modes)} modes need windows of "
-            f"{least_s:.3g} s"
-        )
-    request = DitherRequest(
-        id=asked.id,
-        kind=DitherKind.BINARY,
-        modes=modes,
-        amplitude_m=(amplitude_m,) * len(modes),
-        seed=now_ns % (1 << 31),
-        duration_s=SETTLING_S + asked.duration_s + SPARE_S,
-    )
-    return Dither(request=request, asked_ns_utc=now_ns, window_s=asked.duration_s / n_windows)
-
-
-def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:
-    """Return how a random dither is correlated, from where the loop has settled.
-
-    Raises
-    ------
-    ModelError
-        If its windows are too short for its modes.
-    """
-    return RandomPlan(
-        modes=dither.request.modes,
-        amplitude_m=dither.request.amplitude_m,
-        n_frames=int((dither.window_s or window_s) * rtc.frame_rate_hz * (1.0 + 1e-12)),
-        first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
-    )
-
-
-def _modes(asked: tuple[int, ...] | ModeSet, rtc: Status) -> tuple[int, ...]:
-    if isinstance(asked, ModeSet):
-        modes = tuple(range(rtc.n_modes if asked is ModeSet.ALL else rtc.n_controlled))
-    else:
-        modes = asked
-    if not modes or max(modes) >= rtc.n_modes:
-        raise CommandError(
-            f"dither: found mode {max(modes, default=None)}; expected 0 to {rtc.n_modes - 1}"
-        )
-    if len(modes) > rtc.max_dither_modes:
-        raise CommandError(
-            f"dither: found {len(modes)} modes; the RTC dithers at most {rtc.max_dither_modes}"
-        )
-    return modes
-
+from service.wire import Status
 
 MIN_WINDOWS = 3
 """Windows that must agree before the dither is less than the whole budget, or pauses."""
@@ -346,6 +67,12 @@ tenth of a degree."""
 
 STANDS_OUT = 6.0
 """A jump of so many σ of one window is told by two, wherever in the first it falls."""
+
+ROUNDING = 1.001
+"""What a dither may be stronger by than what was asked for."""
+
+RESULT_WITHIN_S = 10.0
+"""For the estimate of a window whose dither has ended."""
 
 _SLOWEST = 1e-9
 """Random walk after a second, numeric units: nothing on a telescope stands stiller."""
@@ -531,3 +258,62 @@ def _steady(state: TrackerState, found: Schedule, demand: Demand) -> float:
         return found.total_m
     ratio = found.total_m / before.total_m
     return before.total_m if 1.0 / CHANGE <= ratio <= CHANGE else found.total_m
+
+
+def why_none(state: TrackerState, rtc: Status, policy: Policy) -> str | None:
+    """Return why the service asks for no dither of its own, or None."""
+    still = state.dithering.unwanted_id
+    left = "" if still is None else f"; the RTC still plays {still}"
+    if state.dither_stopped:
+        return f"stopped by the operator{left}"
+    if not policy.dither_enabled and state.dither is None:
+        return f"the settings forbid it{left}"
+    if not rtc.in_loop:
+        return why_open(rtc)
+    unnamed = rtc.cm_id is None or state.unfetched
+    if state.in_use is None and not unnamed and state.dither is None and rtc.dither is None:
+        return "the reconstructor in use is not known yet"
+    alarm = forbidding(state, Act.MEASURE)
+    return None if alarm is None else f"nothing would be measured under {alarm.name}"
+
+
+def awaits_a_result(state: TrackerState, wish: Wish, now_ns: int) -> bool:
+    """Return whether the window of the dither that ended last may still be on its way."""
+    dithering = state.dithering
+    if wish.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
+        return False
+    late = now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
+    return not late and state.windows_accepted < dithering.results_due
+
+
+def too_strong(state: TrackerState, rtc: Status, policy: Policy) -> str | None:
+    """Return why a dither that is played costs more than it may, or None.
+
+    An operator's own may cost more than the budget, but not more than was asked for.
+    """
+    if rtc.dither is None:
+        return None
+    running, dithering = rtc.dither.request, state.dithering
+    found_m, most_m = total_m(running), budget_m(rtc, policy)
+    over = own_sine(running) and found_m > ROUNDING * most_m
+    if not over and running.id != dithering.loud_id:
+        return None
+    if running.id == dithering.loud_id and dithering.loud_text:
+        return dithering.loud_text
+    return (
+        f"the RTC plays a dither of {1e9 * found_m:.3g} nm RMS in all, more than the budget of "
+        f"{1e9 * most_m:.3g} nm"
+    )
+
+
+def why_unwanted(state: TrackerState, rtc: Status, policy: Policy) -> str | None:
+    """Return why the dither that the RTC plays must go though it is not too strong, or None."""
+    running = rtc.dither_id
+    if running is None or not running.startswith(OUR_DITHERS):
+        return None
+    followed = state.dither is not None and state.dither.id == running
+    if state.dither_stopped and not followed:
+        return "the operator wants no dither"
+    if not policy.dither_enabled and state.dither is None and running.startswith(OWN_DITHER):
+        return "the settings forbid a dither"
+    return None

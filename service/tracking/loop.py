@@ -1,4 +1,4 @@
-"""The RTC's loop and its dither as a status shows them: what makes two of them the same loop."""
+"""The RTC's loop as a status shows it: what makes two of them the same loop."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.wire import DitherRequest, Loop, Pointing, Status
+from service.wire import Loop, Pointing, Status
 
 SAME_GAIN = 0.05
 """Relative: an RTC may follow the seeing with its gains once a second, and the gate judges with the
@@ -101,33 +101,6 @@ def _unit(pointing: Pointing) -> NDArray[np.float64]:
     elevation, azimuth = np.deg2rad([pointing.elevation_deg, pointing.azimuth_deg])
     across = np.cos(elevation)
     return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Dither:
-    """A dither that the service follows, asked for or running."""
-
-    request: DitherRequest
-    """What is played."""
-
-    start_seq: int | None = None
-    """First frame that contains it; None until the RTC has accepted."""
-
-    asked_ns_utc: int
-    """When it was asked for, then when it was accepted or adopted."""
-
-    window_s: float | None = None
-    """Of telemetry in one estimate, where it was planned with the dither."""
-
-    @property
-    def id(self) -> str:
-        """The request's."""
-        return self.request.id
-
-    @property
-    def frequency_hz(self) -> tuple[float, ...]:
-        """One for each mode of a sine; a binary dither has none."""
-        return self.request.frequency_hz or ()
 
 
 class CommandState(StrEnum):

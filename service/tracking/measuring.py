@@ -12,7 +12,7 @@ import numpy as np
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking.dither import ask_for, ask_to_stop, drop, make_way_for_noisy
-from service.tracking.dither_plan import RANDOM_TOTAL_M, RandomChoice, plan_random, total_m
+from service.tracking.dither_request import RANDOM_TOTAL_M, RandomChoice, plan_random, total_m
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import (

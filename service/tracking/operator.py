@@ -8,18 +8,19 @@ from itertools import pairwise
 from service.errors import CommandError
 from service.tracking import events as ev
 from service.tracking.dither import allow, ask_for
-from service.tracking.dither_plan import (
+from service.tracking.dither_plan import by_hand
+from service.tracking.dither_request import (
     ASKED_DITHER,
     RANDOM_TOTAL_M,
     Choice,
+    Dither,
     RandomChoice,
-    by_hand,
     plan_dither,
     plan_random,
     total_m,
     why_unusable,
 )
-from service.tracking.loop import CommandState, Dither, LoopCommand, extended_gains
+from service.tracking.loop import CommandState, LoopCommand, extended_gains
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ModeSet
 from service.tracking.reconstructors import (

@@ -29,7 +29,7 @@ from service.tracking.reconstructors import (
     not_fetched,
     use_named,
 )
-from service.tracking.stages import AcquisitionStage
+from service.tracking.state import AcquisitionStage
 from service.tracking.turn import Turn, tell_bursts
 from service.tracking.validity import end_alarm, forget, forget_bias, point, unconfirm, void
 from service.wire import DitherRequest, DitherStop, Status

@@ -6,12 +6,11 @@ import re
 from dataclasses import replace
 
 from service.tracking.alarms import Act, forbidding
+from service.tracking.dither_request import Dither, Dithering
 from service.tracking.events import Effect, Event
-from service.tracking.loop import Dither
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
-from service.tracking.stages import Acquisition, Dithering
-from service.tracking.state import Alarm, Level, LogEntry, Retries, TrackerState
+from service.tracking.state import Acquisition, Alarm, Level, LogEntry, Retries, TrackerState
 from service.wire import Status
 
 LOG_LENGTH = 500

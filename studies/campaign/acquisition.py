@@ -25,8 +25,7 @@ from service.config.policy import policy_of
 from service.model.misregistration import BOUNDARY_SCALE
 from service.telemetry.openloop import FarEstimate
 from service.tracking.events import FarFitted
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Mode
+from service.tracking.state import AcquisitionStage, Mode
 from studies.campaign.acquisition_table import table
 from studies.campaign.observatory import Observatory
 from studies.campaign.rows import Row, RowFile, range_of, tell

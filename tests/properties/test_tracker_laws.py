@@ -10,7 +10,7 @@ from service.errors import CommandError
 from service.telemetry.frames import WindowRefused
 from service.tracker import step
 from service.tracking import events as ev
-from service.tracking.dither_plan import total_m
+from service.tracking.dither_request import total_m
 from service.tracking.estimate import HISTORY_LENGTH
 from service.tracking.measuring import MEASUREMENTS_KEPT
 from service.tracking.products import MatrixState, MeasurementRecord, MeasureState

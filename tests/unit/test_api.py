@@ -29,6 +29,7 @@ from service.errors import (
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.snapshot import Snapshot
+from service.tracking.dither_request import Dither, Dithering, DitherPhase, DitherPlan
 from service.tracking.events import (
     Approve,
     Publish,
@@ -40,7 +41,7 @@ from service.tracking.events import (
     StartDither,
     StopDither,
 )
-from service.tracking.loop import CommandState, Dither, LoopCommand
+from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.products import (
     MatrixState,
     MeasurementRecord,
@@ -58,7 +59,6 @@ from service.tracking.registration import (
     Validity,
     Watchdog,
 )
-from service.tracking.stages import Dithering, DitherPhase, DitherPlan
 from service.tracking.state import Alarm, Level, LogEntry, Mode, TrackerState
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status
 

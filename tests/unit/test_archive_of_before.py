@@ -10,8 +10,7 @@ from service.archive import Archive, AuditEntry
 from service.archive.records import TrackingFile
 from service.tracking.products import MatrixState, MeasureState, NoisyState
 from service.tracking.registration import ModeGain
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Mode, Orders
+from service.tracking.state import AcquisitionStage, Mode, Orders
 from service.wire import Pattern
 
 WRITTEN = Path(__file__).parents[1] / "data" / "archive"

@@ -13,8 +13,7 @@ from service.runtime.actions import Actions, Publishing
 from service.runtime.supervisor import Supervisor
 from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from service.worker import OpticsWorker, start_worker
 from studies.campaign.observatory import Observatory
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED

@@ -10,8 +10,7 @@ from service.runtime.streams import Streams, fed, with_dither, with_rtc
 from service.telemetry.frames import FrameBlock, WindowRefused
 from service.telemetry.lockin import LockIn
 from service.telemetry.random_dither import Correlated
-from service.tracking.dither_plan import RandomChoice, plan_random
-from service.tracking.loop import Dither
+from service.tracking.dither_request import Dither, RandomChoice, plan_random
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest
 from service.worker import Description

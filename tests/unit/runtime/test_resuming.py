@@ -14,8 +14,7 @@ from service.runtime.estimates import Backlog
 from service.runtime.recording import has_news, is_urgent, leave, taken_up
 from service.tracking import events as ev
 from service.tracking.resume import restored
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from service.worker import Compute, OpticsWorker
 from studies.campaign.acquisition import Start
 from studies.campaign.observatory import Observatory

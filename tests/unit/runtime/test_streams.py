@@ -17,7 +17,7 @@ from service.telemetry.frames import FrameBlock, WindowRefused
 from service.telemetry.health import LOW_MODES, Actuators
 from service.telemetry.lockin import Spectra
 from service.tracking import events as ev
-from service.tracking.loop import Dither
+from service.tracking.dither_request import Dither
 from service.tracking.state import TrackerState
 from service.wire import DitherKind, DitherRequest
 from service.worker import Description

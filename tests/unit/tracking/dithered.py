@@ -7,7 +7,7 @@ import numpy as np
 from service.control.dither import tabulated
 from service.telemetry.passive import PassiveEstimate
 from service.tracking import events as ev
-from service.tracking.dither_plan import SETTLING_S, total_m
+from service.tracking.dither_request import SETTLING_S, total_m
 from service.tracking.state import Mode
 from service.wire import DitherRequest, DitherStatus, DitherStop
 from tests.unit.tracking.situations import ALPHA, Story, dither_answered, estimate, moved, rtc

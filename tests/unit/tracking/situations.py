@@ -9,7 +9,8 @@ from service.model.misregistration import Misregistration
 from service.telemetry.lockin import WindowEstimate
 from service.tracker import step
 from service.tracking import events as ev
-from service.tracking.loop import Dither, commanded_gains
+from service.tracking.dither_request import Dither
+from service.tracking.loop import commanded_gains
 from service.tracking.policy import Policy
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.tracking.state import Mode, TrackerState

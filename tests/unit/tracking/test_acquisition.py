@@ -19,10 +19,9 @@ from service.tracking.acquisition_stages import (
     OUT_OF_HAND_S,
     far_dither,
 )
-from service.tracking.dither_plan import lock_in_plan
+from service.tracking.dither_request import lock_in_plan
 from service.tracking.products import MatrixState
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Mode
+from service.tracking.state import AcquisitionStage, Mode
 from service.tracking.worth import fewer_than
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
 from tests.unit.tracking.situations import (

@@ -6,8 +6,7 @@ from service.tracking import events as ev
 from service.tracking.acquisition import ENOUGH_WINDOWS
 from service.tracking.acquisition_stages import MISSES_DESPITE
 from service.tracking.products import MatrixState
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Mode
+from service.tracking.state import AcquisitionStage, Mode
 from service.wire import Loop, LoopRequest
 from tests.unit.tracking.situations import foreign, moved
 from tests.unit.tracking.test_acquisition import CALM, DIVERGING, FAR, Acquiring

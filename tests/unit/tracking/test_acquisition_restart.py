@@ -8,8 +8,7 @@ from service.tracking import events as ev
 from service.tracking.acquisition_stages import MOST_ATTEMPTS
 from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
 from tests.unit.tracking.situations import POLICY, SECOND, foreign
 from tests.unit.tracking.test_acquisition import ACQUIRES, DIVERGING, FAR, Acquiring

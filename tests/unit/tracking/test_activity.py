@@ -10,8 +10,7 @@ from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking.activity import under_way
 from service.tracking.products import MatrixState, MeasureState, ModeSet, NoisyState
-from service.tracking.stages import AcquisitionStage
-from service.tracking.state import Mode
+from service.tracking.state import AcquisitionStage, Mode
 from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern, Pointing
 from tests.unit.tracking.situations import POLICY, Story
 from tests.unit.tracking.world import World

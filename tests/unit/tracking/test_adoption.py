@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from service.tracking import events as ev
 from service.tracking.alarms import OVER_BUDGET
-from service.tracking.dither_plan import plan_dither, why_unusable
-from service.tracking.loop import Dither
+from service.tracking.dither_request import Dither, plan_dither, why_unusable
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     POLICY,

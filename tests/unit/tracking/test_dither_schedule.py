@@ -10,15 +10,8 @@ from hypothesis import given, settings
 from service.control.dither import tabulated
 from service.errors import CommandError
 from service.tracking import events as ev
-from service.tracking.dither_plan import (
-    FAINT_WINDOW_S,
-    LASTING_S,
-    MIN_WINDOWS,
-    SETTLING_S,
-    budget_m,
-    total_m,
-)
-from service.tracking.stages import DitherPhase
+from service.tracking.dither_plan import FAINT_WINDOW_S, LASTING_S, MIN_WINDOWS, budget_m
+from service.tracking.dither_request import SETTLING_S, DitherPhase, total_m
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.dithered import DitheredNight
 from tests.unit.tracking.situations import ALPHA, POLICY, Story, moved, of_kind

@@ -8,9 +8,9 @@ from service.tracking import events as ev
 from service.tracking.activity import GONE_WITHIN_S
 from service.tracking.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
 from service.tracking.dither import CALM_S, TELL_EVERY_S
-from service.tracking.dither_plan import total_m
+from service.tracking.dither_request import DitherPhase, total_m
 from service.tracking.products import NoisyState
-from service.tracking.stages import AcquisitionStage, DitherPhase
+from service.tracking.state import AcquisitionStage
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import POLICY, Story, dither_answered, of_kind, rtc, stopping
 

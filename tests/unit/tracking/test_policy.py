@@ -4,7 +4,7 @@ import pytest
 
 from service.errors import ModelError
 from service.tracking import events as ev
-from service.tracking.dither_plan import lock_in_plan, plan_dither
+from service.tracking.dither_request import lock_in_plan, plan_dither
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest, DitherStop

@@ -8,7 +8,7 @@ import pytest
 from service.errors import CommandError
 from service.telemetry.random_dither import RandomEstimate
 from service.tracking import events as ev
-from service.tracking.dither_plan import total_m
+from service.tracking.dither_request import total_m
 from service.tracking.products import ModeSet
 from service.tracking.registration import Source
 from service.wire import DitherKind, DitherRequest

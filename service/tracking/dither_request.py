@@ -1,0 +1,472 @@
+"""A dither: what is asked of the RTC, how it is read, what the service makes of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.dither import (
+    SPAN,
+    clear_of,
+    most_telling,
+)
+from service.errors import CommandError, ModelError
+from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan
+from service.telemetry.played import Asked
+from service.telemetry.random_dither import FRAMES_PER_MODE, RandomPlan
+from service.tracking.policy import Policy
+from service.tracking.products import ModeSet
+from service.wire import DitherKind, DitherRequest, Status
+
+LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
+"""Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""
+
+LINE_RANGE = (0.2, 0.35)
+"""Of the frame rate, where lines may go to keep clear of vibrations."""
+
+CLEARANCES_HZ = (21.0, 8.0)
+"""Between a line and a vibration: beyond the side bins that measure the noise, or at least beyond
+a vibration's own width."""
+
+SETTLING_S = 0.3
+"""Of the loop, after a dither has begun, before the first window."""
+
+SPARE_S = 0.3
+"""Of dither behind the last window, for one that begins late because frames were lost."""
+
+OWN_DITHER = "dither-"
+ASKED_DITHER = "operator-"
+NOISY_DITHER = "noisy-"
+ACQUIRING_DITHER = "acquire-"
+"""How the id of a dither begins that the service has chosen, an operator, one that measures a
+noisy interaction matrix, and one that finds α from nothing."""
+
+OUR_DITHERS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
+
+_N_LINES = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dither:
+    """A dither that the service follows, asked for or running."""
+
+    request: DitherRequest
+    """What is played."""
+
+    start_seq: int | None = None
+    """First frame that contains it; None until the RTC has accepted."""
+
+    asked_ns_utc: int
+    """When it was asked for, then when it was accepted or adopted."""
+
+    window_s: float | None = None
+    """Of telemetry in one estimate, where it was planned with the dither."""
+
+    @property
+    def id(self) -> str:
+        """The request's."""
+        return self.request.id
+
+    @property
+    def frequency_hz(self) -> tuple[float, ...]:
+        """One for each mode of a sine; a binary dither has none."""
+        return self.request.frequency_hz or ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """What a dither is to be like, besides what settings or an operator fix."""
+
+    total_m: float
+    """RMS of all lines together, metres OPD."""
+
+    window_s: float
+    """Telemetry in one estimate."""
+
+    n_windows: int
+    """Windows it must last for."""
+
+    avoid_hz: tuple[float, ...] = ()
+    """Vibrations."""
+
+    last_hz: tuple[float, ...] = ()
+    """Lines it need not leave without reason."""
+
+
+def why_unusable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
+    """Return why the lines of a dither cannot be told apart in its windows, or None."""
+    kind = dither.request.kind
+    if kind is not DitherKind.SINE:
+        return f"{dither.id} is {kind}, not a sine"
+    try:
+        lock_in_plan(dither, rtc, policy.window_s)
+    except ModelError as error:
+        return str(error)
+    return None
+
+
+def plan_dither(
+    rtc: Status,
+    policy: Policy,
+    now_ns: int,
+    *,
+    choice: Choice | None = None,
+    modes: tuple[int, ...] | None = None,
+    amplitude_m: float | None = None,
+    frequency_hz: tuple[float, ...] | None = None,
+    duration_s: float | None = None,
+) -> Dither:
+    """Return the dither to ask for: what is not given is the policy's own choice.
+
+    The lines are rounded to whole periods in a window. The modes are ones the loop does not and
+    will not control: nothing there amplifies the dither or the noise. Without a ``choice`` it is
+    the whole budget for as long as the policy allows.
+    """
+    asked = any(wish is not None for wish in (modes, amplitude_m, frequency_hz, duration_s))
+    n_windows = int((policy.dither_duration_s - SETTLING_S - SPARE_S) / policy.window_s)
+    choice = choice or Choice(
+        total_m=policy.dither_budget_m, window_s=policy.window_s, n_windows=max(n_windows, 1)
+    )
+    chosen = (modes or policy.dither_modes or _uncontrolled_modes(rtc, policy))[
+        : rtc.max_dither_modes
+    ]
+    lines = frequency_hz or policy.dither_frequencies_hz
+    if lines is None:
+        lines = clear_lines(rtc, len(chosen), choice)
+    amplitude = amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))
+    lasting_s = SETTLING_S + choice.n_windows * choice.window_s + SPARE_S
+    step_hz = _step_hz(rtc, choice.window_s)
+    request = DitherRequest(
+        id=f"{ASKED_DITHER if asked else OWN_DITHER}{now_ns}",
+        kind=DitherKind.SINE,
+        modes=chosen,
+        amplitude_m=(float(min(amplitude, rtc.max_dither_m)),) * len(chosen),
+        frequency_hz=tuple(round(f / step_hz) * step_hz for f in lines),
+        duration_s=duration_s or lasting_s,
+    )
+    return Dither(request=request, asked_ns_utc=now_ns, window_s=choice.window_s)
+
+
+def own_sine(request: DitherRequest) -> bool:
+    """Return whether a dither is one that the service has chosen by itself."""
+    return request.id.startswith(OWN_DITHER) and request.kind is DitherKind.SINE
+
+
+def total_m(request: DitherRequest) -> float:
+    """Return the RMS of all lines of a dither together, metres OPD."""
+    return float(np.sqrt(np.sum(np.square(request.amplitude_m))))
+
+
+def lock_in_plan(dither: Dither, rtc: Status, window_s: float) -> LockInPlan:
+    """Return how a dither is demodulated, from where the loop has settled.
+
+    Its own window counts; ``window_s`` is for a dither that was planned without one.
+
+    Raises
+    ------
+    ModelError
+        If its lines cannot be told apart in a window.
+    """
+    return LockInPlan(
+        modes=dither.request.modes,
+        frequencies_hz=dither.frequency_hz,
+        amplitude_m=dither.request.amplitude_m,
+        frame_rate_hz=rtc.frame_rate_hz,
+        n_frames=round((dither.window_s or window_s) * rtc.frame_rate_hz),
+        first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
+    )
+
+
+def asked_of(dither: Dither, rtc: Status) -> Asked:
+    """Return a dither as the frames should hold it."""
+    first_seq, request = dither.start_seq or 0, dither.request
+    return Asked(
+        modes=request.modes,
+        amplitude_m=request.amplitude_m,
+        frequency_hz=dither.frequency_hz,
+        frame_rate_hz=rtc.frame_rate_hz,
+        first_seq=first_seq,
+        stop_seq=first_seq + round(request.duration_s * rtc.frame_rate_hz),
+        own=tuple(mode not in rtc.in_loop for mode in request.modes),
+    )
+
+
+def clear_lines(rtc: Status, n_lines: int, choice: Choice) -> tuple[float, ...]:
+    """Return lines in the band that wind leaves alone, as clear of vibrations as these allow.
+
+    Those of the last dither stay while none of them is on a vibration.
+    """
+    last = choice.last_hz
+    near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
+    if len(last) == n_lines and min(near, default=np.inf) >= CLEARANCES_HZ[-1]:
+        return last
+    rate, step = rtc.frame_rate_hz, _step_hz(rtc, choice.window_s)
+    fractions = LINE_FRACTIONS[:n_lines]
+    if n_lines > _N_LINES:
+        fractions = tuple(np.linspace(*LINE_RANGE, n_lines).tolist())
+    wanted = tuple(fraction * rate for fraction in fractions)
+    edge = float(SIDE_OFFSETS_HZ.max()) + step
+    band = (max(LINE_RANGE[0] * rate, edge), min(LINE_RANGE[1] * rate, rate / 2 - edge))
+    for clearance_hz in (*CLEARANCES_HZ, 4.0 * step):
+        found = clear_of(
+            wanted, choice.avoid_hz, clearance_hz=clearance_hz, step_hz=step, range_hz=band
+        )
+        if found is not None:
+            return found
+    return wanted
+
+
+def on_vibrations(dither: Dither, avoid_hz: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the lines of a dither that are not clear of vibrations."""
+    near = CLEARANCES_HZ[-1] - 1e-6
+    return tuple(f for f in dither.frequency_hz if any(abs(f - v) < near for v in avoid_hz))
+
+
+def n_lines(rtc: Status, policy: Policy) -> int:
+    """Return how many modes the service dithers by itself."""
+    return min(len(policy.dither_modes or range(_N_LINES)), rtc.max_dither_modes)
+
+
+def _step_hz(rtc: Status, window_s: float) -> float:
+    """Return the frequency of one period in a window."""
+    return rtc.frame_rate_hz / max(round(window_s * rtc.frame_rate_hz), 1)
+
+
+def _uncontrolled_modes(rtc: Status, policy: Policy) -> tuple[int, ...]:
+    """Return the four most telling modes above the controlled ones, or the highest four there are.
+
+    Until the model is known they are spread evenly.
+    """
+    first = max(rtc.n_controlled, min(policy.n_modes_target, rtc.n_modes))
+    spare = rtc.n_modes - first
+    if spare < _N_LINES:
+        return tuple(range(max(rtc.n_modes - _N_LINES, 0), rtc.n_modes))
+    if policy.mode_information is not None:
+        above = range(first, min(first + SPAN, rtc.n_modes))
+        return most_telling(policy.mode_information, above, _N_LINES, policy.dither_sigma)
+    step = max(1, min(20, spare // (_N_LINES + 1)))
+    return tuple(first + step // 2 + step * line for line in range(_N_LINES))
+
+
+RANDOM_TOTAL_M = 5e-9
+"""RMS of all modes together where none is asked for, within the budget."""
+
+COMFORTABLE = 2.0
+"""Windows are longer by this than they have to be for so many modes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RandomChoice:
+    """What a random dither is to be like."""
+
+    id: str
+    modes: tuple[int, ...] | ModeSet
+    total_m: float
+    """RMS of all modes together, metres OPD."""
+
+    duration_s: float
+    """Of telemetry, settling not included."""
+
+
+def plan_random(asked: RandomChoice, rtc: Status, policy: Policy, now_ns: int) -> Dither:
+    """Return the dither to ask for; its windows, all alike, fill its whole length.
+
+    Raises
+    ------
+    CommandError
+        If the RTC would not play it, or no window fits into it.
+    """
+    modes = _modes(asked.modes, rtc)
+    amplitude_m = float(asked.total_m / np.sqrt(len(modes)))
+    if amplitude_m > rtc.max_dither_m:
+        raise CommandError(
+            f"dither: found {1e9 * amplitude_m:.3g} nm on each of {len(modes)} modes, the RTC "
+            f"takes at most {1e9 * rtc.max_dither_m:.3g} nm"
+        )
+    least_s = max(policy.window_s, COMFORTABLE * FRAMES_PER_MODE * len(modes) / rtc.frame_rate_hz)
+    n_windows = int(asked.duration_s / least_s * (1.0 + 1e-9))
+    if n_windows < 1:
+        raise CommandError(
+            f"dither: found {asked.duration_s:g} s; {len(modes)} modes need windows of "
+            f"{least_s:.3g} s"
+        )
+    request = DitherRequest(
+        id=asked.id,
+        kind=DitherKind.BINARY,
+        modes=modes,
+        amplitude_m=(amplitude_m,) * len(modes),
+        seed=now_ns % (1 << 31),
+        duration_s=SETTLING_S + asked.duration_s + SPARE_S,
+    )
+    return Dither(request=request, asked_ns_utc=now_ns, window_s=asked.duration_s / n_windows)
+
+
+def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:
+    """Return how a random dither is correlated, from where the loop has settled.
+
+    Raises
+    ------
+    ModelError
+        If its windows are too short for its modes.
+    """
+    return RandomPlan(
+        modes=dither.request.modes,
+        amplitude_m=dither.request.amplitude_m,
+        n_frames=int((dither.window_s or window_s) * rtc.frame_rate_hz * (1.0 + 1e-12)),
+        first_seq=(dither.start_seq or 0) + round(SETTLING_S * rtc.frame_rate_hz),
+    )
+
+
+def _modes(asked: tuple[int, ...] | ModeSet, rtc: Status) -> tuple[int, ...]:
+    if isinstance(asked, ModeSet):
+        modes = tuple(range(rtc.n_modes if asked is ModeSet.ALL else rtc.n_controlled))
+    else:
+        modes = asked
+    if not modes or max(modes) >= rtc.n_modes:
+        raise CommandError(
+            f"dither: found mode {max(modes, default=None)}; expected 0 to {rtc.n_modes - 1}"
+        )
+    if len(modes) > rtc.max_dither_modes:
+        raise CommandError(
+            f"dither: found {len(modes)} modes; the RTC dithers at most {rtc.max_dither_modes}"
+        )
+    return modes
+
+
+class DitherPhase(StrEnum):
+    """How the service dithers."""
+
+    OFF = "off"
+    """None is wanted, or none can be had."""
+
+    ACQUIRE = "acquire"
+    """α is not known, or something asks to see it again: the whole budget, without pause."""
+
+    FOLLOW = "follow"
+    """Without pause, for the flexure leaves no time for one; as weak as that allows."""
+
+    SPARSE = "sparse"
+    """A sitting of a few windows now and then, off in between."""
+
+    OPERATOR = "operator"
+    """An operator's own, or one somebody else started."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Precision:
+    """How precise windows are, learnt from those accepted; kept from star to star."""
+
+    ratio: NDArray[np.float64]
+    """``(4,)`` measured κ of ``σ = κ / (A sqrt(T))`` over that of the table for the magnitude."""
+
+    n_windows: int
+    """Windows it was learnt from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DitherPlan:
+    """The dither that is wanted in the present state."""
+
+    total_m: float
+    """RMS of all lines together on the mirror, metres OPD."""
+
+    window_s: float
+    """Telemetry in one estimate, seconds."""
+
+    interval_s: float
+    """From one sitting to the next, seconds; ``window_s``: no pause."""
+
+    sigma: NDArray[np.float64]
+    """``(4,)`` 1 σ of α that is to be expected just before each sitting, numeric units."""
+
+    sufficient: bool
+    """Whether that is what was asked for."""
+
+    mean_cost_m: float
+    """Quadratic mean of it over time, pauses included, metres OPD."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Dithering:
+    """The dither policy's memory, and its account to the operator."""
+
+    phase: DitherPhase = DitherPhase.OFF
+    reason: str = "nothing has been decided yet"
+    """Why it is on or off."""
+
+    budget_m: float = 0.0
+    """Largest RMS of all lines together that settings and RTC allow, metres OPD."""
+
+    plan: DitherPlan | None = None
+    """None: none could be made yet."""
+
+    next_ns_utc: int | None = None
+    """When the next sitting is due; None: now, or never."""
+
+    precision: Precision | None = None
+    """None: no window has been accepted yet."""
+
+    avoided_hz: tuple[float, ...] = ()
+    """Vibrations the lines keep clear of."""
+
+    lines_hz: tuple[float, ...] = ()
+    """Of the last dither asked for: they stay where they are while they can."""
+
+    passive_ns_utc: int | None = None
+    """When the estimate was last renewed without a dithered window."""
+
+    results_due: int = 0
+    """Windows accepted in all, once the last dither has told what it was asked for."""
+
+    ended_ns_utc: int | None = None
+    """When the last of the service's own dithers ended by itself; None: one runs, or it was
+    stopped."""
+
+    stopped_id: str | None = None
+    """The last dither that the service asked the RTC to stop by itself."""
+
+    stopped_ns_utc: int = 0
+    """When it did."""
+
+    unwanted_id: str | None = None
+    """A dither the RTC plays and should not; None: none."""
+
+    unwanted_since_ns_utc: int = 0
+    """Since when the service knows of it."""
+
+    told_ns_utc: int = 0
+    """When the RTC was last told to stop one that nobody wants."""
+
+    loud_id: str | None = None
+    """The last dither the RTC played stronger than was asked for, and than the budget."""
+
+    loud_ns_utc: int = 0
+    """When one that was too strong was last told to stop; 0: none ever was."""
+
+    loud_text: str = ""
+    """What the frames held of that one; empty: its status told."""
+
+    amiss_id: str | None = None
+    """The last dither of which the frames held something else than was asked for."""
+
+    amiss_m: float = 0.0
+    """RMS of all of it, metres OPD."""
+
+    mean_square_m2: float = 0.0
+    """Mean square of what has been on the mirror, over ten minutes, metres OPD squared."""
+
+    seen_ns_utc: int | None = None
+    """Up to when that mean was taken."""
+
+    @property
+    def mean_cost_m(self) -> float:
+        """Quadratic mean of what has been on the mirror, over ten minutes, metres OPD."""
+        return float(np.sqrt(self.mean_square_m2))
+
+    @property
+    def n_windows_learnt(self) -> int:
+        """Windows that the precision was learnt from."""
+        return 0 if self.precision is None else self.precision.n_windows

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from http import HTTPStatus
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from starlette.requests import ClientDisconnect
 
 from service.errors import MatrixError
@@ -28,6 +28,23 @@ _TEXT = 200
 """Longest name of an array or a file."""
 
 
+def _understood(parse: Callable[[str], object]) -> AfterValidator:
+    """Return what refuses a text that ``parse`` does not understand."""
+
+    def check(text: str) -> str:
+        parse(text)
+        return text
+
+    return AfterValidator(check)
+
+
+def _packaged(name: str) -> None:
+    if name.endswith(".toml"):
+        raise ValueError(
+            f"found {name!r}, expected a packaged name; a file of your own goes into the upload"
+        )
+
+
 class FitParameters(BaseModel):
     """What is asked for; the same words as of ``pyrcal fit``."""
 
@@ -39,10 +56,10 @@ class FitParameters(BaseModel):
     method: Method = Method.JOINT
     """"joint", "paper" or "sensitivity"."""
 
-    modes: str | None = Field(default=None, max_length=10_000)
+    modes: Annotated[str, Field(max_length=10_000), _understood(parse_modes)] | None = None
     """Basis indices, like 0:400 or 3,5,9; default all."""
 
-    start: str | None = Field(default=None, max_length=_TEXT)
+    start: Annotated[str, Field(max_length=_TEXT), _understood(parse_alpha)] | None = None
     """X,Y,ROT,MAG: subapertures, degrees, ratio."""
 
     gain_map: bool = False
@@ -51,7 +68,9 @@ class FitParameters(BaseModel):
     anamorphosis: bool = False
     """Whether the mirror's image may be stretched."""
 
-    instrument: str | None = Field(default=None, pattern=r"^[A-Za-z0-9._-]{1,64}$")
+    instrument: (
+        Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$"), _understood(_packaged)] | None
+    ) = None
     """A packaged instrument; default: the service's own, or the one in the upload."""
 
     reference: str | None = Field(default=None, min_length=1, max_length=_TEXT)
@@ -59,29 +78,6 @@ class FitParameters(BaseModel):
 
     measurement: str | None = Field(default=None, min_length=1, max_length=_TEXT)
     """Id of a matrix the RTC has measured for this service; there is no body then."""
-
-    @field_validator("instrument")
-    @classmethod
-    def _instrument_is_packaged(cls, name: str | None) -> str | None:
-        if name is not None and name.endswith(".toml"):
-            raise ValueError(
-                f"found {name!r}, expected a packaged name; a file of your own goes into the upload"
-            )
-        return name
-
-    @field_validator("modes")
-    @classmethod
-    def _modes_are_modes(cls, text: str | None) -> str | None:
-        if text is not None:
-            parse_modes(text)
-        return text
-
-    @field_validator("start")
-    @classmethod
-    def _start_is_a_registration(cls, text: str | None) -> str | None:
-        if text is not None:
-            parse_alpha(text)
-        return text
 
     def asked(self) -> FitAsked:
         """Return this as the fit understands it."""

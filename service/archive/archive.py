@@ -4,22 +4,15 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Self
-
-import numpy as np
-from numpy.typing import NDArray
 
 from service.archive.index import AuditEntry, Index
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
 from service.archive.records import TrackingFile
-from service.archive.store import Provenance
 from service.errors import ArchiveError, StorageError
 from service.tracking.products import ReconstructorRecord
-
-PROBE_BYTES = 1 << 20
-"""Least that must fit on the disk for it to be called writable."""
 
 
 class Archive:
@@ -39,7 +32,8 @@ class Archive:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._index = Index(directory / "index.sqlite")
-        self._products = ReconstructorArchive(directory / "reconstructors", self._index)
+        self.reconstructors = ReconstructorArchive(directory / "reconstructors", self._index)
+        """Those that were made here or read back from the RTC, and what became of each."""
         self.measured = MeasuredArchive(directory / "interaction_matrices", self._index)
         """Interaction matrices the RTC has measured."""
         self.noisy = NoisyArchive(directory / "noisy_matrices", self._index)
@@ -47,7 +41,6 @@ class Archive:
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
         self._lock: IO[str] | None = None
-        self._largest_bytes = PROBE_BYTES
         self.wrong: tuple[str, ...] = ()
         """What :meth:`open` has found wrong, a line for each."""
 
@@ -80,7 +73,7 @@ class Archive:
         try:
             self._directory.mkdir(parents=True, exist_ok=True)
             self._lock = _locked(self._directory / "lock")
-            folders = (self._products, self.measured, self.noisy)
+            folders = (self.reconstructors, self.measured, self.noisy)
             told = [line for folder in folders for line in folder.prepare()]
         except OSError as error:
             self.close()
@@ -92,7 +85,7 @@ class Archive:
         except ArchiveError:
             self.close()
             raise
-        if anew and (n_products := len(self._products.records())):
+        if anew and (n_products := len(self.reconstructors.records())):
             lost = self._directory / "index.sqlite"
             text = f"was not there: made anew of {n_products} products; the audit trail begins here"
             told.append(f"{lost}: {text}")
@@ -106,57 +99,6 @@ class Archive:
             self._lock.close()
             self._lock = None
 
-    def store(
-        self,
-        record: ReconstructorRecord,
-        matrix: NDArray[np.float32],
-        covariance: NDArray[np.float64] | None,
-        provenance: Mapping[str, Provenance],
-    ) -> None:
-        """Write a reconstructor for good.
-
-        Parameters
-        ----------
-        record
-            What is known of it; its ``sha256``, where given, must be the matrix'.
-        matrix
-            ``(n_modes, n_slopes)``, metres per slope.
-        covariance
-            ``(4, 4)`` of its registration, floor included, numeric units (rotation in radians);
-            None: not known.
-        provenance
-            What it was made from (instrument, software version, session...): attributes of the
-            file's group ``provenance``.
-
-        Raises
-        ------
-        ArchiveError
-            If the id is taken, the matrix is not what the record says, or the disk refuses.
-        WireError
-            If the id is not one.
-        """
-        self._largest_bytes = max(self._largest_bytes, matrix.nbytes)
-        self._products.store(record, matrix, covariance, provenance)
-
-    def matrix(self, matrix_id: str) -> NDArray[np.float32]:
-        """Return a reconstructor, ``(n_modes, n_slopes)``, its checksum verified.
-
-        Raises
-        ------
-        UnknownIdError
-            If no such reconstructor was ever stored here.
-        ArchiveError
-            If its file is missing, damaged, or holds other numbers than were stored.
-        """
-        return self._products.matrix(matrix_id)
-
-    def records(self) -> tuple[ReconstructorRecord, ...]:
-        """Return what is known of every reconstructor, oldest first.
-
-        One whose product was missing or damaged at the start has failed, with the reason.
-        """
-        return self._products.records()
-
     def record(self, records: Sequence[ReconstructorRecord], entries: Sequence[AuditEntry]) -> None:
         """Remember where reconstructors are now and add to the audit trail: all or nothing.
 
@@ -166,7 +108,7 @@ class Archive:
             If the disk refuses.
         """
         for record in records:
-            self._products.write_fate(record)
+            self.reconstructors.write_fate(record)
         self._index.record(records, entries)
 
     def probe(self) -> None:
@@ -177,10 +119,10 @@ class Archive:
         StorageError
             If the disk refuses.
         """
-        path = self._products.directory / "probe.part"
+        path = self.reconstructors.directory / "probe.part"
         try:
             with path.open("wb") as file:
-                file.write(bytes(self._largest_bytes))
+                file.write(bytes(self.reconstructors.largest_bytes))
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:

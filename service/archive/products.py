@@ -28,6 +28,9 @@ from service.tracking.products import (
 from service.tracking.registration import table_of
 from service.wire import checksum
 
+PROBE_BYTES = 1 << 20
+"""Least that must fit on the disk for it to be called writable."""
+
 
 class ReconstructorArchive(Store[ReconstructorRecord]):
     """Reconstructors, and beside each what has become of it, for the day when the index is lost."""
@@ -37,6 +40,8 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
         super().__init__(
             directory, index, ReconstructorRecord, "reconstructor", description, "reconstructor"
         )
+        self.largest_bytes = PROBE_BYTES
+        """Of all matrices so far: what must fit on the disk."""
 
     def store(
         self,
@@ -45,7 +50,28 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
         covariance: NDArray[np.float64] | None,
         provenance: Mapping[str, Provenance],
     ) -> None:
-        """Write one for good; see :meth:`service.archive.Archive.store`."""
+        """Write a reconstructor for good.
+
+        Parameters
+        ----------
+        record
+            What is known of it; its ``sha256``, where given, must be the matrix'.
+        matrix
+            ``(n_modes, n_slopes)``, metres per slope.
+        covariance
+            ``(4, 4)`` of its registration, floor included, numeric units (rotation in radians);
+            None: not known.
+        provenance
+            What it was made from (instrument, software version, session...): attributes of the
+            file's group ``provenance``.
+
+        Raises
+        ------
+        ArchiveError
+            If the id is taken, the matrix is not what the record says, or the disk refuses.
+        WireError
+            If the id is not one.
+        """
 
         def fill(file: h5py.File) -> None:
             file.attrs.update(_attributes(record))
@@ -55,6 +81,7 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
                 put_covariance(file, covariance)
             file.create_group("provenance").attrs.update(provenance)
 
+        self.largest_bytes = max(self.largest_bytes, matrix.nbytes)
         self._write(record, matrix, (record.n_modes, matrix.shape[-1]), record.sha256, fill)
 
     @override

@@ -178,7 +178,7 @@ def _supervisor(
     state = TrackerState(
         system=system,
         mode=Mode(settings.service.mode),
-        reconstructors=restored(archive.records()),
+        reconstructors=restored(archive.reconstructors.records()),
         measurements=archive.measured.records()[-MEASUREMENTS_KEPT:],
         noisy=archive.noisy.records()[-NOISY_KEPT:],
         basis_id=instrument.basis_id,

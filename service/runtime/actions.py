@@ -131,7 +131,7 @@ class Actions:
             If the archive's file is damaged.
         """
         kept = self._matrices.get(matrix_id)
-        return kept if kept is not None else self._archive.matrix(matrix_id)
+        return kept if kept is not None else self._archive.reconstructors.matrix(matrix_id)
 
     def offer(self, state: TrackerState) -> None:
         """Let an RTC ask for the matrix in use, whoever made it.
@@ -359,7 +359,9 @@ class Actions:
             "software": f"pyrcal {__version__}",
             "why": why,
         }
-        await asyncio.to_thread(self._archive.store, record, matrix, covariance, provenance)
+        await asyncio.to_thread(
+            self._archive.reconstructors.store, record, matrix, covariance, provenance
+        )
 
     def _remember(self, matrix_id: str, matrix: NDArray[np.float32]) -> None:
         self._matrices[matrix_id] = matrix
@@ -369,10 +371,10 @@ class Actions:
     def _store_foreign(self, record: ReconstructorRecord, matrix: NDArray[np.float32]) -> None:
         """Archive the RTC's own matrix, once; another one under the same id is an error."""
         try:
-            same = checksum(self._archive.matrix(record.id)) == record.sha256
+            same = checksum(self._archive.reconstructors.matrix(record.id)) == record.sha256
         except UnknownIdError:
             provenance = {"instrument": self._instrument.name, "why": record.reason}
-            self._archive.store(record, matrix, None, provenance)
+            self._archive.reconstructors.store(record, matrix, None, provenance)
             return
         if not same:
             raise LinkError(

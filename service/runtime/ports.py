@@ -63,16 +63,8 @@ class NoisyPort(Protocol):
         """Keep one of the instrument of that name."""
 
 
-class StorePort(Protocol):
-    """Where matrices are kept; :class:`service.archive.Archive` is the real one."""
-
-    @property
-    def measured(self) -> MeasuredPort:
-        """Interaction matrices the RTC has measured."""
-
-    @property
-    def noisy(self) -> NoisyPort:
-        """Noisy interaction matrices of random dithers."""
+class ReconstructorPort(Protocol):
+    """Where reconstructors are kept."""
 
     def store(
         self,
@@ -86,3 +78,19 @@ class StorePort(Protocol):
 
     def matrix(self, matrix_id: str, /) -> NDArray[np.float32]:
         """Return a reconstructor that was kept; UnknownIdError if there is none."""
+
+
+class StorePort(Protocol):
+    """Where matrices are kept; :class:`service.archive.Archive` is the real one."""
+
+    @property
+    def reconstructors(self) -> ReconstructorPort:
+        """Reconstructors."""
+
+    @property
+    def measured(self) -> MeasuredPort:
+        """Interaction matrices the RTC has measured."""
+
+    @property
+    def noisy(self) -> NoisyPort:
+        """Noisy interaction matrices of random dithers."""

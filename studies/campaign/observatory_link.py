@@ -124,11 +124,10 @@ class Kept:
         self.records.append(record)
 
 
-class Shelf:
-    """Keeps reconstructors in memory: a simulated night is over when its program ends."""
+class KeptReconstructors:
+    """Keeps reconstructors in memory."""
 
     def __init__(self) -> None:
-        self.measured, self.noisy = Kept(), Kept()
         self._matrices: dict[str, NDArray[np.float32]] = {}
 
     def store(
@@ -152,3 +151,11 @@ class Shelf:
         if matrix_id not in self._matrices:
             raise UnknownIdError(f"no reconstructor {matrix_id}")
         return self._matrices[matrix_id]
+
+
+class Shelf:
+    """Keeps matrices in memory: a simulated night is over when its program ends."""
+
+    def __init__(self) -> None:
+        self.reconstructors = KeptReconstructors()
+        self.measured, self.noisy = Kept(), Kept()

@@ -67,7 +67,7 @@ def archive(tmp_path):
 
 
 def product(archive, matrix_id="cm-1"):
-    return archive._products.path_of(matrix_id)
+    return archive.reconstructors.path_of(matrix_id)
 
 
 def damage(path):
@@ -85,13 +85,13 @@ def test_making_an_archive_touches_nothing(tmp_path):
 
 def test_an_archive_that_is_not_open_says_so(tmp_path):
     with pytest.raises(ArchiveError, match="not open"):
-        Archive(tmp_path / "var").records()
+        Archive(tmp_path / "var").reconstructors.records()
 
 
 def test_a_stored_matrix_comes_back_bit_for_bit(archive):
     matrix = np.random.default_rng(1).normal(size=(3, 50)).astype(np.float32)
-    archive.store(record_of(), np.asfortranarray(matrix), np.eye(4), {})
-    found = archive.matrix("cm-1")
+    archive.reconstructors.store(record_of(), np.asfortranarray(matrix), np.eye(4), {})
+    found = archive.reconstructors.matrix("cm-1")
     assert found.dtype == np.float32
     assert found.tobytes() == matrix.tobytes()
 
@@ -102,20 +102,20 @@ def test_records_come_back_after_a_restart_oldest_first(tmp_path):
         archive = Archive(tmp_path)
         archive.open()
         with archive:
-            archive.store(record, MATRIX, None, {})
+            archive.reconstructors.store(record, MATRIX, None, {})
     archive = Archive(tmp_path)
     assert archive.open() == ()
     with archive:
-        found = archive.records()
+        found = archive.reconstructors.records()
         assert [r.id for r in found] == ["a", "b"]
         assert_same(found[0], older)
-        np.testing.assert_array_equal(archive.matrix("b"), MATRIX)
+        np.testing.assert_array_equal(archive.reconstructors.matrix("b"), MATRIX)
 
 
 def test_a_record_without_registration_or_verdict_comes_back_as_it_was(archive):
     bare = ReconstructorRecord(id="rtc-7", state=MatrixState.APPLIED, n_modes=400, created_ns_utc=5)
     archive.record((bare,), ())
-    assert_same(archive.records()[0], bare)
+    assert_same(archive.reconstructors.records()[0], bare)
 
 
 def test_what_a_verdict_was_of_is_not_kept_and_must_be_found_out_anew(archive):
@@ -128,22 +128,24 @@ def test_what_a_verdict_was_of_is_not_kept_and_must_be_found_out_anew(archive):
         sigma=np.full(4, 1e-3),
     )
     archive.record((record_of(judged=then),), ())
-    assert_same(archive.records()[0], record_of())
+    assert_same(archive.reconstructors.records()[0], record_of())
 
 
 def test_an_update_changes_the_index_but_not_the_product(archive):
-    archive.store(record_of(), MATRIX, None, {})
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
     before = product(archive).read_bytes()
     applied = record_of(state=MatrixState.APPLIED, applied_frame_seq=77, published_ns_utc=5)
     archive.record((applied,), ())
-    assert_same(archive.records()[0], applied)
+    assert_same(archive.reconstructors.records()[0], applied)
     assert product(archive).read_bytes() == before
-    np.testing.assert_array_equal(archive.matrix("cm-1"), MATRIX)
+    np.testing.assert_array_equal(archive.reconstructors.matrix("cm-1"), MATRIX)
 
 
 def test_the_file_says_what_it_is_with_units_in_its_names(archive):
     covariance = np.diag([1e-4, 4e-4, np.deg2rad(0.03) ** 2, 1e-6])
-    archive.store(record_of(), MATRIX, covariance, {"instrument": "flao-lbt", "n_frames": 5000})
+    archive.reconstructors.store(
+        record_of(), MATRIX, covariance, {"instrument": "flao-lbt", "n_frames": 5000}
+    )
     with h5py.File(product(archive)) as file:
         assert file["reconstructor"].shape == (3, 4)
         assert file["reconstructor"].dtype == np.dtype("<f4")
@@ -161,17 +163,17 @@ def test_the_file_says_what_it_is_with_units_in_its_names(archive):
 
 
 def test_an_id_is_never_reused(archive):
-    archive.store(record_of(), MATRIX, None, {})
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
     with pytest.raises(ArchiveError, match="cm-1: already stored, ids are never reused"):
-        archive.store(record_of(), MATRIX + 1, None, {})
-    np.testing.assert_array_equal(archive.matrix("cm-1"), MATRIX)
+        archive.reconstructors.store(record_of(), MATRIX + 1, None, {})
+    np.testing.assert_array_equal(archive.reconstructors.matrix("cm-1"), MATRIX)
 
 
 def test_a_record_may_be_known_before_its_matrix_is_stored(archive):
     archive.record((record_of(state=MatrixState.REFUSED),), ())
-    archive.store(record_of(), MATRIX, None, {})
-    assert [r.state for r in archive.records()] == [MatrixState.PROPOSED]
-    np.testing.assert_array_equal(archive.matrix("cm-1"), MATRIX)
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
+    assert [r.state for r in archive.reconstructors.records()] == [MatrixState.PROPOSED]
+    np.testing.assert_array_equal(archive.reconstructors.matrix("cm-1"), MATRIX)
 
 
 @pytest.mark.parametrize(
@@ -189,51 +191,51 @@ def test_a_record_may_be_known_before_its_matrix_is_stored(archive):
 )
 def test_a_matrix_that_is_not_what_its_record_says_is_not_stored(archive, record, matrix, expected):
     with pytest.raises(ArchiveError, match=expected):
-        archive.store(record, matrix, None, {})
-    assert archive.records() == ()
+        archive.reconstructors.store(record, matrix, None, {})
+    assert archive.reconstructors.records() == ()
     assert list(product(archive).parent.iterdir()) == []
 
 
 @pytest.mark.parametrize("matrix_id", ["../escape", "a/b", "", "current"])
 def test_an_id_that_is_no_id_never_becomes_a_file_name(archive, matrix_id):
     with pytest.raises(WireError):
-        archive.store(record_of(matrix_id), MATRIX, None, {})
+        archive.reconstructors.store(record_of(matrix_id), MATRIX, None, {})
 
 
 @pytest.mark.parametrize("matrix_id", ["nobody", "../index", "rtc-7"])
 def test_a_matrix_that_was_never_stored_is_unknown(archive, matrix_id):
     archive.record((record_of("rtc-7"),), ())
     with pytest.raises(UnknownIdError, match=f"{matrix_id}: no such matrix in the archive"):
-        archive.matrix(matrix_id)
+        archive.reconstructors.matrix(matrix_id)
 
 
 # --- damage
 
 
 def test_a_changed_byte_is_found_by_the_checksum_and_the_rest_goes_on(archive):
-    archive.store(record_of("bad"), MATRIX, None, {})
-    archive.store(record_of("good"), MATRIX, None, {})
+    archive.reconstructors.store(record_of("bad"), MATRIX, None, {})
+    archive.reconstructors.store(record_of("good"), MATRIX, None, {})
     damage(product(archive, "bad"))
     with pytest.raises(ArchiveError, match=r"bad\.h5: damaged: found checksum"):
-        archive.matrix("bad")
-    np.testing.assert_array_equal(archive.matrix("good"), MATRIX)
+        archive.reconstructors.matrix("bad")
+    np.testing.assert_array_equal(archive.reconstructors.matrix("good"), MATRIX)
 
 
 @pytest.mark.parametrize("keep", [0, 100, 2000])
 def test_a_truncated_file_is_named(archive, keep):
-    archive.store(record_of(), MATRIX, None, {})
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
     path = product(archive)
     path.chmod(0o644)
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(ArchiveError, match=r"cm-1\.h5: damaged"):
-        archive.matrix("cm-1")
+        archive.reconstructors.matrix("cm-1")
 
 
 def test_a_missing_file_is_named(archive):
-    archive.store(record_of(), MATRIX, None, {})
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
     product(archive).unlink()
     with pytest.raises(ArchiveError, match=r"cm-1\.h5: missing, although it was stored"):
-        archive.matrix("cm-1")
+        archive.reconstructors.matrix("cm-1")
 
 
 def test_a_lost_index_is_made_anew_from_the_sound_products(tmp_path):
@@ -241,7 +243,7 @@ def test_a_lost_index_is_made_anew_from_the_sound_products(tmp_path):
     archive.open()
     with archive:
         for name in ("a", "b", "c", "d"):
-            archive.store(record_of(name), MATRIX, None, {})
+            archive.reconstructors.store(record_of(name), MATRIX, None, {})
         damage(product(archive, "a"))
         product(archive, "b").rename(product(archive, "z"))
         product(archive, "c").chmod(0o644)
@@ -250,8 +252,8 @@ def test_a_lost_index_is_made_anew_from_the_sound_products(tmp_path):
         leftover.unlink()
     damaged = archive.open()
     with archive:
-        assert [r.id for r in archive.records()] == ["d"]
-        np.testing.assert_array_equal(archive.matrix("d"), MATRIX)
+        assert [r.id for r in archive.reconstructors.records()] == ["d"]
+        np.testing.assert_array_equal(archive.reconstructors.matrix("d"), MATRIX)
     assert len(damaged) == 4
     assert "made anew of 1 products" in damaged[3]
     assert "a.h5: damaged: found checksum" in damaged[0]
@@ -305,7 +307,7 @@ def begun_anew(archive):
 
 def test_a_missing_and_a_cut_product_are_told_at_the_start(archive):
     for name in ("cm-1", "cm-2", "cm-3"):
-        archive.store(record_of(name), MATRIX, None, {})
+        archive.reconstructors.store(record_of(name), MATRIX, None, {})
     archive.record((record_of("cm-2", state=MatrixState.SUPERSEDED),), ())
     product(archive, "cm-1").unlink()
     cut = product(archive, "cm-2")
@@ -315,7 +317,7 @@ def test_a_missing_and_a_cut_product_are_told_at_the_start(archive):
     assert len(told) == 2
     assert "cm-1.h5: missing, although it was stored" in told[0]
     assert "cm-2.h5: damaged" in told[1]
-    first, second, third = archive.records()
+    first, second, third = archive.reconstructors.records()
     assert first.state is second.state is MatrixState.FAILED
     assert "missing" in first.reason
     assert "superseded" in second.reason
@@ -323,30 +325,30 @@ def test_a_missing_and_a_cut_product_are_told_at_the_start(archive):
 
 
 def test_a_product_that_is_there_again_is_what_it_was(archive, tmp_path):
-    archive.store(record_of(), MATRIX, None, {})
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
     product(archive).rename(tmp_path / "away.h5")
     assert begun_anew(archive)
     (tmp_path / "away.h5").rename(product(archive))
     assert begun_anew(archive) == ()
-    assert_same(archive.records()[0], record_of())
+    assert_same(archive.reconstructors.records()[0], record_of())
 
 
 def test_a_record_nobody_understands_is_taken_from_its_product(archive):
-    archive.store(record_of(), MATRIX, None, {})
-    archive.store(record_of("cm-2", created_ns_utc=2_000), MATRIX, None, {})
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
+    archive.reconstructors.store(record_of("cm-2", created_ns_utc=2_000), MATRIX, None, {})
     archive._index._connection.execute("UPDATE reconstructor SET record = '{' WHERE id = 'cm-1'")
     (told,) = begun_anew(archive)
     assert "record of reconstructor cm-1 not understood" in told
-    assert [record.id for record in archive.records()] == ["cm-1", "cm-2"]
+    assert [record.id for record in archive.reconstructors.records()] == ["cm-1", "cm-2"]
 
 
 def test_a_record_nobody_understands_and_without_a_product_is_left_out_and_told(archive):
     archive.record((record_of(),), ())
-    archive.store(record_of("cm-2"), MATRIX, None, {})
+    archive.reconstructors.store(record_of("cm-2"), MATRIX, None, {})
     archive._index._connection.execute("UPDATE reconstructor SET record = '{' WHERE id = 'cm-1'")
     (told,) = begun_anew(archive)
     assert "record of reconstructor cm-1 not understood" in told
-    assert [record.id for record in archive.records()] == ["cm-2"]
+    assert [record.id for record in archive.reconstructors.records()] == ["cm-2"]
 
 
 @pytest.mark.parametrize("folder", ["reconstructors", "interaction_matrices", "noisy_matrices"])
@@ -367,7 +369,7 @@ def test_a_lost_index_is_made_anew_with_what_became_of_every_matrix(archive):
         "d": MatrixState.SUPERSEDED,
     }
     for name, state in became.items():
-        archive.store(record_of(name), MATRIX, None, {})
+        archive.reconstructors.store(record_of(name), MATRIX, None, {})
         archive.record(
             (record_of(name, state=state, reason=f"it was {state}", published_ns_utc=7),), ()
         )
@@ -377,14 +379,14 @@ def test_a_lost_index_is_made_anew_with_what_became_of_every_matrix(archive):
     (told,) = archive.open()
     assert "index.sqlite: was not there: made anew of 4 products" in told
     assert "the audit trail begins here" in told
-    found = {record.id: record for record in archive.records()}
+    found = {record.id: record for record in archive.reconstructors.records()}
     assert {name: record.state for name, record in found.items()} == became
     assert found["b"].reason == "it was rejected"
     assert found["b"].published_ns_utc == 7
 
 
 def test_of_a_matrix_whose_fate_is_lost_with_the_index_it_is_said(archive):
-    archive.store(record_of(), MATRIX, None, {})
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
     archive.record((record_of(state=MatrixState.APPLIED),), ())
     archive.close()
     for leftover in archive._directory.glob("index.sqlite*"):
@@ -392,7 +394,7 @@ def test_of_a_matrix_whose_fate_is_lost_with_the_index_it_is_said(archive):
     for fate in product(archive).parent.glob("*.json"):
         fate.write_text("{")
     archive.open()
-    (record,) = archive.records()
+    (record,) = archive.reconstructors.records()
     assert record.state is MatrixState.DISCARDED
     assert "what became of it was lost with the index" in record.reason
 
@@ -434,7 +436,7 @@ def test_the_audit_trail_only_grows(archive, statement):
 
 def test_calls_from_several_threads_queue_up(archive):
     def work(k):
-        archive.store(record_of(f"cm-{k}"), MATRIX + k, None, {})
+        archive.reconstructors.store(record_of(f"cm-{k}"), MATRIX + k, None, {})
         note(archive, k, f"cm-{k}")
 
     threads = [threading.Thread(target=work, args=(k,)) for k in range(8)]
@@ -442,9 +444,9 @@ def test_calls_from_several_threads_queue_up(archive):
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(archive.records()) == len(archive.audit_trail()) == 8
+    assert len(archive.reconstructors.records()) == len(archive.audit_trail()) == 8
     for k in range(8):
-        np.testing.assert_array_equal(archive.matrix(f"cm-{k}"), MATRIX + k)
+        np.testing.assert_array_equal(archive.reconstructors.matrix(f"cm-{k}"), MATRIX + k)
 
 
 # --- a service that dies
@@ -463,7 +465,7 @@ for k in range(100_000):
     record = ReconstructorRecord(
         id=f"cm-{k:06d}", state=MatrixState.PROPOSED, n_modes=400, created_ns_utc=k
     )
-    archive.store(record, matrix, None, {})
+    archive.reconstructors.store(record, matrix, None, {})
     archive.record((), (AuditEntry(t_ns_utc=k, who="service", name="stored", text=record.id),))
     print(record.id, flush=True)
 """
@@ -486,11 +488,11 @@ def assert_nothing_told_is_lost(directory):
     archive = Archive(directory / "var")
     assert archive.open() == ()
     with archive:
-        found = [record.id for record in archive.records()]
+        found = [record.id for record in archive.reconstructors.records()]
         assert told == found[: len(told)]
         assert len(found) <= len(told) + 1
         for matrix_id in found:
-            assert archive.matrix(matrix_id).shape == (400, 1384)
+            assert archive.reconstructors.matrix(matrix_id).shape == (400, 1384)
         assert {path.stem for path in product(archive).parent.iterdir()} == set(found)
         return found
 
@@ -530,12 +532,12 @@ def test_a_product_that_did_not_reach_the_index_is_taken_in_at_the_next_start(tm
     archive = Archive(tmp_path)
     archive.open()
     with archive:
-        archive.store(record_of(), MATRIX, None, {})
+        archive.reconstructors.store(record_of(), MATRIX, None, {})
         archive._index._connection.execute("DELETE FROM reconstructor")
         (product(archive).parent / "cm-2.h5.part").write_bytes(b"half")
     assert archive.open() == ()
     with archive:
-        assert_same(archive.records()[0], record_of())
+        assert_same(archive.reconstructors.records()[0], record_of())
         assert os.listdir(product(archive).parent) == ["cm-1.h5"]
 
 

@@ -185,5 +185,5 @@ def test_an_index_from_before_there_were_measurements_is_brought_up_to_date(tmp_
     assert archive.open() == ()
     with archive:
         archive.measured.store(record_of(), MATRIX, "flao-lbt")
-        assert [r.id for r in archive.records()] == ["r"]
+        assert [r.id for r in archive.reconstructors.records()] == ["r"]
         assert archive.measured.records() == (record_of(),)

@@ -122,9 +122,9 @@ def test_records_come_back_after_a_restart_oldest_first(tmp_path):
 
 def test_the_archive_of_reconstructors_does_not_know_it(archive, tmp_path):
     archive.noisy.store(record_of(), NUMBERS, "flao-lbt")
-    assert archive.records() == ()
+    assert archive.reconstructors.records() == ()
     assert archive.measured.records() == ()
-    for ask in (archive.matrix, archive.measured.matrix):
+    for ask in (archive.reconstructors.matrix, archive.measured.matrix):
         with pytest.raises(UnknownIdError):
             ask("noisy-1")
 

@@ -31,7 +31,7 @@ def archive(folder):
 
 
 def test_reconstructors_are_what_they_were(archive):
-    bare, made = archive.records()
+    bare, made = archive.reconstructors.records()
     assert (bare.id, bare.state, bare.n_modes) == ("rtc-7", MatrixState.SUPERSEDED, 400)
     assert bare.alpha is bare.sigma is bare.gate is None
     assert (made.id, made.state, made.parent) == ("cm-1", MatrixState.APPLIED, "cm-0")
@@ -44,17 +44,19 @@ def test_reconstructors_are_what_they_were(archive):
     assert made.optical_gains == (
         ModeGain(mode=2, gain=0.61, sigma=0.02, scatter=0.03, t_ns_utc=7),
     )
-    np.testing.assert_array_equal(archive.matrix("cm-1"), np.arange(12.0).reshape(3, 4))
+    np.testing.assert_array_equal(
+        archive.reconstructors.matrix("cm-1"), np.arange(12.0).reshape(3, 4)
+    )
 
 
 def test_they_are_what_they_were_without_the_index_too(archive, folder):
-    (with_index,) = (record for record in archive.records() if record.id == "cm-1")
+    (with_index,) = (record for record in archive.reconstructors.records() if record.id == "cm-1")
     archive.close()
     for leftover in folder.glob("index.sqlite*"):
         leftover.unlink()
     (told,) = archive.open()
     assert "made anew of 1 products" in told
-    (made,) = archive.records()
+    (made,) = archive.reconstructors.records()
     assert (made.state, made.gate) == (MatrixState.APPLIED, with_index.gate)
     np.testing.assert_array_equal(made.alpha.vector, with_index.alpha.vector)
 

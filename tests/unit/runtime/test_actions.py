@@ -50,13 +50,13 @@ async def test_a_made_reconstructor_is_archived_before_anybody_hears_of_it(
     actions, archive, bridge
 ):
     found, _ = await made(actions)
-    matrix = archive.matrix(found.id)
+    matrix = archive.reconstructors.matrix(found.id)
     assert matrix.shape == (N_CONTROLLED, N_SLOPES)
     assert (found.state, found.sha256) == (MatrixState.PROPOSED, checksum(matrix))
     assert (found.alpha, found.parent, found.reason) == (ALPHA, "initial", "a test")
     np.testing.assert_allclose(found.sigma, SIGMA * np.sqrt(2))
     assert found.gate.accepted
-    assert [kept.id for kept in archive.records()] == [found.id]
+    assert [kept.id for kept in archive.reconstructors.records()] == [found.id]
     assert not bridge.published
 
 
@@ -142,7 +142,9 @@ async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(actions, a
     assert (copy.parent, copy.sha256, copy.alpha) == (source.id, source.sha256, ALPHA)
     assert copy.gate is not source.gate
     assert copy.reason == "back"
-    np.testing.assert_array_equal(archive.matrix(copy.id), archive.matrix(source.id))
+    np.testing.assert_array_equal(
+        archive.reconstructors.matrix(copy.id), archive.reconstructors.matrix(source.id)
+    )
 
 
 @pytest.mark.parametrize(
@@ -182,7 +184,7 @@ async def test_the_rtcs_own_matrix_is_fetched_and_archived_once(actions, archive
     for _ in range(2):
         event = await actions.perform(ev.FetchMatrix(id="initial"), STATE)
         assert (event.record.id, event.record.parent) == ("initial", None)
-    np.testing.assert_array_equal(archive.matrix("initial"), BROUGHT)
+    np.testing.assert_array_equal(archive.reconstructors.matrix("initial"), BROUGHT)
     np.testing.assert_array_equal(actions.matrix("initial"), BROUGHT)
 
 
@@ -210,7 +212,9 @@ async def test_a_matrix_swapped_while_it_was_asked_for_is_named(actions):
 
 
 async def test_old_matrices_come_from_the_archive(actions, archive):
-    archive.store(record("cm-old", n_modes=N_CONTROLLED, sha256=""), BROUGHT, None, {})
+    archive.reconstructors.store(
+        record("cm-old", n_modes=N_CONTROLLED, sha256=""), BROUGHT, None, {}
+    )
     np.testing.assert_array_equal(actions.matrix("cm-old"), BROUGHT)
     with pytest.raises(UnknownIdError):
         actions.matrix("cm-never")

@@ -158,4 +158,4 @@ async def test_nothing_that_publishes_finds_one(workers, archive):
     ):
         with pytest.raises(UnknownIdError, match="noisy-1"):
             await actions.perform(effect, state)
-    assert archive.records() == ()
+    assert archive.reconstructors.records() == ()

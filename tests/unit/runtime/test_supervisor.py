@@ -108,8 +108,8 @@ async def test_what_happens_is_written_to_the_archive_in_order(supervisor, archi
 async def test_a_reconstructor_on_the_shelf_is_known_after_a_restart(supervisor, archive):
     async with running(supervisor):
         supervisor._post(ev.MatrixMade(record=record("cm-1"), wanted=False))
-        await until(lambda: archive.records())
-    assert [kept.id for kept in archive.records()] == ["cm-1"]
+        await until(lambda: archive.reconstructors.records())
+    assert [kept.id for kept in archive.reconstructors.records()] == ["cm-1"]
 
 
 async def test_a_deed_that_fails_is_on_record_and_the_service_goes_on(supervisor):
@@ -333,9 +333,9 @@ async def test_what_could_not_be_written_is_written_once_it_can_be_and_only_once
             await until(lambda: alarm_of(supervisor, "archive-failed"))
             supervisor._post(ev.Noted(name="note", text="second"))
             await asyncio.sleep(0.2)
-            assert archive.records() == ()
+            assert archive.reconstructors.records() == ()
         await until(lambda: alarm_of(supervisor, "archive-failed") is None)
-    assert [kept.id for kept in archive.records()] == ["cm-1"]
+    assert [kept.id for kept in archive.reconstructors.records()] == ["cm-1"]
     told = [text for name, text in trail(archive, "service") if name == "note"]
     assert told == ["first", "second"]
 
@@ -378,7 +378,7 @@ async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
 
     monkeypatch.setattr(bridge, "publish", publish)
     matrix = np.zeros((3, 4), np.float32)
-    archive.store(record("cm-1", n_modes=3), matrix, None, {})
+    archive.reconstructors.store(record("cm-1", n_modes=3), matrix, None, {})
     story = Story(Mode.HOLD).meet()
     known = replace(story.state, reconstructors=(record("cm-1", n_modes=3),))
     supervisor._engine.state = known
@@ -399,7 +399,7 @@ async def test_a_matrix_that_cannot_be_stored_is_never_heard_of_and_the_disk_is_
     made = record("cm-9", n_modes=300)
 
     async def make(_effect, _state):
-        await asyncio.to_thread(archive.store, made, matrix, None, {})
+        await asyncio.to_thread(archive.reconstructors.store, made, matrix, None, {})
         return ev.MatrixMade(record=made, wanted=False)
 
     monkeypatch.setattr(supervisor._actions, "perform", make)
@@ -415,7 +415,7 @@ async def test_a_matrix_that_cannot_be_stored_is_never_heard_of_and_the_disk_is_
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         await until(lambda: alarm_of(supervisor, "archive-failed") is None)
-    assert not list(archive._products.directory.iterdir())
+    assert not list(archive.reconstructors.directory.iterdir())
 
 
 async def test_a_refused_order_is_audited_with_the_reason(supervisor, archive):

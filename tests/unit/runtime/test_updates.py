@@ -183,7 +183,7 @@ class TestGains:
         state = replace(STATE, registration=replace(REGISTRATION, optical_gains=MEASURED))
         made = (await make(actions, state)).record
         assert made.optical_gains == MEASURED
-        assert archive.records()[-1].optical_gains == MEASURED
+        assert archive.reconstructors.records()[-1].optical_gains == MEASURED
         with h5py.File(tmp_path / "reconstructors" / f"{made.id}.h5") as file:
             assert file["gains"].attrs["measured_modes"].tolist() == [60, 70, 80]
             assert file["gains/factor"].shape == (N_CONTROLLED,)

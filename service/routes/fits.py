@@ -16,7 +16,7 @@ from service.errors import MatrixError
 from service.files.request import parse_alpha, parse_modes
 from service.files.uploads import FitAsked, FitState
 from service.fit.matrix import FitOptions, Method
-from service.routes import views as shown
+from service.routes import views
 from service.routes.problems import INVALID, UNKNOWN, problem_response
 from service.routes.views import FitJobs, FitsDep, ServiceDep, answer, picture, shows
 
@@ -198,7 +198,7 @@ async def fit(
     return FitAcceptedView(id=job.id, links={"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"})
 
 
-@router.get("/fits", responses={200: shows(shown.FIT_JOBS)})
+@router.get("/fits", responses={200: shows(views.FIT_JOBS)})
 async def fits_known(fits: FitsDep) -> Response:
     """Return the fits the service remembers, oldest first."""
     return answer(FitJobs(fits=tuple(fits.jobs())))
@@ -208,7 +208,7 @@ async def fits_known(fits: FitsDep) -> Response:
     "/fits/{id}",
     response_model=FitDocument,
     responses={
-        202: shows(shown.FIT_JOB) | {"description": "Not finished yet"},
+        202: shows(views.FIT_JOB) | {"description": "Not finished yet"},
         **UNKNOWN,
     },
 )

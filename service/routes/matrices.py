@@ -15,7 +15,7 @@ from fastapi import APIRouter, Path, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import Field, model_validator
 
-from service.routes import views as shown
+from service.routes import views
 from service.routes.commands import (
     MOST_MODES,
     AcceptedView,
@@ -150,13 +150,13 @@ async def measure(service: ServiceDep, body: MeasureBody | None = None) -> Matri
     return MatrixAcceptedView(id=command.id, **answered.model_dump())
 
 
-@router.get("/measurements", responses={200: shows(shown.MEASUREMENTS)})
+@router.get("/measurements", responses={200: shows(views.MEASUREMENTS)})
 async def measurements(service: ServiceDep) -> Response:
     """Return the interaction matrices that were measured or are being measured, oldest first."""
-    return answer(service.snapshot().tracker, shown.MEASUREMENTS)
+    return answer(service.snapshot().tracker, views.MEASUREMENTS)
 
 
-@router.get("/measurements/{id}", responses={200: shows(shown.MEASUREMENT), **UNKNOWN})
+@router.get("/measurements/{id}", responses={200: shows(views.MEASUREMENT), **UNKNOWN})
 async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Response:
     """Return how a matrix was measured, or how far it is."""
     record = service.snapshot().tracker.measurement(measurement_id)
@@ -229,13 +229,13 @@ async def measure_noisy(service: ServiceDep, body: NoisyBody | None = None) -> M
     return MatrixAcceptedView(id=command.id, **answered.model_dump())
 
 
-@noisy.get("/noisy-matrix", responses={200: shows(shown.NOISY_MATRICES)})
+@noisy.get("/noisy-matrix", responses={200: shows(views.NOISY_MATRICES)})
 async def noisy_matrices(service: ServiceDep) -> Response:
     """Return the noisy interaction matrices the service remembers, oldest first."""
-    return answer(service.snapshot().tracker, shown.NOISY_MATRICES)
+    return answer(service.snapshot().tracker, views.NOISY_MATRICES)
 
 
-@noisy.get("/noisy-matrix/{id}", responses={200: shows(shown.NOISY), **UNKNOWN})
+@noisy.get("/noisy-matrix/{id}", responses={200: shows(views.NOISY), **UNKNOWN})
 async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return what is known of one, or how far it is."""
     record = service.snapshot().tracker.noisy_matrix(noisy_id)

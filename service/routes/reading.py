@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.errors import CommandError
-from service.routes import views as shown
+from service.routes import views
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.routes.views import GainTableShown, MatrixId, ServiceDep, answer, known, shows
 from service.tracking.registration import ModeGain, table_of
@@ -91,7 +91,7 @@ def describes_numbers(description: str, rows_and_columns: str, example: str) -> 
     }
 
 
-@router.get("/state", responses={200: shows(shown.STATE)})
+@router.get("/state", responses={200: shows(views.STATE)})
 async def state(service: ServiceDep) -> Response:
     """Everything at one glance."""
     return answer(service.snapshot())
@@ -100,7 +100,7 @@ async def state(service: ServiceDep) -> Response:
 @router.get(
     "/alpha",
     responses={
-        200: shows(shown.ALPHA),
+        200: shows(views.ALPHA),
         404: problem_response("No window of telemetry has been accepted yet"),
     },
 )
@@ -118,23 +118,23 @@ async def alpha(request: Request, service: ServiceDep) -> Response:
     return answer(current)
 
 
-@router.get("/alpha/history", responses={200: shows(shown.HISTORY)})
+@router.get("/alpha/history", responses={200: shows(views.HISTORY)})
 async def alpha_history(
     service: ServiceDep, parameters: Annotated[LimitParameters, Query()]
 ) -> Response:
     """Return the estimates of the last windows, oldest first."""
     tracker = service.snapshot().tracker
     last = replace(tracker, history=tracker.history[-parameters.limit :])
-    return answer(last, shown.HISTORY)
+    return answer(last, views.HISTORY)
 
 
-@router.get("/reconstructors", responses={200: shows(shown.RECONSTRUCTORS)})
+@router.get("/reconstructors", responses={200: shows(views.RECONSTRUCTORS)})
 async def reconstructors(service: ServiceDep) -> Response:
     """Return the reconstructors the service remembers, oldest first."""
-    return answer(service.snapshot().tracker, shown.RECONSTRUCTORS)
+    return answer(service.snapshot().tracker, views.RECONSTRUCTORS)
 
 
-@router.get("/reconstructors/{id}", responses={200: shows(shown.RECONSTRUCTOR), **UNKNOWN})
+@router.get("/reconstructors/{id}", responses={200: shows(views.RECONSTRUCTOR), **UNKNOWN})
 async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return what is known of one reconstructor."""
     record = service.snapshot().tracker.reconstructor(matrix_id)
@@ -165,14 +165,14 @@ async def reconstructor_matrix(
     return await numbers_of(service.matrix, matrix_id, raw=raw)
 
 
-@router.get("/events", responses={200: shows(shown.EVENTS)})
+@router.get("/events", responses={200: shows(views.EVENTS)})
 async def events(service: ServiceDep, parameters: Annotated[LimitParameters, Query()]) -> Response:
     """Return what happened, oldest first, and the alarms that last."""
     tracker = service.snapshot().tracker
-    return answer(replace(tracker, log=tracker.log[-parameters.limit :]), shown.EVENTS)
+    return answer(replace(tracker, log=tracker.log[-parameters.limit :]), views.EVENTS)
 
 
-@router.get("/gains", responses={200: shows(shown.GAINS), **COMMAND})
+@router.get("/gains", responses={200: shows(views.GAINS), **COMMAND})
 async def gains(service: ServiceDep) -> Response:
     """Return the table as it is now, for all modes of the basis.
 
@@ -186,7 +186,7 @@ async def gains(service: ServiceDep) -> Response:
     return _gain_table(None, measured, tracker.rtc.n_modes)
 
 
-@router.get("/reconstructors/{id}/gains", responses={200: shows(shown.GAINS), **UNKNOWN})
+@router.get("/reconstructors/{id}/gains", responses={200: shows(views.GAINS), **UNKNOWN})
 async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the table that was measured when this reconstructor was made, for its modes."""
     found = service.snapshot().tracker.reconstructor(matrix_id)

@@ -18,6 +18,14 @@ from tests.system.pace import patience
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 
 
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """A service that nobody gives an order to."""
+    with a_night(tmp_path_factory.mktemp("night")) as night:
+        night.service("hold")
+        yield night
+
+
 @pytest.fixture
 def night(tmp_path):
     with a_night(tmp_path) as night:
@@ -40,27 +48,6 @@ def audit_of(night):
     index = night.directory / "data" / "index.sqlite"
     with contextlib.closing(sqlite3.connect(f"file:{index}?mode=ro", uri=True)) as connection:
         return connection.execute("SELECT name, text FROM audit WHERE who = 'operator'").fetchall()
-
-
-def test_on_a_disk_that_refuses_nothing_is_ordered_and_afterwards_all_is_on_record(night):
-    (process,) = night.processes
-    with no_file_may_grow(process):
-        refused = night.client.put("/v1/mode", json={"mode": "auto"})
-        assert refused.status_code == httpx.codes.INSUFFICIENT_STORAGE, refused.text
-        assert "index.sqlite" in refused.json()["detail"]
-        assert night.state["mode"] == "hold"
-        wait_for(lambda: "archive-failed" in night.alarms, 5.0, "the alarm")
-        assert night.metrics["pyrcal_archive_failures_total"] > 0
-        assert night.client.get("/healthz").status_code == httpx.codes.OK
-    wait_for(lambda: "archive-failed" not in night.alarms, 10.0, "the end of the alarm")
-    assert night.client.put("/v1/mode", json={"mode": "auto"}).status_code == httpx.codes.ACCEPTED
-    unknown = night.client.post("/v1/reconstructors/cm-7/approve")
-    assert unknown.status_code == httpx.codes.NOT_FOUND
-    wait_for(lambda: len(audit_of(night)) == 5, 5.0, "the refusal in the audit trail")
-    names = [name for name, _ in audit_of(night)]
-    assert names == ["SetMode", "SetMode.refused", "SetMode", "Approve", "Approve.refused"]
-    process.send(signal.SIGTERM)
-    assert process.ended(30.0) == 0, process.log
 
 
 def resident_mb(pid):
@@ -95,12 +82,12 @@ def fate(night, content):
     return found.json()["detail"]
 
 
-def test_an_upload_reaches_no_file_of_the_server_and_claims_no_memory(night):
-    secret = night.directory / "secret.h5"
+def test_an_upload_reaches_no_file_of_the_server_and_claims_no_memory(shared):
+    secret = shared.directory / "secret.h5"
     with h5py.File(secret, "w") as file:
         file["interaction_matrix"] = [[1.0]]
-    assert f"found a link to another file, {secret}" in fate(night, a_thief(secret))
-    assert "of 0 bytes in the file" in fate(night, a_bomb())
+    assert f"found a link to another file, {secret}" in fate(shared, a_thief(secret))
+    assert "of 0 bytes in the file" in fate(shared, a_bomb())
 
 
 def endless():
@@ -137,13 +124,34 @@ def n_sockets(pid):
     return n_found
 
 
-def test_a_page_from_elsewhere_and_a_foreign_name_give_no_orders(night):
+def test_a_page_from_elsewhere_and_a_foreign_name_give_no_orders(shared):
     for headers, status in (
         ({"Origin": "http://evil.example"}, httpx.codes.FORBIDDEN),
         ({"Host": "evil.example"}, httpx.codes.MISDIRECTED_REQUEST),
     ):
         headers |= {"Content-Type": "text/plain"}
-        answer = night.client.post("/v1/dither", headers=headers)
+        answer = shared.client.post("/v1/dither", headers=headers)
         assert answer.status_code == status
         assert answer.headers["content-type"] == "application/problem+json"
-    assert audit_of(night) == []
+    assert audit_of(shared) == []
+
+
+def test_on_a_disk_that_refuses_nothing_is_ordered_and_afterwards_all_is_on_record(night):
+    (process,) = night.processes
+    with no_file_may_grow(process):
+        refused = night.client.put("/v1/mode", json={"mode": "auto"})
+        assert refused.status_code == httpx.codes.INSUFFICIENT_STORAGE, refused.text
+        assert "index.sqlite" in refused.json()["detail"]
+        assert night.state["mode"] == "hold"
+        wait_for(lambda: "archive-failed" in night.alarms, 5.0, "the alarm")
+        assert night.metrics["pyrcal_archive_failures_total"] > 0
+        assert night.client.get("/healthz").status_code == httpx.codes.OK
+    wait_for(lambda: "archive-failed" not in night.alarms, 10.0, "the end of the alarm")
+    assert night.client.put("/v1/mode", json={"mode": "auto"}).status_code == httpx.codes.ACCEPTED
+    unknown = night.client.post("/v1/reconstructors/cm-7/approve")
+    assert unknown.status_code == httpx.codes.NOT_FOUND
+    wait_for(lambda: len(audit_of(night)) == 5, 5.0, "the refusal in the audit trail")
+    names = [name for name, _ in audit_of(night)]
+    assert names == ["SetMode", "SetMode.refused", "SetMode", "Approve", "Approve.refused"]
+    process.send(signal.SIGTERM)
+    assert process.ended(30.0) == 0, process.log

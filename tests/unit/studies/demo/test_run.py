@@ -86,8 +86,6 @@ def test_the_demo_refuses_a_busy_port_instead_of_watching_another_service(capsys
         ("--seconds", "soon"),
         ("--seed", "-1"),
         ("--port", "70000"),
-        ("--alpha", "1,2"),
-        ("--mag", "x"),
         ("--jump", "30"),
         ("--json", "nowhere/figures.json"),
         ("--nonsense", "1"),

@@ -22,7 +22,7 @@ from service.fit.methods import (
 )
 from service.fit.models import FitModels
 from service.fit.orientation import LEAST_CORRELATION, find_orientation
-from service.fit.reference import Checked, Reference, Target, checked, oriented, target_of
+from service.fit.reference import Reference, Target, checked, oriented, target_of
 from service.fit.solver import Nuisances, Solution, nuisances_of
 from service.fit.uncertainty import pupil_regions, uncertainty
 from service.fit.verdict import SUSPICIOUS, Evidence, alternatives, judged, remarks
@@ -187,7 +187,7 @@ def fit_matrix(
         If a mode that is to be used was not measured, or the instrument cannot be modelled.
     """
     options = options or FitOptions()
-    tell = progress or _silent
+    tell = progress or (lambda _: None)
     if basis is None:
         tell("modes")
         basis = modal_basis(instrument)
@@ -198,12 +198,12 @@ def fit_matrix(
         wavelength_m=instrument.wfs.wavelength_m,
         stroke_known=instrument.mirror.stroke_known,
     )
-    used = basis.subset(usable.reference.columns)
+    used = basis.subset(usable.columns)
     tell("orientation")
     instrument, told = _masked(instrument), instrument.slopes.order
     axes = _axes(instrument, usable, used, options, mapper)
     instrument = oriented(instrument, axes.order, axes.orientation)
-    target = target_of(usable.reference, instrument)
+    target = target_of(usable, instrument)
     models = FitModels(
         instrument=instrument, basis=used, illumination=options.illumination, mapper=mapper
     )
@@ -216,10 +216,6 @@ def fit_matrix(
     found = _found(models, target, start, options)
     tell("verdict")
     return _answer(models, found, usable, axes, told)
-
-
-def _silent(_: str) -> None:
-    return None
 
 
 def _masked(instrument: Instrument) -> Instrument:
@@ -268,7 +264,7 @@ class _Axes:
 
 
 def _axes(
-    instrument: Instrument, usable: Checked, basis: Basis, options: FitOptions, mapper: Mapper
+    instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
 ) -> _Axes:
     """Return the axes that are stated, or found where they are not.
 
@@ -279,7 +275,7 @@ def _axes(
     if stated is not None and options.start is not None:
         return _Axes(order=order, orientation=stated, rotation_rad=None)
     known = replace(instrument, slopes=replace(instrument.slopes, orientation=stated))
-    search = find_orientation(known, usable.reference, basis, mapper=mapper)
+    search = find_orientation(known, usable, basis, mapper=mapper)
     best = search.best
     sure = best.correlation >= LEAST_CORRELATION
     return _Axes(
@@ -322,7 +318,7 @@ def _found(models: FitModels, target: Target, start: Array, options: FitOptions)
 
 
 def _answer(
-    models: FitModels, found: _Found, usable: Checked, axes: _Axes, told: SlopeOrder
+    models: FitModels, found: _Found, usable: Reference, axes: _Axes, told: SlopeOrder
 ) -> Fit:
     solution, target = found.solution, found.target
     seen = solution.projection
@@ -352,7 +348,7 @@ def _answer(
         if residual_fraction > SUSPICIOUS
         else (),
         axes=axes.refusal,
-        passes=usable.reference.passes,
+        passes=usable.passes,
         stroke_known=models.instrument.mirror.stroke_known,
     )
     accepted, verdict = judged(evidence)

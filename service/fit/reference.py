@@ -45,6 +45,9 @@ class Reference:
     double_pass: bool = False
     """Whether the light met the mirror twice: the matrix is then twice the model's."""
 
+    left_out: tuple[str, ...] = ()
+    """What was no measurement and is gone, and why: one sentence for each kind."""
+
     @property
     def columns(self) -> NDArray[np.intp]:
         """Index of each column in the instrument's basis, ``(n_columns,)``."""
@@ -58,17 +61,6 @@ class Reference:
         return 2 if self.double_pass else 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Checked:
-    """A reference of the right shape without what was no measurement."""
-
-    reference: Reference
-    """Only the usable columns."""
-
-    left_out: tuple[str, ...]
-    """What was left out, and why: one sentence for each kind."""
-
-
 def checked(
     reference: Reference,
     *,
@@ -76,8 +68,8 @@ def checked(
     n_modes: int,
     wavelength_m: float,
     stroke_known: bool = True,
-) -> Checked:
-    """Return the usable columns of a reference for an instrument, and name the others.
+) -> Reference:
+    """Return the usable columns of a reference for an instrument; the others are named in it.
 
     Parameters
     ----------
@@ -104,10 +96,11 @@ def checked(
         matrix=matrix,
         modes=np.asarray(reference.columns)[kept],
         noise=None if reference.noise is None else np.asarray(reference.noise)[kept],
+        left_out=left_out,
     )
     if stroke_known:
         _check_unit(matrix, wavelength_m)
-    return Checked(reference=usable, left_out=left_out)
+    return usable
 
 
 def _check_shape(reference: Reference, n_slopes: int, n_modes: int) -> None:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,16 +61,6 @@ GAIN_MAP_SIGMA = 0.3
 
 ANAMORPHOSIS_SIGMA = 0.02
 """Half the stretch of the mirror's image along one axis over the other."""
-
-
-class Model(Protocol):
-    """An optical model whose modes are the measured columns, in their order."""
-
-    def interaction_matrix(self, alpha: Misregistration) -> NDArray[Any]:
-        """Return D(α), ``(n_slopes, n_columns)``."""
-
-    def derivatives(self, alpha: Misregistration) -> NDArray[Any]:
-        """Return dD/dα ``(4, n_slopes, n_columns)``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -188,7 +178,7 @@ def within_limits(vector: Array) -> bool:
 
 
 def approach(
-    model: Model,
+    model: InteractionModel,
     columns: Columns,
     start: Array,
     *,

@@ -49,16 +49,10 @@ LEAST_PER_SET = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Uncertainty:
-    """The parts of σ, and what they are made of."""
+    """How sure the registration is, and how far sets of modes agree."""
 
     covariance: Array
     """``(4, 4)`` of the registration, everything included."""
-
-    from_modes: Array
-    """``(4, 4)`` from the disagreement of single modes: noise, and errors of single modes."""
-
-    from_model: Array
-    """``(4, 4)`` from the disagreement of regions of the pupil, and the floor."""
 
     subset_steps: Array
     """``(n_sets, 4)`` where each disjoint set of modes alone would go from the common solution."""
@@ -131,8 +125,6 @@ def uncertainty(
         scatter = np.diag(steps.var(axis=0, ddof=1) / n_sets)
     return Uncertainty(
         covariance=_at_least(from_modes, scatter) + from_model,
-        from_modes=from_modes,
-        from_model=from_model,
         subset_steps=steps,
         subset_covariance=covariances + from_model,
     )

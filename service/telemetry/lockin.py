@@ -267,9 +267,8 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     slopes = spectra.slopes[:, 0]
     seen = _images(linearisation, spectra.commands[:, 0])
     known = _apply(matrix, _instrument(spectra, coupling, loop, np.ones(len(slopes))))
-    gains = np.array(
-        [_projected_gain(s, c[0], z) for s, c, z in zip(slopes, seen, known, strict=True)]
-    )
+    # the first guess: <D Z, S> / <D Z, D C>
+    gains = np.sum(known.conj() * slopes, axis=1) / np.sum(known.conj() * seen[:, 0], axis=1)
     known = _images(linearisation, _instrument(spectra, coupling, loop, gains))
     step = np.zeros(4)
     for _ in range(N_STEPS):
@@ -378,11 +377,6 @@ def _total_dither_m(spectra: Spectra) -> float:
     """Return the RMS of all lines together, from the dither columns of the window."""
     amplitudes = np.abs(spectra.dither).max(axis=1) * np.sqrt(2.0) / (0.5 * spectra.plan.n_frames)
     return float(np.sqrt(np.sum(amplitudes**2)))
-
-
-def _projected_gain(slopes: Array, seen: Array, known: Array) -> complex:
-    """Return ``<D Z, S> / <D Z, D C>``: the first guess of the complex gain."""
-    return complex(np.vdot(known, slopes) / np.vdot(known, seen))
 
 
 def _regressors(images: Array, gain: complex, step: Array) -> Array:

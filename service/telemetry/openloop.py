@@ -10,14 +10,14 @@ some per cent of a subaperture, which is what closing a loop takes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.fit import solver
 from service.fit.solver import LONGEST_STEP, Columns
-from service.model.interaction import Linearisation
+from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.telemetry.frames import ClosedLoop, WindowRefused
 from service.telemetry.lockin import MAX_LAG_FRAMES, Spectra, WindowEstimate, fit_window
@@ -42,13 +42,6 @@ NOT_FOUND = "registration not found"
 """How the reason begins of a window that was good and led nowhere."""
 
 
-class LinesModel(solver.Model, Protocol):
-    """An optical model of the dithered modes alone, columns in the order of the lines."""
-
-    def linearise(self, alpha: Misregistration) -> Linearisation:
-        """Return D(α) and its derivatives together."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FarEstimate:
     """Where the mirror is, from one window with the loop open."""
@@ -67,11 +60,11 @@ class FarEstimate:
 class FarSearch:
     """Where to look, and with what."""
 
-    far: LinesModel
-    """Coarse: leads."""
+    far: InteractionModel
+    """Of the dithered modes alone, columns in the order of the lines. Coarse: leads."""
 
-    near: LinesModel
-    """Fine: decides."""
+    near: InteractionModel
+    """The same, fine: decides."""
 
     nominal: Misregistration
     """Centre of the range."""

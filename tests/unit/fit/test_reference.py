@@ -19,7 +19,7 @@ def check(reference: Reference, **changes):
 def test_a_good_matrix_passes_unchanged():
     given = matrix()
     found = check(Reference(matrix=given))
-    np.testing.assert_array_equal(found.reference.matrix, given)
+    np.testing.assert_array_equal(found.matrix, given)
     assert found.left_out == ()
 
 
@@ -28,7 +28,7 @@ def test_dead_and_nan_columns_are_named_and_left_out():
     given[3, 2] = np.nan
     given[:, 4] = 0.0
     found = check(Reference(matrix=given, modes=np.array([0, 1, 7, 3, 9, 5])))
-    assert list(found.reference.columns) == [0, 1, 3, 5]
+    assert list(found.columns) == [0, 1, 3, 5]
     assert found.left_out == ("not finite: mode 7", "dead (no response): mode 9")
 
 
@@ -50,7 +50,7 @@ def test_another_unit_than_the_metre_is_named(factor, unit):
 
 def test_any_unit_will_do_where_the_stroke_is_unknown():
     found = check(Reference(matrix=1e-9 * matrix()), stroke_known=False)
-    assert found.reference.matrix.shape == (N_SLOPES, 6)
+    assert found.matrix.shape == (N_SLOPES, 6)
 
 
 def test_modes_beyond_the_basis_are_refused():

@@ -68,13 +68,6 @@ class Snapshot:
     pace: Pace = field(default_factory=Pace)
     """What the work costs."""
 
-    estimate_arrival_ns: int | None = None
-    """When the last window that entered the estimate arrived, on the service's clock.
-
-    None: the age is judged by the RTC's timestamps, which is wrong where the clocks differ or a
-    simulated RTC runs slower than its timestamps.
-    """
-
     archive_failures: int = 0
     """Attempts to write that the disk has refused."""
 
@@ -120,9 +113,7 @@ class Alpha:
     @property
     def age_s(self) -> float:
         """Since the last telemetry that entered it arrived, seconds."""
-        arrival_ns = self.snapshot.estimate_arrival_ns
-        then_ns = self.known.t_ns_utc if arrival_ns is None else arrival_ns
-        return (self.snapshot.now_ns - then_ns) / 1e9
+        return (self.snapshot.now_ns - self.known.arrived_ns_utc) / 1e9
 
     @property
     def window_age_s(self) -> float | None:

@@ -82,7 +82,7 @@ class Supervisor:
 
     def snapshot(self) -> Snapshot:
         """Return what is known now."""
-        known, waiting = self._engine.state.registration, self._waiting()
+        waiting = self._waiting()
         return Snapshot(
             tracker=self._engine.state,
             link=self._bridge.statistics(),
@@ -92,7 +92,6 @@ class Supervisor:
             ready_reason="; ".join(f"{wait.party}: {wait.text}" for wait in waiting) or "ready",
             waiting_for=waiting,
             pace=self._meter.pace,
-            estimate_arrival_ns=known.arrived_ns_utc if known is not None else None,
             archive_failures=self._recorder.failures,
             archive_waiting=self._recorder.waiting,
         )

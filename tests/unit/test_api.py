@@ -128,8 +128,8 @@ STATE = TrackerState(
         alpha=ALPHA,
         covariance=np.diag(SIGMA**2),
         floor=np.array([0.003, 0.003, np.deg2rad(0.005), 0.0003]),
-        t_ns_utc=90 * SECOND,
-        arrived_ns_utc=80 * SECOND,
+        t_ns_utc=80 * SECOND,
+        arrived_ns_utc=90 * SECOND,
         n_windows=4,
         optical_gain=0.6,
     ),
@@ -297,8 +297,8 @@ async def test_alpha_leaves_in_the_units_of_its_names(client):
     assert (body["age_s"], body["n_windows"], body["optical_gain"]) == (10.0, 4, 0.6)
 
 
-async def test_the_age_is_judged_by_arrival_where_it_is_known(client, service):
-    service.now = replace(service.now, estimate_arrival_ns=98 * SECOND)
+async def test_the_age_is_judged_by_arrival(client, service):
+    service.change(registration=replace(STATE.registration, arrived_ns_utc=98 * SECOND))
     assert (await body_of(client, "/v1/alpha"))["age_s"] == 2.0
 
 

@@ -5,6 +5,7 @@
     <directory>/
       reconstructors/<id>.h5        one reconstructor each, written once, complete or absent
       interaction_matrices/<id>.h5  one measured interaction matrix each, likewise
+      noisy_matrices/<id>.h5        one noisy interaction matrix each, likewise
       tracking.json                 the registration, for the service after this one
       index.sqlite                  where each is on its way, and who did what, when
       lock                          held while a service uses the directory

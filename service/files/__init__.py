@@ -17,7 +17,7 @@ _OTHERS = {b"\x93NUMPY": "a NumPy file", b"MATLAB 5": "a MATLAB file older than 
 
 
 def is_hdf5(path: Path) -> bool:
-    """Return whether a file is HDF5, or FITS, by its content and not by its name.
+    """Return True for an HDF5 file and False for FITS, by its content and not by its name.
 
     HDF5 may begin with a block of its user's, of 512 bytes or a power of two more.
 

@@ -198,7 +198,7 @@ class World(Story):
         yield loop_answered(asked.id, accepted=not busy, reason=busy)
 
     def of_matrices(self, effect):
-        known, view = self.state.registration, self.state.rtc or self.status().rtc
+        known, view = self.state.registration, self.state.rtc or self.status()
         match effect:
             case ev.MakeMatrix() | ev.CopyMatrix() as asked:
                 self.n_made += 1

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.campaign.rows import Row
+from studies.campaign.rows import UNITS, Row, heading, line
 
 WRONG = np.array([0.1, 0.1, 0.1, 0.005])
 """An α further off than this is wrong (boundary units): what a loop needs, and ten times the
@@ -16,10 +16,10 @@ accuracy asked for; or further than 5 of its own σ."""
 
 WRONG_SIGMA = 5.0
 
-_HEADER = (
-    "| telescope, plant, truth | starts | tracking (share) | time s: median, longest | "
-    "opened again | failed, clear state | unclear | wrong α | unstable matrix applied | "
-    "error RMS x, y % / mdeg / % |\n|---|---|---|---|---|---|---|---|---|---|\n"
+_HEADER = heading(
+    *("telescope, plant, truth", "starts", "tracking (share)", "time s: median, longest"),
+    *("opened again", "failed, clear state", "unclear", "wrong α", "unstable matrix applied"),
+    "error RMS x, y % / mdeg / %",
 )
 
 
@@ -52,14 +52,14 @@ def _line(key: tuple[Any, ...], rows: list[Row]) -> str:
     errors = np.array([row["error"] for row in tracking if row["error"] is not None])
     rms = "-"
     if len(errors):
-        x, y, rotation, magnification = np.sqrt(np.mean(errors**2, axis=0)) * [100, 100, 1e3, 100]
+        x, y, rotation, magnification = np.sqrt(np.mean(errors**2, axis=0)) * UNITS
         rms = f"{x:.2f} {y:.2f} {rotation:.1f} {magnification:.3f}"
-    return (
-        f"| {name}, {plant}, {truth}, mag {magnitude:g}, {n_controlled} modes g {gain:g} | "
-        f"{len(rows)} | "
-        f"{len(tracking)} ({len(tracking) / len(rows):.0%}) | {spent} | {again} | {len(failed)} | "
-        f"{len(rows) - len(tracking) - len(failed)} | {sum(map(wrong, rows))} | {unstable} | "
-        f"{rms} |\n"
+    return line(
+        f"{name}, {plant}, {truth}, mag {magnitude:g}, {n_controlled} modes g {gain:g}",
+        len(rows),
+        f"{len(tracking)} ({len(tracking) / len(rows):.0%})",
+        *(spent, again, len(failed), len(rows) - len(tracking) - len(failed)),
+        *(sum(map(wrong, rows)), unstable, rms),
     )
 
 

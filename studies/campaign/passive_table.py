@@ -6,17 +6,14 @@ from collections import defaultdict
 
 import numpy as np
 
-from studies.campaign.rows import Row
-
-UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
-"""Printed in % of a subaperture, thousandths of a degree, %."""
+from studies.campaign.rows import UNITS, Row, four, heading, line
 
 WITHIN = 1.96
 """σ that a normal error stays within in 95 of 100 cases."""
 
-HEADER = (
-    "| nights | reading | looks | error RMS x, y % / mdeg / % | largest | stated σ "
-    "| within 1.96 σ, each | misfit |\n|---|---|---|---|---|---|---|---|\n"
+HEADER = heading(
+    *("nights", "reading", "looks", "error RMS x, y % / mdeg / %", "largest", "stated σ"),
+    *("within 1.96 σ, each", "misfit"),
 )
 
 
@@ -46,15 +43,11 @@ def _line(name: str, reading: str, rows: list[Row]) -> str:
     errors = np.array([row["error"][reading] for row in rows])
     sigma = np.array([row["sigma"][reading] for row in rows])
     within = np.mean(np.abs(errors) <= WITHIN * sigma, axis=0)
-    cells = (
-        _four(np.sqrt(np.mean(errors**2, axis=0)) * UNITS),
-        _four(np.abs(errors).max(axis=0) * UNITS),
-        _four(np.sqrt(np.mean(sigma**2, axis=0)) * UNITS),
+    return line(
+        *(name, reading, len(rows)),
+        four(np.sqrt(np.mean(errors**2, axis=0)) * UNITS),
+        four(np.abs(errors).max(axis=0) * UNITS),
+        four(np.sqrt(np.mean(sigma**2, axis=0)) * UNITS),
         " ".join(f"{share:.0%}" for share in within),
         f"{np.median([row['misfit'] for row in rows]):.2f}",
     )
-    return f"| {name} | {reading} | {len(rows)} | " + " | ".join(cells) + " |\n"
-
-
-def _four(values: np.ndarray) -> str:
-    return " ".join(f"{value:.2f}" for value in values)

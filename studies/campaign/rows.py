@@ -7,7 +7,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 Row = dict[str, Any]
+
+UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
+"""An α is printed in % of a subaperture, thousandths of a degree, %."""
 
 
 class RowFile:
@@ -24,6 +30,21 @@ class RowFile:
         self.rows += rows
         with self._path.open("a") as file:
             file.writelines(json.dumps(row) + "\n" for row in rows)
+
+
+def heading(*columns: str) -> str:
+    """Return the head of a Markdown table."""
+    return line(*columns) + "|---" * len(columns) + "|\n"
+
+
+def line(*cells: object) -> str:
+    """Return a line of a Markdown table."""
+    return f"| {' | '.join(map(str, cells))} |\n"
+
+
+def four(values: NDArray[np.float64]) -> str:
+    """Return the four numbers of an α as one cell."""
+    return " ".join(f"{value:.2f}" for value in values)
 
 
 def tell(text: str, path: Path | None, program: str) -> None:

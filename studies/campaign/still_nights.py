@@ -25,7 +25,7 @@ from service.tracking.events import Event
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import new_lines
 from studies.campaign.observatory import Observatory
-from studies.campaign.rows import Row, RowFile
+from studies.campaign.rows import Row, RowFile, heading, line
 from studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of
 
 PLANTS = {
@@ -99,19 +99,15 @@ def play(plant: str, sky: str, worker: str, seed: int, seconds: float) -> Row:
 
 def table(rows: Sequence[Row]) -> str:
     """Return the campaign as a Markdown table, a line for each plant and worker."""
-    lines = [
-        "| plant | worker | skies | hours | jumps named | suspected | windows |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    text = heading("plant", "worker", "skies", "hours", "jumps named", "suspected", "windows")
     for plant, worker in itertools.product(PLANTS, WORKERS):
         nights = [row for row in rows if (row["plant"], row["worker"]) == (plant, worker)]
         if nights:
             hours = sum(row["seconds"] for row in nights) / 3600
             counts = (sum(row[key] for row in nights) for key in ("named", "suspected", "windows"))
             skies = len({row["sky"] for row in nights})
-            cells = (plant, worker, skies, f"{hours:.2f}", *counts)
-            lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join(lines) + "\n"
+            text += line(plant, worker, skies, f"{hours:.2f}", *counts)
+    return text
 
 
 def main() -> int:

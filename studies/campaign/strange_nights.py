@@ -31,7 +31,7 @@ from service.tracking.state import Mode
 from service.wire import Acknowledgement, Loop, LoopRequest, Pattern
 from studies.campaign.observatory import Latencies, Observatory
 from studies.campaign.observatory_dome import Moment
-from studies.campaign.rows import Row, RowFile, range_of, tell
+from studies.campaign.rows import Row, RowFile, heading, line, range_of, tell
 from studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of
 from studies.campaign.strange_rtc import DIALECTS, Mischief, StrangeDome, StrangeLink
 
@@ -269,15 +269,16 @@ def _night(seed: int, instrument: str, seconds: float, *, listening: bool) -> St
 def table(rows: Sequence[Row]) -> str:
     """Return the campaign as a Markdown table, and every night that went wrong."""
     wrong = [row for row in rows if row["blamed"] or row["opened"] or row["sent_in_dialect"]]
-    lines = [
-        "| nights | matrices sent | loops beyond 1 um for 1 s | of them the service's doing "
-        "| healthy loops opened | matrices sent in a wrong dialect |",
-        "|---|---|---|---|---|---|",
-        f"| {len(rows)} | {sum(r['n_swaps'] for r in rows)} | {sum(len(r['lost']) for r in rows)} "
-        f"| {sum(len(r['blamed']) for r in rows)} | {sum(len(r['opened']) for r in rows)} "
-        f"| {sum(r['sent_in_dialect'] for r in rows)} |",
-    ]
-    return "\n".join([*lines, "", *(f"- {json.dumps(row)}" for row in wrong)]) + "\n"
+    text = heading(
+        *("nights", "matrices sent", "loops beyond 1 um for 1 s", "of them the service's doing"),
+        *("healthy loops opened", "matrices sent in a wrong dialect"),
+    )
+    text += line(
+        *(len(rows), sum(row["n_swaps"] for row in rows)),
+        *(sum(len(row[name]) for row in rows) for name in ("lost", "blamed", "opened")),
+        sum(row["sent_in_dialect"] for row in rows),
+    )
+    return text + "\n" + "".join(f"- {json.dumps(row)}\n" for row in wrong)
 
 
 def main() -> int:

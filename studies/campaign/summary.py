@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from service.telemetry.estimate import model_error
 from studies.campaign.plan import Estimator
-from studies.campaign.rows import Row
+from studies.campaign.rows import UNITS, Row, four, heading, line
 
 Array = NDArray[np.float64]
 
@@ -21,12 +21,9 @@ GROUPED_BY = (
 )  # fmt: skip
 """Nights that differ in nothing but the seed make one line of the table."""
 
-UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
-"""Printed in % of a subaperture, thousandths of a degree, %."""
-
-HEADER = (
-    "| night | windows (refused) | bias x, y % / mdeg / % | scatter | scatter/σ | chi2/4 "
-    "| inside 95 % | error RMS | wavefront nm |\n|---|---|---|---|---|---|---|---|---|\n"
+HEADER = heading(
+    *("night", "windows (refused)", "bias x, y % / mdeg / %", "scatter", "scatter/σ", "chi2/4"),
+    *("inside 95 %", "error RMS", "wavefront nm"),
 )
 
 
@@ -40,18 +37,17 @@ def table(rows: list[Row], floor: Array, *, pooled: bool = False) -> str:
         common = row | {"wind_m_s": None} if pooled else row
         values = (common[name] for name in GROUPED_BY)
         groups[tuple(tuple(v) if isinstance(v, list) else v for v in values)].append(row)
-    return HEADER + "".join(line(key, group, floor) for key, group in groups.items())
+    return HEADER + "".join(_line(key, group, floor) for key, group in groups.items())
 
 
-def line(key: tuple[Any, ...], rows: list[Row], floor: Array) -> str:
-    """Return one line of the table."""
+def _line(key: tuple[Any, ...], rows: list[Row], floor: Array) -> str:
     good = [row for row in rows if row["refused"] is None]
     wavefront = np.array([row["wavefront_nm"] for row in rows if row["wavefront_nm"] is not None])
     name = _name(dict(zip(GROUPED_BY, key, strict=True)))
     counted = f"{len(rows)} ({len(rows) - len(good)})"
     error_nm = f"{np.sqrt(np.mean(wavefront**2)):.1f}" if wavefront.size else "-"
     if not good:
-        return f"| {name} | {counted} | - | - | - | - | - | - | {error_nm} |\n"
+        return line(name, counted, *"------", error_nm)
     errors = np.array([row["error"] for row in good])
     covariances = np.array([row["covariance"] for row in good])
     seeds = np.array([row["seed"] for row in good])
@@ -59,16 +55,16 @@ def line(key: tuple[Any, ...], rows: list[Row], floor: Array) -> str:
     scatter = _within(errors, seeds)
     squares = distances(errors, covariances + model_errors(good), floor)
     inside = np.mean(squares < chi2.ppf(0.95, 4))
-    cells = (
-        _four(errors.mean(axis=0) * UNITS),
-        _four(scatter * UNITS),
-        _four(scatter / sigma),
+    return line(
+        *(name, counted),
+        four(errors.mean(axis=0) * UNITS),
+        four(scatter * UNITS),
+        four(scatter / sigma),
         f"{squares.mean() / 4:.2f}",
         f"{inside:.0%}",
-        _four(np.sqrt(np.mean(errors**2, axis=0)) * UNITS),
+        four(np.sqrt(np.mean(errors**2, axis=0)) * UNITS),
         error_nm,
     )
-    return f"| {name} | {counted} | " + " | ".join(cells) + " |\n"
 
 
 def model_errors(rows: list[Row]) -> Array:
@@ -92,10 +88,6 @@ def _within(errors: Array, seeds: NDArray[np.int_]) -> Array:
         squares += np.sum((own - own.mean(axis=0)) ** 2, axis=0)
         freedom += len(own) - 1
     return np.asarray(np.sqrt(squares / freedom)) if freedom else np.full(4, np.nan)
-
-
-def _four(values: Array) -> str:
-    return " ".join(f"{value:.2f}" for value in values)
 
 
 def _name(key: dict[str, Any]) -> str:

@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.campaign.rows import Row
-
-UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
-"""Printed in % of a subaperture, thousandths of a degree, %."""
+from studies.campaign.rows import UNITS, Row, four, heading, line
 
 GROUPED_BY = (
     "case", "plant", "truth", "magnitude", "gain", "n_controlled", "seconds", "period_s",
@@ -18,10 +15,10 @@ GROUPED_BY = (
 )  # fmt: skip
 """Nights that differ in nothing but the seed make one line."""
 
-HEADER = (
-    "| nights | good α after s | own matrix after s | tracking RMS x, y % / mdeg / % "
-    "| flagged after s | corrected after s | wavefront nm | dither nm | cost nm "
-    "| windows (refused) | published | refused by the gate | unstable |\n" + "|---" * 13 + "|\n"
+HEADER = heading(
+    *("nights", "good α after s", "own matrix after s", "tracking RMS x, y % / mdeg / %"),
+    *("flagged after s", "corrected after s", "wavefront nm", "dither nm", "cost nm"),
+    *("windows (refused)", "published", "refused by the gate", "unstable"),
 )
 
 
@@ -30,13 +27,13 @@ def table(rows: list[Row]) -> str:
     groups: dict[str, list[Row]] = defaultdict(list)
     for row in rows:
         groups[str([row[name] for name in GROUPED_BY])].append(row)
-    return HEADER + "".join(line(_name(group[0]), group) for group in groups.values())
+    return HEADER + "".join(line_of(_name(group[0]), group) for group in groups.values())
 
 
-def line(name: str, rows: list[Row]) -> str:
-    """Return one line of the table."""
+def line_of(name: str, rows: list[Row]) -> str:
+    """Return the line of a group of nights."""
     jumps = [jump for row in rows for jump in row["jumps"]]
-    cells = (
+    return line(
         f"{len(rows)} x {name}",
         _worst([row["good_alpha_s"] for row in rows]),
         _worst([row["own_matrix_s"] for row in rows]),
@@ -47,11 +44,10 @@ def line(name: str, rows: list[Row]) -> str:
         _mean([row["dither_nm"] for row in rows], ".2f"),
         _cost(rows),
         f"{sum(sum(row['windows']) for row in rows)} ({sum(row['windows'][1] for row in rows)})",
-        str(sum(len(row["published"]) for row in rows)),
-        str(sum(row["refused"] for row in rows)),
-        str(sum(row["unstable"] for row in rows)),
+        sum(len(row["published"]) for row in rows),
+        sum(row["refused"] for row in rows),
+        sum(row["unstable"] for row in rows),
     )
-    return "| " + " | ".join(cells) + " |\n"
 
 
 def _name(row: Row) -> str:
@@ -71,8 +67,7 @@ def _tracking(rows: list[Row]) -> str:
     found = [row["tracking_rms"] for row in rows if row["tracking_rms"] is not None]
     if not found:
         return "-"
-    rms = np.sqrt(np.mean(np.square(found), axis=0)) * UNITS
-    return " ".join(f"{value:.2f}" for value in rms)
+    return four(np.sqrt(np.mean(np.square(found), axis=0)) * UNITS)
 
 
 def _worst(values: list[Any]) -> str:

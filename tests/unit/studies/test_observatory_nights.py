@@ -9,7 +9,7 @@ import pytest
 from sim_rtc.options import parse_options
 from studies.campaign import system_nights
 from studies.campaign.system_cases import Case, Plan
-from studies.campaign.system_table import line, table
+from studies.campaign.system_table import line_of, table
 from tests.unit.runtime.small import INSTRUMENT, N_CONTROLLED
 
 
@@ -59,7 +59,7 @@ def test_a_line_tells_the_mean_the_worst_and_what_never_came():
         {"at_s": 30.0, "flagged_s": 2.0, "corrected_s": 10.0},
         {"at_s": 60.0, "flagged_s": 4.0, "corrected_s": None},
     ]
-    text = line("nights", [row(Case.JUMP, jumps=jumps), row(Case.JUMP, own_matrix_s=20.0)])
+    text = line_of("nights", [row(Case.JUMP, jumps=jumps), row(Case.JUMP, own_matrix_s=20.0)])
     cells = [cell.strip() for cell in text.split("|")]
     assert "15.0 (20.0)" in cells
     assert "3.0 (4.0)" in cells
@@ -68,7 +68,7 @@ def test_a_line_tells_the_mean_the_worst_and_what_never_came():
 
 
 def test_the_cost_of_a_dither_is_the_plain_difference_with_its_twin():
-    text = line("nights", [row(Case.BUDGET, twin_nm=120.2), row(Case.BUDGET, twin_nm=120.4)])
+    text = line_of("nights", [row(Case.BUDGET, twin_nm=120.2), row(Case.BUDGET, twin_nm=120.4)])
     assert "| 0.200 (0.300) |" in text
 
 

@@ -8,7 +8,6 @@ from functools import partial
 
 from service.config import load_settings
 from service.config.instrument_schema import read_instrument_file
-from service.processes import Worker
 
 _OPTIONS = {
     "instrument": "service.instrument",
@@ -35,6 +34,8 @@ def main(options: argparse.Namespace) -> int:
     settings = load_settings(options.config, os.environ, given)
     read_instrument_file(settings.service.instrument)
     # from here on each import takes its time: the worker's first, so that it imports beside them
+    from service.processes import Worker
+
     early = Worker().begin() if options.own_process else Worker()
     from service.config import load_instrument
     from service.config.policy import compute_of

@@ -32,7 +32,7 @@ from service.telemetry.random_dither import (
     joined,
     noisy_matrix,
 )
-from service.tracking.products import NoisyRecord, NoisyState
+from service.tracking.products import MeasureState, NoisyRecord
 from service.wire import DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
@@ -193,7 +193,7 @@ def _archive(
     found, instrument = work_out(bench, total, start), load_instrument("flao-lbt")
     record = NoisyRecord(
         id=f"noisy-mag{given.magnitude:g}",
-        state=NoisyState.FINISHING,
+        state=MeasureState.FINISHING,
         modes=total.plan.modes,
         total_m=1e-9 * given.total_nm,
         duration_s=given.window_s * given.windows,

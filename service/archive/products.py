@@ -20,9 +20,9 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.tracking.products import (
     MatrixState,
     MeasurementRecord,
+    MeasureState,
     NoisyFinding,
     NoisyRecord,
-    NoisyState,
     ReconstructorRecord,
 )
 from service.tracking.registration import table_of
@@ -234,7 +234,7 @@ class NoisyArchive(Store[NoisyRecord]):
             If the id is not one.
         """
         finding = record.finding
-        if finding is None or record.state is not NoisyState.STORED:
+        if finding is None or record.state is not MeasureState.STORED:
             found = "nothing" if finding is None else "a finding"
             raise ArchiveError(
                 f"noisy matrix {record.id}: found it {record.state} with {found}, expected it "

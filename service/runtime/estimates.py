@@ -26,7 +26,7 @@ from service.tracking import events as ev
 from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
 from service.tracking.events import Event
 from service.tracking.loop import loop_numbers
-from service.tracking.products import NoisyFinding, NoisyRecord, NoisyState, ReconstructorRecord
+from service.tracking.products import MeasureState, NoisyFinding, NoisyRecord, ReconstructorRecord
 from service.tracking.state import Level, TrackerState
 from service.tracking.windows import fit_begins_at
 from service.wire import checksum
@@ -320,7 +320,7 @@ def finished(record: NoisyRecord, total: Correlated, found: Found) -> NoisyRecor
         sha256=checksum(found.numbers.matrix),
     )
     reason = f"no registration could be fitted: {found.reason}" if found.reason else ""
-    return replace(record, state=NoisyState.STORED, reason=reason, finding=finding)
+    return replace(record, state=MeasureState.STORED, reason=reason, finding=finding)
 
 
 def _mean_gain(estimate: RandomEstimate) -> float:

@@ -6,6 +6,7 @@ Of a noisy one the sums are kept where the telemetry comes in; here is only how 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,12 +16,7 @@ from service.tracking.dither import ask_for, ask_to_stop, drop, make_way_for_noi
 from service.tracking.dither_request import RANDOM_TOTAL_M, RandomChoice, plan_random, total_m
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import (
-    MeasurementRecord,
-    MeasureState,
-    NoisyRecord,
-    NoisyState,
-)
+from service.tracking.products import MeasurementRecord, MeasureState, NoisyRecord
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
 from service.wire import DitherRequest, MeasureRequest, Pattern, Reply, Status
@@ -61,12 +57,7 @@ LONGEST_S = 3600.0
 
 MEASURING = "an interaction matrix is being measured: these frames are no ordinary telemetry"
 
-_OVER = (
-    MeasureState.REFUSED,
-    MeasureState.FAILED,
-    MeasureState.STORED,
-    MeasureState.GIVEN_UP,
-)
+_R = TypeVar("_R", MeasurementRecord, NoisyRecord)
 
 
 def measure(turn: Turn, command: ev.Measure) -> None:
@@ -116,11 +107,7 @@ def give_up_measuring(turn: Turn, measurement_id: str) -> None:
     UnknownIdError
         If nobody has heard of it.
     """
-    record = turn.state.measurement(measurement_id)
-    if record is None:
-        raise UnknownIdError(f"measurement {measurement_id}: nobody has heard of it")
-    if not record.under_way:
-        raise CommandError(f"{measurement_id} is {record.state}: there is nothing to give up")
+    record = _under_way(turn.state.measurement(measurement_id), f"measurement {measurement_id}")
     text = "given up by the operator; the RTC may go on with it, what it sends is ignored"
     _keep(turn, replace(record, state=MeasureState.GIVEN_UP, reason=text))
     turn.log("measurement.given-up", f"{measurement_id}: {text}")
@@ -131,6 +118,15 @@ def give_up_measuring(turn: Turn, measurement_id: str) -> None:
     left_s = max((record.duration_s or 0.0) - since_s, 0.0)
     # the RTC has no hand free for a dither, nor can windows tell of α
     turn.put_off(dither_s=left_s, make_s=left_s)
+
+
+def _under_way(record: _R | None, name: str) -> _R:
+    """Return a record that can be given up."""
+    if record is None:
+        raise UnknownIdError(f"{name}: nobody has heard of it")
+    if not record.under_way:
+        raise CommandError(f"{record.id} is {record.state}: there is nothing to give up")
+    return record
 
 
 def watch_measurement(turn: Turn) -> None:
@@ -159,7 +155,7 @@ def on_measured(turn: Turn, record: MeasurementRecord) -> None:
     known = turn.state.measurement(record.id)
     if known is not None:
         given_up = known.state is MeasureState.GIVEN_UP
-        if given_up or (known.state in _OVER and record.state not in _OVER):
+        if given_up or (record.under_way and not known.under_way):
             return
         record = replace(
             record,
@@ -272,7 +268,7 @@ def measure_noisy(turn: Turn, command: ev.MeasureNoisy) -> None:
     dither = plan_random(choice, rtc, turn.policy, turn.now_ns)
     record = NoisyRecord(
         id=command.id,
-        state=NoisyState.WAITING,
+        state=MeasureState.WAITING,
         modes=dither.request.modes,
         total_m=total_m(dither.request),
         duration_s=duration_s,
@@ -304,12 +300,8 @@ def give_up_noisy(turn: Turn, noisy_id: str) -> None:
     UnknownIdError
         If nobody has heard of it.
     """
-    record = turn.state.noisy_matrix(noisy_id)
-    if record is None:
-        raise UnknownIdError(f"noisy matrix {noisy_id}: nobody has heard of it")
-    if not record.under_way:
-        raise CommandError(f"{noisy_id} is {record.state}: there is nothing to give up")
-    _keep_noisy(turn, replace(record, state=NoisyState.GIVEN_UP, reason="by the operator"))
+    record = _under_way(turn.state.noisy_matrix(noisy_id), f"noisy matrix {noisy_id}")
+    _keep_noisy(turn, replace(record, state=MeasureState.GIVEN_UP, reason="by the operator"))
     turn.log("noisy-matrix.given-up", noisy_id)
     if turn.dither is not None and turn.dither.id == noisy_id:
         drop(turn)
@@ -323,14 +315,14 @@ def follow_noisy(turn: Turn) -> None:
         return
     waited_s = (turn.now_ns - record.asked_ns_utc) / SECOND_NS
     match record.state:
-        case NoisyState.WAITING if isinstance(turn.event, ev.StopDither):
+        case MeasureState.WAITING if isinstance(turn.event, ev.StopDither):
             cut_off(turn, "the operator stopped the dither")
-        case NoisyState.WAITING:
+        case MeasureState.WAITING:
             if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:
                 _begin_noisy(turn, record, rtc)
             elif waited_s > FREE_WITHIN_S:
                 cut_off(turn, f"the dither that ran did not end within {FREE_WITHIN_S:.0f} s")
-        case NoisyState.ASKED | NoisyState.RUNNING:
+        case MeasureState.ASKED | MeasureState.RUNNING:
             _follow_playing(turn, record)
         case _:
             # a simulated RTC may be ten times slower than its timestamps
@@ -348,13 +340,13 @@ def cut_off(turn: Turn, why: str) -> None:
 def awaits_its_dither(state: TrackerState) -> bool:
     """Return whether another dither has to end first: until then the service begins none."""
     record = state.gathering
-    return record is not None and record.state is NoisyState.WAITING
+    return record is not None and record.state is MeasureState.WAITING
 
 
 def on_noisy_made(turn: Turn, record: NoisyRecord) -> None:
     """Note that a noisy matrix is in the archive, unless nobody wanted it any more."""
     known, found = turn.state.noisy_matrix(record.id), record.finding
-    if found is None or (known is not None and known.state is NoisyState.GIVEN_UP):
+    if found is None or (known is not None and known.state is MeasureState.GIVEN_UP):
         return
     _keep_noisy(turn, record)
     text = f"{record.id}: {found.n_frames} frames, signal / noise of an element {found.snr:.2f}"
@@ -364,8 +356,8 @@ def on_noisy_made(turn: Turn, record: NoisyRecord) -> None:
 def noisy_failed(turn: Turn, record: NoisyRecord, text: str) -> None:
     """Note why there is no noisy matrix, unless nobody wanted it any more."""
     known = turn.state.noisy_matrix(record.id)
-    if known is None or known.state is not NoisyState.GIVEN_UP:
-        _keep_noisy(turn, replace(record, state=NoisyState.FAILED, reason=text))
+    if known is None or known.state is not MeasureState.GIVEN_UP:
+        _keep_noisy(turn, replace(record, state=MeasureState.FAILED, reason=text))
         turn.warn("noisy-matrix.failed", f"{record.id}: {text}")
 
 
@@ -380,7 +372,7 @@ def _begin_noisy(turn: Turn, record: NoisyRecord, rtc: Status) -> None:
         return
     asked = replace(
         record,
-        state=NoisyState.ASKED,
+        state=MeasureState.ASKED,
         window_s=dither.window_s or record.duration_s,
         seed=dither.request.seed or 0,
     )
@@ -400,14 +392,14 @@ def _follow_playing(turn: Turn, record: NoisyRecord) -> None:
             return
         case _:
             pass
-    dither, asked = turn.dither, record.state is NoisyState.ASKED
+    dither, asked = turn.dither, record.state is MeasureState.ASKED
     if dither is not None and dither.id == record.id:
         if asked and dither.start_seq is not None:
-            _keep_noisy(turn, replace(record, state=NoisyState.RUNNING))
+            _keep_noisy(turn, replace(record, state=MeasureState.RUNNING))
     elif asked:
         noisy_failed(turn, record, "its dither never began")
     else:
-        record = replace(record, state=NoisyState.FINISHING)
+        record = replace(record, state=MeasureState.FINISHING)
         _keep_noisy(turn, record)
         turn.ask(ev.FinishNoisy(record=record))
 

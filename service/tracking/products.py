@@ -147,13 +147,19 @@ class ModeLimit:
 
 
 class MeasureState(StrEnum):
-    """Where a measurement of an interaction matrix is."""
+    """Where a measurement of an interaction matrix is, by the RTC alone or by random signs."""
+
+    WAITING = "waiting"
+    """The service's own dither has to end first."""
 
     ASKED = "asked"
     """The RTC has not answered yet."""
 
     RUNNING = "running"
-    """The RTC measures."""
+    """The RTC measures, or the random signs play and are summed."""
+
+    FINISHING = "finishing"
+    """The random signs are over; the matrix is being fitted and archived."""
 
     REFUSED = "refused"
     """The RTC would not; the reason is the RTC's."""
@@ -166,6 +172,16 @@ class MeasureState(StrEnum):
 
     GIVEN_UP = "given-up"
     """An operator waits for it no longer; the RTC may go on, what it sends is ignored."""
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the service still waits for the matrix, or works on it."""
+        return self in {
+            MeasureState.WAITING,
+            MeasureState.ASKED,
+            MeasureState.RUNNING,
+            MeasureState.FINISHING,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,7 +246,7 @@ class MeasurementRecord:
     @property
     def under_way(self) -> bool:
         """Whether the service waits for the matrix."""
-        return self.state in {MeasureState.ASKED, MeasureState.RUNNING}
+        return self.state.under_way
 
 
 class ModeSet(StrEnum):
@@ -241,31 +257,6 @@ class ModeSet(StrEnum):
 
     ALL = "all"
     """Those of the basis."""
-
-
-class NoisyState(StrEnum):
-    """Where a noisy interaction matrix is."""
-
-    WAITING = "waiting"
-    """The service's own dither has to end first."""
-
-    ASKED = "asked"
-    """The RTC has not answered yet."""
-
-    RUNNING = "running"
-    """The dither plays, its windows are being summed."""
-
-    FINISHING = "finishing"
-    """The dither is over; the matrix is being fitted and archived."""
-
-    STORED = "stored"
-    """It is in the archive."""
-
-    FAILED = "failed"
-    """There is none; the reason says why."""
-
-    GIVEN_UP = "given-up"
-    """An operator did not want it any more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -320,7 +311,7 @@ class NoisyRecord:
     id: str
     """Never reused; also that of its dither."""
 
-    state: NoisyState
+    state: MeasureState
     modes: tuple[int, ...]
     """0-based basis indices, one for each column."""
 
@@ -358,9 +349,4 @@ class NoisyRecord:
     @property
     def under_way(self) -> bool:
         """Whether the service still works on it."""
-        return self.state in {
-            NoisyState.WAITING,
-            NoisyState.ASKED,
-            NoisyState.RUNNING,
-            NoisyState.FINISHING,
-        }
+        return self.state.under_way

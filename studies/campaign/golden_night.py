@@ -14,13 +14,7 @@ from service.errors import LinkError, PyrcalError
 from service.tracking import events as ev
 from service.tracking.events import Command, Effect, Event
 from service.tracking.policy import Policy
-from service.tracking.products import (
-    MatrixState,
-    MeasureState,
-    NoisyFinding,
-    NoisyRecord,
-    NoisyState,
-)
+from service.tracking.products import MatrixState, MeasureState, NoisyFinding, NoisyRecord
 from service.tracking.state import Mode, TrackerState
 from service.wire import Acknowledgement, DitherRequest, Reply
 from service.wire import Command as Order
@@ -269,7 +263,7 @@ class GoldenNight(Observatory):
             created_ns_utc=self.dome.now_ns,
             sha256="0" * 64,
         )
-        return replace(record, state=NoisyState.STORED, finding=finding)
+        return replace(record, state=MeasureState.STORED, finding=finding)
 
 
 def _again(word: str, words: Sequence[str]) -> bool:

@@ -13,13 +13,13 @@ from service.model.misregistration import Misregistration
 from service.routes.views import GATHERING, picture
 from service.snapshot import Snapshot
 from service.tracking.events import GiveUpNoisy, MeasureNoisy
-from service.tracking.products import ModeSet, NoisyFinding, NoisyRecord, NoisyState
+from service.tracking.products import MeasureState, ModeSet, NoisyFinding, NoisyRecord
 from service.tracking.state import TrackerState
 
 FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"
 STORED = NoisyRecord(
     id="noisy-1",
-    state=NoisyState.STORED,
+    state=MeasureState.STORED,
     modes=(0, 7, 3),
     total_m=5e-9,
     duration_s=30.0,
@@ -43,7 +43,7 @@ STORED = NoisyRecord(
         sha256="0" * 64,
     ),
 )
-RUNNING = replace(STORED, id="noisy-2", state=NoisyState.RUNNING, finding=None)
+RUNNING = replace(STORED, id="noisy-2", state=MeasureState.RUNNING, finding=None)
 
 
 class FakeService:
@@ -199,4 +199,4 @@ async def test_the_state_shows_the_one_under_way(client):
     assert shown["state"] == "running"
     state = picture(TrackerState(system="x", noisy=(RUNNING,)).gathering, GATHERING)
     found = (state["id"], state["state"], state["duration_s"])
-    assert found == ("noisy-2", NoisyState.RUNNING, 30.0)
+    assert found == ("noisy-2", MeasureState.RUNNING, 30.0)

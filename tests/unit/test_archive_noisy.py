@@ -12,7 +12,7 @@ from service.archive.records import from_json, to_json
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.files.container import read_recorded
 from service.model.misregistration import Misregistration
-from service.tracking.products import NoisyFinding, NoisyRecord, NoisyState
+from service.tracking.products import MeasureState, NoisyFinding, NoisyRecord
 from service.wire import checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3) * 1e6
@@ -43,7 +43,7 @@ def record_of(name="noisy-1", matrix=MATRIX, **changes):
     )
     record = NoisyRecord(
         id=name,
-        state=NoisyState.STORED,
+        state=MeasureState.STORED,
         modes=(0, 7, 3),
         total_m=5e-9,
         duration_s=30.0,
@@ -77,7 +77,7 @@ def test_a_record_survives_its_json():
     again = from_json(to_json(record_of()), NoisyRecord)
     np.testing.assert_allclose(again.finding.covariance, record_of().finding.covariance)
     np.testing.assert_allclose(again.finding.alpha.vector, record_of().finding.alpha.vector)
-    assert (again.modes, again.state, again.seed) == ((0, 7, 3), NoisyState.STORED, 77)
+    assert (again.modes, again.state, again.seed) == ((0, 7, 3), MeasureState.STORED, 77)
     without = record_of(finding=replace(record_of().finding, alpha=None, covariance=None))
     assert from_json(to_json(without), NoisyRecord).finding.alpha is None
 
@@ -142,7 +142,7 @@ def test_an_id_is_never_reused(archive):
         (record_of(), replace(NUMBERS, noise=NUMBERS.noise * np.nan), "found noise of shape"),
         (record_of(matrix=MATRIX + 1), NUMBERS, "found a matrix of checksum"),
         (record_of(finding=None), NUMBERS, "found it stored with nothing"),
-        (record_of(state=NoisyState.RUNNING), NUMBERS, "found it running with a finding"),
+        (record_of(state=MeasureState.RUNNING), NUMBERS, "found it running with a finding"),
     ],
 )
 def test_numbers_that_are_not_what_the_record_says_are_refused(archive, record, numbers, words):

@@ -8,7 +8,7 @@ import pytest
 
 from service.archive import Archive, AuditEntry
 from service.archive.records import TrackingFile
-from service.tracking.products import MatrixState, MeasureState, NoisyState
+from service.tracking.products import MatrixState, MeasureState
 from service.tracking.registration import ModeGain
 from service.tracking.state import AcquisitionStage, Mode, Orders
 from service.wire import Pattern
@@ -72,7 +72,7 @@ def test_measured_matrices_are_what_they_were(archive):
 
 def test_noisy_matrices_are_what_they_were(archive):
     first, second = archive.noisy.records()
-    assert (first.id, first.state, first.modes) == ("noisy-1", NoisyState.STORED, (0, 7, 3))
+    assert (first.id, first.state, first.modes) == ("noisy-1", MeasureState.STORED, (0, 7, 3))
     np.testing.assert_allclose(first.finding.alpha.vector, [0.1, 0.0, 0.003, 1.002], rtol=1e-14)
     np.testing.assert_allclose(
         first.finding.covariance, np.diag([1e-4, 1e-4, 1e-7, 1e-6]), rtol=1e-14

@@ -13,7 +13,7 @@ from service.runtime.estimates import NoisySums
 from service.telemetry.frames import FrameBlock
 from service.telemetry.random_dither import RandomDither, RandomPlan, accumulate
 from service.tracking import events as ev
-from service.tracking.products import NoisyRecord, NoisyState
+from service.tracking.products import MeasureState, NoisyRecord
 from service.tracking.state import Alarm, TrackerState
 from service.worker import OpticsWorker
 from tests.unit.runtime.small import COMPUTE, small_instrument
@@ -28,7 +28,7 @@ DIVERGING = Alarm(name="loop-diverging", since_ns_utc=0, text="it does")
 N_FRAMES = 1000
 RUNNING = NoisyRecord(
     id="noisy-1",
-    state=NoisyState.RUNNING,
+    state=MeasureState.RUNNING,
     modes=MODES,
     total_m=TOTAL_M,
     duration_s=2.0,
@@ -96,7 +96,7 @@ async def test_windows_become_an_archived_matrix_and_the_registration_in_it(desk
     made = await finish(desk, workers)
     assert isinstance(made, ev.NoisyMade)
     record = made.record
-    assert (record.state, record.reason) == (NoisyState.STORED, "")
+    assert (record.state, record.reason) == (MeasureState.STORED, "")
     found = record.finding
     assert (found.n_frames, found.session, found.cm_id) == (1998, "s1", "cm-1")
     sigma = np.sqrt(np.diag(found.covariance))

@@ -9,7 +9,7 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking.activity import under_way
-from service.tracking.products import MatrixState, MeasureState, ModeSet, NoisyState
+from service.tracking.products import MatrixState, MeasureState, ModeSet
 from service.tracking.state import AcquisitionStage, Mode
 from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern, Pointing
 from tests.unit.tracking.situations import POLICY, Story
@@ -56,7 +56,7 @@ def measuring_sines():
 def waiting_for_a_noisy_one():
     world = own_dither()
     world.tell(ev.MeasureNoisy(id="noisy-1", duration_s=30.0))
-    assert world.state.gathering.state is NoisyState.WAITING
+    assert world.state.gathering.state is MeasureState.WAITING
     return world
 
 
@@ -64,7 +64,7 @@ def gathering():
     world = idle()
     world.tell(ev.MeasureNoisy(id="noisy-1", modes=ModeSet.CONTROLLED, duration_s=30.0))
     world.pass_(3.0)
-    assert world.state.gathering.state is NoisyState.RUNNING
+    assert world.state.gathering.state is MeasureState.RUNNING
     return world
 
 
@@ -301,7 +301,7 @@ def test_a_loop_that_goes_out_of_hand_while_signs_are_gathered_takes_the_dither_
     world.pass_(4.0)
     assert world.state.acquisition.under_way
     (noisy,) = world.state.noisy
-    assert noisy.state is NoisyState.FAILED
+    assert noisy.state is MeasureState.FAILED
     assert "acquisition" in noisy.reason
 
 
@@ -309,7 +309,7 @@ def test_a_stopped_dither_ends_the_wait_for_one_that_measures():
     world = waiting_for_a_noisy_one()
     world.tell(ev.StopDither())
     (noisy,) = world.state.noisy
-    assert noisy.state is NoisyState.FAILED
+    assert noisy.state is MeasureState.FAILED
     assert "stopped" in noisy.reason
     assert not world.pass_(20.0).playing
 

@@ -9,7 +9,7 @@ from service.tracking.activity import GONE_WITHIN_S
 from service.tracking.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
 from service.tracking.dither import CALM_S, TELL_EVERY_S
 from service.tracking.dither_request import DitherPhase, total_m
-from service.tracking.products import NoisyState
+from service.tracking.products import MeasureState
 from service.tracking.state import AcquisitionStage
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import POLICY, Story, dither_answered, of_kind, rtc, stopping
@@ -318,5 +318,5 @@ class TestByTheFrames:
         playing(story, dither)
         self.measured(story, dither, 5.0)
         (noisy,) = story.state.noisy
-        assert noisy.state is NoisyState.FAILED
+        assert noisy.state is MeasureState.FAILED
         assert "too strong" in noisy.reason

@@ -160,7 +160,7 @@ def test_a_stored_matrix_ends_it_and_keeps_how_it_was_asked_for(story):
     record = story.state.measurement("im-1")
     assert story.state.measuring is None
     assert (record.state, record.asked_ns_utc, record.start_seq) == ("stored", asked_ns, 40)
-    assert story.logged[-1] == "measurement.stored"
+    assert story.logged[-2:] == ["measurement.stored", "reconstructor.adopted"]
 
 
 def test_a_refusal_ends_it_with_the_rtcs_words(story):

@@ -8,7 +8,7 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking.measuring import FREE_WITHIN_S
-from service.tracking.products import ModeSet, NoisyFinding, NoisyState
+from service.tracking.products import MeasureState, ModeSet, NoisyFinding
 from service.wire import DitherKind, DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     ALPHA,
@@ -79,7 +79,7 @@ def test_random_signs_on_all_controlled_modes_are_asked_for(story):
         tuple(range(400)),
     )
     assert np.sqrt(np.sum(np.square(dither.amplitude_m))) == pytest.approx(5e-9)
-    assert state_of(story) is NoisyState.ASKED
+    assert state_of(story) is MeasureState.ASKED
     assert story.state.gathering.seed == dither.seed
 
 
@@ -87,7 +87,7 @@ def test_the_services_own_dither_makes_way_and_none_of_its_own_follows(dithering
     effects = dithering.tell(ASK)
     assert of_kind(effects, DitherStop)
     assert not of_kind(effects, DitherRequest)
-    assert state_of(dithering) is NoisyState.WAITING
+    assert state_of(dithering) is MeasureState.WAITING
     assert not dithering.wait(2.0)
     (asked,) = of_kind(status(dithering, dither_id=None), DitherRequest)
     assert asked.id == "noisy-1"
@@ -98,13 +98,13 @@ def test_a_dither_that_does_not_make_way_ends_the_wait(dithering):
     dithering.tell(ASK)
     status(dithering, dither=own)
     dithering.wait(FREE_WITHIN_S + 2.0)
-    assert state_of(dithering) is NoisyState.FAILED
+    assert state_of(dithering) is MeasureState.FAILED
     assert "did not end within" in dithering.state.noisy_matrix("noisy-1").reason
 
 
 def test_it_runs_from_when_the_rtc_has_accepted(story):
     begun(story)
-    assert state_of(story) is NoisyState.RUNNING
+    assert state_of(story) is MeasureState.RUNNING
     assert story.state.dither.id == "noisy-1"
 
 
@@ -113,21 +113,21 @@ def test_the_end_of_the_dither_is_the_beginning_of_the_fit(story):
     effects = status(story, dither_id=None, seq=1100 + 31_000)
     (finish,) = of_kind(effects, ev.FinishNoisy)
     assert finish.record.id == "noisy-1"
-    assert state_of(story) is NoisyState.FINISHING
+    assert state_of(story) is MeasureState.FINISHING
     assert not of_kind(story.wait(3.0), ev.FinishNoisy)
 
 
 def finished(story):
     begun(story)
     status(story, dither_id=None, seq=1100 + 31_000)
-    record = replace(story.state.gathering, state=NoisyState.STORED, finding=FINDING)
+    record = replace(story.state.gathering, state=MeasureState.STORED, finding=FINDING)
     story.tell(ev.NoisyMade(record=record))
     return story
 
 
 def test_what_is_archived_is_stored_and_the_service_dithers_on(story):
     finished(story)
-    assert state_of(story) is NoisyState.STORED
+    assert state_of(story) is MeasureState.STORED
     assert story.state.gathering is None
     assert "signal / noise of an element 1.40" in story.state.log[-1].text
 
@@ -153,7 +153,7 @@ def test_a_dither_that_never_begins_is_a_failure_with_its_reason(story, event, w
     if event == "silence":
         event = ev.JobFailed(effect=ev.Ask(request=asked), text=words)
     story.tell(event)
-    assert state_of(story) is NoisyState.FAILED
+    assert state_of(story) is MeasureState.FAILED
     assert story.state.noisy_matrix("noisy-1").reason == words
 
 
@@ -161,7 +161,7 @@ def test_a_fit_that_fails_is_a_failure_with_its_reason(story):
     begun(story)
     (finish,) = of_kind(status(story, dither_id=None, seq=1100 + 31_000), ev.FinishNoisy)
     story.tell(ev.JobFailed(effect=finish, text="no window of its dither was whole"))
-    assert state_of(story) is NoisyState.FAILED
+    assert state_of(story) is MeasureState.FAILED
 
 
 def test_one_given_up_ends_its_dither_and_stays_given_up(story):
@@ -169,9 +169,9 @@ def test_one_given_up_ends_its_dither_and_stays_given_up(story):
     effects = story.tell(ev.GiveUpNoisy(id="noisy-1"))
     assert of_kind(effects, DitherStop)
     assert story.state.dither is None
-    record = replace(story.state.noisy[-1], state=NoisyState.STORED, finding=FINDING)
+    record = replace(story.state.noisy[-1], state=MeasureState.STORED, finding=FINDING)
     story.tell(ev.NoisyMade(record=record))
-    assert state_of(story) is NoisyState.GIVEN_UP
+    assert state_of(story) is MeasureState.GIVEN_UP
 
 
 def test_one_that_is_over_cannot_be_given_up(story):

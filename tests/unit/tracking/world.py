@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from service.telemetry.openloop import FarEstimate
 from service.tracking import events as ev
-from service.tracking.products import MatrixState, MeasureState, NoisyFinding, NoisyState
+from service.tracking.products import MatrixState, MeasureState, NoisyFinding
 from service.tracking.state import Mode
 from service.wire import (
     DitherRequest,
@@ -228,7 +228,7 @@ class World(Story):
                     session=f"s{self.session}",
                 )
             case ev.FinishNoisy(record=asked):
-                yield ev.NoisyMade(record=replace(asked, state=NoisyState.STORED, finding=FOUND))
+                yield ev.NoisyMade(record=replace(asked, state=MeasureState.STORED, finding=FOUND))
             case _:
                 raise TypeError(f"nobody answers {effect!r}")
 

@@ -1,0 +1,142 @@
+"""The house: one name for one thing, one place for one name, files one can read in a sitting.
+
+What is not so yet is listed here by name. No list may grow, and what has been mended leaves it.
+"""
+
+import ast
+import itertools
+from collections import defaultdict
+from functools import cache
+from pathlib import Path
+
+import vulture
+
+import service
+from service.tracking.alarms import ALARMS
+
+PACKAGE = Path(service.__file__).parent
+ROOT = PACKAGE.parent
+
+TWICE = {
+    "Method",
+}
+"""Names of two classes each."""
+
+ALIKE = {
+    "AboutTable and Instrument",
+    "Acknowledgement and MeasurementRecord",
+    "Compute and ComputeTable",
+    "DitherPlan and Schedule",
+    "Earlier and Registration",
+    "Estimate and Measured",
+    "Estimate and NoisyFinding",
+    "FitDocument and FourNumbers",
+    "Instrument and InstrumentFile",
+    "LoopBody and LoopRequest",
+    "LoopBody and SetLoop",
+    "LoopBody and Status",
+    "LoopFound and SetLoop",
+    "LoopRequest and Status",
+    "Measure and MeasureBody",
+    "Measure and MeasureRequest",
+    "Measure and MeasurementRecord",
+    "MeasureBody and MeasureRequest",
+    "MeasureBody and MeasurementRecord",
+    "MeasureNoisy and NoisyRecord",
+    "MeasureNoisy and RandomChoice",
+    "MeasureNoisy and StartDither",
+    "MeasureRequest and MeasurementRecord",
+    "Mirror and MirrorTable",
+    "NoisyBody and StartDitherRequest",
+    "NoisyRecord and RandomChoice",
+    "Pyramid and WfsTable",
+    "StartDither and StartDitherRequest",
+}
+"""Pairs of records of which one has most of the other's fields."""
+
+LONG = {
+    "runtime/actions.py",
+    "tracking/events.py",
+}
+SHORT = set()
+"""Files that want to be divided, or to join another."""
+
+SHORTEST, LONGEST = 40, 500
+
+CALLED_FROM_ELSEWHERE = {
+    "__getattr__",  # Python
+    "capture_signals",  # uvicorn
+    "collect",  # prometheus_client
+    "send_400_response",  # uvicorn
+    "decode_state",  # whoever listens to the service
+    "decode_alarm",
+}
+
+WORDS_TOO = {"acquisition", "archive-failed", "dither", "margin"}
+"""Alarms whose name means something else, too: a word of the wire, of REST, of a file."""
+
+
+@cache
+def trees():
+    return {
+        path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))
+    }
+
+
+def records():
+    """Every class as (name, its fields)."""
+    for tree in trees().values():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                stated = [line.target for line in node.body if isinstance(line, ast.AnnAssign)]
+                yield node.name, {name.id for name in stated if isinstance(name, ast.Name)}
+
+
+def test_no_two_classes_have_one_name():
+    names = [name for name, _ in records()]
+    assert {name for name in names if names.count(name) > 1} == TWICE
+
+
+def test_no_two_records_say_the_same():
+    """Four fields or more in common, and four fifths of the smaller one's."""
+    found = set()
+    for (one, these), (other, those) in itertools.combinations(records(), 2):
+        n_common = len(these & those)
+        if n_common >= 4 and n_common >= 0.8 * min(len(these), len(those)):
+            found.add(" and ".join(sorted((one, other))))
+    assert found - ALIKE == set(), "let one of them be the other, or hold it"
+    assert ALIKE - found == set(), "no longer alike: take them off the list"
+
+
+def test_a_file_is_read_in_a_sitting_and_worth_opening():
+    n_lines = {
+        str(path.relative_to(PACKAGE)): path.read_text(encoding="utf-8").count("\n")
+        for path in trees()
+        if path.name != "__init__.py"
+    }
+    assert {name for name, n in n_lines.items() if n > LONGEST} == LONG
+    assert {name for name, n in n_lines.items() if n < SHORTEST} == SHORT
+
+
+def test_the_name_of_an_alarm_is_written_once():
+    where = defaultdict(list)
+    for path, tree in trees().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and node.value in ALARMS.keys() - WORDS_TOO:
+                where[node.value].append(str(path.relative_to(PACKAGE)))
+    assert {name: found for name, found in where.items() if found != ["tracking/alarms.py"]} == {}
+
+
+def test_nothing_is_there_that_nobody_calls():
+    """Decorators call routes and checks of fields; what REST shows is named in words."""
+    tool = vulture.Vulture(
+        ignore_decorators=["@*.get", "@*.post", "@*.put", "@*.delete", "@*_validator*"]
+    )
+    tool.scavenge([str(ROOT / name) for name in ("service", "sim_rtc", "studies", "benchmarks")])
+    idle = {
+        item.name
+        for item in tool.get_unused_code()
+        if PACKAGE in item.filename.parents
+        and item.typ not in {"variable", "attribute", "property"}
+    }
+    assert idle == CALLED_FROM_ELSEWHERE

@@ -6,6 +6,7 @@ import pytest
 
 from service.tracking import events as ev
 from service.tracking.loop import extended_gains
+from service.tracking.products import MeasureState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode
 from service.tracking.worth import more_to_try
@@ -78,7 +79,7 @@ def test_a_measurement_that_found_it_partial_is_over_when_it_is_partial_again():
     story.tell(ev.StopDither())
     story.tell(ev.Measure(id="im-1", pattern="hadamard"))
     asked = story.state.measuring
-    record = replace(asked, state="running", start_seq=10)
+    record = replace(asked, state=MeasureState.RUNNING, start_seq=10)
     story.tell(ev.MatrixMeasured(record=record))
     story.tell(partial())
     story.wait(20)

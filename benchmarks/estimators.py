@@ -23,7 +23,7 @@ from service.config import load_instrument
 from service.model.instrument import Mirror
 from service.model.modes import karhunen_loeve_basis
 from service.telemetry import lockin, loopcheck, passive, random_dither
-from service.telemetry.frames import ClosedLoop, FrameBlock
+from service.telemetry.frames import FrameBlock
 from service.telemetry.health import (
     Actuators,
     EdgeHealth,
@@ -38,6 +38,7 @@ from service.telemetry.lockin import LockIn, LockInPlan
 from service.telemetry.loopcheck import LoopCheck
 from service.telemetry.passive import Passive
 from service.telemetry.random_dither import RandomDither, RandomPlan
+from service.telemetry.windows import ClosedLoop
 
 N_SLOPES, N_MODES, N_CONTROLLED = 1408, 594, 400
 RATE_HZ = 1000.0

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from service.tracking import (
     dither,
+    evidence,
     measuring,
     operator,
     reconstructors,
     rtc,
-    windows,
 )
 from service.tracking import events as ev
 from service.tracking.acquisition import abort_on_command, acquire, acquire_on_command
@@ -97,16 +97,16 @@ def _react(turn: Turn) -> None:  # noqa: C901 - one line for each event
         case ev.FarFitted():
             pass  # an acquisition's
         case ev.WindowFitted() if turn.state.measuring is not None:
-            windows.refuse_window(turn, measuring.MEASURING)
+            evidence.refuse_window(turn, measuring.MEASURING)
         case ev.WindowFitted(estimate=estimate) as fitted:
-            windows.on_window(turn, fitted)
+            evidence.on_window(turn, fitted)
             dither.learn(turn, estimate)
         case ev.WindowLost(refused=refused):
-            windows.refuse_window(turn, refused.reason, mistold=refused.mistold)
+            evidence.refuse_window(turn, refused.reason, mistold=refused.mistold)
         case ev.Watched() as watched:
-            windows.on_watchdog(turn, watched)
+            evidence.on_watchdog(turn, watched)
         case ev.Unwatched(text=text):
-            windows.cannot_watch(turn, text)
+            evidence.cannot_watch(turn, text)
         case _:
             _react_to_answer(turn)
 

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from service.config.mirrors import grid
 from service.fit.matrix import fit_matrix
 from service.fit.reference import Reference
+from service.model.detector_windows import frame_windows, slopes_from_frames, slopes_per_unit
 from service.model.instrument import (
     FrameWindows,
     Instrument,
@@ -26,11 +27,10 @@ from service.model.instrument import (
     Pyramid,
     Stop,
 )
-from service.model.interaction import rotation, rtc_valid_subapertures
-from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.interaction import rtc_valid_subapertures
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import modal_basis
 from service.model.slopes import Normalisation, SlopeRecipe
-from service.model.windows import frame_windows, slopes_from_frames, slopes_per_unit
 from sim_rtc.telescope.diffractive import DiffractivePyramid, centred_pupil
 
 Array = NDArray[np.float64]

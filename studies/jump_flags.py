@@ -21,12 +21,12 @@ from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.tracking.estimate import Measured
 from service.tracking.events import Tick
+from service.tracking.evidence import enter
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Source
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
 from service.tracking.validity import taken
-from service.tracking.windows import enter
 
 WINDOW_S = 2.0
 FIT_S = 0.5

@@ -23,7 +23,6 @@ from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.estimates import finished, work_out
 from service.telemetry import random_dither
-from service.telemetry.frames import WindowRefused
 from service.telemetry.random_dither import (
     Correlated,
     RandomDither,
@@ -32,6 +31,7 @@ from service.telemetry.random_dither import (
     joined,
     noisy_matrix,
 )
+from service.telemetry.windows import WindowRefused
 from service.tracking.products import MeasureState, NoisyRecord
 from service.wire import DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker

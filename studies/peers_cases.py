@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from service.config import load_instrument
 from service.model.instrument import Influence, Instrument, Mirror, Stop
-from service.model.interaction import rotation
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Misregistration, rotation
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from studies.peers_pushpull import Bench
 

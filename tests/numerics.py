@@ -24,8 +24,9 @@ from service.model.instrument import (
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from service.telemetry.frames import ClosedLoop, FrameBlock
+from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockInPlan
+from service.telemetry.windows import ClosedLoop
 
 Array = NDArray[Any]
 

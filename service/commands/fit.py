@@ -16,8 +16,8 @@ from service.files.figures import check_plots, write_sheet
 from service.files.light import Light, read_light
 from service.files.report import document, fill_fit, table
 from service.files.run import fit_file
+from service.fit.light_rotation import Arms
 from service.fit.matrix import FitOptions, Method
-from service.fit.pupil_rotation import Arms
 from service.model.instrument import Instrument
 
 ACCEPTED, REFUSED = 0, 1

@@ -20,6 +20,7 @@ from service.config.instrument_schema import (
 from service.config.mirrors import MirrorFile, own_modes, read_mirror
 from service.config.sources import read_dataset, refuse
 from service.errors import ConfigurationError, ModelError
+from service.model.detector_windows import by_quadrant
 from service.model.instrument import (
     FrameWindows,
     Instrument,
@@ -31,7 +32,6 @@ from service.model.instrument import (
     TabulatedModes,
 )
 from service.model.slopes import Normalisation, Orientation, SlopeOrder, SlopeRecipe
-from service.model.windows import by_quadrant
 
 _SEPARATION_TOLERANCE = 0.1
 

@@ -17,8 +17,7 @@ from service.files.report import FitReport, verdict_line
 from service.fit.matrix import Fit
 from service.fit.methods import ScanStep
 from service.model.instrument import Instrument, TabulatedModes
-from service.model.interaction import rotation
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Misregistration, rotation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

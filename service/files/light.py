@@ -18,7 +18,7 @@ from service.fit.light import (
     measured_illumination,
     relative_light,
 )
-from service.fit.pupil_rotation import Arms, LightRotation, find_rotation
+from service.fit.light_rotation import Arms, LightRotation, find_rotation
 from service.model.instrument import Instrument
 from service.model.pupil import Illumination
 from service.model.slopes import turned_mask

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from service.fit.pupil_rotation import Arms
+    from service.fit.light_rotation import Arms
     from service.model.misregistration import Misregistration
 
 MOST_MODES = 100_000
@@ -83,7 +83,7 @@ def parse_arms(text: str) -> Arms:
     if not angles or len(width) != 1 or width[0] <= 0.0:
         expected = "expected WIDTH:DEG,DEG,... of the spider's arms, like 0.9:90,210,330"
         raise ValueError(f"found {text.strip()!r}, {expected}")
-    from service.fit.pupil_rotation import Arms
+    from service.fit.light_rotation import Arms
 
     return Arms(angles_rad=tuple(math.radians(a) for a in angles), width_subap=width[0])
 

@@ -16,8 +16,8 @@ from service.files.container import FLUX_FRAME, Recorded, read_recorded
 from service.files.report import FitReport, instrument_sha256
 from service.fit.matrix import FitOptions, fit_matrix
 from service.fit.reference import Reference
+from service.model.detector_windows import frame_windows, slopes_from_frames
 from service.model.instrument import FrameWindows, Instrument
-from service.model.windows import frame_windows, slopes_from_frames
 
 Progress = Callable[[str], None]
 

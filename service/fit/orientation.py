@@ -23,8 +23,8 @@ from service.fit.models import LowOrder, low_order_of
 from service.fit.reference import Reference, Target, oriented, target_of
 from service.fit.solver import vertex
 from service.model.instrument import Instrument
-from service.model.interaction import InteractionModel, rotation, rtc_valid_subapertures
-from service.model.misregistration import Misregistration, wrapped
+from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.misregistration import Misregistration, rotation, wrapped
 from service.model.modes import Basis
 from service.model.pyramid import Mapper
 from service.model.slopes import Orientation, SlopeOrder, turned_mask

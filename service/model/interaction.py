@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.model.instrument import Instrument, Stop
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Misregistration, rotation
 from service.model.modes import Basis
 from service.model.pupil import Illumination, annular_pupil, instrument_pupil
 from service.model.pyramid import Mapper, Nodes, PyramidOptics, Response, enough_modulation_points
@@ -347,12 +347,6 @@ def _times(slopes: Array, flux_gradient: Array) -> Array:
         return np.asarray(column * flux_gradient)
     both = column.reshape(2, -1, 1) * flux_gradient
     return both.reshape(len(slopes), -1)
-
-
-def rotation(angle_rad: float) -> NDArray[np.float64]:
-    """Return R with ``R @ p`` turned from +x towards +y; ``p @ R`` turns rows back."""
-    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[cosine, -sine], [sine, cosine]])
 
 
 @dataclass(slots=True)

@@ -94,3 +94,9 @@ class Misregistration:
         """Return the four named numbers used on the wire, in files and in REST (degrees)."""
         values = self.vector * BOUNDARY_SCALE
         return dict(zip(PARAMETERS, (float(v) for v in values), strict=True))
+
+
+def rotation(angle_rad: float) -> NDArray[np.float64]:
+    """Return R with ``R @ p`` turned from +x towards +y; ``p @ R`` turns rows back."""
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cosine, -sine], [sine, cosine]])

@@ -22,11 +22,12 @@ from service.runtime.streams import (
     with_matrix,
     with_rtc,
 )
-from service.telemetry.frames import FrameBlock, WindowRefused
+from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import Spectra
 from service.telemetry.passive import Passive
 from service.telemetry.played import LOUDER, Finding
 from service.telemetry.random_dither import Correlated
+from service.telemetry.windows import WindowRefused
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.alarms import (

@@ -17,18 +17,18 @@ from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
 from service.telemetry import lockin, random_dither
-from service.telemetry.frames import ClosedLoop, Telemetry, WindowRefused
 from service.telemetry.lockin import Spectra, WindowEstimate
 from service.telemetry.openloop import FarEstimate
 from service.telemetry.passive import Passive
 from service.telemetry.random_dither import Correlated, RandomEstimate, noisy_matrix
+from service.telemetry.windows import ClosedLoop, Telemetry, WindowRefused
 from service.tracking import events as ev
 from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
 from service.tracking.events import Event
+from service.tracking.evidence import fit_begins_at
 from service.tracking.loop import loop_numbers
 from service.tracking.products import MeasureState, NoisyFinding, NoisyRecord, ReconstructorRecord
 from service.tracking.state import Level, TrackerState
-from service.tracking.windows import fit_begins_at
 from service.wire import checksum
 from service.worker import OpticsWorker, run_job
 

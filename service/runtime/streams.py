@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.telemetry import loopcheck, passive
-from service.telemetry.frames import ClosedLoop, FrameBlock, WindowRefused
+from service.telemetry.frames import FrameBlock
 from service.telemetry.health import (
     EdgeHealth,
     EdgeWatch,
@@ -24,6 +24,7 @@ from service.telemetry.loopcheck import LoopCheck, LoopLaw, Obedience
 from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, measured
 from service.telemetry.random_dither import Correlated, RandomDither
+from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.tracking.dither_request import SETTLING_S, Dither, asked_of, lock_in_plan, random_plan
 from service.tracking.loop import last_seq, same_loop, same_rate, why_open
 from service.wire import DitherKind, Status

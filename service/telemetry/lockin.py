@@ -20,16 +20,16 @@ from service.errors import ModelError
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import DitheredEstimate
-from service.telemetry.frames import (
+from service.telemetry.frames import FrameBlock
+from service.telemetry.windows import (
     CHUNK_FRAMES,
     ClosedLoop,
-    FrameBlock,
     Telemetry,
     Window,
     WindowCutter,
     WindowPlan,
 )
-from service.telemetry.frames import WindowRefused as WindowRefused
+from service.telemetry.windows import WindowRefused as WindowRefused
 
 Array = NDArray[Any]
 

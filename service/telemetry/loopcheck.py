@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import unit_like
-from service.telemetry.frames import ClosedLoop, FrameBlock, joined_frames
+from service.telemetry.frames import FrameBlock, joined_frames
+from service.telemetry.windows import ClosedLoop
 
 Array = NDArray[Any]
 

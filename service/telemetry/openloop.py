@@ -19,8 +19,8 @@ from service.fit import solver
 from service.fit.solver import LONGEST_STEP, Columns
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import ClosedLoop, WindowRefused
 from service.telemetry.lockin import MAX_LAG_FRAMES, Spectra, WindowEstimate, fit_window
+from service.telemetry.windows import ClosedLoop, WindowRefused
 
 Array = NDArray[Any]
 

@@ -25,7 +25,8 @@ from service.fit.solver import Columns
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import Estimate
-from service.telemetry.frames import CHUNK_FRAMES, FrameBlock, joined_frames
+from service.telemetry.frames import FrameBlock, joined_frames
+from service.telemetry.windows import CHUNK_FRAMES
 
 Array = NDArray[Any]
 

@@ -20,14 +20,8 @@ from service.fit.solver import Columns, Projection
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import DitheredEstimate
-from service.telemetry.frames import (
-    FrameBlock,
-    Telemetry,
-    Window,
-    WindowCutter,
-    WindowPlan,
-    WindowRefused,
-)
+from service.telemetry.frames import FrameBlock
+from service.telemetry.windows import Telemetry, Window, WindowCutter, WindowPlan, WindowRefused
 
 Array = NDArray[Any]
 

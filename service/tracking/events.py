@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import WindowRefused
 from service.telemetry.lockin import WindowEstimate
 from service.telemetry.openloop import FarEstimate
 from service.telemetry.passive import PassiveEstimate
 from service.telemetry.random_dither import RandomEstimate
+from service.telemetry.windows import WindowRefused
 from service.tracking.products import (
     Judged,
     MeasurementRecord,

@@ -27,10 +27,10 @@ from service.model.turbulence import Halo
 from service.prepared import Prepared
 from service.telemetry import passive
 from service.telemetry.estimate import DitheredEstimate
-from service.telemetry.frames import ClosedLoop, WindowRefused
 from service.telemetry.lockin import Spectra, WindowEstimate, fit_window
 from service.telemetry.openloop import NOT_FOUND, FarEstimate, FarSearch, find
 from service.telemetry.random_dither import Correlated, RandomEstimate, fit_random
+from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.worker.records import (
     Compute,
     Description,

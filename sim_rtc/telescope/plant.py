@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.instrument import Instrument, Mirror, Stop
-from service.model.interaction import rotation, valid_subapertures
-from service.model.misregistration import Misregistration
+from service.model.interaction import valid_subapertures
+from service.model.misregistration import Misregistration, rotation
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
 from sim_rtc.telescope.atmosphere import PhaseResponse

@@ -17,10 +17,10 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.telemetry.frames import ClosedLoop, WindowRefused
 from service.telemetry.lockin import Spectra, WindowEstimate
 from service.telemetry.passive import Passive, PassiveEstimate
 from service.telemetry.random_dither import Correlated, RandomEstimate
+from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import Ahead

@@ -13,7 +13,6 @@ from service.config.policy import policy_of
 from service.model.misregistration import Misregistration
 from service.runtime.streams import PASSIVE_MEMORY_S
 from service.telemetry import lockin
-from service.telemetry.frames import WindowRefused
 from service.telemetry.kalman import (
     Drift,
     Joint,
@@ -25,6 +24,7 @@ from service.telemetry.kalman import (
 )
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.passive import Passive, accumulate
+from service.telemetry.windows import WindowRefused
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.computer import RealTimeComputer

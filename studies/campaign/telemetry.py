@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from service.telemetry import lockin, passive, random_dither
-from service.telemetry.frames import FrameBlock, WindowRefused
+from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.passive import Passive
 from service.telemetry.random_dither import Correlated, RandomDither, RandomPlan
+from service.telemetry.windows import WindowRefused
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.computer import RealTimeComputer

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from service.model.instrument import Stop
-from service.model.interaction import rotation
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Misregistration, rotation
 from service.model.slopes import (
     Orientation,
     SlopeOrder,

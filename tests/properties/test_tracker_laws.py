@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 
 from service.errors import CommandError
-from service.telemetry.frames import WindowRefused
+from service.telemetry.windows import WindowRefused
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.dither_request import total_m

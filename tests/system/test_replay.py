@@ -15,8 +15,8 @@ from service.link.session import Endpoint
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime.actions import record_of
 from service.runtime.engine import Engine
-from service.telemetry.frames import ClosedLoop as FitLoop
 from service.telemetry.lockin import WindowEstimate
+from service.telemetry.windows import ClosedLoop as FitLoop
 from service.tracking import events as ev
 from service.tracking.policy import Policy
 from service.tracking.state import Mode, TrackerState

@@ -17,7 +17,7 @@ from service.model.slopes import Orientation
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from tests.data.tiny.make import ALPHA, HERE, ORIENTATION, SEED
 from tests.unit.fit.lamps import beam, counts_of, flao, gaussian
-from tests.unit.fit.test_pupil_rotation import SHIFT, TRIPOD, arms, shaded, turned
+from tests.unit.fit.test_light_rotation import SHIFT, TRIPOD, arms, shaded, turned
 
 
 def oriented(orientation):

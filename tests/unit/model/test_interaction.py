@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from service.model.instrument import Stop
-from service.model.interaction import InteractionModel, reference_slopes, rotation
-from service.model.misregistration import Misregistration
+from service.model.interaction import InteractionModel, reference_slopes
+from service.model.misregistration import Misregistration, rotation
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.model.pupil import instrument_pupil
 from service.model.pyramid import PyramidOptics

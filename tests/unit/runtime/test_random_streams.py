@@ -7,9 +7,10 @@ import pytest
 
 from service.errors import CommandError, ModelError
 from service.runtime.streams import Streams, fed, with_dither, with_rtc
-from service.telemetry.frames import FrameBlock, WindowRefused
+from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn
 from service.telemetry.random_dither import Correlated
+from service.telemetry.windows import WindowRefused
 from service.tracking.dither_request import Dither, RandomChoice, plan_random
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest

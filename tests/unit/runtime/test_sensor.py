@@ -10,7 +10,7 @@ from service.control.gate import judge
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.turbulence import working_point
-from service.telemetry.frames import ClosedLoop
+from service.telemetry.windows import ClosedLoop
 from service.worker import OpticsWorker, sensor
 from service.worker.sensor import FOLLOWED, STRENGTHS
 from tests.unit.runtime.small import (

@@ -13,9 +13,10 @@ from service.runtime.streams import (
     with_matrix,
     with_rtc,
 )
-from service.telemetry.frames import FrameBlock, WindowRefused
+from service.telemetry.frames import FrameBlock
 from service.telemetry.health import LOW_MODES, Actuators
 from service.telemetry.lockin import Spectra
+from service.telemetry.windows import WindowRefused
 from service.tracking import events as ev
 from service.tracking.dither_request import Dither
 from service.tracking.state import TrackerState

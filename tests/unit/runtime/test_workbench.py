@@ -8,8 +8,9 @@ import pytest
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.telemetry import passive
-from service.telemetry.frames import ClosedLoop, FrameBlock, WindowRefused
+from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
+from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.worker import OpticsWorker, run_job
 from tests.unit.runtime.small import (
     COMPUTE,

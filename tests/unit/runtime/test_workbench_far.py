@@ -5,9 +5,10 @@ import pytest
 
 from service.control.dither import FINER, SMOOTH, lines_of, modes_of
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import FrameBlock, WindowRefused
+from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, accumulate
 from service.telemetry.openloop import FarEstimate
+from service.telemetry.windows import WindowRefused
 from service.worker import OpticsWorker
 from tests.unit.fit.lamps import counts_of
 from tests.unit.runtime.small import COMPUTE, small_instrument

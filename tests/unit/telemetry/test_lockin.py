@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.telemetry.frames import FrameBlock, WindowRefused
+from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import (
     SIDE_OFFSETS_HZ,
     LockIn,
@@ -17,6 +17,7 @@ from service.telemetry.lockin import (
     accumulate,
     joined,
 )
+from service.telemetry.windows import WindowRefused
 from tests.numerics import DT_NS, FRAME_RATE_HZ, T0_NS, block_of, part, sines
 
 N_FRAMES = 1000

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from service.telemetry.frames import FrameBlock, WindowRefused
+from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
+from service.telemetry.windows import WindowRefused
 
 PLAN = LockInPlan(
     modes=(0,),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.telemetry.frames import ClosedLoop, FrameBlock
+from service.telemetry.frames import FrameBlock
 from service.telemetry.loopcheck import (
     ENOUGH_SAMPLES,
     KEPT_SAMPLES,
@@ -14,6 +14,7 @@ from service.telemetry.loopcheck import (
     obedience,
     observe,
 )
+from service.telemetry.windows import ClosedLoop
 
 N_SLOPES, N_MODES, N_CONTROLLED = 60, 24, 16
 RATE_HZ = 1000.0

@@ -9,9 +9,9 @@ import pytest
 from service.control.dither import FINER, SMOOTH, lines_of, modes_of
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import WindowRefused
 from service.telemetry.lockin import LockIn, LockInPlan, accumulate
 from service.telemetry.openloop import UNEXPLAINED, FarEstimate, FarSearch, find
+from service.telemetry.windows import WindowRefused
 from tests.numerics import (
     FRAME_RATE_HZ,
     N_MODES,

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import CHUNK_FRAMES
 from service.telemetry.passive import (
     SAMPLES_KEPT,
     TAPER_FRAMES,
@@ -17,6 +16,7 @@ from service.telemetry.passive import (
     fit,
     passive_matrix,
 )
+from service.telemetry.windows import CHUNK_FRAMES
 from tests.numerics import (
     N_CONTROLLED,
     N_MODES,

@@ -10,7 +10,6 @@ import pytest
 from service.errors import ModelError
 from service.model.interaction import Linearisation
 from service.telemetry import random_dither
-from service.telemetry.frames import WindowRefused
 from service.telemetry.random_dither import (
     Correlated,
     RandomDither,
@@ -21,6 +20,7 @@ from service.telemetry.random_dither import (
     joined,
     noisy_matrix,
 )
+from service.telemetry.windows import WindowRefused
 from tests.numerics import (
     N_MODES,
     SOMEWHERE,

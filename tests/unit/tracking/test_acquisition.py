@@ -7,8 +7,8 @@ import pytest
 
 from service.errors import CommandError
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import WindowRefused
 from service.telemetry.openloop import FarEstimate
+from service.telemetry.windows import WindowRefused
 from service.tracking import events as ev
 from service.tracking.acquisition import PATIENCE_S
 from service.tracking.acquisition_stages import (

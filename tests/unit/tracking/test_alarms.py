@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError
-from service.telemetry.frames import WindowRefused
+from service.telemetry.windows import WindowRefused
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.alarms import ALARMS, Act, Kind

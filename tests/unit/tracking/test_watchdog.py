@@ -8,10 +8,10 @@ import pytest
 from service.model.misregistration import Misregistration
 from service.telemetry.passive import PassiveEstimate
 from service.tracking import events as ev
+from service.tracking.evidence import fit_begins_at
 from service.tracking.loop import loop_numbers
 from service.tracking.registration import Source, Validity
 from service.tracking.state import Mode, TrackerState
-from service.tracking.windows import fit_begins_at
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,

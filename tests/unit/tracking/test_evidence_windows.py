@@ -6,7 +6,7 @@ import pytest
 
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import MODEL_ERROR
-from service.telemetry.frames import WindowRefused
+from service.telemetry.windows import WindowRefused
 from service.tracking import events as ev
 from service.tracking.estimate import HISTORY_LENGTH
 from service.tracking.state import Level, Mode

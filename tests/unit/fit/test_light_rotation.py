@@ -7,7 +7,7 @@ import pytest
 
 from service.errors import ModelError
 from service.fit.light import CannotTell, PupilPosition, measured_illumination, relative_light
-from service.fit.pupil_rotation import Arms, LightRotation, find_rotation
+from service.fit.light_rotation import Arms, LightRotation, find_rotation
 from tests.unit.fit.lamps import beam, counts_of, flao, gaussian
 from tests.unit.fit.test_light_illumination import at
 

@@ -1,6 +1,6 @@
-"""Writes docs/states.md: what the service can be in, from the tables that it goes by itself.
+"""Writes the pages of docs that repeat what the code says: states.md and house.md.
 
-Run: ``python -m studies.state_tables``, then ``git diff``; a test compares.
+Run: ``python -m studies.pages``, then ``git diff``; a test compares.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from service.tracking.products import MatrixState, MeasureState
 from service.tracking.registration import Validity
 from service.tracking.state import AcquisitionStage, Mode
 
-PAGE = Path(__file__).parents[1] / "docs" / "states.md"
+ROOT = Path(__file__).parents[1]
 
 _STATES: dict[str, type[StrEnum]] = {
     "Modes": Mode,
@@ -32,11 +32,11 @@ _STATES: dict[str, type[StrEnum]] = {
 }
 
 
-def page() -> str:
-    """Return docs/states.md."""
+def states() -> str:
+    """Return docs/states.md: what the service can be in, from the tables that it goes by."""
     parts = [
         "# What the service can be in",
-        "Written by `python -m studies.state_tables` from the tables that the service goes by; "
+        "Written by `python -m studies.pages` from the tables that the service goes by; "
         "change those.",
         "## What runs, and which commands that refuses",
         "Two may run at a time: what refuses a command says so, and how to end it.",
@@ -52,6 +52,27 @@ def page() -> str:
         _table(("alarm", "it means", "do", "forbids"), _alarms()),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def house() -> str:
+    """Return docs/house.md: every file of the service and the simulator by its first line."""
+    parts = [
+        "# Which file has what",
+        "Written by `python -m studies.pages` from the first line of each file; change those.",
+    ]
+    for top in ("service", "sim_rtc"):
+        folders = sorted({path.parent for path in (ROOT / top).rglob("*.py")})
+        for folder in folders:
+            rows = [
+                (f"`{path.name}`", (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""))
+                for path in sorted(folder.glob("*.py"))
+            ]
+            lines = [(name, text.partition("\n")[0]) for name, text in rows]
+            parts += [f"## {folder.relative_to(ROOT)}", _table(("file", "has"), lines)]
+    return "\n\n".join(parts) + "\n"
+
+
+PAGES = {"states.md": states, "house.md": house}
 
 
 def _refusals() -> list[tuple[str, ...]]:
@@ -109,4 +130,5 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    for name, page in PAGES.items():
+        (ROOT / "docs" / name).write_text(page(), encoding="utf-8")

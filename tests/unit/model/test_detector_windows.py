@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.instrument import FrameWindows
-from service.model.slopes import Normalisation
-from service.model.windows import (
+from service.model.detector_windows import (
     by_quadrant,
     found_centres,
     frame_windows,
     slopes_from_frames,
     slopes_per_unit,
 )
+from service.model.instrument import FrameWindows
+from service.model.slopes import Normalisation
 from tests.numerics import small_instrument
 
 RECTANGLE = np.array([[14.0, 15.0], [14.0, 45.0], [44.0, 15.0], [44.0, 45.0]])

@@ -26,7 +26,7 @@ demo: $(STAMP) ## service and simulated RTC together; ARGS="--seconds 60" and th
 	@.venv/bin/pyrcal demo $(ARGS)
 
 test: $(STAMP) ## all that a change needs, what is known soonest first; ARGS go to pytest
-	@$(PYTEST) -n 3 -m 'not long and not slow' $(ARGS)
+	@$(PYTEST) -n 2 -m 'not long and not slow' $(ARGS)
 
 test-long: $(STAMP) ## the other tests: what takes minutes of real time
 	@$(PYTEST) -n 3 -m 'long and not slow' $(ARGS)  # they wait more than they work

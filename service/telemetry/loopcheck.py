@@ -6,9 +6,8 @@ itself is wrong.
 
 **Every mode, on a few frames** (``observe``, ``obedience``). Both sides are differenced twice: what
 else moves the mirror (turbulence played on it by day, a vibration) is slow, the sensor's noise is
-not. Then a mode that takes the share r of the steps it is asked for shows r, whatever the
-turbulence does. A command that stays exactly where it was though it was asked to move is at a
-limit.
+not. Then a mode that takes the share r of its steps shows r, whatever the turbulence does. A
+command that stays exactly where it was though it was asked to move is at a limit.
 
 **A few modes, on every frame** (``follow``, ``judged``): ``c[k+1] = leak c[k] - sum_d h_d (R
 s)[k+1-d]``. An RTC that does what it says leaves nothing over: its commands follow from slopes and

@@ -69,9 +69,10 @@ async def test_a_killed_process_is_a_lost_job():
 
 
 async def test_a_job_that_takes_too_long_is_stopped(tmp_path):
+    before = set(multiprocessing.active_children())  # a worker that other tests share
     with pytest.raises(WorkerError, match="longer than 3 s"):
         await run_in_process(partial(process_id, tmp_path), nice=0, limit_s=3.0)
-    assert multiprocessing.active_children() == []
+    assert set(multiprocessing.active_children()) <= before
 
 
 async def test_a_job_nobody_waits_for_is_stopped(tmp_path):

@@ -56,38 +56,35 @@ class Admitted:
 class SessionWatch:
     """A session counts until it falls silent; one that speaks beside it is a second RTC."""
 
-    __slots__ = ("_heard_s", "_left", "_other", "_previous", "_rivals", "_since_s", "current")
+    __slots__ = ("_heard_s", "_left", "_previous", "_rivals", "_since_s", "current", "other")
 
     def __init__(self) -> None:
         self.current: str | None = None
         self._heard_s = 0.0
         self._since_s = 0.0
         self._left = False
-        self._other: str | None = None
+        self.other: str | None = None
+        """Another session that spoke last: the one that counts may be over. None: it is not."""
+
         self._previous: str | None = None
         self._rivals: dict[str, float] = {}
 
     def admit(self, session: str, now_s: float) -> Admitted:
         """Judge a message by its session, and remember that it was heard."""
         if session == self.current:
-            self._heard_s, self._left, self._other = now_s, False, None
+            self._heard_s, self._left, self.other = now_s, False, None
             return Admitted(accepted=True, rival=self._rival(now_s))
         if self.current is None or self._left or now_s - self._heard_s >= SILENCE_S:
             return self._begun(session, now_s)
         echo = session == self._previous and now_s - self._since_s < SILENCE_S
         if not echo and len(self._rivals) < REMEMBERED:
             self._rivals.setdefault(session, now_s)
-            self._other = session
+            self.other = session
         return Admitted(accepted=False)
 
     def leave(self) -> None:
         """Note that the RTC has said goodbye: unless it speaks again, its session is over."""
         self._left = True
-
-    @property
-    def other(self) -> str | None:
-        """Another session that spoke last: the one that counts may be over. None: it is not."""
-        return self._other
 
     def waiting(self, now_s: float) -> str | None:
         """Return the session that will count if the present one stays silent, or None."""
@@ -97,7 +94,7 @@ class SessionWatch:
     def _begun(self, session: str, now_s: float) -> Admitted:
         self._previous, self.current = self.current, session
         self._heard_s = self._since_s = now_s
-        self._left, self._other = False, None
+        self._left, self.other = False, None
         self._rivals.clear()
         return Admitted(accepted=True, previous=self._previous, changed=True)
 

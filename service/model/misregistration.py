@@ -92,8 +92,12 @@ class Misregistration:
 
     def to_boundary(self) -> dict[str, float]:
         """Return the four named numbers used on the wire, in files and in REST (degrees)."""
-        values = self.vector * BOUNDARY_SCALE
-        return dict(zip(PARAMETERS, (float(v) for v in values), strict=True))
+        return at_boundary(self.vector)
+
+
+def at_boundary(four: NDArray[np.float64]) -> dict[str, float]:
+    """Return α or its σ, ``(4,)`` in numeric units, as four named numbers in boundary units."""
+    return dict(zip(PARAMETERS, (four * BOUNDARY_SCALE).tolist(), strict=True))
 
 
 def rotation(angle_rad: float) -> NDArray[np.float64]:

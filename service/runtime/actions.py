@@ -17,7 +17,7 @@ from service.control.loop import ControlLoop
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.model.misregistration import at_boundary
 from service.runtime.estimates import NoisySums
 from service.runtime.ports import RtcPort, StorePort, WorkerPort
 from service.tracking import events as ev
@@ -482,9 +482,7 @@ def manifest_of(
         id=record.id,
         layout=layout,
         alpha=None if record.alpha is None else record.alpha.to_boundary(),
-        sigma=None
-        if record.sigma is None
-        else dict(zip(PARAMETERS, (record.sigma * BOUNDARY_SCALE).tolist(), strict=True)),
+        sigma=None if record.sigma is None else at_boundary(record.sigma),
         im_id=None,
         parent=record.parent,
         basis_id=rtc.basis_id,

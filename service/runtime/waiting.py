@@ -9,7 +9,7 @@ from typing import Final
 
 from service.link.intake import SPARED
 from service.link.statistics import MALFORMED, RECENT_S, USED, Fate, LinkStatistics
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.model.misregistration import at_boundary
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.alarms import Act, forbids
@@ -365,13 +365,12 @@ def state_message(
 ) -> StateMessage:
     """Return the short account of the state for whoever listens on the network."""
     known = state.registration
-    sigma = None if known is None else known.sigma * BOUNDARY_SCALE
     return StateMessage(
         system=state.system,
         t_ns=now_ns,
         mode=state.mode.value,
         alpha=None if known is None else known.alpha.to_boundary(),
-        sigma=None if sigma is None else dict(zip(PARAMETERS, sigma.tolist(), strict=True)),
+        sigma=None if known is None else at_boundary(known.sigma),
         in_use=state.in_use,
         validity=None if known is None else known.standing.validity.value,
         waiting_for=tuple(f"{w.party}: {w.text}"[:TEXT_LIMIT] for w in waiting),

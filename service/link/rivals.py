@@ -77,9 +77,10 @@ class SessionWatch:
         if self.current is None or self._left or now_s - self._heard_s >= SILENCE_S:
             return self._begun(session, now_s)
         echo = session == self._previous and now_s - self._since_s < SILENCE_S
-        if not echo and len(self._rivals) < REMEMBERED:
-            self._rivals.setdefault(session, now_s)
+        if not echo:
             self.other = session
+            if len(self._rivals) < REMEMBERED:
+                self._rivals.setdefault(session, now_s)
         return Admitted(accepted=False)
 
     def leave(self) -> None:

@@ -151,6 +151,7 @@ def test_endless_strangers_are_remembered_within_bounds():
     for k in range(100):
         watch.admit(f"s{k}", 0.01 * k)
     assert len(watch._rivals) <= 16
+    assert watch.other == "s99"
 
 
 # ---------------------------------------------------------------- several services

@@ -40,7 +40,6 @@ from service.wire import (
     Reply,
     Role,
     StateMessage,
-    chunk_index,
     decode_acknowledgement,
     decode_reply,
     encode_alarm,
@@ -326,17 +325,11 @@ class Bridge:
         with query:
             key, part = str(query.key_expr), query.parameters.get("chunk")
             try:
-                if key == self._keys.current:
-                    data, encoding = self._outbox.current_commit(), Encodings.COMMIT
-                else:
-                    index = None if part is None else chunk_index(part, "a query")
-                    data = self._outbox.answer(
-                        self._keys.matrix_id_of(key), index, time.monotonic()
-                    )
-                    encoding = Encodings.COMMIT if index is None else Encodings.BYTES
+                data = self._outbox.asked(self._keys, key, part, time.monotonic())
             except (UnknownIdError, WireError) as error:
                 query.reply_err(str(error).encode())
             else:
+                encoding = Encodings.COMMIT if part is None else Encodings.BYTES
                 query.reply(key, data, encoding=encoding)
 
     def _prepare(self, manifest: Manifest, matrix: NDArray[np.float32]) -> Offer:

@@ -1,4 +1,4 @@
-"""Writes the pages of docs that repeat what the code says: states.md and house.md.
+"""Writes what the pages of docs repeat of the code: states.md, house.md, the tables of rtc.md.
 
 Run: ``python -m studies.pages``, then ``git diff``; a test compares.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
-from collections.abc import Sequence
 from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +19,7 @@ from service.tracking.events import Command
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.registration import Validity
 from service.tracking.state import AcquisitionStage, Mode
+from studies.contract_tables import table, with_tables
 
 ROOT = Path(__file__).parents[1]
 
@@ -40,16 +40,16 @@ def states() -> str:
         "change those.",
         "## What runs, and which commands that refuses",
         "Two may run at a time: what refuses a command says so, and how to end it.",
-        _table(("while", "refused"), _refusals()),
+        table(("while", "refused"), _refusals()),
     ]
     for title, kind in _STATES.items():
         rows = [(f"`{state}`", text) for state, text in _described(kind).items()]
-        parts += [f"## {title}", _table(("state", "meaning"), rows)]
+        parts += [f"## {title}", table(("state", "meaning"), rows)]
     parts += [
         "## Alarms",
         "An alarm lasts as long as what it tells of. What one forbids: "
         + "; ".join(f"*{_plain(act)}*: {_lower(text)}" for act, text in _described(Act).items()),
-        _table(("alarm", "it means", "do", "forbids"), _alarms()),
+        table(("alarm", "it means", "do", "forbids"), _alarms()),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -68,11 +68,16 @@ def house() -> str:
                 for path in sorted(folder.glob("*.py"))
             ]
             lines = [(name, text.partition("\n")[0]) for name, text in rows]
-            parts += [f"## {folder.relative_to(ROOT)}", _table(("file", "has"), lines)]
+            parts += [f"## {folder.relative_to(ROOT)}", table(("file", "has"), lines)]
     return "\n\n".join(parts) + "\n"
 
 
-PAGES = {"states.md": states, "house.md": house}
+def rtc() -> str:
+    """Return docs/rtc.md with the tables of the messages' keys as the records have them."""
+    return with_tables((ROOT / "docs" / "rtc.md").read_text(encoding="utf-8"))
+
+
+PAGES = {"states.md": states, "house.md": house, "rtc.md": rtc}
 
 
 def _refusals() -> list[tuple[str, ...]]:
@@ -122,11 +127,6 @@ def _plain(act: str) -> str:
 
 def _lower(text: str) -> str:
     return text[:1].lower() + text[1:].rstrip(".")
-
-
-def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    lines = [head, ("---",) * len(head), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 if __name__ == "__main__":

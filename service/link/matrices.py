@@ -17,6 +17,7 @@ from service.wire import (
     Keys,
     Manifest,
     MeasuredManifest,
+    chunk_index,
     decode_measured_manifest,
 )
 
@@ -143,6 +144,21 @@ class Outbox:
         if not 0 <= index < len(offer.parts):
             raise UnknownIdError(f"chunk {index} of {matrix_id}: there are {len(offer.parts)}")
         return offer.parts[index]
+
+    def asked(self, keys: Keys, key: str, part: str | None, now_s: float) -> bytes:
+        """Return what answers a query on ``cm/current`` or ``cm/{id}``, or for its ``?chunk=``.
+
+        Raises
+        ------
+        UnknownIdError
+            If it is not on offer.
+        WireError
+            If key or part are none.
+        """
+        if key == keys.current:
+            return self.current_commit()
+        index = None if part is None else chunk_index(part, "a query")
+        return self.answer(keys.matrix_id_of(key), index, now_s)
 
     def _forget(self, now_s: float) -> None:
         idle = [name for name in self._offers if name != self._current]

@@ -87,9 +87,16 @@ class FourNumbers:
     """The four parameters of a registration, or their 1 σ, by their names at every boundary."""
 
     shift_x_subap: Finite
+    """Along +x of the sensor."""
+
     shift_y_subap: Finite
+    """Along +y of the sensor."""
+
     rotation_deg: Finite
+    """From +x towards +y."""
+
     magnification: Finite
+    """1: as the instrument file says."""
 
 
 def pack(record: DataclassInstance, omit: tuple[str, ...] = (), **replaced: object) -> bytes:

@@ -93,6 +93,8 @@ class DitherRequest:
     """Of the command: repeated with the same id it is carried out once."""
 
     kind: DitherKind
+    """Sines, or random signs."""
+
     modes: tuple[Count, ...]
     """0-based basis indices."""
 
@@ -103,6 +105,8 @@ class DitherRequest:
     """Of each mode, below half the frame rate; None: binary."""
 
     duration_s: _Duration
+    """It ends by itself after ``round(duration_s * frame_rate_hz)`` frames."""
+
     seed: Count | None = None
     """Of the binary sequence; None: sine."""
 
@@ -112,6 +116,7 @@ class DitherStop:
     """Stop the dither, whichever plays; this always succeeds."""
 
     id: Id
+    """Of this command, not of the dither that it stops."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +124,11 @@ class LoopRequest:
     """Change the loop; None leaves a value as it is, opening zeroes the integrator."""
 
     id: Id
+    """Of the command: repeated with the same id it is carried out once."""
+
     loop: Loop | None = None
+    """Open or close it; the service never asks for partial."""
+
     gains: tuple[Annotated[float, number(0.0)], ...] | None = None
     """One per mode of the basis, 0 where uncontrolled."""
 
@@ -138,6 +147,8 @@ class MeasureRequest:
     """Of the command, and of the matrix that follows."""
 
     pattern: Pattern
+    """How; the first is mandatory, the others are optional."""
+
     modes: tuple[Count, ...]
     """0-based basis indices."""
 
@@ -163,6 +174,8 @@ class RampRequest:
     """
 
     id: Id
+    """Of the command: repeated with the same id it is carried out once."""
+
     groups: tuple[_Pair, ...]
     """First and last mode of each group, 0-based basis indices, both included; none overlap."""
 
@@ -184,6 +197,8 @@ class Reply:
     """The command's; None when the command had none that could be read."""
 
     accepted: bool
+    """Whether it is, or has been, carried out."""
+
     reason: Text
     """Empty, or begins with missing, v, id, busy, range or unsupported."""
 

@@ -141,8 +141,14 @@ class MeasuredManifest:
     """The RTC's session."""
 
     basis_id: Opaque
+    """As in the frames."""
+
     config_id: Opaque
+    """As in the frames."""
+
     system: Id
+    """The ``{system}`` of the keys."""
+
     created_ns: Count
     """When it was measured, nanoseconds since the Unix epoch, UTC."""
 

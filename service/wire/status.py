@@ -81,6 +81,8 @@ class Status:
     """The RTC's own account of its loop, a few times a second."""
 
     session: Opaque
+    """As in the frames."""
+
     seq: Count | None
     """The last frame processed; None: there has been none yet."""
 
@@ -88,7 +90,11 @@ class Status:
     """Nanoseconds since the Unix epoch, UTC."""
 
     loop: Loop
+    """Closed, open, or closed with the gain of some controlled modes at 0."""
+
     frame_rate_hz: Annotated[float, above(0.0, 1e6)]
+    """Frames a second, nominal or measured."""
+
     delay_frames: Annotated[float, number(0.0, 100.0)]
     """End to end, from exposure to the command that answers it."""
 
@@ -99,14 +105,26 @@ class Status:
     """Per frame; 1 forgets nothing."""
 
     n_slopes: Annotated[int, integer(1)]
+    """Slopes of a frame."""
+
     n_modes: Annotated[int, integer(1)]
+    """Modes of the whole basis, controlled or not."""
+
     n_controlled: Count
+    """Modes that the reconstructor in use commands, the first ones of the basis."""
+
     cm_id: Id | None
     """The reconstructor in use; None when the RTC does not know."""
 
     basis_id: Opaque
+    """Of the modal basis, as in the frames."""
+
     config_id: Opaque
+    """Of the sensor, as in the frames."""
+
     dither: DitherStatus | None
+    """What plays, as it was asked for; None: nothing does."""
+
     max_dither_m: Annotated[float, number(0.0)]
     """Most the RTC accepts for one mode, metres RMS."""
 
@@ -159,6 +177,8 @@ class Acknowledgement:
     """The RTC's word on one reconstructor."""
 
     session: Opaque
+    """The RTC's, as in the frames: an acknowledgement of another session is ignored."""
+
     id: Id | None
     """None: the commit that is rejected could not be read."""
 
@@ -166,6 +186,8 @@ class Acknowledgement:
     """Of the matrix meant, 64 lower-case hex digits; None where ``id`` is."""
 
     state: AckState
+    """How far it has come."""
+
     reason: Text
     """Why it was rejected; empty otherwise."""
 
@@ -178,6 +200,8 @@ class StateMessage:
     """What the service knows, for whoever listens; an RTC ignores it."""
 
     system: Id
+    """The ``{system}`` of the keys."""
+
     t_ns: Count
     """When it was said, nanoseconds since the Unix epoch, UTC."""
 
@@ -206,6 +230,8 @@ class AlarmMessage:
     """One alarm that came or went, for whoever listens."""
 
     system: Id
+    """The ``{system}`` of the keys."""
+
     t_ns: Count
     """When it came or went, nanoseconds since the Unix epoch, UTC."""
 

@@ -219,7 +219,7 @@ class RealTimeComputer:
             settings = self._settings
             return Status(
                 session=self._session,
-                seq=max(self._seq - 1, 0),
+                seq=self._seq - 1 if self._seq else None,
                 t_ns=0,
                 loop=self._loop_state(),
                 frame_rate_hz=settings.frame_rate_hz,

@@ -22,6 +22,7 @@ from service.model.interaction import InteractionModel
 from service.model.modes import ModalBasis
 from service.wire import (
     CHUNK_LIMIT,
+    TEXT_LIMIT,
     Acknowledgement,
     AckState,
     ChunkAssembler,
@@ -197,6 +198,17 @@ class Staging:
             sha256=manifest.layout.sha256,
             state=state,
             reason=reason,
+            frame_seq=None,
+        )
+
+    def unreadable(self, reason: str) -> Acknowledgement:
+        """Return what is said of a commit that cannot be read: nobody knows of which matrix."""
+        return Acknowledgement(
+            session=self._terms().session,
+            id=None,
+            sha256=None,
+            state=AckState.REJECTED,
+            reason=reason[:TEXT_LIMIT],
             frame_seq=None,
         )
 

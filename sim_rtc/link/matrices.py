@@ -149,15 +149,14 @@ class Matrices(Background):
             self._carry_out(self._staging.chunk(matrix_id, index, data))
 
     def _commit(self, key: str, data: bytes) -> None:
+        if self._plan.active(FaultKind.DEAF):
+            return
         try:
             manifest = decode_manifest(data)
             if manifest.id != self._keys.matrix_id_of(key):
                 raise WireError(f"id: {manifest.id} in the manifest at {key}")
         except WireError as error:
-            # Without a readable manifest there is no id and checksum to acknowledge.
-            _log.warning("reconstructor.refused", reason=str(error))
-            return
-        if self._plan.active(FaultKind.DEAF):
+            self._acknowledge(self._staging.unreadable(str(error)))
             return
         if self._refuses():
             reason = "range: refused as a fault asked for"

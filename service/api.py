@@ -15,7 +15,7 @@ from fastapi.routing import APIRoute
 from typing_extensions import override
 
 from service import __version__
-from service.routes import commands, fits, health, matrices, problems, reading, views
+from service.routes import commands, fits, health, matrices, page, problems, reading, stream, views
 from service.routes.admission import Admission, Hosts, server_config
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
@@ -42,7 +42,7 @@ async def answer(
 ) -> None:
     """Answer requests under these ``names`` until it is ``over``."""
     host, port = listener.getsockname()[:2]
-    app = create_app(service, desk, hosts=Hosts(bound=host, allowed=names))
+    app = create_app(service, desk, hosts=Hosts(bound=host, allowed=names), over=over)
     server = _Server(server_config(app, timeout_graceful_shutdown=REQUESTS_WITHIN_S))
     server.over = over
     structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
@@ -65,11 +65,16 @@ class _Server(uvicorn.Server):
 
 
 def create_app(
-    service: Supervisor, desk: FitQueue | None = None, *, hosts: Hosts | None = None
+    service: Supervisor,
+    desk: FitQueue | None = None,
+    *,
+    hosts: Hosts | None = None,
+    over: asyncio.Event | None = None,
 ) -> FastAPI:
     """Return the REST application of a service, and of a desk for fits where there is one.
 
-    It answers to ``hosts``, loopback alone where they are not given, and to no other name.
+    It answers to ``hosts``, loopback alone where they are not given, and to no other name. Streams
+    end when it is ``over``.
 
     Swagger and ReDoc pages are left out: they load their scripts from the internet, which an
     observatory's network need not reach. ``/openapi.json`` is there.
@@ -85,9 +90,12 @@ def create_app(
     )
     app.add_middleware(Admission, hosts=hosts or Hosts())
     app.state.service = service
+    app.state.stream = stream.Stream(service, over or asyncio.Event())
     problems.install(app)
     routers = [
         reading.router,
+        stream.router,
+        page.router,
         commands.router,
         commands.observatory,
         matrices.router,

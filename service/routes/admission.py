@@ -24,6 +24,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.errors import PyrcalError, TooLargeError, TooSlowError
 from service.routes.problems import Problem, known_problem, problem
+from service.routes.stream import ABORT
 
 MOST_BODY_BYTES = 1_000_000
 """Of a request; uploads to be fitted have a limit of their own."""
@@ -229,6 +230,16 @@ async def _busy(scope: Scope, receive: Receive, send: Send) -> None:
     await answer(scope, receive, send)
 
 
+def _abortable(app: Any, transport: asyncio.Transport) -> Any:  # noqa: ANN401 - uvicorn's own
+    """Let the application end the connection itself, where nobody takes what it sends."""
+
+    async def abortable(scope: Scope, receive: Receive, send: Send) -> None:
+        scope["extensions"] = {ABORT: transport.abort}
+        await app(scope, receive, send)
+
+    return abortable
+
+
 class _Connection(H11Protocol):
     """A connection that does not wait for ever, and gives way to others while it does.
 
@@ -249,6 +260,7 @@ class _Connection(H11Protocol):
                 min(resting, key=lambda c: c._since_s).transport.abort()  # noqa: SLF001 - its own
             else:
                 self.app = _busy
+        self.app = _abortable(self.app, transport)
         self._watch()
 
     @override

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from http import HTTPStatus
 from typing import Annotated, Any
@@ -13,13 +14,13 @@ import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
 from service.errors import CommandError
 from service.routes import views
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.routes.views import GainTableShown, MatrixId, ServiceDep, answer, known, shows
-from service.tracking.registration import ModeGain, table_of
+from service.tracking.registration import HistoryEntry, ModeGain, table_of
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -45,6 +46,61 @@ class LimitParameters(Parameters):
 
     limit: int = Field(default=200, ge=1, le=100_000)
     """At most so many entries, the newest ones."""
+
+
+Points = Annotated[int, Field(ge=8, le=2000)]
+Nanoseconds = Annotated[int, Field(ge=0)]
+
+
+class RangeParameters(LimitParameters):
+    """Which part of a history to return."""
+
+    since_ns: Nanoseconds | None = None
+    """From this time on, nanoseconds since the Unix epoch, UTC."""
+
+    until_ns: Nanoseconds | None = None
+    """Up to this time, which belongs to it."""
+
+    since: AwareDatetime | None = None
+    """``since_ns`` as RFC 3339 says it, such as 2026-03-01T21:14:03Z."""
+
+    until: AwareDatetime | None = None
+    """``until_ns`` as RFC 3339 says it."""
+
+    after: Nanoseconds | None = None
+    """``t_ns_utc`` of the last entry of the page before: the ``limit`` entries that follow it,
+    instead of the newest ones; one more where two are of the same time."""
+
+    points: Points | None = None
+    """At most so many entries of the whole range, whatever the limit: the lowest and the highest of
+    each parameter in each part of it."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> RangeParameters:
+        both = {self.since_ns, self.since}, {self.until_ns, self.until}
+        if any(None not in pair for pair in both):
+            raise ValueError("a time in nanoseconds or as RFC 3339, not both")
+        first, last = self.between
+        if first > last:
+            raise ValueError(f"since <= until: since {first} ns, until {last} ns")
+        return self
+
+    @property
+    def between(self) -> tuple[int, int]:
+        """First and last time, nanoseconds."""
+        first = _nanoseconds(self.since) if self.since_ns is None else self.since_ns
+        last = _nanoseconds(self.until) if self.until_ns is None else self.until_ns
+        return first or 0, FOREVER_NS if last is None else last
+
+
+FOREVER_NS = 1 << 63
+"""Nobody asks for later."""
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def _nanoseconds(time: datetime | None) -> int | None:
+    return None if time is None else (time - _EPOCH) // timedelta(microseconds=1) * 1000
 
 
 class MatrixParameters(Parameters):
@@ -120,12 +176,51 @@ async def alpha(request: Request, service: ServiceDep) -> Response:
 
 @router.get("/alpha/history", responses={200: shows(views.HISTORY)})
 async def alpha_history(
-    service: ServiceDep, parameters: Annotated[LimitParameters, Query()]
+    service: ServiceDep, parameters: Annotated[RangeParameters, Query()]
 ) -> Response:
-    """Return the estimates of the last windows, oldest first."""
+    """Return the estimates of the last windows, or of those of a time, oldest first.
+
+    The service remembers the last 5000, and none from before its start.
+    """
     tracker = service.snapshot().tracker
-    last = replace(tracker, history=tracker.history[-parameters.limit :])
-    return answer(last, views.HISTORY)
+    asked = replace(tracker, history=_asked_for(tracker.history, parameters))
+    return await run_in_threadpool(answer, asked, views.HISTORY)
+
+
+History = tuple[HistoryEntry, ...]
+
+
+def _asked_for(history: History, asked: RangeParameters) -> History:
+    first_ns, last_ns = asked.between
+    found = tuple(entry for entry in history if first_ns <= entry.t_ns_utc <= last_ns)
+    if asked.after is not None:
+        found = tuple(entry for entry in found if entry.t_ns_utc > asked.after)
+    if asked.points is not None:
+        return thinned(found, asked.points)
+    if asked.after is None:
+        return found[-asked.limit :]
+    page = found[: asked.limit]
+    rest = found[asked.limit :]
+    return (*page, *(entry for entry in rest if entry.t_ns_utc == page[-1].t_ns_utc))
+
+
+def thinned(history: History, n_points: int) -> History:
+    """Return at most so many entries, with the extremes of each parameter in equal parts of time.
+
+    A line drawn through them looks like one through all, however short a jump was.
+    """
+    if len(history) <= n_points:
+        return history
+    values = np.array([entry.filtered.vector for entry in history])
+    times_s = np.array([entry.t_ns_utc - history[0].t_ns_utc for entry in history]) * 1e-9
+    n_parts = n_points // (2 * values.shape[1])
+    part = (times_s / (np.ptp(times_s) or 1.0) * n_parts).clip(0, n_parts - 1).astype(int)
+    kept: set[int] = set()
+    for members in (np.flatnonzero(part == k) for k in range(n_parts)):
+        if members.size:
+            kept.update(members[values[members].argmin(axis=0)].tolist())
+            kept.update(members[values[members].argmax(axis=0)].tolist())
+    return tuple(history[k] for k in sorted(kept))
 
 
 @router.get("/reconstructors", responses={200: shows(views.RECONSTRUCTORS)})

@@ -83,7 +83,9 @@ class Actions:
         self._bridge = bridge
         self._workers = workers
         self._archive = archive
-        self._instrument = instrument
+        self.instrument = instrument
+        """The telescope that it is all done for."""
+
         self._publishing = publishing
         self._clock_ns = clock_ns
         self._matrices: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
@@ -160,7 +162,7 @@ class Actions:
         """
         record = _measurement_of(heard.manifest)
         if heard.matrix is not None:
-            instrument = self._instrument.name
+            instrument = self.instrument.name
             store = self._archive.measured.store
             await asyncio.to_thread(store, record, heard.matrix, instrument)
         return ev.MatrixMeasured(record=record)
@@ -355,7 +357,7 @@ class Actions:
         self._remember(record.id, matrix)
         covariance = None if registration is None else registration.total_covariance
         provenance = {
-            "instrument": self._instrument.name,
+            "instrument": self.instrument.name,
             "software": f"pyrcal {__version__}",
             "why": why,
         }
@@ -373,7 +375,7 @@ class Actions:
         try:
             same = checksum(self._archive.reconstructors.matrix(record.id)) == record.sha256
         except UnknownIdError:
-            provenance = {"instrument": self._instrument.name, "why": record.reason}
+            provenance = {"instrument": self.instrument.name, "why": record.reason}
             self._archive.reconstructors.store(record, matrix, None, provenance)
             return
         if not same:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from service.archive import Archive
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.link.matrices import MeasuredMatrix
+from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions, why_not
 from service.runtime.engine import Engine
@@ -79,6 +80,16 @@ class Supervisor:
 
         self._started_ns = time.time_ns()
         self._log = structlog.get_logger().bind(system=state.system)
+
+    @property
+    def instrument(self) -> Instrument:
+        """The telescope it works for."""
+        return self._actions.instrument
+
+    @property
+    def policy(self) -> Policy:
+        """The user's numbers that it goes by."""
+        return self._engine.policy
 
     def snapshot(self) -> Snapshot:
         """Return what is known now."""

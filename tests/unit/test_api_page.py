@@ -1,0 +1,151 @@
+"""What the operator's page is made of: the mirror it draws, the history it shows."""
+
+from dataclasses import replace
+
+import httpx
+import numpy as np
+import pytest
+
+from service.api import create_app
+from service.config import packaged_instrument
+from service.model.instrument import TabulatedModes
+from service.model.misregistration import PARAMETERS
+from tests.unit.test_api import (
+    ALPHA,
+    LINK,
+    SECOND,
+    STATE,
+    FakeService,
+    Snapshot,
+    assert_problem,
+    body_of,
+    entry,
+)
+from tests.unit.tracking.situations import POLICY
+
+
+@pytest.fixture
+def service():
+    service = FakeService(
+        Snapshot(
+            tracker=STATE, link=LINK, now_ns=100, started_ns=40, ready=True, ready_reason="ready"
+        )
+    )
+    service.instrument = packaged_instrument("flao-lbt")
+    service.policy = POLICY
+    return service
+
+
+@pytest.fixture
+async def client(service):
+    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+        yield client
+
+
+# --- the mirror
+
+
+async def test_the_mirror_is_drawn_in_subapertures_about_the_centre(client):
+    body = await body_of(client, "/v1/mirror")
+    assert (body["n_subapertures"], body["pupil_diameter_subap"]) == (30, 30.0)
+    assert (body["obscuration_ratio"], body["stop"]) == (0.11, "mirror")
+    places = np.array(body["actuators"])
+    assert places.shape == (663, 2)
+    # thirteen rings of FLAO, the outermost at 13.5 pitches of 0.3 m; 8.22 m are 30 subapertures
+    assert np.hypot(*places.T).max() == pytest.approx(13.5 * 0.3 / 8.22 * 30, abs=1e-3)
+    assert body["nominal"] == dict(zip(PARAMETERS, (0.0, 0.0, 0.0, 1.0), strict=True))
+    tolerance = POLICY.update_threshold
+    assert body["tolerance"]["rotation_deg"] == pytest.approx(np.rad2deg(tolerance[2]))
+
+
+async def test_a_mirror_seen_from_behind_is_drawn_so(client, service):
+    before = (await body_of(client, "/v1/mirror"))["actuators"]
+    mirror = replace(service.instrument.mirror, parity=-1)
+    service.instrument = replace(service.instrument, mirror=mirror)
+    after = (await body_of(client, "/v1/mirror"))["actuators"]
+    np.testing.assert_allclose(after, np.array(before) * [1, -1])
+
+
+async def test_of_measured_modes_nobody_knows_the_actuators(client, service):
+    modes = TabulatedModes(cube=np.zeros((2, 3, 3)), pitch_m=1.0, known=np.ones((3, 3), bool))
+    service.instrument = replace(service.instrument, mirror=modes)
+    assert (await body_of(client, "/v1/mirror"))["actuators"] == []
+
+
+# --- the history
+
+
+def times(body):
+    return [e["t_ns_utc"] // SECOND for e in body["entries"]]
+
+
+async def history(client, **parameters):
+    return await body_of(client, "/v1/alpha/history", **parameters)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "expected"),
+    [
+        ({"since_ns": 2 * SECOND}, [2, 3, 4]),
+        ({"until_ns": 2 * SECOND}, [0, 1, 2]),
+        ({"since": "1970-01-01T00:00:01Z", "until": "1970-01-01T02:00:03+02:00"}, [1, 2, 3]),
+        ({"since_ns": SECOND, "limit": 2}, [3, 4]),
+        ({"since_ns": 9 * SECOND}, []),
+        ({"after": SECOND, "limit": 2}, [2, 3]),
+        ({"after": 4 * SECOND}, []),
+    ],
+)
+async def test_a_part_of_the_history_is_asked_for_by_its_time(client, parameters, expected):
+    assert times(await history(client, **parameters)) == expected
+
+
+async def test_page_by_page_is_all_of_it_two_of_one_time_too(client, service):
+    every = tuple(entry(k // 2) for k in range(20))
+    service.change(history=every)
+    found, after = [], 0
+    while page := times(await history(client, after=after, limit=3)):
+        found += page
+        after = page[-1] * SECOND
+    assert found == [k // 2 for k in range(2, 20)]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"since_ns": 2, "until_ns": 1}, ["since 2 ns, until 1 ns"]),
+        ({"since_ns": 2, "since": "1970-01-01T00:00:01Z"}, ["not both"]),
+        ({"since": "1970-01-01T00:00:01"}, ["since"]),
+        ({"since": "yesterday"}, ["since"]),
+        ({"points": 3000}, ["points"]),
+        ({"after": -1}, ["after"]),
+        ({"sinse": 1}, ["sinse: unknown"]),
+    ],
+)
+async def test_a_range_that_is_none_is_refused_with_what_was_found(client, parameters, words):
+    answer = await client.get("/v1/alpha/history", params=parameters)
+    assert_problem(answer, 422, "invalid", *words)
+
+
+async def test_of_a_night_every_extreme_is_kept_however_short(client, service):
+    rng = np.random.default_rng(1)
+    values = np.cumsum(rng.normal(0.0, 0.01, (5000, 4)), axis=0)
+    values[2500, 0] = 9.0  # a jump of a single window
+    values[:, 3] = 1.0 + 1e-3 * values[:, 3]
+    service.change(
+        history=tuple(
+            replace(entry(k), filtered=type(ALPHA).from_vector(vector))
+            for k, vector in enumerate(values)
+        )
+    )
+    body = await history(client, points=800)
+    assert 200 < len(body["entries"]) <= 800
+    found = np.array([list(e["filtered"].values()) for e in body["entries"]])
+    found[:, 2] = np.deg2rad(found[:, 2])
+    np.testing.assert_allclose(found.min(axis=0), values.min(axis=0))
+    np.testing.assert_allclose(found.max(axis=0), values.max(axis=0))
+    assert times(body) == sorted(times(body))
+
+
+async def test_few_entries_are_not_thinned(client):
+    assert times(await history(client, points=8)) == [0, 1, 2, 3, 4]

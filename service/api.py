@@ -11,11 +11,22 @@ from typing import Any
 import structlog
 import uvicorn
 from fastapi import FastAPI
-from fastapi.routing import APIRoute
+from fastapi.routing import APIRoute, iter_route_contexts
 from typing_extensions import override
 
 from service import __version__
-from service.routes import commands, fits, health, matrices, page, problems, reading, stream, views
+from service.routes import (
+    commands,
+    fits,
+    health,
+    matrices,
+    orders,
+    page,
+    problems,
+    reading,
+    stream,
+    views,
+)
 from service.routes.admission import Admission, Hosts, server_config
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
@@ -117,8 +128,24 @@ class _Application(FastAPI):
     def openapi(self) -> dict[str, Any]:
         if self.openapi_schema is None:
             document = super().openapi()
-            document["components"]["schemas"] |= views.schemas()
+            document["components"]["schemas"] |= views.schemas() | self._tell_bodies(document)
         return super().openapi()
+
+    def _tell_bodies(self, document: dict[str, Any]) -> dict[str, views.Schema]:
+        """Say of each operation what it reads, and return the schemas of that."""
+        read = {
+            f"{method.lower()} {route.path_format}": found.call
+            for route in iter_route_contexts(self.routes)
+            if isinstance(route.original_route, APIRoute)
+            for found in route.dependant.dependencies
+            for method in route.methods or ()
+            if isinstance(found.call, orders.Body)
+        }
+        bodies, schemas = orders.bodies(read)
+        for operation, body in bodies.items():
+            method, _, path = operation.partition(" ")
+            document["paths"][path][method]["requestBody"] = body
+        return schemas
 
 
 def _operation_id(route: APIRoute) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
-from service.tracking.events import GainGroup
+from service.tracking.commands import GainGroup
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState, Waiting
 from service.wire import Status

@@ -6,6 +6,7 @@ night therefore replays exactly, and every reaction of the service can be tested
 
 from __future__ import annotations
 
+from service.tracking import commands as cmd
 from service.tracking import (
     dither,
     evidence,
@@ -17,7 +18,8 @@ from service.tracking import (
 from service.tracking import events as ev
 from service.tracking.acquisition import abort_on_command, acquire, acquire_on_command
 from service.tracking.activity import refuse_if_occupied
-from service.tracking.events import Command, Effect, Event
+from service.tracking.commands import Command
+from service.tracking.events import Effect, Event
 from service.tracking.loop import CommandState
 from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
@@ -173,29 +175,29 @@ def _react_to_failure(turn: Turn, effect: Effect, text: str) -> None:
 
 def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
     match turn.event:
-        case ev.SetMode(mode=mode):
+        case cmd.SetMode(mode=mode):
             operator.set_mode(turn, mode)
-        case ev.SetPointing(pointing=pointing):
+        case cmd.SetPointing(pointing=pointing):
             point(turn, pointing)
-        case ev.SetLoop() as command:
+        case cmd.SetLoop() as command:
             operator.set_loop(turn, command)
-        case ev.Ramp() as command:
+        case cmd.Ramp() as command:
             operator.ramp(turn, command)
-        case ev.Acquire():
+        case cmd.Acquire():
             acquire_on_command(turn)
-        case ev.AbortAcquisition():
+        case cmd.AbortAcquisition():
             abort_on_command(turn)
-        case ev.StartDither() as command:
+        case cmd.StartDither() as command:
             operator.start_dither(turn, command)
-        case ev.StopDither():
+        case cmd.StopDither():
             dither.stop_by_operator(turn)
-        case ev.Measure() as command:
+        case cmd.Measure() as command:
             measuring.measure(turn, command)
-        case ev.GiveUp(id=name):
+        case cmd.GiveUp(id=name):
             measuring.give_up_measuring(turn, name)
-        case ev.MeasureNoisy() as command:
+        case cmd.MeasureNoisy() as command:
             measuring.measure_noisy(turn, command)
-        case ev.GiveUpNoisy(id=name):
+        case cmd.GiveUpNoisy(id=name):
             measuring.give_up_noisy(turn, name)
         case _:
             _obey_about_matrices(turn)
@@ -203,15 +205,15 @@ def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
 
 def _obey_about_matrices(turn: Turn) -> None:
     match turn.event:
-        case ev.Refit(n_modes=n_modes):
+        case cmd.Refit(n_modes=n_modes):
             operator.refit(turn, n_modes)
-        case ev.Approve(id=name):
+        case cmd.Approve(id=name):
             operator.approve(turn, name)
-        case ev.Reject(id=name, reason=reason):
+        case cmd.Reject(id=name, reason=reason):
             operator.reject(turn, name, reason)
-        case ev.Publish(id=name):
+        case cmd.Publish(id=name):
             operator.publish(turn, name)
-        case ev.Rollback():
+        case cmd.Rollback():
             operator.roll_back(turn)
         case _:
             raise TypeError(f"an event the tracker does not know: {turn.event!r}")

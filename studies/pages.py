@@ -15,7 +15,7 @@ from typing import get_args
 
 from service.tracking.activity import ALLOWS
 from service.tracking.alarms import ALARMS, Act
-from service.tracking.events import Command
+from service.tracking.commands import Command
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.registration import Validity
 from service.tracking.state import AcquisitionStage, Mode

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.control.gate import FORGIVING_LEAK
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Mode
 from service.worker import Compute, OpticsWorker
@@ -78,7 +79,7 @@ def leak(given: argparse.Namespace, bench: OpticsWorker) -> None:
     """Print what becomes of the modes while the leak is too weak for so many, and after."""
     night = night_of(given, [], {}, bench)
     night.advance(given.seconds / 4)
-    night.command(ev.SetLoop(leak=FORGIVING_LEAK))
+    night.command(cmd.SetLoop(leak=FORGIVING_LEAK))
     sys.stdout.write(f"{night.time_s:6.1f} s: the operator sets a leak of {FORGIVING_LEAK}\n")
     night.advance(3 * given.seconds / 4)
     _tell(night)

@@ -142,7 +142,7 @@ async def _invalid(request: Request, error: RequestValidationError) -> JSONRespo
 
 def _line(error: Mapping[str, Any]) -> str:
     where = ".".join(str(part) for part in error["loc"])
-    if error["type"] == "extra_forbidden":
+    if error["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
         return f"{where}: unknown"
     if error["type"] == "missing":
         return f"{where}: missing"

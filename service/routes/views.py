@@ -13,7 +13,7 @@ import math
 import re
 import sys
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import cache
@@ -36,8 +36,8 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistr
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 from service.snapshot import Alpha, Pace, Rtc, Snapshot
+from service.tracking.commands import GainGroup
 from service.tracking.dither_request import Dither, Dithering, DitherPlan
-from service.tracking.events import GainGroup
 from service.tracking.loop import LoopCommand
 from service.tracking.products import (
     Assessment,
@@ -272,10 +272,8 @@ def _without_none(kind: Any) -> Any:  # noqa: ANN401  a type
 def _facts(record: type) -> tuple[dict[str, Any], dict[str, str]]:
     """Return types and descriptions of a record's fields and properties, by name."""
     hints = get_type_hints(record) if is_dataclass(record) else {}
-    tree = ast.parse(textwrap.dedent(inspect.getsource(record)))
     texts = {}
-    (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
-    for statement, after in pairwise([*body, ast.Pass()]):
+    for statement, after in pairwise([*_statements(record), ast.Pass()]):
         match statement, after:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(
                 value=ast.Constant(value=str(text))
@@ -288,6 +286,18 @@ def _facts(record: type) -> tuple[dict[str, Any], dict[str, str]]:
             case _:
                 pass
     return hints, texts
+
+
+def _statements(record: type) -> Iterator[ast.stmt]:
+    """Yield what the source of a record says, of those it is derived from first."""
+    for base in reversed(record.__mro__[:-1]):
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        yield from tree.body if isinstance(tree, ast.ClassDef) else ()
+
+
+def explained(record: type) -> dict[str, str]:
+    """Return what a record says of its fields, by name."""
+    return {name: _for_readers(text) for name, text in _facts(record)[1].items()}
 
 
 def _for_readers(text: str) -> str:

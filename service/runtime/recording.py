@@ -14,7 +14,8 @@ from service.archive import Archive, AuditEntry
 from service.errors import ArchiveError, StorageError
 from service.tracking import events as ev
 from service.tracking.alarms import ARCHIVE_FAILED
-from service.tracking.events import Command, Effect
+from service.tracking.commands import Command
+from service.tracking.events import Effect
 from service.tracking.operator import orders_of
 from service.tracking.policy import Policy
 from service.tracking.products import ReconstructorRecord

@@ -27,8 +27,10 @@ from service.runtime.workers import PaceMeter, WorkerPool
 from service.snapshot import Snapshot
 from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
+from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.events import Command, Effect, Event
+from service.tracking.commands import Command
+from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.products import MeasureState
 from service.tracking.state import Level, TrackerState, Waiting
@@ -131,7 +133,7 @@ class Supervisor:
         StorageError
             If it cannot be recorded; nothing has been done.
         """
-        if isinstance(command, ev.SetPointing):  # told every second, and decides nothing
+        if isinstance(command, cmd.SetPointing):  # told every second, and decides nothing
             effects = self._post(command)
         else:
             await self._recorder.ordered(command)
@@ -146,7 +148,7 @@ class Supervisor:
         """Do what is asked; hear what the RTC says to it where that takes but a moment."""
         running = set(self._running)
         effects = self._post(command)
-        if isinstance(command, ev.Measure | ev.SetLoop | ev.Ramp):
+        if isinstance(command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
             asked = self._running - running
             if asked:
                 await asyncio.wait(asked)

@@ -19,6 +19,7 @@ from dataclasses import replace
 from service.control.gate import FORGIVING_LEAK
 from service.errors import CommandError
 from service.telemetry.openloop import NOT_FOUND
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import (
     abort,
@@ -182,9 +183,9 @@ def _end_by_event(turn: Turn) -> bool:
     acquisition, state = turn.acquisition, turn.state
     late = turn.now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
     match turn.event:
-        case ev.StopDither():
+        case cmd.StopDither():
             abort(turn, "because the dither was stopped")
-        case ev.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
+        case cmd.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
             abort(turn, f"because the mode is {mode}")
         case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
             restart(turn, "the RTC began a new session")
@@ -242,7 +243,7 @@ def _closed_stage(turn: Turn, rtc: Status) -> None:
         return
     elif rtc.loop == "open":
         if acquisition.command is None:
-            request_loop(turn, ev.SetLoop(closed=True))
+            request_loop(turn, cmd.SetLoop(loop="closed"))
     else:
         n_windows = turn.state.windows_accepted
         go_on(turn, replace(acquisition, applied=record.id, windows=n_windows))
@@ -289,7 +290,7 @@ def _on_refused(turn: Turn, record: ReconstructorRecord) -> None:
     elif slippery and rtc is not None and rtc.leak > FORGIVING_LEAK:
         text = f"a leak of {FORGIVING_LEAK} is to keep the outer ring in place"
         turn.log("acquisition.leak", text)
-        request_loop(turn, ev.SetLoop(leak=FORGIVING_LEAK))
+        request_loop(turn, cmd.SetLoop(leak=FORGIVING_LEAK))
     else:
         reason = gate.reason if gate is not None else record.reason
         give_up(turn, f"no number of modes passes the gate: {reason}")
@@ -361,7 +362,7 @@ def _forget_when_over(turn: Turn) -> None:
     acquisition, event = turn.acquisition, turn.event
     if acquisition.stage is not AcquisitionStage.FAILED and not acquisition.held_off:
         return
-    if acquisition.held_off and isinstance(event, ev.SetMode):
+    if acquisition.held_off and isinstance(event, cmd.SetMode):
         text = f"an operator has set the mode, {event.mode}, since the last was ended"
     elif _followed(turn.state):
         text = f"{ENOUGH_WINDOWS} windows agree in the closed loop: none is needed any more"

@@ -16,6 +16,7 @@ from service.control.dither import (
     modes_of,
 )
 from service.model.misregistration import Misregistration
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import ACQUISITION, Act, forbidding, forbids
 from service.tracking.dither import ask_for, ask_to_stop, make_way
@@ -227,7 +228,7 @@ def enter_stage(turn: Turn, stage: AcquisitionStage, text: str) -> None:
     turn.log(f"acquisition.{stage}", text, level)
 
 
-def request_loop(turn: Turn, command: ev.SetLoop) -> None:
+def request_loop(turn: Turn, command: cmd.SetLoop) -> None:
     """Ask the RTC to change its loop, and remember having asked."""
     set_loop(turn, command)
     asked = turn.state.loop_command
@@ -262,7 +263,7 @@ def restart(turn: Turn, reason: str, *, slipped: bool = False) -> None:
     )
     enter_stage(turn, AcquisitionStage.OPENING, f"opening the loop again: {reason}")
     if turn.rtc is not None and turn.rtc.loop != "open":
-        request_loop(turn, ev.SetLoop(closed=False))
+        request_loop(turn, cmd.SetLoop(loop="open"))
 
 
 def give_up(turn: Turn, reason: str) -> None:
@@ -273,7 +274,7 @@ def give_up(turn: Turn, reason: str) -> None:
     forget(turn)
     turn.acquisition = replace(turn.acquisition, windows=turn.state.windows_accepted)
     if closed and out_of_hand:
-        request_loop(turn, ev.SetLoop(closed=False))
+        request_loop(turn, cmd.SetLoop(loop="open"))
     text = (
         f"no registration was acquired: {reason}; see the log, then acquire again, or close the "
         "loop on a matrix of your own"
@@ -294,7 +295,7 @@ def abort(turn: Turn, why: str, *, held_off: bool = False) -> None:
     left, found = "left as it is", _to_give_back(turn.state)
     if found is not None:
         left = "closed as it was found"
-        request_loop(turn, ev.SetLoop(closed=True, leak=found.leak))
+        request_loop(turn, cmd.SetLoop(loop="closed", leak=found.leak))
     text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
     over = replace(turn.acquisition, held_off=held_off, windows=turn.state.windows_accepted)
     turn.acquisition = over
@@ -307,7 +308,7 @@ def far_stage(turn: Turn, rtc: Status) -> None:
     if acquisition.stage is AcquisitionStage.OPENING:
         if rtc.loop != "open":
             if acquisition.command is None:
-                request_loop(turn, ev.SetLoop(closed=False))
+                request_loop(turn, cmd.SetLoop(loop="open"))
             return
         text = "looking for the registration with the loop open, on smooth modes"
         enter_stage(turn, AcquisitionStage.COARSE, text)

@@ -11,10 +11,11 @@ from enum import StrEnum
 from typing import get_args
 
 from service.errors import CommandError
-from service.tracking import events as ev
+from service.tracking import commands as cmd
 from service.tracking.alarms import STANDING_BY
+from service.tracking.commands import Command
 from service.tracking.dither_request import OUR_DITHERS, OWN_DITHER
-from service.tracking.events import Command, Event
+from service.tracking.events import Event
 from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
@@ -45,13 +46,13 @@ _ALL = frozenset[type](get_args(Command))
 
 _ALWAYS = frozenset[type](
     {
-        ev.AbortAcquisition,
-        ev.GiveUp,
-        ev.GiveUpNoisy,
-        ev.Reject,
-        ev.SetMode,
-        ev.SetPointing,
-        ev.StopDither,
+        cmd.AbortAcquisition,
+        cmd.GiveUp,
+        cmd.GiveUpNoisy,
+        cmd.Reject,
+        cmd.SetMode,
+        cmd.SetPointing,
+        cmd.StopDither,
     }
 )
 """What ends something, and what disturbs nothing."""
@@ -59,15 +60,15 @@ _ALWAYS = frozenset[type](
 ALLOWS: dict[Activity, frozenset[type]] = {
     Activity.MEASURING: _ALWAYS,
     # a swap costs it a window, and must not wait for minutes
-    Activity.GATHERING: _ALWAYS | {ev.Refit, ev.Approve, ev.Publish, ev.Rollback},
+    Activity.GATHERING: _ALWAYS | {cmd.Refit, cmd.Approve, cmd.Publish, cmd.Rollback},
     Activity.RAMPING: _ALWAYS,
     Activity.ACQUIRING: _ALWAYS,
     # it makes way for what needs the loop, and an RTC measures under no dither
-    Activity.OWN_DITHER: _ALL - {ev.Measure, ev.StartDither},
-    Activity.OTHER_DITHER: _ALL - {ev.Measure, ev.StartDither, ev.MeasureNoisy},
-    Activity.STANDING_BY: frozenset[type]({ev.Reject, ev.SetMode, ev.SetPointing}),
-    Activity.MAKING: _ALL - {ev.Measure, ev.Refit, ev.Publish, ev.Rollback},
-    Activity.SENDING: _ALL - {ev.Measure},
+    Activity.OWN_DITHER: _ALL - {cmd.Measure, cmd.StartDither},
+    Activity.OTHER_DITHER: _ALL - {cmd.Measure, cmd.StartDither, cmd.MeasureNoisy},
+    Activity.STANDING_BY: frozenset[type]({cmd.Reject, cmd.SetMode, cmd.SetPointing}),
+    Activity.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish, cmd.Rollback},
+    Activity.SENDING: _ALL - {cmd.Measure},
 }
 """Commands that are carried out while it runs; a gain ramp also lets the loop be opened."""
 
@@ -170,4 +171,4 @@ def _of_matrices(state: TrackerState) -> tuple[Running, ...]:
 
 
 def _opens(command: Command) -> bool:
-    return isinstance(command, ev.SetLoop) and command.closed is False
+    return isinstance(command, cmd.SetLoop) and command.loop == "open"

@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from service.errors import CommandError, UnknownIdError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither import ask_for, ask_to_stop, drop, make_way_for_noisy
 from service.tracking.dither_request import RANDOM_TOTAL_M, RandomChoice, plan_random, total_m
@@ -60,7 +61,7 @@ MEASURING = "an interaction matrix is being measured: these frames are no ordina
 _R = TypeVar("_R", MeasurementRecord, NoisyRecord)
 
 
-def measure(turn: Turn, command: ev.Measure) -> None:
+def measure(turn: Turn, command: cmd.Measure) -> None:
     """Ask the RTC to measure an interaction matrix.
 
     Raises
@@ -212,7 +213,7 @@ def _give_up_overdue(turn: Turn, record: MeasurementRecord, *, closed: bool) -> 
             _keep(turn, replace(record, overdue_since_ns_utc=since_ns))
 
 
-def _planned(command: ev.Measure, rtc: Status, policy: Policy, now_ns: int) -> MeasurementRecord:
+def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> MeasurementRecord:
     sine = command.pattern is Pattern.SINE
     modes = command.modes or tuple(range(rtc.n_controlled))
     if sine and command.modes is None:
@@ -243,7 +244,7 @@ def _keep(turn: Turn, record: MeasurementRecord) -> None:
     turn.state = replace(turn.state, measurements=(*others, record)[-MEASUREMENTS_KEPT:])
 
 
-def measure_noisy(turn: Turn, command: ev.MeasureNoisy) -> None:
+def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
     """Measure a noisy interaction matrix: first the dither that runs has to end.
 
     Raises
@@ -258,7 +259,7 @@ def measure_noisy(turn: Turn, command: ev.MeasureNoisy) -> None:
         text = f"{command.id} was measured before; ids are never reused"
         raise CommandError(f"noisy matrix: {text}")
     duration_s, budget_m = command.duration_s or DURATION_S, turn.policy.dither_budget_m
-    total = command.total_m or min(RANDOM_TOTAL_M, budget_m)
+    total = command.total_amplitude_m or min(RANDOM_TOTAL_M, budget_m)
     if total > budget_m * (1.0 + 1e-9) and not command.over_budget:
         raise CommandError(
             f"noisy matrix: {1e9 * total:.3g} nm RMS in all, budget {1e9 * budget_m:.3g} nm; say "
@@ -315,7 +316,7 @@ def follow_noisy(turn: Turn) -> None:
         return
     waited_s = (turn.now_ns - record.asked_ns_utc) / SECOND_NS
     match record.state:
-        case MeasureState.WAITING if isinstance(turn.event, ev.StopDither):
+        case MeasureState.WAITING if isinstance(turn.event, cmd.StopDither):
             cut_off(turn, "the operator stopped the dither")
         case MeasureState.WAITING:
             if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:

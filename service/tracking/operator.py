@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 from service.errors import CommandError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.commands import GainGroup, ModeGroup
 from service.tracking.dither import allow, ask_for
 from service.tracking.dither_plan import by_hand
 from service.tracking.dither_request import (
@@ -159,7 +160,7 @@ def refit(turn: Turn, n_modes: int | None) -> None:
     make(turn, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
 
 
-def start_dither(turn: Turn, command: ev.StartDither) -> None:
+def start_dither(turn: Turn, command: cmd.StartDither) -> None:
     """Start a dither; what is not said of it is the service's own choice.
 
     Raises
@@ -186,7 +187,7 @@ def start_dither(turn: Turn, command: ev.StartDither) -> None:
 
 
 def _planned(
-    command: ev.StartDither, choice: Choice, rtc: Status, policy: Policy, now_ns: int
+    command: cmd.StartDither, choice: Choice, rtc: Status, policy: Policy, now_ns: int
 ) -> Dither:
     """Return the dither to ask for.
 
@@ -195,11 +196,11 @@ def _planned(
     CommandError
         If it could not be played, or not be read.
     """
-    if command.kind is DitherKind.BINARY or isinstance(command.modes, ModeSet):
+    if command.kind is DitherKind.BINARY or isinstance(command.modes, ModeSet):  # for the types
         asked = RandomChoice(
             id=f"{ASKED_DITHER}{now_ns}",
             modes=command.modes or ModeSet.CONTROLLED,
-            total_m=command.total_m or min(RANDOM_TOTAL_M, policy.dither_budget_m),
+            total_m=command.total_amplitude_m or min(RANDOM_TOTAL_M, policy.dither_budget_m),
             duration_s=command.duration_s or policy.dither_duration_s,
         )
         return plan_random(asked, rtc, policy, now_ns)
@@ -257,10 +258,7 @@ CLOSE_AGAIN_FOR_S = 3600.0
 """Then somebody wants the loop open."""
 
 
-_LOOP = {None: None, True: Loop.CLOSED, False: Loop.OPEN}
-
-
-def set_loop(turn: Turn, command: ev.SetLoop) -> None:
+def set_loop(turn: Turn, command: cmd.SetLoop) -> None:
     """Ask the RTC to change its loop.
 
     Raises
@@ -276,13 +274,13 @@ def set_loop(turn: Turn, command: ev.SetLoop) -> None:
     gains = None if groups is None else _gains(rtc, groups, n_modes)
     if command.effective_gain is not None:
         gains = _compensated(turn, rtc, command.effective_gain, n_modes)
-    if command.closed is not None:
+    if command.loop is not None:
         turn.state = replace(turn.state, close_since_ns_utc=None)
     _ask_loop(
         turn,
         LoopRequest(
             id=f"loop-{turn.now_ns}",
-            loop=_LOOP[command.closed],
+            loop=None if command.loop is None else Loop(command.loop),
             gains=gains,
             leak=command.leak,
             n_controlled=n_controlled,
@@ -292,7 +290,7 @@ def set_loop(turn: Turn, command: ev.SetLoop) -> None:
     )
 
 
-def ramp(turn: Turn, command: ev.Ramp) -> None:
+def ramp(turn: Turn, command: cmd.Ramp) -> None:
     """Ask the RTC to try gains on groups of modes.
 
     Raises
@@ -304,14 +302,14 @@ def ramp(turn: Turn, command: ev.Ramp) -> None:
     if rtc.loop == "open":
         raise CommandError("ramp: found the loop open; expected it closed, to see its residual")
     groups = command.groups or _paper_groups(rtc.n_controlled)
-    _check_ranges("ramp", groups, rtc.n_controlled)
+    ranges = _ranges("ramp", groups, rtc.n_controlled)
     gains = command.gains or RAMP_GAINS
     n_frames = max(1, round((command.step_s or RAMP_STEP_S) * rtc.frame_rate_hz))
-    lasts_s = len(groups) * len(gains) * n_frames / rtc.frame_rate_hz
-    spans = ", ".join(f"{first} to {last}" for first, last in groups)
+    lasts_s = len(ranges) * len(gains) * n_frames / rtc.frame_rate_hz
+    spans = ", ".join(f"{first} to {last}" for first, last in ranges)
     text = f"{len(gains)} gains on modes {spans}: {lasts_s:.0f} s"
     name = f"ramp-{turn.now_ns}"
-    request = RampRequest(id=name, groups=groups, gains=gains, frames_per_gain=n_frames)
+    request = RampRequest(id=name, groups=ranges, gains=gains, frames_per_gain=n_frames)
     _ask_loop(turn, request, text, lasts_s)
 
 
@@ -357,13 +355,12 @@ def close_again(turn: Turn) -> None:
         _ask_loop(turn, request, "close again after a measurement given up")
 
 
-def _gains(rtc: Status, groups: tuple[ev.GainGroup, ...], n_modes: int) -> tuple[float, ...]:
+def _gains(rtc: Status, groups: tuple[GainGroup, ...], n_modes: int) -> tuple[float, ...]:
     """Return a gain for each mode of the basis: those in force, but for the groups.
 
     The status of an open loop does not tell the gains it will close with.
     """
-    ranges = tuple((group.first, group.last) for group in groups)
-    _check_ranges("loop", ranges, n_modes)
+    ranges = _ranges("loop", groups, n_modes)
     named = sum(last - first + 1 for first, last in ranges)
     if rtc.loop == "open" and named < n_modes:
         raise CommandError(
@@ -388,28 +385,28 @@ def _compensated(turn: Turn, rtc: Status, in_effect: float, n_modes: int) -> tup
     return (*gains.tolist(), *(0.0,) * (rtc.n_modes - n_modes))
 
 
-def _paper_groups(n_controlled: int) -> tuple[tuple[int, int], ...]:
+def _paper_groups(n_controlled: int) -> tuple[ModeGroup, ...]:
     end = n_controlled - 1
     return tuple(
-        (first, end if last is None else min(last, end))
+        ModeGroup(first=first, last=end if last is None else min(last, end))
         for first, last in RAMP_GROUPS
         if first <= end
     )
 
 
-def _check_ranges(what: str, ranges: tuple[tuple[int, int], ...], n_modes: int) -> None:
-    for first, last in ranges:
-        if not 0 <= first <= last < n_modes:
+def _ranges(what: str, groups: tuple[ModeGroup, ...], n_modes: int) -> tuple[tuple[int, int], ...]:
+    """Return first and last mode of each group, all of them modes of the loop."""
+    for group in groups:
+        if group.last >= n_modes:
             raise CommandError(
-                f"{what}: found modes {first} to {last}; expected a range within 0 to {n_modes - 1}"
+                f"{what}: found modes {group.first} to {group.last}; expected a range within 0 to "
+                f"{n_modes - 1}"
             )
-    for before, after in pairwise(sorted(ranges)):
-        if after[0] <= before[1]:
-            raise CommandError(f"{what}: found mode {after[0]} in two groups; expected it in one")
+    return tuple((group.first, group.last) for group in groups)
 
 
-def _said(command: ev.SetLoop) -> str:
-    said = {True: ["close"], False: ["open"], None: []}[command.closed]
+def _said(command: cmd.SetLoop) -> str:
+    said = {"closed": ["close"], "open": ["open"], None: []}[command.loop]
     said += [f"gain {g.gain:g} on modes {g.first} to {g.last}" for g in command.gains or ()]
     if command.effective_gain is not None:
         said.append(f"gain {command.effective_gain:g} in effect on every mode, by the gain table")
@@ -417,7 +414,7 @@ def _said(command: ev.SetLoop) -> str:
         said.append(f"leak {command.leak:g}")
     if command.n_controlled is not None:
         said.append(f"{command.n_controlled} modes from the next reconstructor on")
-    return ", ".join(said) or "no change"
+    return ", ".join(said)
 
 
 def _ask_loop(

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from service.control.expected_gain import explained_by_noise
 from service.model.misregistration import BOUNDARY_SCALE
-from service.tracking.events import Event, Reject
+from service.tracking.commands import Reject
+from service.tracking.events import Event
 from service.tracking.loop import SAME_DELAY, SAME_LEAK, same_gains
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import (

@@ -34,6 +34,11 @@ class Renewal:
             "DitherAnswered": self._answered,
             "LoopAnswered": self._answered,
             "MatrixMeasured": self._measured,
+            "SetLoop": _set_loop,
+            "Ramp": _ramp,
+            "StartDither": _total,
+            "MeasureNoisy": _total,
+            "SetPointing": lambda old: old.get("pointing", old) | {"is": "SetPointing"},
         }
 
     def entry(self, entry: Record) -> Record:
@@ -103,6 +108,28 @@ def _failed(entry: Record) -> Record:
     effect = {"is": "SendMatrix", "id": entry["event"]["id"], "n_modes": 0, "gains": None}
     failure = {"is": "JobFailed", "effect": effect, "text": text}
     return entry | {"event": failure, "log": [["job.failed", text, "warning"]]}
+
+
+def _set_loop(old: Record) -> Record:
+    order = dict(old)
+    closed = order.pop("closed", None)
+    return order if closed is None else order | {"loop": _LOOP[closed]}
+
+
+def _ramp(old: Record) -> Record:
+    groups = [
+        {"is": "ModeGroup", "first": group[0], "last": group[1]}
+        if isinstance(group, list)
+        else group
+        for group in old.get("groups", ())
+    ]
+    return old | ({"groups": groups} if groups else {})
+
+
+def _total(old: Record) -> Record:
+    order = dict(old)
+    total_m = order.pop("total_m", None)
+    return order if total_m is None else order | {"total_amplitude_m": total_m}
 
 
 def _dither_request(view: Record) -> Record:

@@ -12,7 +12,7 @@ from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -80,7 +80,7 @@ def decoded(hint: object, value: Json) -> Value:
         return hint(value)
     if hint is float:
         return float(value)
-    if hint in (bool, int, str) and isinstance(value, hint):
+    if origin is Literal or (hint in (bool, int, str) and isinstance(value, hint)):
         return value
     raise TypeError(f"found {value!r}; expected {hint}")
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.events import Command, Event
+from service.tracking.commands import Command
+from service.tracking.events import Event
 from service.tracking.state import Mode
-from service.wire import Acknowledgement, AckState, DitherKind, DitherRequest, Pattern, Pointing
+from service.wire import Acknowledgement, AckState, DitherKind, DitherRequest, Pattern
 from service.wire import Command as Order
 from studies.campaign.golden_night import GoldenNight
 from studies.campaign.strange_rtc import Mischief
@@ -100,17 +102,17 @@ def appear(night: GoldenNight) -> None:
 
 def approve(night: GoldenNight) -> None:
     """Approve the last proposal."""
-    night.ask(ev.Approve(id=night.proposed()))
+    night.ask(cmd.Approve(id=night.proposed()))
 
 
 def reject(night: GoldenNight) -> None:
     """Reject it."""
-    night.ask(ev.Reject(id=night.proposed(), reason="not this one"))
+    night.ask(cmd.Reject(id=night.proposed(), reason="not this one"))
 
 
 def publish_first(night: GoldenNight) -> None:
     """Send the oldest reconstructor again."""
-    night.ask(ev.Publish(id=night.state.reconstructors[0].id))
+    night.ask(cmd.Publish(id=night.state.reconstructors[0].id))
 
 
 def measured(night: GoldenNight) -> None:
@@ -148,11 +150,7 @@ def slew(first_deg: float, rate_deg_s: float, begin_s: float, seconds: float) ->
     return tuple(
         (
             begin_s + k,
-            ask(
-                ev.SetPointing(
-                    pointing=Pointing(elevation_deg=first_deg + k * rate_deg_s, azimuth_deg=30.0)
-                )
-            ),
+            ask(cmd.SetPointing(elevation_deg=first_deg + k * rate_deg_s, azimuth_deg=30.0)),
         )
         for k in range(round(seconds))
     )
@@ -161,30 +159,31 @@ def slew(first_deg: float, rate_deg_s: float, begin_s: float, seconds: float) ->
 NOISY = 4.0
 """Seconds of a noisy matrix."""
 
-CLOSE, OPEN = ev.SetLoop(closed=True), ev.SetLoop(closed=False)
-STOP, START = ev.StopDither(), ev.StartDither()
-ACQUIRE, ABORT, REFIT = ev.Acquire(), ev.AbortAcquisition(), ev.Refit()
-RAMP = ev.Ramp(groups=((0, 1), (2, 44)), gains=(0.3, 0.4), step_s=0.5)
-MEASURE = ev.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL, n_average=1)
-SINE = ev.Measure(id="im-2", pattern=Pattern.SINE, modes=(50, 52), duration_s=2.0)
+CLOSE, OPEN = cmd.SetLoop(loop="closed"), cmd.SetLoop(loop="open")
+STOP, START = cmd.StopDither(), cmd.StartDither()
+ACQUIRE, ABORT, REFIT = cmd.Acquire(), cmd.AbortAcquisition(), cmd.Refit()
+GROUPS = (cmd.ModeGroup(first=0, last=1), cmd.ModeGroup(first=2, last=44))
+RAMP = cmd.Ramp(groups=GROUPS, gains=(0.3, 0.4), step_s=0.5)
+MEASURE = cmd.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL, n_average=1)
+SINE = cmd.Measure(id="im-2", pattern=Pattern.SINE, modes=(50, 52), duration_s=2.0)
 EVERYTHING: tuple[Command, ...] = (
     REFIT,
-    ev.Rollback(),
+    cmd.Rollback(),
     START,
     RAMP,
     MEASURE,
     SINE,
     ACQUIRE,
     CLOSE,
-    ev.SetLoop(leak=0.99),
-    ev.MeasureNoisy(id="noisy-late", duration_s=NOISY),
-    ev.GiveUp(id="im-1"),
-    ev.GiveUpNoisy(id="noisy-1"),
+    cmd.SetLoop(leak=0.99),
+    cmd.MeasureNoisy(id="noisy-late", duration_s=NOISY),
+    cmd.GiveUp(id="im-1"),
+    cmd.GiveUpNoisy(id="noisy-1"),
     ABORT,
-    ev.Approve(id="nobody"),
-    ev.Reject(id="nobody"),
-    ev.Publish(id="nobody"),
-    ev.SetPointing(pointing=Pointing(elevation_deg=70.0, azimuth_deg=0.0)),
+    cmd.Approve(id="nobody"),
+    cmd.Reject(id="nobody"),
+    cmd.Publish(id="nobody"),
+    cmd.SetPointing(elevation_deg=70.0, azimuth_deg=0.0),
 )
 """One command of each kind; what ends things comes last."""
 
@@ -195,7 +194,7 @@ def everything(begin_s: float, step_s: float = 0.1, *, ending: bool = False) -> 
     return tuple((begin_s + k * step_s, ask(command)) for k, command in enumerate(given))
 
 
-_ENDING = (ev.GiveUp, ev.GiveUpNoisy, ev.AbortAcquisition)
+_ENDING = (cmd.GiveUp, cmd.GiveUpNoisy, cmd.AbortAcquisition)
 
 
 def dither(name: str) -> DitherRequest:

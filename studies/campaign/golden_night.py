@@ -12,7 +12,8 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import LinkError, PyrcalError
 from service.tracking import events as ev
-from service.tracking.events import Command, Effect, Event
+from service.tracking.commands import Command
+from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, MeasureState, NoisyFinding, NoisyRecord
 from service.tracking.state import Mode, TrackerState

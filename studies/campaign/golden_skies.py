@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Level, Mode
 from service.wire import AckState, DitherRequest, Loop, LoopRequest
@@ -91,7 +92,7 @@ TRACKING = (
             (16.0, refuse(LoopRequest)),
             (20.0, approve),
             (23.0, refuse()),
-            (26.0, ask(ev.Refit(n_modes=80))),
+            (26.0, ask(cmd.Refit(n_modes=80))),
         ),
     ),
 )
@@ -117,9 +118,9 @@ ACQUIRING = (
             (11.0, ask(ACQUIRE)),
             (13.0, ask(STOP)),
             (16.0, ask(ACQUIRE)),
-            (17.0, ask(ev.SetMode(mode=Mode.HOLD))),
+            (17.0, ask(cmd.SetMode(mode=Mode.HOLD))),
             (18.0, ask(ABORT)),
-            (20.0, ask(ev.SetMode(mode=Mode.AUTO))),
+            (20.0, ask(cmd.SetMode(mode=Mode.AUTO))),
         ),
     ),
     Plan(
@@ -195,7 +196,7 @@ FAULTS = (
             (10.0, break_worker("")),
             (14.0, break_worker()),
             (15.0, ask(REFIT)),
-            (17.0, ask(ev.Rollback())),
+            (17.0, ask(cmd.Rollback())),
             (19.0, break_worker("")),
         ),
     ),
@@ -274,12 +275,12 @@ FAULTS = (
         seconds=36.0,
         deeds=(
             (8.0, restart()),
-            (14.0, ask(ev.SetMode(mode=Mode.HOLD))),
+            (14.0, ask(cmd.SetMode(mode=Mode.HOLD))),
             (15.0, ask(STOP)),
             (17.0, restart()),
             (22.0, ask(START)),
-            (23.0, ask(ev.SetMode(mode=Mode.AUTO))),
-            (28.0, ask(ev.SetMode(mode=Mode.HOLD))),
+            (23.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+            (28.0, ask(cmd.SetMode(mode=Mode.HOLD))),
             (29.0, restart(Mode.PROPOSE)),
         ),
     ),

@@ -28,7 +28,8 @@ from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
 from service.tracker import step
 from service.tracking import events as ev
-from service.tracking.events import Command, Effect, Event
+from service.tracking.commands import Command
+from service.tracking.events import Effect, Event
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.state import Mode, TrackerState
 from service.wire import CHUNK_LIMIT, Manifest, Status

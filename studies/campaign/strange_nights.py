@@ -24,7 +24,7 @@ from typing_extensions import override
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import PyrcalError
-from service.tracking import events as ev
+from service.tracking import commands as cmd
 from service.tracking.events import Event
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
@@ -80,11 +80,11 @@ class StrangeNight(Observatory):
         self.sent_in_dialect = 0
         self._n_orders = 0
 
-    def ask(self, command: ev.Command) -> None:
+    def ask(self, command: cmd.Command) -> None:
         """Let an operator ask for something; a refusal is an answer, too."""
         if self.listening:
             return
-        self.may_open |= isinstance(command, ev.Acquire | ev.SetLoop | ev.Measure)
+        self.may_open |= isinstance(command, cmd.Acquire | cmd.SetLoop | cmd.Measure)
         try:
             self.command(command)
         except PyrcalError:
@@ -163,19 +163,19 @@ def _mischief(time_s: float, mischief: Mischief, end_s: float) -> list[Deed]:
 def _order(time_s: float, rng: np.random.Generator) -> Deed:
     """Return an operator's order, any of them, to be given at any time."""
     number = int(time_s * 1000)
-    plain: list[ev.Command] = [
-        ev.Acquire(),
-        ev.AbortAcquisition(),
-        ev.Refit(),
-        ev.Rollback(),
-        ev.StartDither(),
-        ev.StopDither(),
-        ev.Ramp(),
-        ev.MeasureNoisy(id=f"noisy-{number}", duration_s=5.0),
-        ev.Measure(id=f"im-{number}", pattern=Pattern.PUSH_PULL_MODAL),
-        ev.SetLoop(closed=False),
-        ev.SetLoop(closed=True),
-        *(ev.SetMode(mode=mode) for mode in Mode),
+    plain: list[cmd.Command] = [
+        cmd.Acquire(),
+        cmd.AbortAcquisition(),
+        cmd.Refit(),
+        cmd.Rollback(),
+        cmd.StartDither(),
+        cmd.StopDither(),
+        cmd.Ramp(),
+        cmd.MeasureNoisy(id=f"noisy-{number}", duration_s=5.0),
+        cmd.Measure(id=f"im-{number}", pattern=Pattern.PUSH_PULL_MODAL),
+        cmd.SetLoop(loop="open"),
+        cmd.SetLoop(loop="closed"),
+        *(cmd.SetMode(mode=mode) for mode in Mode),
     ]
     k = int(rng.integers(len(plain) + 2))
     if k < len(plain):
@@ -188,9 +188,9 @@ def _approve(night: StrangeNight) -> None:
     shelf = night.state.reconstructors
     proposed = [record.id for record in shelf if record.state is MatrixState.PROPOSED]
     if proposed:
-        night.ask(ev.Approve(id=proposed[-1]))
+        night.ask(cmd.Approve(id=proposed[-1]))
     elif shelf:
-        night.ask(ev.Publish(id=shelf[0].id))
+        night.ask(cmd.Publish(id=shelf[0].id))
 
 
 def play(seed: int, instrument: str, seconds: float) -> Row:

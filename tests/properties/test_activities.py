@@ -4,6 +4,7 @@ import hypothesis.strategies as st
 from hypothesis import HealthCheck, settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.activity import ALLOWS, Activity, under_way
 from tests.unit.tracking.test_activity import (
@@ -33,7 +34,7 @@ class Operators(RuleBasedStateMachine):
         refusal = refused(self.world, command)
         assert "\n" not in refusal
         forbidding = [one.text for one in running if type(command) not in ALLOWS[one.activity]]
-        opens = isinstance(command, ev.SetLoop) and command.closed is False
+        opens = isinstance(command, cmd.SetLoop) and command.closed is False
         if forbidding and not opens:
             assert refusal == f"{type(command).__name__}: {forbidding[0]}"
 

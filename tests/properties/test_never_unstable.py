@@ -6,6 +6,7 @@ import hypothesis.strategies as st
 from hypothesis import given
 
 from service.control.expected_gain import ExpectedGain
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.loop import commanded_gains
 from service.tracking.products import MatrixState
@@ -45,9 +46,9 @@ made = st.builds(
     st.booleans(),
 )
 more_commands = st.one_of(
-    st.builds(ev.Approve, id=st.sampled_from([*MADE, "extra-1", "extra-2", "extra-3"])),
-    st.builds(ev.Publish, id=any_id),
-    st.builds(ev.SetLoop, effective_gain=st.sampled_from([0.3, 1.5])),
+    st.builds(cmd.Approve, id=st.sampled_from([*MADE, "extra-1", "extra-2", "extra-3"])),
+    st.builds(cmd.Publish, id=any_id),
+    st.builds(cmd.SetLoop, effective_gain=st.sampled_from([0.3, 1.5])),
 )
 retuned = st.builds(
     lambda gain, leak: rtc(gains=(gain,) * 400 + (0.0,) * 194, leak=leak),
@@ -100,6 +101,6 @@ def test_a_proposal_whose_verdict_has_changed_since_cannot_be_approved():
     proposal = replace(record("extra-1"), created_ns_utc=night.now_ns)
     night.tell(ev.MatrixMade(record=proposal, wanted=False), 0.1)
     night.tell(ev.MarginJudged(id="extra-1", verdict=verdict(accepted=False)), 0.1)
-    night.tell(ev.Approve(id="extra-1"), 0.1)
+    night.tell(cmd.Approve(id="extra-1"), 0.1)
     assert not night.last
     assert night.state.reconstructor("extra-1").state is MatrixState.PROPOSED

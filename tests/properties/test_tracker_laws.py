@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from service.errors import CommandError
 from service.telemetry.windows import WindowRefused
 from service.tracker import step
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import total_m
 from service.tracking.estimate import HISTORY_LENGTH
@@ -57,18 +58,18 @@ TROUBLES = [
     "other",
 ]
 COMMANDS = (
-    ev.SetMode,
-    ev.Refit,
-    ev.StartDither,
-    ev.StopDither,
-    ev.Approve,
-    ev.Reject,
-    ev.Publish,
-    ev.Rollback,
-    ev.Measure,
-    ev.GiveUp,
-    ev.SetLoop,
-    ev.Ramp,
+    cmd.SetMode,
+    cmd.Refit,
+    cmd.StartDither,
+    cmd.StopDither,
+    cmd.Approve,
+    cmd.Reject,
+    cmd.Publish,
+    cmd.Rollback,
+    cmd.Measure,
+    cmd.GiveUp,
+    cmd.SetLoop,
+    cmd.Ramp,
 )
 
 ids = st.sampled_from(IDS)
@@ -95,34 +96,42 @@ windows = st.builds(
     lag=st.sampled_from([0.0, 0.0, 0.0, 0.5]),
 )
 commands = st.one_of(
-    st.builds(ev.SetMode, mode=st.sampled_from(list(Mode))),
-    st.builds(ev.Refit, n_modes=st.sampled_from([None, 0, 1, 400, 594, 595])),
+    st.builds(cmd.SetMode, mode=st.sampled_from(list(Mode))),
+    st.builds(cmd.Refit, n_modes=st.sampled_from([None, 0, 1, 400, 594, 595])),
     st.builds(
-        ev.StartDither,
+        cmd.StartDither,
         modes=st.sampled_from([None, (501,), (501, 502), (700,)]),
-        frequency_hz=st.sampled_from([None, (250.0,), (1.0,)]),
         amplitude_m=st.sampled_from([None, 1e-9, 2e-8]),
         over_budget=st.booleans(),
     ),
-    st.just(ev.StopDither()),
-    st.builds(ev.Approve, id=ids),
-    st.builds(ev.Reject, id=ids),
-    st.builds(ev.Publish, id=ids),
-    st.just(ev.Rollback()),
     st.builds(
-        ev.Measure,
+        cmd.StartDither,
+        modes=st.sampled_from([(501,), (700,)]),
+        frequency_hz=st.sampled_from([(250.0,), (1.0,)]),
+    ),
+    st.just(cmd.StopDither()),
+    st.builds(cmd.Approve, id=ids),
+    st.builds(cmd.Reject, id=ids),
+    st.builds(cmd.Publish, id=ids),
+    st.just(cmd.Rollback()),
+    st.builds(
+        cmd.Measure,
         id=st.sampled_from(MEASURED),
         pattern=st.sampled_from([Pattern.PUSH_PULL_MODAL, Pattern.SINE]),
         modes=st.sampled_from([None, (3, 9), (594,)]),
     ),
-    st.builds(ev.GiveUp, id=st.sampled_from(MEASURED)),
+    st.builds(cmd.GiveUp, id=st.sampled_from(MEASURED)),
     st.builds(
-        ev.SetLoop,
-        closed=st.sampled_from([None, True, False]),
-        gains=st.sampled_from([None, (ev.GainGroup(first=0, last=299, gain=0.3),)]),
-        n_controlled=st.sampled_from([None, 300, 595]),
+        cmd.SetLoop,
+        loop=st.sampled_from(["open", "closed"]),
     ),
-    st.builds(ev.Ramp, groups=st.sampled_from([None, ((0, 400),)])),
+    st.builds(
+        cmd.SetLoop,
+        leak=st.sampled_from([None, 0.99]),
+        gains=st.sampled_from([None, (cmd.GainGroup(first=0, last=299, gain=0.3),)]),
+        n_controlled=st.sampled_from([300, 595]),
+    ),
+    st.builds(cmd.Ramp, groups=st.sampled_from([None, (cmd.ModeGroup(first=0, last=400),)])),
 )
 heard = st.one_of(
     st.just(ev.Tick()),
@@ -416,12 +425,12 @@ def test_in_hold_nothing_is_made_or_sent_by_itself(story):
 def test_in_propose_nothing_is_sent_but_what_an_operator_approved_or_asked_for_again(story):
     night = Night(Mode.PROPOSE)
     for event, after_s in story:
-        if isinstance(event, ev.SetMode):
+        if isinstance(event, cmd.SetMode):
             continue
         copied = any(isinstance(effect, ev.CopyMatrix) for effect in night.open[:1])
         night.tell(event, after_s)
         if of_kind(night.last, ev.SendMatrix):
-            assert isinstance(event, ev.Approve) or copied
+            assert isinstance(event, cmd.Approve) or copied
 
 
 @LAWS

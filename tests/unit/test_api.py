@@ -29,8 +29,7 @@ from service.errors import (
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.snapshot import Snapshot
-from service.tracking.dither_request import Dither, Dithering, DitherPhase, DitherPlan
-from service.tracking.events import (
+from service.tracking.commands import (
     Approve,
     Publish,
     Refit,
@@ -41,6 +40,7 @@ from service.tracking.events import (
     StartDither,
     StopDither,
 )
+from service.tracking.dither_request import Dither, Dithering, DitherPhase, DitherPlan
 from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.products import (
     MatrixState,
@@ -560,7 +560,7 @@ async def test_a_damaged_matrix_is_a_problem_that_says_so(client, service):
             "PUT",
             "/v1/pointing",
             {"elevation_deg": 61.5, "azimuth_deg": -20.0},
-            SetPointing(pointing=Pointing(elevation_deg=61.5, azimuth_deg=-20.0)),
+            SetPointing(elevation_deg=61.5, azimuth_deg=-20.0),
         ),
     ],
 )

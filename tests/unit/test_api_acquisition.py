@@ -8,7 +8,7 @@ import pytest
 from service.api import create_app
 from service.errors import CommandError
 from service.routes.views import picture
-from service.tracking.events import AbortAcquisition, Acquire
+from service.tracking.commands import AbortAcquisition, Acquire
 from service.tracking.state import Acquisition, AcquisitionStage
 from tests.unit.tracking.situations import ALPHA
 

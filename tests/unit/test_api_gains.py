@@ -7,7 +7,7 @@ import httpx
 import pytest
 
 from service.api import create_app
-from service.tracking.events import SetLoop
+from service.tracking.commands import SetLoop
 from service.tracking.registration import ModeGain
 from service.tracking.state import TrackerState
 from tests.unit.runtime.handmade import REGISTRATION

@@ -5,7 +5,7 @@ import pytest
 
 from service.api import create_app
 from service.errors import CommandError, LinkError
-from service.tracking.events import GainGroup, Ramp, SetLoop
+from service.tracking.commands import GainGroup, ModeGroup, Ramp, SetLoop
 
 
 class FakeService:
@@ -37,8 +37,8 @@ async def client(service):
 @pytest.mark.parametrize(
     ("body", "command"),
     [
-        ({"loop": "open"}, SetLoop(closed=False)),
-        ({"loop": "closed", "leak": 0.99}, SetLoop(closed=True, leak=0.99)),
+        ({"loop": "open"}, SetLoop(loop="open")),
+        ({"loop": "closed", "leak": 0.99}, SetLoop(loop="closed", leak=0.99)),
         ({"n_controlled": 300}, SetLoop(n_controlled=300)),
         (
             {"gains": [{"first": 0, "last": 1, "gain": 0.4}, {"first": 2, "last": 9, "gain": 0}]},
@@ -63,7 +63,9 @@ async def test_a_bare_ramp_leaves_the_choice_to_the_service(client, service):
 async def test_a_ramp_as_wanted(client, service):
     body = {"groups": [{"first": 0, "last": 1}], "gains": [0.2, 0.5], "step_s": 0.5}
     assert (await client.post("/v1/loop/ramp", json=body)).status_code == 202
-    assert service.commands == [Ramp(groups=((0, 1),), gains=(0.2, 0.5), step_s=0.5)]
+    assert service.commands == [
+        Ramp(groups=(ModeGroup(first=0, last=1),), gains=(0.2, 0.5), step_s=0.5)
+    ]
 
 
 @pytest.mark.parametrize(

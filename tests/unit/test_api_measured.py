@@ -12,7 +12,7 @@ import pytest
 from service.api import create_app
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.snapshot import Snapshot
-from service.tracking.events import GiveUp, Measure
+from service.tracking.commands import GiveUp, Measure
 from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import TrackerState
 from service.wire import Pattern

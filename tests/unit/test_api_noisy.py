@@ -12,7 +12,7 @@ from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.routes.views import GATHERING, picture
 from service.snapshot import Snapshot
-from service.tracking.events import GiveUpNoisy, MeasureNoisy
+from service.tracking.commands import GiveUpNoisy, MeasureNoisy
 from service.tracking.products import MeasureState, ModeSet, NoisyFinding, NoisyRecord
 from service.tracking.state import TrackerState
 
@@ -115,7 +115,7 @@ async def test_every_choice_reaches_the_command(client, service, modes, expected
     assert command == MeasureNoisy(
         id=response.json()["id"],
         modes=expected,
-        total_m=2e-9,
+        total_amplitude_m=2e-9,
         duration_s=60.0,
         over_budget=True,
     )
@@ -124,9 +124,12 @@ async def test_every_choice_reaches_the_command(client, service, modes, expected
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ({"modes": "every"}, "modes: found 'every', expected 'controlled', 'all' or a list"),
+        (
+            {"modes": "every"},
+            "modes: found 'every', expected a valid array or 'controlled' or 'all'",
+        ),
         ({"modes": []}, "modes: found []"),
-        ({"modes": [1, 1]}, "modes: found [1, 1], expected modes without any of them twice"),
+        ({"modes": [1, 1]}, "expected modes without any of them twice"),
         ({"modes": [-1]}, "modes.0: found -1"),
         ({"total_amplitude_m": 0.0}, "total_amplitude_m"),
         ({"duration_s": 4000.0}, "duration_s"),

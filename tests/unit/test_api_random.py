@@ -5,7 +5,7 @@ import pytest
 
 from service.api import create_app
 from service.snapshot import Snapshot
-from service.tracking.events import StartDither
+from service.tracking.commands import StartDither
 from service.tracking.products import ModeSet
 from service.tracking.state import TrackerState
 from service.wire import DitherKind
@@ -49,7 +49,9 @@ async def test_random_signs_on_hundreds_of_modes(client, service, modes, expecte
     body = {"action": "start", "kind": "binary", "modes": modes, "total_amplitude_m": 5e-9}
     response = await client.post("/v1/dither", json=body)
     assert response.status_code == 202, response.text
-    assert service.commands == [StartDither(kind=DitherKind.BINARY, modes=expected, total_m=5e-9)]
+    assert service.commands == [
+        StartDither(kind=DitherKind.BINARY, modes=expected, total_amplitude_m=5e-9)
+    ]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from service.archive import Archive
 from service.archive.records import TrackingFile
 from service.errors import ArchiveError
-from service.tracking import events as ev
+from service.tracking import commands as cmd
 from service.tracking.loop import loop_numbers
 from service.tracking.registration import Registration
 from service.tracking.resume import saved_of
@@ -78,7 +78,7 @@ def test_what_is_read_is_what_was_written_but_for_what_depends_on_the_time(file,
 def cut_off():
     """What a service has left that ended while its loop was open."""
     story = Acquiring()
-    story.tell(ev.Acquire())
+    story.tell(cmd.Acquire())
     story.open()
     return saved_of(story.state, story.now_ns)
 

@@ -27,36 +27,26 @@ ALIKE = {
     "Acknowledgement and MeasurementRecord",
     "Compute and ComputeTable",
     "DitherPlan and Schedule",
+    "DitherRequest and StartDither",
     "Earlier and Registration",
     "Estimate and Measured",
     "Estimate and NoisyFinding",
     "FitDocument and FourNumbers",
     "Instrument and InstrumentFile",
-    "LoopBody and LoopRequest",
-    "LoopBody and SetLoop",
-    "LoopBody and Status",
-    "LoopFound and SetLoop",
+    "LoopRequest and SetLoop",
     "LoopRequest and Status",
-    "Measure and MeasureBody",
-    "Measure and MeasureRequest",
-    "Measure and MeasurementRecord",
-    "MeasureBody and MeasureRequest",
-    "MeasureBody and MeasurementRecord",
-    "MeasureNoisy and NoisyRecord",
-    "MeasureNoisy and RandomChoice",
-    "MeasureNoisy and StartDither",
+    "MeasureChoice and MeasureRequest",
+    "MeasureChoice and MeasurementRecord",
     "MeasureRequest and MeasurementRecord",
     "Mirror and MirrorTable",
-    "NoisyBody and StartDitherRequest",
     "NoisyRecord and RandomChoice",
     "Pyramid and WfsTable",
-    "StartDither and StartDitherRequest",
+    "SetLoop and Status",
 }
 """Pairs of records of which one has most of the other's fields."""
 
 LONG = {
     "runtime/actions.py",
-    "tracking/events.py",
 }
 SHORT = set()
 """Files that want to be divided, or to join another."""

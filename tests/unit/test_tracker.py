@@ -5,6 +5,7 @@ import pytest
 
 from service.errors import CommandError
 from service.tracker import step
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode, TrackerState
@@ -58,7 +59,7 @@ def test_in_propose_nothing_is_sent_until_the_operator_has_spoken():
     story.make("cm-1")
     story.see(n_windows=30)
     assert not story.asked(ev.SendMatrix)
-    apply_what_is_sent(story, story.tell(ev.Approve(id="cm-1")), 400)
+    apply_what_is_sent(story, story.tell(cmd.Approve(id="cm-1")), 400)
     assert story.state.in_use == "cm-1"
     assert len(story.asked(ev.SendMatrix)) == 1
 
@@ -148,7 +149,7 @@ def test_the_same_night_replays_to_the_same_decisions():
 def test_a_command_that_is_refused_changes_nothing():
     story = Story(Mode.PROPOSE)
     with pytest.raises(CommandError):
-        story.tell(ev.Rollback())
+        story.tell(cmd.Rollback())
     assert story.state.log == ()
     assert story.state.mode is Mode.PROPOSE
 

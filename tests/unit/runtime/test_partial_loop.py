@@ -11,7 +11,7 @@ from service.config.policy import policy_of
 from service.runtime.engine import shape_mismatch
 from service.runtime.streams import Streams, fed, taken, with_rtc
 from service.telemetry.health import LOW_MODES
-from service.tracking import events as ev
+from service.tracking import commands as cmd
 from service.tracking.registration import Source
 from service.tracking.state import Mode
 from service.worker import OpticsWorker
@@ -38,8 +38,8 @@ def night():
         policy = policy_of(load_settings(None, {}, given))
         night = Observatory(words, policy, Mode.AUTO, bench, with_poles=False)
         night.advance(2.0)
-        groups = tuple(ev.GainGroup(first=first, last=last, gain=0.0) for first, last in STILL)
-        night.command(ev.SetLoop(gains=groups))
+        groups = tuple(cmd.GainGroup(first=first, last=last, gain=0.0) for first, last in STILL)
+        night.command(cmd.SetLoop(gains=groups))
         night.advance(16.0)
     return night
 

@@ -12,6 +12,7 @@ from service.config.policy import policy_of
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog
 from service.runtime.recording import has_news, is_urgent, leave, taken_up
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.resume import restored
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
@@ -29,7 +30,7 @@ class TestWhatCannotWait:
     def test_every_stage_of_an_acquisition_and_the_session_it_opened_the_loop_in(self):
         story = Acquiring()
         before = story.state
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         assert is_urgent(before, story.state)
         for follow in (story.open, story.see_afar, story.see_afar, lambda: story.close(150)):
             before = story.state
@@ -37,10 +38,10 @@ class TestWhatCannotWait:
             assert is_urgent(before, story.state)
             assert has_news(before, story.state)
 
-    @pytest.mark.parametrize("order", [ev.SetMode(mode=Mode.HOLD), ev.StopDither()])
+    @pytest.mark.parametrize("order", [cmd.SetMode(mode=Mode.HOLD), cmd.StopDither()])
     def test_what_an_operator_orders_and_takes_back(self, order):
         story = Acquiring()
-        back = {"SetMode": ev.SetMode(mode=story.state.mode), "StopDither": ev.StartDither()}
+        back = {"SetMode": cmd.SetMode(mode=story.state.mode), "StopDither": cmd.StartDither()}
         for command in (order, back[type(order).__name__]):
             before = story.state
             story.tell(command)
@@ -57,7 +58,7 @@ class TestWhatCannotWait:
 
     def test_nothing_new_is_no_news(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         before = story.state
         story.tell(ev.Tick(), 1.0)
         assert not has_news(before, story.state)
@@ -70,7 +71,7 @@ def test_the_alpha_on_the_disk_goes_when_an_acquisition_forgets_it(tmp_path):
         story.see(n_windows=3)
         leave(archive, story.state, story.now_ns)
         assert archive.tracking.read().registration is not None
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         leave(archive, story.state, story.now_ns)
         state = taken_up(archive, TrackerState(system="flao"), story.policy, story.now_ns)
     assert state.registration is None

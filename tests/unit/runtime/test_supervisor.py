@@ -16,6 +16,7 @@ from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.engine import followed
 from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Level, LogEntry, Mode, TrackerState
 from tests.system.cable import free_port
@@ -76,7 +77,7 @@ async def test_it_is_ready_when_the_model_is(supervisor):
 
 
 async def test_a_command_changes_the_state_and_enters_the_audit_trail(supervisor, archive):
-    text = await supervisor.submit(ev.SetMode(mode=Mode.AUTO))
+    text = await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
     assert text.startswith("SetMode")
     assert supervisor.snapshot().tracker.mode is Mode.AUTO
     (entry,) = archive.audit_trail()
@@ -87,14 +88,14 @@ async def test_a_command_changes_the_state_and_enters_the_audit_trail(supervisor
 async def test_a_command_that_cannot_be_carried_out_is_the_callers_to_hear_of(supervisor):
     before = supervisor.snapshot().tracker
     with pytest.raises(CommandError, match="no RTC is there"):
-        await supervisor.submit(ev.Refit())
+        await supervisor.submit(cmd.Refit())
     assert supervisor.snapshot().tracker is before
 
 
 async def test_what_happens_is_written_to_the_archive_in_order(supervisor, archive):
     async with running(supervisor):
-        await supervisor.submit(ev.SetMode(mode=Mode.AUTO))
-        await supervisor.submit(ev.SetMode(mode=Mode.PROPOSE))
+        await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
+        await supervisor.submit(cmd.SetMode(mode=Mode.PROPOSE))
 
         def names():
             return [entry.text for entry in archive.audit_trail() if entry.who == "service"]
@@ -114,7 +115,7 @@ async def test_a_reconstructor_on_the_shelf_is_known_after_a_restart(supervisor,
 
 async def test_a_deed_that_fails_is_on_record_and_the_service_goes_on(supervisor):
     async with running(supervisor):
-        await supervisor.submit(ev.StopDither())
+        await supervisor.submit(cmd.StopDither())
         await until(lambda: any(e.name == "job.failed" for e in supervisor.snapshot().tracker.log))
         assert supervisor.snapshot().ready
 
@@ -197,7 +198,7 @@ async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
     async with running(supervisor):
         know(supervisor, registration=story.state.registration)
         await until(lambda: archive.tracking.read() is not None)
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         know(supervisor, registration=None, acquisition=story.state.acquisition)
         began = time.monotonic()
         await until(lambda: archive.tracking.read().acquisition is not None)
@@ -213,7 +214,7 @@ async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_for
         know(supervisor, registration=known)
         await until(lambda: archive.tracking.read() is not None)
         began = time.monotonic()
-        await supervisor.submit(ev.StopDither())
+        await supervisor.submit(cmd.StopDither())
         await until(lambda: archive.tracking.read().orders is not None)
         assert in_time(began, 0.5)
     again = TrackerState(system="small", mode=Mode.AUTO)
@@ -310,7 +311,7 @@ async def test_an_order_that_cannot_be_recorded_is_not_carried_out(supervisor, a
     async with running(supervisor):
         with full_disk(archive):
             with pytest.raises(ArchiveError, match=r"index\.sqlite: .*full \(SQLITE_FULL\)"):
-                await supervisor.submit(ev.SetMode(mode=Mode.AUTO))
+                await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
             assert supervisor.snapshot().tracker.mode is Mode.HOLD
             alarm = alarm_of(supervisor, "archive-failed")
             assert "index.sqlite" in alarm.text
@@ -318,7 +319,7 @@ async def test_an_order_that_cannot_be_recorded_is_not_carried_out(supervisor, a
             assert supervisor.snapshot().archive_failures > 0
             assert supervisor.snapshot().archive_waiting > 0
         await until(lambda: alarm_of(supervisor, "archive-failed") is None)
-        await supervisor.submit(ev.SetMode(mode=Mode.PROPOSE))
+        await supervisor.submit(cmd.SetMode(mode=Mode.PROPOSE))
     names = [name for name, _ in trail(archive, "operator")]
     assert names == ["SetMode", "SetMode.refused", "SetMode"]
 
@@ -352,7 +353,7 @@ async def test_an_index_that_is_damaged_meanwhile_does_not_end_the_service(
             supervisor._post(ev.Noted(name="note", text="first"))
             await until(lambda: alarm_of(supervisor, "archive-failed"))
             with pytest.raises(ArchiveError, match="move it away"):
-                await supervisor.submit(ev.SetMode(mode=Mode.AUTO))
+                await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
         await until(lambda: alarm_of(supervisor, "archive-failed") is None)
         assert supervisor.snapshot().tracker.mode is Mode.HOLD
     assert ("note", "first") in trail(archive, "service")
@@ -421,7 +422,7 @@ async def test_a_matrix_that_cannot_be_stored_is_never_heard_of_and_the_disk_is_
 async def test_a_refused_order_is_audited_with_the_reason(supervisor, archive):
     async with running(supervisor):
         with pytest.raises(CommandError):
-            await supervisor.submit(ev.Approve(id="cm-7"))
+            await supervisor.submit(cmd.Approve(id="cm-7"))
         await until(lambda: len(trail(archive, "operator")) == 2)
     (asked, _), (refused, why) = trail(archive, "operator")
     assert (asked, refused) == ("Approve", "Approve.refused")
@@ -433,7 +434,7 @@ async def test_what_the_rtc_refuses_is_audited_too(supervisor, archive):
     async with running(supervisor):
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
         with pytest.raises(PyrcalError):
-            await supervisor.submit(ev.SetLoop(closed=False))
+            await supervisor.submit(cmd.SetLoop(loop="open"))
         await until(lambda: len(trail(archive, "operator")) == 2)
     assert trail(archive, "operator")[1][0] == "SetLoop.refused"
 

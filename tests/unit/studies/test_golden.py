@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from service.telemetry.random_dither import RandomEstimate
+from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.products import ModeSet
 from service.tracking.state import Mode, TrackerState
+from service.wire import DitherKind
 from studies.campaign.golden import INSTRUMENT, Teller, first_difference, nights_in, read, written
 from studies.campaign.golden_codec import decoded, encoded
 from tests.unit.tracking.situations import (
@@ -22,9 +25,9 @@ from tests.unit.tracking.situations import (
 EVENTS = [
     ev.Tick(),
     rtc(cm_id=None),
-    ev.SetMode(mode=Mode.HOLD),
-    ev.StartDither(modes=(3, 4), frequency_hz=(100.0, 120.5)),
-    ev.StartDither(modes="controlled"),
+    cmd.SetMode(mode=Mode.HOLD),
+    cmd.StartDither(modes=(3, 4), frequency_hz=(100.0, 120.5)),
+    cmd.StartDither(kind=DitherKind.BINARY, modes=ModeSet.CONTROLLED),
     ev.WindowFitted(estimate=estimate(optical_gain=np.array([0.6 + 0.25j, 1 / 3 + 0j]))),
     ev.MatrixMade(record=record("cm-1"), wanted=False),
     ev.MatrixFetched(record=foreign()),
@@ -54,7 +57,7 @@ def test_what_cannot_be_written_is_refused():
 
 def test_a_record_of_another_class_is_refused():
     with pytest.raises(TypeError, match="SetMode"):
-        decoded(RandomEstimate, encoded(ev.SetMode(mode=Mode.AUTO)))
+        decoded(RandomEstimate, encoded(cmd.SetMode(mode=Mode.AUTO)))
 
 
 def test_a_difference_says_where_it_is():

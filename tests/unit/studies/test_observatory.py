@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_limits
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import CommandError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
@@ -166,7 +167,7 @@ def test_a_worker_too_slow_for_the_telemetry_gets_longer_windows(bench, policy):
 def test_an_operator_is_told_what_cannot_be_done(bench, policy):
     night = short(bench, policy, 0.5, Mode.HOLD)
     with pytest.raises(CommandError):
-        night.command(ev.Refit())
+        night.command(cmd.Refit())
 
 
 def test_an_effect_of_unknown_duration_is_refused_aloud(bench, policy):
@@ -209,6 +210,6 @@ def test_nothing_is_published_that_nobody_approved(bench, policy):
     night = short(bench, policy, 7.0, Mode.PROPOSE)
     assert not night.swaps
     (proposed,) = [r for r in night.state.reconstructors if r.state is MatrixState.PROPOSED]
-    night.command(ev.Approve(id=proposed.id))
+    night.command(cmd.Approve(id=proposed.id))
     night.advance(0.5)
     assert [swap.id for swap in night.swaps] == [proposed.id]

@@ -9,6 +9,7 @@ from service.errors import CommandError
 from service.model.misregistration import Misregistration
 from service.telemetry.openloop import FarEstimate
 from service.telemetry.windows import WindowRefused
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition import PATIENCE_S
 from service.tracking.acquisition_stages import (
@@ -124,7 +125,7 @@ class Acquiring(Story):
         return self.closed(n_modes)
 
     def to_partial(self):
-        self.tell(ev.Acquire())
+        self.tell(cmd.Acquire())
         self.open()
         self.see_afar()
         self.see_afar(moved(FAR, shift_x_subap=0.02))
@@ -138,7 +139,7 @@ class Acquiring(Story):
 
 def test_an_operator_is_led_from_nothing_to_tracking():
     story = Acquiring(Mode.PROPOSE)
-    story.tell(ev.Acquire())
+    story.tell(cmd.Acquire())
     assert story.stage is AcquisitionStage.OPENING
     story.open()
     assert story.stage is AcquisitionStage.COARSE
@@ -178,7 +179,7 @@ def test_reconstructors_are_judged_and_sent_with_the_gains_the_loop_was_found_wi
 def test_a_loop_found_open_is_closed_with_a_low_gain_and_not_opened_first():
     story = Acquiring()
     story.status(loop="open", gains=(0.0,) * 594)
-    story.tell(ev.Acquire())
+    story.tell(cmd.Acquire())
     assert story.stage is AcquisitionStage.COARSE
     assert not story.asked(LoopRequest)
     story.see_afar()
@@ -211,7 +212,7 @@ class TestByItself:
 
     def test_not_when_an_operator_stopped_the_dither(self):
         story = Acquiring()
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         story.tell(DIVERGING)
         story.wait(60)
         assert not story.asked(LoopRequest)
@@ -248,7 +249,7 @@ class TestByItself:
 
     def test_it_does_not_begin_again_after_it_has_failed(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         command = story.asked(LoopRequest)[-1]
         story.tell(loop_answered(command.id, accepted=False, reason="busy"))
         story.tell(DIVERGING)
@@ -259,7 +260,7 @@ class TestByItself:
 
     def test_it_begins_again_when_an_rtc_that_vanished_is_back_and_diverges(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.tell(ev.RtcVanished())
         story.meet(session="s9")
         assert story.stage is AcquisitionStage.ABORTED
@@ -271,7 +272,7 @@ class TestByItself:
 class TestNothingWrong:
     def test_two_estimates_that_disagree_are_not_believed(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         story.see_afar()
         story.see_afar(moved(FAR, rotation_rad=np.deg2rad(3.0)))
@@ -281,7 +282,7 @@ class TestNothingWrong:
 
     def test_a_window_of_another_session_is_not_used(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         late = estimate(FAR, session="s1", modes=story.state.dither.request.modes)
         story.tell(ev.FarFitted(found=FarEstimate(estimate=late, unexplained=0.0, n_starts=1)))
@@ -289,7 +290,7 @@ class TestNothingWrong:
 
     def test_a_window_of_other_modes_is_not_used(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         other = estimate(FAR, session="s2", modes=(1, 2, 3))
         story.tell(ev.FarFitted(found=FarEstimate(estimate=other, unexplained=0.0, n_starts=1)))
@@ -298,7 +299,7 @@ class TestNothingWrong:
     def test_nothing_known_before_is_relied_on(self):
         story = Acquiring()
         story.see(n_windows=3)
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         assert story.state.registration is None
 
     def test_fewer_modes_are_made_where_the_gate_refuses_many(self):
@@ -343,7 +344,7 @@ class TestNothingWrong:
         story = Acquiring()
         story.see(n_windows=3)
         assert story.asked(ev.MakeMatrix)
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.make("cm-late")
         assert not story.asked(ev.SendMatrix)
 
@@ -398,7 +399,7 @@ class TestTrouble:
 
     def test_windows_that_lead_nowhere_begin_it_anew_and_end_it_after_a_few_attempts(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         for _ in range(MOST_ATTEMPTS * MOST_MISSES):
             assert story.state.acquisition.under_way
@@ -410,7 +411,7 @@ class TestTrouble:
 
     def test_windows_that_were_never_looked_at_do_not_count(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         for _ in range(2 * MOST_MISSES):
             story.miss_afar("the worker is too slow for the telemetry: a window was given up")
@@ -418,14 +419,14 @@ class TestTrouble:
 
     def test_a_stage_that_takes_too_long_begins_it_anew(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         story.wait(PATIENCE_S + 2)
         assert story.state.acquisition.attempt == 2
 
     def test_an_rtc_that_will_not_open_its_loop_ends_it(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         command = story.asked(LoopRequest)[-1]
         story.tell(loop_answered(command.id, accepted=False, reason="busy"))
         assert story.stage is AcquisitionStage.FAILED
@@ -440,7 +441,7 @@ class TestTrouble:
 
     def test_a_refused_dither_is_asked_for_again(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         dither = story.state.dither
         refused = dither_answered(dither.id, accepted=False, reason="busy", start_seq=None)
@@ -460,7 +461,7 @@ class TestTrouble:
 
     def test_a_loop_somebody_closes_meanwhile_is_opened_again(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         story.closed(400)
         assert story.stage is AcquisitionStage.OPENING
@@ -470,35 +471,40 @@ class TestTrouble:
         story = Acquiring()
         story.status(max_dither_modes=2)
         with pytest.raises(CommandError, match="at least 3"):
-            story.tell(ev.Acquire())
+            story.tell(cmd.Acquire())
 
 
 class TestOperator:
     @pytest.mark.parametrize(
         "command",
-        [ev.Refit(), ev.SetLoop(closed=True), ev.StartDither(), ev.MeasureNoisy(id="noisy-1")],
+        [
+            cmd.Refit(),
+            cmd.SetLoop(loop="closed"),
+            cmd.StartDither(),
+            cmd.MeasureNoisy(id="noisy-1"),
+        ],
     )
     def test_cannot_disturb_it(self, command):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         with pytest.raises(CommandError, match="acquisition"):
             story.tell(command)
 
     def test_can_have_only_one(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         with pytest.raises(CommandError, match="under way"):
-            story.tell(ev.Acquire())
+            story.tell(cmd.Acquire())
 
     def test_cannot_abort_what_is_not_there(self):
         with pytest.raises(CommandError, match="none is under way"):
-            Acquiring().tell(ev.AbortAcquisition())
+            Acquiring().tell(cmd.AbortAcquisition())
 
     def test_who_aborts_gets_a_healthy_loop_back_as_it_was(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
-        story.tell(ev.AbortAcquisition())
+        story.tell(cmd.AbortAcquisition())
         assert story.stage is AcquisitionStage.ABORTED
         last = story.asked(LoopRequest)[-1]
         assert (last.loop, last.gains, last.leak) == (Loop.CLOSED, None, 0.999)
@@ -507,53 +513,53 @@ class TestOperator:
     def test_who_aborts_gets_a_diverging_loop_open(self):
         story = Acquiring()
         story.tell(DIVERGING)
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
-        story.tell(ev.AbortAcquisition())
+        story.tell(cmd.AbortAcquisition())
         assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
 
     def test_who_aborts_late_keeps_the_loop_on_its_judged_matrix(self):
         story = Acquiring().to_widening()
         n_asked = len(story.asked(LoopRequest))
-        story.tell(ev.AbortAcquisition())
+        story.tell(cmd.AbortAcquisition())
         assert len(story.asked(LoopRequest)) == n_asked
         assert story.state.registration is not None
 
     def test_stopping_the_dither_aborts_it(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         assert story.stage is AcquisitionStage.ABORTED
 
     def test_hold_aborts_what_began_by_itself(self):
         story = Acquiring()
         story.tell(DIVERGING)
         story.wait(4)
-        story.tell(ev.SetMode(mode=Mode.HOLD))
+        story.tell(cmd.SetMode(mode=Mode.HOLD))
         assert story.stage is AcquisitionStage.ABORTED
 
     def test_hold_leaves_alone_what_was_asked_for(self):
         story = Acquiring()
-        story.tell(ev.Acquire())
-        story.tell(ev.SetMode(mode=Mode.HOLD))
+        story.tell(cmd.Acquire())
+        story.tell(cmd.SetMode(mode=Mode.HOLD))
         assert story.state.acquisition.under_way
 
     def test_cannot_have_it_without_an_rtc(self):
         story = Acquiring()
         story.tell(ev.RtcVanished())
         with pytest.raises(CommandError, match="no RTC"):
-            story.tell(ev.Acquire())
+            story.tell(cmd.Acquire())
 
     def test_cannot_have_it_where_the_settings_forbid_a_dither(self):
         story = Acquiring(policy=replace(ACQUIRES, dither_enabled=False))
         with pytest.raises(CommandError, match="forbid"):
-            story.tell(ev.Acquire())
+            story.tell(cmd.Acquire())
 
 
 def test_the_loop_open_alarm_is_kept_quiet_meanwhile():
     story = Acquiring()
-    story.tell(ev.Acquire())
+    story.tell(cmd.Acquire())
     story.open()
     assert "loop-open" not in story.alarms
 
@@ -580,7 +586,7 @@ def test_a_status_whose_rate_differs_by_parts_per_million_reads_the_dither_all_t
 
 def test_one_whose_dither_cannot_be_read_ends_and_says_why():
     story = Acquiring()
-    story.tell(ev.Acquire())
+    story.tell(cmd.Acquire())
     story.open()
     story.tell(ev.Noted(name="dither.unusable", text="600 frames cut a period"))
     assert story.stage is AcquisitionStage.FAILED
@@ -589,7 +595,7 @@ def test_one_whose_dither_cannot_be_read_ends_and_says_why():
 
 def test_one_in_whose_dithers_no_window_ever_ends_comes_to_an_end():
     story = Acquiring()
-    story.tell(ev.Acquire())
+    story.tell(cmd.Acquire())
     story.open()
     for _ in range(1200):
         dither = story.state.dither

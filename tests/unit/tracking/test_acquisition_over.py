@@ -2,6 +2,7 @@
 
 import pytest
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition import ENOUGH_WINDOWS
 from service.tracking.acquisition_stages import MISSES_DESPITE
@@ -26,7 +27,7 @@ class Failed(Acquiring):
 
     def close_on_their_own(self, **changes):
         """The operator closes the loop as the alarm says, on a matrix of nobody here."""
-        self.tell(ev.SetLoop(closed=True))
+        self.tell(cmd.SetLoop(loop="closed"))
         self.status(cm_id="own", **changes)
         self.tell(ev.MatrixFetched(record=foreign("own")))
         return self
@@ -109,7 +110,7 @@ class Ended(Acquiring):
         self.tell(trouble)
         self.wait(4)
         assert self.stage is AcquisitionStage.OPENING
-        self.tell(ev.AbortAcquisition(), 1.0)
+        self.tell(cmd.AbortAcquisition(), 1.0)
 
     @property
     def began(self):
@@ -160,7 +161,7 @@ def test_windows_from_before_it_was_ended_do_not_count():
     story.widen(400)
     story.see(FAR)
     assert story.state.registration.n_windows >= ENOUGH_WINDOWS
-    story.tell(ev.AbortAcquisition())
+    story.tell(cmd.AbortAcquisition())
     assert story.stage is AcquisitionStage.ABORTED
     story.tell(DIVERGING)
     story.wait(10)
@@ -169,14 +170,14 @@ def test_windows_from_before_it_was_ended_do_not_count():
 
 def test_setting_the_mode_anew_lets_it_begin():
     story = Ended()
-    story.tell(ev.SetMode(mode=Mode.AUTO))
+    story.tell(cmd.SetMode(mode=Mode.AUTO))
     assert story.stage is AcquisitionStage.OPENING
     assert story.began == 2
 
 
 def test_so_does_an_operator_who_asks():
     story = Ended()
-    story.tell(ev.Acquire())
+    story.tell(cmd.Acquire())
     assert story.stage is AcquisitionStage.OPENING
     assert not story.state.acquisition.held_off
 
@@ -194,6 +195,6 @@ def test_one_that_hold_ended_is_not_held_off():
     story = Acquiring()
     story.tell(DIVERGING)
     story.wait(4)
-    story.tell(ev.SetMode(mode=Mode.HOLD))
+    story.tell(cmd.SetMode(mode=Mode.HOLD))
     assert (story.stage, story.state.acquisition.held_off) == (AcquisitionStage.ABORTED, False)
     assert "none begins" not in story.text

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import MOST_ATTEMPTS
 from service.tracking.products import MatrixState
@@ -47,7 +48,7 @@ def opened():
     """A healthy loop was opened because an operator asked; the mirror is looked for."""
     story = Acquiring()
     story.see(n_windows=3)
-    story.tell(ev.Acquire())
+    story.tell(cmd.Acquire())
     story.open()
     assert story.stage is AcquisitionStage.COARSE
     return story
@@ -95,7 +96,7 @@ def test_in_other_modes_it_waits_and_says_what_to_do(opened, mode):
 
 def test_it_begins_when_the_operator_says_auto(opened):
     again = Again(opened, Mode.PROPOSE).find()
-    again.tell(ev.SetMode(mode=Mode.AUTO))
+    again.tell(cmd.SetMode(mode=Mode.AUTO))
     again.still_open()
     assert again.stage is AcquisitionStage.COARSE
     assert "acquisition" not in again.alarms
@@ -103,7 +104,7 @@ def test_it_begins_when_the_operator_says_auto(opened):
 
 def test_it_begins_when_the_operator_asks_and_comes_back_to_the_loop_as_it_was(opened):
     again = Again(opened, Mode.PROPOSE).find()
-    again.tell(ev.Acquire())
+    again.tell(cmd.Acquire())
     assert again.stage is AcquisitionStage.COARSE
     found = again.state.acquisition.found
     assert (found.closed, found.n_controlled, set(found.gains[:400])) == (True, 400, {0.4})
@@ -127,13 +128,13 @@ def test_a_loop_that_is_open_in_another_session_is_not_touched(opened):
     assert not again.asked(LoopRequest)
     assert not again.asked(DitherRequest)
     assert "another session" in again.text
-    again.tell(ev.Acquire())
+    again.tell(cmd.Acquire())
     assert again.state.acquisition.found.closed is False
 
 
 def test_who_aborts_gets_a_healthy_loop_back_as_it_was(opened):
     again = Again(opened, Mode.PROPOSE).find()
-    again.tell(ev.AbortAcquisition())
+    again.tell(cmd.AbortAcquisition())
     assert again.stage is AcquisitionStage.ABORTED
     (asked,) = again.asked(LoopRequest)
     assert (asked.loop, asked.leak) == (Loop.CLOSED, 0.999)
@@ -142,7 +143,7 @@ def test_who_aborts_gets_a_healthy_loop_back_as_it_was(opened):
 
 def test_who_aborts_in_another_session_closes_nothing(opened):
     again = Again(opened, Mode.PROPOSE).find(session="s9")
-    again.tell(ev.AbortAcquisition())
+    again.tell(cmd.AbortAcquisition())
     assert not again.asked(LoopRequest)
     assert "left as it is" in again.text
 
@@ -152,8 +153,8 @@ def test_who_aborts_after_a_matrix_was_sent_closes_nothing():
     story = Acquiring().to_partial()
     story.make("cm-150", n_modes=150)
     again = Again(story, Mode.PROPOSE).find(cm_id="cm-150")
-    again.tell(ev.Acquire())
-    again.tell(ev.AbortAcquisition())
+    again.tell(cmd.Acquire())
+    again.tell(cmd.AbortAcquisition())
     assert not again.asked(LoopRequest)
 
 
@@ -163,7 +164,7 @@ def test_a_loop_that_diverged_is_not_given_back():
     story.wait(4)
     story.open()
     again = Again(story, Mode.PROPOSE).find()
-    again.tell(ev.AbortAcquisition())
+    again.tell(cmd.AbortAcquisition())
     assert not again.asked(LoopRequest)
 
 
@@ -181,7 +182,7 @@ def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there():
 
 def test_a_loop_the_operator_closes_meanwhile_is_the_operators(opened):
     again = Again(opened, Mode.PROPOSE).find()
-    again.tell(ev.SetLoop(closed=True))
+    again.tell(cmd.SetLoop(loop="closed"))
     again.status()
     assert again.stage is AcquisitionStage.ABORTED
     assert "not judged" in again.text
@@ -190,7 +191,7 @@ def test_a_loop_the_operator_closes_meanwhile_is_the_operators(opened):
 
 def test_a_loop_that_had_not_been_opened_yet_is_left_closed():
     story = Acquiring()
-    story.tell(ev.Acquire())
+    story.tell(cmd.Acquire())
     assert story.stage is AcquisitionStage.OPENING
     again = Again(story)
     again.find(loop="closed", gains=(0.4,) * 400 + (0.0,) * 194)
@@ -241,7 +242,7 @@ def test_one_that_had_failed_has_still_failed():
 
 
 def test_one_that_was_aborted_leaves_no_alpha_behind(opened):
-    opened.tell(ev.AbortAcquisition())
+    opened.tell(cmd.AbortAcquisition())
     again = Again(opened)
     assert again.stage is AcquisitionStage.ABORTED
     assert again.state.registration is None
@@ -300,7 +301,7 @@ class TestGap:
 
     def test_in_another_mode_it_waits_and_says_what_to_do(self):
         story = Acquiring(Mode.PROPOSE)
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         story.tell(ev.RtcVanished())
         story.still_open()
@@ -349,10 +350,10 @@ class TestGap:
 
     def test_who_aborts_after_it_gets_a_healthy_loop_back_as_it_was(self):
         story = Acquiring(Mode.PROPOSE)
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.open()
         story.tell(ev.RtcVanished())
         story.still_open()
-        story.tell(ev.AbortAcquisition())
+        story.tell(cmd.AbortAcquisition())
         last = story.asked(LoopRequest)[-1]
         assert (last.loop, last.leak) == (Loop.CLOSED, 0.999)

@@ -7,11 +7,12 @@ from functools import cache
 import pytest
 
 from service.errors import CommandError, UnknownIdError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.activity import under_way
 from service.tracking.products import MatrixState, MeasureState, ModeSet
 from service.tracking.state import AcquisitionStage, Mode
-from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern, Pointing
+from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern
 from tests.unit.tracking.situations import POLICY, Story
 from tests.unit.tracking.world import World
 
@@ -29,12 +30,12 @@ def quiet():
     world = World(Mode.HOLD)
     world.pass_(10.0)
     assert world.state.registration is not None
-    world.tell(ev.Refit())
+    world.tell(cmd.Refit())
     world.pass_(2.0)
-    world.tell(ev.Approve(id="cm-1"))
+    world.tell(cmd.Approve(id="cm-1"))
     world.pass_(2.0)
-    world.tell(ev.StopDither())
-    world.tell(ev.SetMode(mode=Mode.PROPOSE))
+    world.tell(cmd.StopDither())
+    world.tell(cmd.SetMode(mode=Mode.PROPOSE))
     world.pass_(3.0)
     assert world.state.in_use == "cm-1"
     assert not under_way(world.state, world.now_ns)
@@ -43,26 +44,26 @@ def quiet():
 
 def measuring():
     world = idle()
-    world.tell(ev.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL))
+    world.tell(cmd.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL))
     return world.pass_(1.0)
 
 
 def measuring_sines():
     world = idle()
-    world.tell(ev.Measure(id="im-1", pattern=Pattern.SINE))
+    world.tell(cmd.Measure(id="im-1", pattern=Pattern.SINE))
     return world.pass_(1.0)
 
 
 def waiting_for_a_noisy_one():
     world = own_dither()
-    world.tell(ev.MeasureNoisy(id="noisy-1", duration_s=30.0))
+    world.tell(cmd.MeasureNoisy(id="noisy-1", duration_s=30.0))
     assert world.state.gathering.state is MeasureState.WAITING
     return world
 
 
 def gathering():
     world = idle()
-    world.tell(ev.MeasureNoisy(id="noisy-1", modes=ModeSet.CONTROLLED, duration_s=30.0))
+    world.tell(cmd.MeasureNoisy(id="noisy-1", modes=ModeSet.CONTROLLED, duration_s=30.0))
     world.pass_(3.0)
     assert world.state.gathering.state is MeasureState.RUNNING
     return world
@@ -70,25 +71,25 @@ def gathering():
 
 def ramping():
     world = idle()
-    world.tell(ev.Ramp())
+    world.tell(cmd.Ramp())
     return world.pass_(1.0)
 
 
 def acquiring():
     world = idle()
-    world.tell(ev.Acquire())
+    world.tell(cmd.Acquire())
     return world.pass_(2.0)
 
 
 def own_dither():
     world = idle()
-    world.tell(ev.StartDither())
+    world.tell(cmd.StartDither())
     return world.pass_(2.0)
 
 
 def operators_dither():
     world = idle()
-    world.tell(ev.StartDither(modes=(501,), amplitude_m=2e-9, frequency_hz=(250.0,)))
+    world.tell(cmd.StartDither(modes=(501,), amplitude_m=2e-9, frequency_hz=(250.0,)))
     return world.pass_(2.0)
 
 
@@ -108,16 +109,16 @@ def others_dither():
 
 def making():
     world = idle()
-    world.tell(ev.Refit())
+    world.tell(cmd.Refit())
     return world
 
 
 def sending():
     world = idle()
-    world.tell(ev.Refit())
+    world.tell(cmd.Refit())
     world.pass_(0.5)
     proposed = [r.id for r in world.state.reconstructors if r.state is MatrixState.PROPOSED]
-    world.tell(ev.Approve(id=proposed[-1]))
+    world.tell(cmd.Approve(id=proposed[-1]))
     return world
 
 
@@ -136,27 +137,27 @@ ACTIVITIES = [
     sending,
 ]
 COMMANDS = [
-    ev.Acquire(),
-    ev.AbortAcquisition(),
-    ev.SetMode(mode=Mode.AUTO),
-    ev.SetMode(mode=Mode.HOLD),
-    ev.Refit(),
-    ev.StartDither(),
-    ev.StartDither(modes=(502,), amplitude_m=2e-9, frequency_hz=(260.0,)),
-    ev.StopDither(),
-    ev.Approve(id="cm-1"),
-    ev.Reject(id="cm-1"),
-    ev.Publish(id="initial"),
-    ev.Rollback(),
-    ev.Measure(id="im-9", pattern=Pattern.PUSH_PULL_MODAL),
-    ev.Measure(id="im-9", pattern=Pattern.SINE),
-    ev.GiveUp(id="im-1"),
-    ev.MeasureNoisy(id="noisy-9", duration_s=30.0),
-    ev.GiveUpNoisy(id="noisy-1"),
-    ev.SetLoop(closed=False),
-    ev.SetLoop(gains=(ev.GainGroup(first=0, last=399, gain=0.3),)),
-    ev.SetPointing(pointing=Pointing(elevation_deg=60.0, azimuth_deg=0.0)),
-    ev.Ramp(),
+    cmd.Acquire(),
+    cmd.AbortAcquisition(),
+    cmd.SetMode(mode=Mode.AUTO),
+    cmd.SetMode(mode=Mode.HOLD),
+    cmd.Refit(),
+    cmd.StartDither(),
+    cmd.StartDither(modes=(502,), amplitude_m=2e-9, frequency_hz=(260.0,)),
+    cmd.StopDither(),
+    cmd.Approve(id="cm-1"),
+    cmd.Reject(id="cm-1"),
+    cmd.Publish(id="initial"),
+    cmd.Rollback(),
+    cmd.Measure(id="im-9", pattern=Pattern.PUSH_PULL_MODAL),
+    cmd.Measure(id="im-9", pattern=Pattern.SINE),
+    cmd.GiveUp(id="im-1"),
+    cmd.MeasureNoisy(id="noisy-9", duration_s=30.0),
+    cmd.GiveUpNoisy(id="noisy-1"),
+    cmd.SetLoop(loop="open"),
+    cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=399, gain=0.3),)),
+    cmd.SetPointing(elevation_deg=60.0, azimuth_deg=0.0),
+    cmd.Ramp(),
 ]
 
 
@@ -167,7 +168,7 @@ def named(command):
 def command_words(command):
     return [
         getattr(command, name)
-        for name in ("id", "pattern", "mode", "closed")
+        for name in ("id", "pattern", "mode", "loop")
         if getattr(command, name, None) is not None
     ]
 
@@ -230,35 +231,35 @@ def test_what_runs_is_named_with_what_ends_it(activity):
 
 
 REFUSED = [
-    (measuring, "im-1", [ev.Acquire(), ev.SetLoop(closed=False), ev.Ramp(), ev.Refit()]),
+    (measuring, "im-1", [cmd.Acquire(), cmd.SetLoop(loop="open"), cmd.Ramp(), cmd.Refit()]),
     (
         gathering,
         "noisy-1",
         [
-            ev.Acquire(),
-            ev.SetLoop(closed=False),
-            ev.Ramp(),
-            ev.StartDither(),
-            ev.Measure(id="im-9", pattern=Pattern.PUSH_PULL_MODAL),
-            ev.MeasureNoisy(id="noisy-9"),
+            cmd.Acquire(),
+            cmd.SetLoop(loop="open"),
+            cmd.Ramp(),
+            cmd.StartDither(),
+            cmd.Measure(id="im-9", pattern=Pattern.PUSH_PULL_MODAL),
+            cmd.MeasureNoisy(id="noisy-9"),
         ],
     ),
     (
         ramping,
         "open the loop to end it",
         [
-            ev.Acquire(),
-            ev.SetLoop(gains=(ev.GainGroup(first=0, last=399, gain=0.3),)),
-            ev.Ramp(),
-            ev.StartDither(),
-            ev.Measure(id="im-9", pattern=Pattern.PUSH_PULL_MODAL),
-            ev.MeasureNoisy(id="noisy-9"),
+            cmd.Acquire(),
+            cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=399, gain=0.3),)),
+            cmd.Ramp(),
+            cmd.StartDither(),
+            cmd.Measure(id="im-9", pattern=Pattern.PUSH_PULL_MODAL),
+            cmd.MeasureNoisy(id="noisy-9"),
         ],
     ),
     (
         others_dither,
         "of-another-program is running; stop it first",
-        [ev.MeasureNoisy(id="noisy-9"), ev.StartDither()],
+        [cmd.MeasureNoisy(id="noisy-9"), cmd.StartDither()],
     ),
 ]
 
@@ -276,7 +277,7 @@ def test_what_would_strand_it_is_refused_by_its_name(activity, what, command):
 
 def test_a_gain_ramp_ends_when_the_loop_is_opened():
     world = ramping()
-    world.tell(ev.SetLoop(closed=False))
+    world.tell(cmd.SetLoop(loop="open"))
     world.pass_(2.0)
     assert world.state.rtc.loop == "open"
     assert not under_way(world.state, world.now_ns)
@@ -284,7 +285,7 @@ def test_a_gain_ramp_ends_when_the_loop_is_opened():
 
 def test_while_gains_are_tried_nothing_is_made_sent_or_dithered():
     world = ramping()
-    world.tell(ev.SetMode(mode=Mode.AUTO))
+    world.tell(cmd.SetMode(mode=Mode.AUTO))
     world.effects.clear()
     world.pass_(15.0)
     assert not world.effects
@@ -295,7 +296,7 @@ def test_while_gains_are_tried_nothing_is_made_sent_or_dithered():
 def test_a_loop_that_goes_out_of_hand_while_signs_are_gathered_takes_the_dither_with_it():
     world = World(Mode.AUTO, replace(POLICY, acquires=True))
     world.pass_(20.0)
-    world.tell(ev.MeasureNoisy(id="noisy-1", duration_s=60.0))
+    world.tell(cmd.MeasureNoisy(id="noisy-1", duration_s=60.0))
     world.pass_(5.0)
     world.tell(ev.Trouble(name="loop-diverging", text="found"))
     world.pass_(4.0)
@@ -307,7 +308,7 @@ def test_a_loop_that_goes_out_of_hand_while_signs_are_gathered_takes_the_dither_
 
 def test_a_stopped_dither_ends_the_wait_for_one_that_measures():
     world = waiting_for_a_noisy_one()
-    world.tell(ev.StopDither())
+    world.tell(cmd.StopDither())
     (noisy,) = world.state.noisy
     assert noisy.state is MeasureState.FAILED
     assert "stopped" in noisy.reason
@@ -316,7 +317,7 @@ def test_a_stopped_dither_ends_the_wait_for_one_that_measures():
 
 def test_a_ramp_nobody_answers_for_keeps_nothing_back_for_ever():
     story = Story().meet()
-    story.tell(ev.Ramp())
+    story.tell(cmd.Ramp())
     assert under_way(story.state, story.now_ns)
     story.wait(60.0)
     assert not [one for one in under_way(story.state, story.now_ns) if "ramp" in one.text]

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import OVER_BUDGET
 from service.tracking.dither_request import Dither, plan_dither, why_unusable
@@ -56,7 +57,7 @@ def test_a_refusal_because_one_runs_is_no_alarm_once_it_is_adopted():
 
 def test_an_operator_who_stopped_the_dither_is_obeyed():
     story = Story().meet(**with_dither())
-    story.tell(ev.StopDither())
+    story.tell(cmd.StopDither())
     story.tell(rtc(**with_dither()))
     assert story.state.dither is None
 

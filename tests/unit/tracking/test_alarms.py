@@ -7,6 +7,7 @@ import pytest
 from service.errors import CommandError
 from service.telemetry.windows import WindowRefused
 from service.tracking import alarms
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import ALARMS, Act, Kind
 from service.tracking.products import MatrixState
@@ -81,7 +82,7 @@ def test_not_even_an_operator_sends_to_an_rtc_that_may_be_another(name):
     story = settled(name)
     story.tell(ev.MatrixMade(record=made(story), wanted=True))
     with pytest.raises(CommandError, match="found"):
-        story.tell(ev.Approve(id="cm-1"))
+        story.tell(cmd.Approve(id="cm-1"))
     assert not story.asked(ev.SendMatrix)
 
 
@@ -128,7 +129,7 @@ def test_while_slopes_are_not_as_told_nothing_is_made_or_sent_whoever_wants_it(n
     story.tell(ev.MatrixMade(record=made(story), wanted=False))
     story.tell(ev.MatrixMade(record=made(story, "cm-2"), wanted=True))
     with pytest.raises(CommandError, match="cm-2 cannot be sent: found"):
-        story.tell(ev.Approve(id="cm-2"))
+        story.tell(cmd.Approve(id="cm-2"))
     story.wait(6)
     assert not of_kind(story.effects, ev.SendMatrix | ev.MakeMatrix)
 

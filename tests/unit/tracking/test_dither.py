@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import pytest
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither import LONGEST_PATIENCE_S, PATIENCE_S
 from service.tracking.state import Mode
@@ -77,7 +78,7 @@ class TestTheStatusShowsNone:
 
     def test_an_operator_who_wants_none_ends_the_alarm(self, story):
         status(story, START + 500)
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         assert "dither-lost" not in story.alarms
 
 

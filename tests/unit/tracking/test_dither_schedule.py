@@ -9,6 +9,7 @@ from hypothesis import given, settings
 
 from service.control.dither import tabulated
 from service.errors import CommandError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_plan import FAINT_WINDOW_S, LASTING_S, MIN_WINDOWS, budget_m
 from service.tracking.dither_request import SETTLING_S, DitherPhase, total_m
@@ -169,21 +170,21 @@ class TestWhen:
 
     def test_stopped_by_the_operator_it_says_so_and_stays_off(self):
         night = DitheredNight(BRISK).live(30)
-        night.pass_on(night.tell(ev.StopDither()))
+        night.pass_on(night.tell(cmd.StopDither()))
         n_requests = len(night.requests)
         night.live(120)
         assert len(night.requests) == n_requests
         assert night.state.dithering.phase is DitherPhase.OFF
         assert night.state.dithering.reason == "stopped by the operator"
-        night.pass_on(night.tell(ev.StartDither()))
+        night.pass_on(night.tell(cmd.StartDither()))
         assert len(night.requests) == n_requests + 1
         night.live(60)
         assert night.state.dithering.phase is DitherPhase.FOLLOW
 
     def test_an_operators_own_is_left_alone_to_its_end(self):
         night = DitheredNight(CALM).live(60)
-        night.pass_on(night.tell(ev.StopDither()))
-        night.pass_on(night.tell(ev.StartDither(amplitude_m=1e-9, duration_s=20.0)))
+        night.pass_on(night.tell(cmd.StopDither()))
+        night.pass_on(night.tell(cmd.StartDither(amplitude_m=1e-9, duration_s=20.0)))
         night.live(15)
         assert night.state.dithering.phase is DitherPhase.OPERATOR
         assert night.playing.id.startswith("operator-")
@@ -193,8 +194,8 @@ class TestWhen:
     def test_an_operators_own_has_the_stars_windows_and_keeps_clear_of_vibrations(self):
         night = DitheredNight(CALM, magnitude=12.5).live(60)
         night.tell(ev.Vibrations(lines_hz=(239.0,)))
-        night.pass_on(night.tell(ev.StopDither()))
-        night.pass_on(night.tell(ev.StartDither(amplitude_m=1e-9)))
+        night.pass_on(night.tell(cmd.StopDither()))
+        night.pass_on(night.tell(cmd.StartDither(amplitude_m=1e-9)))
         asked = night.requests[-1]
         assert night.windows_s[-1] >= FAINT_WINDOW_S
         assert min(abs(line - 239.0) for line in asked.frequency_hz) >= 8.0
@@ -252,17 +253,17 @@ class TestOperatorsBudget:
     @pytest.fixture
     def story(self):
         story = Story(policy=replace(POLICY, dither_budget_m=8e-9)).meet()
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         return story
 
     def test_more_than_the_budget_must_be_meant(self, story):
         with pytest.raises(CommandError, match="20 nm RMS in all, budget 8 nm; say over_budget"):
-            story.tell(ev.StartDither(amplitude_m=10e-9))
-        story.tell(ev.StartDither(amplitude_m=10e-9, over_budget=True))
+            story.tell(cmd.StartDither(amplitude_m=10e-9))
+        story.tell(cmd.StartDither(amplitude_m=10e-9, over_budget=True))
         assert "over budget, as asked" in story.state.log[-1].text
 
     def test_within_the_budget_nothing_need_be_said(self, story):
-        story.tell(ev.StartDither(amplitude_m=4e-9))
+        story.tell(cmd.StartDither(amplitude_m=4e-9))
         assert total_m(story.asked(DitherRequest)[-1]) == pytest.approx(8e-9)
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.activity import GONE_WITHIN_S
 from service.tracking.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
@@ -58,7 +59,7 @@ class TestOffByTheOperator:
     def test_a_stop_that_fails_is_repeated_until_the_status_shows_none(self, story):
         dither = story.state.dither
         accept(story, dither)
-        assert story.tell(ev.StopDither()) == (stopping(story),)
+        assert story.tell(cmd.StopDither()) == (stopping(story),)
         story.tell(ev.JobFailed(effect=stopping(story), text="no answer"))
         asked = of_kind(playing(story, dither, 20), DitherStop)
         assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
@@ -71,7 +72,7 @@ class TestOffByTheOperator:
 
     def test_a_start_that_overtakes_the_stop_is_stopped_too(self, story):
         dither = story.state.dither
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         accept(story, dither)
         assert of_kind(playing(story, dither, 4), DitherStop)
         silent(story)
@@ -80,7 +81,7 @@ class TestOffByTheOperator:
     def test_a_status_from_before_the_stop_is_no_alarm_and_nothing_is_asked_twice(self, story):
         dither = story.state.dither
         accept(story, dither)
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         assert not playing(story, dither)
         silent(story)
         assert not story.alarms
@@ -88,19 +89,19 @@ class TestOffByTheOperator:
     @pytest.mark.parametrize("name", ["operator-1", "noisy-1", "acquire-1"])
     def test_whatever_of_the_services_it_is(self, story, name):
         dither = named(story.state.dither, name)
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         assert of_kind(playing(story, dither, 4), DitherStop)
 
     def test_somebody_elses_is_left_alone_and_told_as_it_is(self, story):
         dither = named(story.state.dither, "engineer-1")
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         assert not playing(story, dither, 10)
         assert not story.alarms
 
     def test_what_it_costs_is_what_the_rtc_plays(self, story):
         dither = story.state.dither
         accept(story, dither)
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         playing(story, dither, 3600)
         expected = pytest.approx(total_m(dither.request), rel=0.01)
         assert story.state.dithering.mean_cost_m == expected
@@ -109,19 +110,19 @@ class TestOffByTheOperator:
     def test_a_loop_out_of_hand_keeps_none_on_the_mirror(self, story, alarm):
         dither = story.state.dither
         accept(story, dither)
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         story.tell(ev.Trouble(name=alarm, text="x"))
         assert of_kind(playing(story, dither, 4), DitherStop)
 
     def test_nobody_knows_whose_it_is_while_two_rtcs_send(self, story):
         dither = story.state.dither
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         story.tell(ev.Trouble(name="second-rtc", text="x"))
         assert not playing(story, dither, 4)
 
     def test_the_alarm_ends_with_the_rtc(self, story):
         dither = story.state.dither
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         playing(story, dither, 10)
         assert NOT_STOPPED in story.alarms
         story.tell(ev.RtcVanished())
@@ -135,9 +136,9 @@ class TestOffByTheOperator:
     def test_the_operator_may_have_it_again(self, story):
         dither = story.state.dither
         accept(story, dither)
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         playing(story, dither, round(GONE_WITHIN_S) + 2)
-        story.tell(ev.StartDither())
+        story.tell(cmd.StartDither())
         assert not of_kind(playing(story, dither, 10), DitherStop)
         assert NOT_STOPPED not in story.alarms
 
@@ -218,8 +219,8 @@ class TestTooStrong:
     def test_an_operators_may_exceed_the_budget_but_not_what_was_asked_for(
         self, story, by, stopped
     ):
-        story.tell(ev.StopDither())
-        story.tell(ev.StartDither(amplitude_m=10e-9, over_budget=True))
+        story.tell(cmd.StopDither())
+        story.tell(cmd.StartDither(amplitude_m=10e-9, over_budget=True))
         dither = story.state.dither
         accept(story, dither)
         effects = playing(story, louder(dither, by), 3)
@@ -228,7 +229,7 @@ class TestTooStrong:
 
     def test_an_operator_who_wants_none_has_no_alarm(self, story, loud):
         playing(story, loud)
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         silent(story, 2)
         assert not story.alarms
 
@@ -285,9 +286,9 @@ class TestByTheFrames:
         assert NOT_AS_ASKED not in story.alarms
 
     def test_what_an_operator_asked_for_may_cost_more_than_the_budget(self, story):
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         story.tell(rtc(), after_s=1.0)
-        meant = ev.StartDither(
+        meant = cmd.StartDither(
             modes=(501,), frequency_hz=(250.0,), amplitude_m=15e-9, over_budget=True
         )
         story.tell(meant)
@@ -299,7 +300,7 @@ class TestByTheFrames:
 
     def test_an_acquisition_ends_and_says_why(self):
         story = Story(policy=replace(POLICY, acquires=True)).meet()
-        story.tell(ev.Acquire())
+        story.tell(cmd.Acquire())
         story.tell(ev.SessionStarted(session="s2"))
         view = rtc(session="s2", loop="open", gains=(0.0,) * 594)
         story.tell(view)
@@ -310,9 +311,9 @@ class TestByTheFrames:
         assert "the frames hold much" in story.state.acquisition.text
 
     def test_a_noisy_matrix_ends_and_says_why(self, story):
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         story.tell(rtc(), after_s=1.0)
-        story.tell(ev.MeasureNoisy(id="noisy-1"))
+        story.tell(cmd.MeasureNoisy(id="noisy-1"))
         dither = story.state.dither
         accept(story, dither)
         playing(story, dither)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.tracking import events as ev
+from service.tracking import commands as cmd
 from service.tracking.registration import ModeGain, table_of
 from service.tracking.state import Mode
 from service.wire import LoopRequest
@@ -28,7 +28,7 @@ def story():
 
 
 def test_they_act_alike_on_every_controlled_mode_and_the_gate_is_asked(story):
-    (effect,) = story.tell(ev.SetLoop(effective_gain=0.3))
+    (effect,) = story.tell(cmd.SetLoop(effective_gain=0.3))
     assert effect.judged
     asked = effect.request
     assert len(asked.gains) == N_MODES
@@ -39,21 +39,21 @@ def test_they_act_alike_on_every_controlled_mode_and_the_gate_is_asked(story):
 
 
 def test_asked_twice_they_are_the_same(story):
-    (first,) = of_kind(story.tell(ev.SetLoop(effective_gain=0.3)), LoopRequest)
+    (first,) = of_kind(story.tell(cmd.SetLoop(effective_gain=0.3)), LoopRequest)
     story.now_ns += 1
-    (second,) = of_kind(story.tell(ev.SetLoop(effective_gain=0.3)), LoopRequest)
+    (second,) = of_kind(story.tell(cmd.SetLoop(effective_gain=0.3)), LoopRequest)
     assert first.gains == second.gains
 
 
 def test_gains_an_operator_names_are_his_own_business(story):
-    groups = (ev.GainGroup(first=0, last=1, gain=0.5),)
-    (asked,) = story.tell(ev.SetLoop(gains=groups))
+    groups = (cmd.GainGroup(first=0, last=1, gain=0.5),)
+    (asked,) = story.tell(cmd.SetLoop(gains=groups))
     assert not asked.judged
 
 
 def test_without_a_measured_gain_there_is_nothing_to_undo():
     with pytest.raises(CommandError, match="no measured optical gain"):
-        Story(Mode.HOLD).meet().tell(ev.SetLoop(effective_gain=0.3))
+        Story(Mode.HOLD).meet().tell(cmd.SetLoop(effective_gain=0.3))
 
 
 def test_the_service_never_sets_them_by_itself():

@@ -1,6 +1,6 @@
 """Evidence counts by when it was taken, not by when a busy worker was done with it."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import hypothesis.strategies as st
 import numpy as np
@@ -9,6 +9,7 @@ from hypothesis import given, settings
 
 from service.errors import CommandError
 from service.telemetry.openloop import FarEstimate
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.registration import Validity
@@ -208,7 +209,7 @@ class TestSlew:
 
     def point(self, night, s, where):
         night.at(s)
-        night.tell(ev.SetPointing(pointing=where))
+        night.tell(cmd.SetPointing(**asdict(where)))
 
     def test_a_window_from_before_it_says_nothing_of_where_the_telescope_is_now(self, night):
         self.point(night, 8, self.FROM)
@@ -237,13 +238,13 @@ class TestVerdicts:
         proposal = made(night)
         of_old = replace(proposal.judged, leak=0.9)
         night.tell(ev.MatrixMade(record=replace(proposal, judged=of_old), wanted=False))
-        assert of_kind(night.tell(ev.Approve(id="cm-1")), ev.JudgeProposal)
+        assert of_kind(night.tell(cmd.Approve(id="cm-1")), ev.JudgeProposal)
         night.look(10, ELSEWHERE)
         passed = ev.ProposalJudged(id="cm-1", verdict=verdict(), judged=proposal.judged)
         assert not of_kind(night.tell(passed), ev.SendMatrix)
         assert night.matrix_state("cm-1") is MatrixState.PROPOSED
         with pytest.raises(CommandError, match="invalid"):
-            night.tell(ev.Approve(id="cm-1"))
+            night.tell(cmd.Approve(id="cm-1"))
 
     def test_a_margin_of_the_place_before_a_jump_calms_nobody(self, night):
         then = judged(night.state.registration, night.state.rtc)
@@ -266,7 +267,7 @@ class TestVerdicts:
     def test_what_is_applied_after_a_jump_is_not_as_good_as_it_was_judged_before(self):
         night = Late(Mode.PROPOSE)
         night.tell(ev.MatrixMade(record=made(night), wanted=False))
-        night.tell(ev.Approve(id="cm-1"))
+        night.tell(cmd.Approve(id="cm-1"))
         for end_s in (10, 12, 14):
             night.window(end_s, THERE)
         effects = night.acknowledge("cm-1")
@@ -291,7 +292,7 @@ def test_what_was_seen_from_afar_before_an_acquisition_began_anew_counts_for_not
     open_loop = {"loop": "open", "gains": (0.0,) * 594}
     night.at(10)
     night.tell(rtc(t_ns=night.now_ns, **open_loop))
-    night.tell(ev.Acquire())
+    night.tell(cmd.Acquire())
     dither = night.state.dither
     found = estimate(ALPHA, t_ns=night.zero_ns + 9 * SECOND, modes=dither.request.modes)
     found = replace(found, covariance=np.diag([0.01, 0.01, 3e-4, 1e-3]) ** 2)

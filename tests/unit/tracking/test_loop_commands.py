@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.loop import CommandState
 from service.tracking.operator import CLOSE_AGAIN_EVERY_S
@@ -15,21 +16,21 @@ from tests.unit.tracking.situations import Story, judged, loop_answered, of_kind
 def story():
     """A closed loop of 400 modes, nothing under way."""
     story = Story(Mode.HOLD).meet()
-    story.tell(ev.StopDither())
+    story.tell(cmd.StopDither())
     return story
 
 
 def group(first, last, gain):
-    return ev.GainGroup(first=first, last=last, gain=gain)
+    return cmd.GainGroup(first=first, last=last, gain=gain)
 
 
 def ask(story, **changes):
-    (asked,) = of_kind(story.tell(ev.SetLoop(**changes)), LoopRequest)
+    (asked,) = of_kind(story.tell(cmd.SetLoop(**changes)), LoopRequest)
     return asked
 
 
 def test_opening_says_nothing_of_the_rest(story):
-    asked = ask(story, closed=False)
+    asked = ask(story, loop="open")
     assert (asked.loop, asked.gains, asked.leak, asked.n_controlled) == (
         Loop.OPEN,
         None,
@@ -55,7 +56,7 @@ def test_an_open_loop_does_not_tell_its_gains_so_all_must_be_named(story):
     story.tell(rtc(loop="open", gains=(0.0,) * 594))
     with pytest.raises(CommandError, match="found gains for 2 modes; expected all 400"):
         ask(story, gains=(group(0, 1, 0.5),))
-    asked = ask(story, closed=True, gains=(group(0, 1, 0.5), group(2, 399, 0.3)))
+    asked = ask(story, loop="closed", gains=(group(0, 1, 0.5), group(2, 399, 0.3)))
     assert asked.gains == (0.5,) * 2 + (0.3,) * 398 + (0.0,) * 194
 
 
@@ -63,7 +64,6 @@ def test_an_open_loop_does_not_tell_its_gains_so_all_must_be_named(story):
     ("changes", "words"),
     [
         ({"gains": (group(390, 400, 0.1),)}, "found modes 390 to 400; expected .* 0 to 399"),
-        ({"gains": (group(0, 5, 0.1), group(5, 9, 0.2))}, "found mode 5 in two groups"),
         ({"n_controlled": 595}, "found 595 modes; expected 1 to 594"),
     ],
 )
@@ -74,7 +74,7 @@ def test_what_the_loop_cannot_be_is_refused(story, changes, words):
 
 
 def test_nobody_changes_the_loop_of_nobody():
-    for command in (ev.SetLoop(closed=True), ev.Ramp()):
+    for command in (cmd.SetLoop(loop="closed"), cmd.Ramp()):
         with pytest.raises(CommandError, match="no RTC is there"):
             Story(Mode.HOLD).tell(command)
 
@@ -130,7 +130,7 @@ def test_a_verdict_on_the_gains_before_is_dropped_and_asked_for_again():
 
 
 def test_a_ramp_tries_the_papers_groups(story):
-    (asked,) = of_kind(story.tell(ev.Ramp(gains=(0.2, 0.4))), RampRequest)
+    (asked,) = of_kind(story.tell(cmd.Ramp(gains=(0.2, 0.4))), RampRequest)
     assert asked.groups == ((0, 1), (2, 99), (100, 399))
     assert (asked.gains, asked.frames_per_gain) == ((0.2, 0.4), 1000)
     assert story.state.loop_command.lasts_s == 6.0
@@ -138,21 +138,21 @@ def test_a_ramp_tries_the_papers_groups(story):
 
 def test_a_ramp_of_few_modes_has_fewer_groups(story):
     story.tell(rtc(60))
-    (asked,) = of_kind(story.tell(ev.Ramp()), RampRequest)
+    (asked,) = of_kind(story.tell(cmd.Ramp()), RampRequest)
     assert asked.groups == ((0, 1), (2, 59))
 
 
 def test_a_ramp_needs_a_closed_loop_and_modes_it_controls(story):
     with pytest.raises(CommandError, match=r"found modes 100 to 400; expected .* 0 to 399"):
-        story.tell(ev.Ramp(groups=((100, 400),)))
+        story.tell(cmd.Ramp(groups=(cmd.ModeGroup(first=100, last=400),)))
     story.tell(rtc(loop="open"))
     with pytest.raises(CommandError, match="found the loop open"):
-        story.tell(ev.Ramp())
+        story.tell(cmd.Ramp())
 
 
 def test_nothing_is_made_while_gains_are_only_tried():
     story = Story(Mode.AUTO).meet()
-    story.tell(ev.Ramp(gains=(0.2, 0.4)))
+    story.tell(cmd.Ramp(gains=(0.2, 0.4)))
     story.tell(loop_answered(story.state.loop_command.id, accepted=True, reason=""))
     story.see(n_windows=2, every_s=2.0)
     assert not story.asked(ev.MakeMatrix)
@@ -162,12 +162,12 @@ def test_nothing_is_made_while_gains_are_only_tried():
 
 class TestAMeasurementGivenUp:
     def begin(self, story, pattern=Pattern.PUSH_PULL_MODAL, *, loop="open"):
-        story.tell(ev.Measure(id="im-1", pattern=pattern))
+        story.tell(cmd.Measure(id="im-1", pattern=pattern))
         story.tell(rtc(loop=loop))
 
     def test_the_loop_is_closed_again_as_often_as_it_takes(self, story):
         self.begin(story)
-        (asked,) = of_kind(story.tell(ev.GiveUp(id="im-1")), LoopRequest)
+        (asked,) = of_kind(story.tell(cmd.GiveUp(id="im-1")), LoopRequest)
         assert asked.loop is Loop.CLOSED
         story.tell(loop_answered(asked.id, accepted=False, reason="busy: im-1"))
         assert len(of_kind(story.wait(2.2 * CLOSE_AGAIN_EVERY_S), LoopRequest)) == 2
@@ -177,24 +177,24 @@ class TestAMeasurementGivenUp:
 
     def test_a_loop_that_opens_only_then_is_closed_too(self, story):
         self.begin(story, loop="closed")
-        assert not of_kind(story.tell(ev.GiveUp(id="im-1")), LoopRequest)
+        assert not of_kind(story.tell(cmd.GiveUp(id="im-1")), LoopRequest)
         story.tell(rtc(loop="open"), after_s=1)
         assert of_kind(story.tell(ev.Tick()), LoopRequest)
 
     def test_a_loop_that_was_open_before_stays_open(self, story):
         story.tell(rtc(loop="open"))
         self.begin(story)
-        assert not of_kind(story.tell(ev.GiveUp(id="im-1")), LoopRequest)
+        assert not of_kind(story.tell(cmd.GiveUp(id="im-1")), LoopRequest)
         assert not of_kind(story.wait(20), LoopRequest)
 
     def test_an_operator_who_opens_the_loop_is_obeyed(self, story):
         self.begin(story)
-        story.tell(ev.GiveUp(id="im-1"))
-        story.tell(ev.SetLoop(closed=False), after_s=1)
+        story.tell(cmd.GiveUp(id="im-1"))
+        story.tell(cmd.SetLoop(loop="open"), after_s=1)
         assert not of_kind(story.wait(20), LoopRequest)
 
     def test_a_loop_nobody_closes_is_not_asked_about_for_ever(self, story):
         self.begin(story)
-        story.tell(ev.GiveUp(id="im-1"))
+        story.tell(cmd.GiveUp(id="im-1"))
         story.wait(3700, every_s=60)
         assert story.state.close_since_ns_utc is None

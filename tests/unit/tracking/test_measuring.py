@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError, UnknownIdError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.measuring import LONGEST_S, OVERDUE_S
 from service.tracking.products import MatrixState, MeasureState
@@ -17,12 +18,12 @@ def story():
     """The dither stopped, α known, nothing under way."""
     story = Story(Mode.HOLD).meet()
     story.see(n_windows=2)
-    story.tell(ev.StopDither())
+    story.tell(cmd.StopDither())
     return story
 
 
 def ask(story, **changes):
-    command = ev.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL)
+    command = cmd.Measure(id="im-1", pattern=Pattern.PUSH_PULL_MODAL)
     return story.tell(replace(command, **changes))
 
 
@@ -84,7 +85,7 @@ def test_nobody_measures_under_a_dither():
 
 
 def test_nobody_measures_while_a_reconstructor_is_made_or_on_its_way(story):
-    story.tell(ev.Refit())
+    story.tell(cmd.Refit())
     with pytest.raises(CommandError, match="being computed; wait"):
         ask(story)
     story.make("cm-1", wanted=True)
@@ -109,13 +110,13 @@ def test_a_mode_the_basis_does_not_have_is_refused(story):
 @pytest.mark.parametrize(
     "command",
     [
-        ev.StartDither(),
-        ev.Refit(),
-        ev.Approve(id="x"),
-        ev.Publish(id="x"),
-        ev.Rollback(),
-        ev.SetLoop(closed=True),
-        ev.Ramp(),
+        cmd.StartDither(),
+        cmd.Refit(),
+        cmd.Approve(id="x"),
+        cmd.Publish(id="x"),
+        cmd.Rollback(),
+        cmd.SetLoop(loop="closed"),
+        cmd.Ramp(),
     ],
 )
 def test_what_would_disturb_it_has_to_wait(story, command):
@@ -126,15 +127,15 @@ def test_what_would_disturb_it_has_to_wait(story, command):
 
 def test_a_mode_can_be_chosen_and_a_dither_stopped_meanwhile(story):
     begin(story)
-    story.tell(ev.SetMode(mode=Mode.AUTO))
-    story.tell(ev.StopDither())
+    story.tell(cmd.SetMode(mode=Mode.AUTO))
+    story.tell(cmd.StopDither())
     assert story.state.measuring is not None
 
 
 @pytest.mark.parametrize("pattern", list(Pattern))
 def test_the_service_does_nothing_by_itself_meanwhile(story, pattern):
     begin(story, pattern=pattern)
-    story.tell(ev.SetMode(mode=Mode.AUTO))
+    story.tell(cmd.SetMode(mode=Mode.AUTO))
     story.state = replace(story.state, dither_stopped=False)
     close(story)
     assert story.wait(10) == ()
@@ -242,7 +243,7 @@ def test_what_is_given_up_is_over_whatever_comes(story):
     begin(story)
     late, (request,) = story.state.measurement("im-1"), story.asked(MeasureRequest)
     lost = ev.Ask(request=request)
-    story.tell(ev.GiveUp(id="im-1"))
+    story.tell(cmd.GiveUp(id="im-1"))
     assert story.state.measuring is None
     for state in (MeasureState.RUNNING, MeasureState.STORED, MeasureState.FAILED):
         story.tell(ev.MatrixMeasured(record=replace(late, state=state)))
@@ -253,18 +254,18 @@ def test_what_is_given_up_is_over_whatever_comes(story):
 
 def test_only_what_is_under_way_can_be_given_up(story):
     with pytest.raises(UnknownIdError, match="im-1: nobody has heard of it"):
-        story.tell(ev.GiveUp(id="im-1"))
+        story.tell(cmd.GiveUp(id="im-1"))
     begin(story)
     answer(story, MeasureState.STORED)
     with pytest.raises(CommandError, match="im-1 is stored: there is nothing to give up"):
-        story.tell(ev.GiveUp(id="im-1"))
+        story.tell(cmd.GiveUp(id="im-1"))
 
 
 def test_nothing_is_asked_while_tones_given_up_still_play(story):
     begin(story, pattern=Pattern.SINE, duration_s=30.0)
     close(story)
-    story.tell(ev.GiveUp(id="im-1"))
-    story.tell(ev.SetMode(mode=Mode.AUTO))
+    story.tell(cmd.GiveUp(id="im-1"))
+    story.tell(cmd.SetMode(mode=Mode.AUTO))
     story.state = replace(story.state, dither_stopped=False, in_use="initial")
     assert not of_kind(story.wait(20), DitherRequest)
     assert of_kind(story.wait(15), DitherRequest)

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import pytest
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
@@ -179,7 +180,7 @@ def test_in_hold_nothing_is_made_however_short_the_margin():
 def test_an_operators_own_number_is_neither_lowered_nor_raised():
     night = Night(Mode.HOLD)
     night.see(n_windows=2)
-    (effect,) = of_kind(night.tell(ev.Refit(n_modes=450)), ev.MakeMatrix)
+    (effect,) = of_kind(night.tell(cmd.Refit(n_modes=450)), ev.MakeMatrix)
     assert effect.fewer == ()
 
 
@@ -190,7 +191,7 @@ class Declined(Night):
         super().__init__()
         (first,) = of_kind(self.see(n_windows=2), ev.MakeMatrix)
         self.make_for(first, 400)
-        self.tell(ev.SetMode(mode=mode))
+        self.tell(cmd.SetMode(mode=mode))
 
     def for_s(self, seconds, decline):
         """Let windows come for so long; every reconstructor asked for is made and declined."""
@@ -219,7 +220,7 @@ class Declined(Night):
 
 
 def the_operator(night, name, _effects):
-    night.tell(ev.Reject(id=name, reason="400 will do"))
+    night.tell(cmd.Reject(id=name, reason="400 will do"))
 
 
 def the_rtc_rejects(night, name, _effects):
@@ -276,7 +277,7 @@ def test_declining_an_update_of_the_modes_in_use_says_nothing_of_more():
     night.policy = replace(WANTED, n_modes_target=400)
     (update,) = of_kind(night.see(moved(shift_x_subap=0.05), n_windows=4), ev.MakeMatrix)
     night.make_for(update, 400)
-    night.tell(ev.Reject(id="cm-2"))
+    night.tell(cmd.Reject(id="cm-2"))
     assert night.state.mode_limit is None
 
 
@@ -292,7 +293,7 @@ def test_a_proposal_that_another_one_replaces_has_not_been_declined():
 def test_an_operators_own_request_for_more_is_heard_at_once_and_lifts_the_limit():
     night = Declined(Mode.PROPOSE)
     night.for_s(20, the_operator)
-    (asked,) = of_kind(night.tell(ev.Refit(n_modes=500)), ev.MakeMatrix)
+    (asked,) = of_kind(night.tell(cmd.Refit(n_modes=500)), ev.MakeMatrix)
     night.make_for(asked, 500)
     assert night.state.mode_limit.n_modes == 500
 
@@ -301,6 +302,6 @@ def test_a_limit_found_by_the_gate_does_not_shorten_an_operators_no():
     night = Declined(Mode.PROPOSE)
     night.for_s(20, the_operator)
     until_ns = night.state.mode_limit.until_ns_utc
-    (asked,) = of_kind(night.tell(ev.Refit(n_modes=500)), ev.MakeMatrix)
+    (asked,) = of_kind(night.tell(cmd.Refit(n_modes=500)), ev.MakeMatrix)
     night.make_for(asked, 500, state=MatrixState.REFUSED)
     assert night.state.mode_limit.until_ns_utc >= until_ns

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError, UnknownIdError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.measuring import FREE_WITHIN_S
 from service.tracking.products import MeasureState, ModeSet, NoisyFinding
@@ -21,7 +22,9 @@ from tests.unit.tracking.situations import (
     rtc,
 )
 
-ASK = ev.MeasureNoisy(id="noisy-1", modes=ModeSet.CONTROLLED, total_m=5e-9, duration_s=30.0)
+ASK = cmd.MeasureNoisy(
+    id="noisy-1", modes=ModeSet.CONTROLLED, total_amplitude_m=5e-9, duration_s=30.0
+)
 STILL = replace(POLICY, dither_enabled=False)
 FINDING = NoisyFinding(
     n_slopes=1384,
@@ -166,7 +169,7 @@ def test_a_fit_that_fails_is_a_failure_with_its_reason(story):
 
 def test_one_given_up_ends_its_dither_and_stays_given_up(story):
     begun(story)
-    effects = story.tell(ev.GiveUpNoisy(id="noisy-1"))
+    effects = story.tell(cmd.GiveUpNoisy(id="noisy-1"))
     assert of_kind(effects, DitherStop)
     assert story.state.dither is None
     record = replace(story.state.noisy[-1], state=MeasureState.STORED, finding=FINDING)
@@ -177,15 +180,15 @@ def test_one_given_up_ends_its_dither_and_stays_given_up(story):
 def test_one_that_is_over_cannot_be_given_up(story):
     finished(story)
     with pytest.raises(CommandError, match="noisy-1 is stored"):
-        story.tell(ev.GiveUpNoisy(id="noisy-1"))
+        story.tell(cmd.GiveUpNoisy(id="noisy-1"))
     with pytest.raises(UnknownIdError, match="noisy-9"):
-        story.tell(ev.GiveUpNoisy(id="noisy-9"))
+        story.tell(cmd.GiveUpNoisy(id="noisy-9"))
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"total_m": 11e-9}, "11 nm RMS in all, budget 8 nm"),
+        ({"total_amplitude_m": 11e-9}, "11 nm RMS in all, budget 8 nm"),
         ({"modes": (600,)}, "found mode 600"),
         ({"duration_s": 2.0}, "400 modes need windows of 3.2 s"),
     ],
@@ -197,7 +200,7 @@ def test_what_cannot_be_measured_is_refused(story, changes, words):
 
 
 def test_more_than_the_budget_must_be_meant(story):
-    story.tell(replace(ASK, total_m=11e-9, over_budget=True))
+    story.tell(replace(ASK, total_amplitude_m=11e-9, over_budget=True))
     assert story.state.gathering.total_m == pytest.approx(11e-9)
 
 
@@ -211,7 +214,7 @@ def test_one_at_a_time_and_never_the_same_id(story):
 
 
 def test_an_operators_dither_is_not_cut_short(story):
-    story.tell(ev.StartDither(modes=(501,), amplitude_m=5e-9, frequency_hz=(250.0,)))
+    story.tell(cmd.StartDither(modes=(501,), amplitude_m=5e-9, frequency_hz=(250.0,)))
     with pytest.raises(CommandError, match="is running; stop it first"):
         story.tell(ASK)
 
@@ -234,7 +237,7 @@ def test_a_dither_left_by_the_service_before_this_one_is_stopped():
 
 @pytest.mark.parametrize(
     "command",
-    [ev.Approve(id="noisy-1"), ev.Publish(id="noisy-1"), ev.Reject(id="noisy-1")],
+    [cmd.Approve(id="noisy-1"), cmd.Publish(id="noisy-1"), cmd.Reject(id="noisy-1")],
 )
 def test_no_command_makes_a_reconstructor_of_it(story, command):
     finished(story).see()

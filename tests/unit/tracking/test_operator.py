@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError, UnknownIdError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
@@ -30,70 +31,70 @@ def refused(story, command, match, kind=CommandError):
 @pytest.mark.parametrize("mode", list(Mode))
 def test_the_mode_can_always_be_changed(mode):
     story = Story(Mode.PROPOSE)
-    story.tell(ev.SetMode(mode=mode))
+    story.tell(cmd.SetMode(mode=mode))
     assert story.state.mode is mode
     assert story.state.log[-1].text == f"mode is {mode.value}"
 
 
 class TestApproval:
     def test_an_approved_proposal_is_sent(self, story):
-        (sent,) = of_kind(story.tell(ev.Approve(id="cm-1")), ev.SendMatrix)
+        (sent,) = of_kind(story.tell(cmd.Approve(id="cm-1")), ev.SendMatrix)
         assert sent.id == "cm-1"
         assert story.matrix_state("cm-1") is MatrixState.PUBLISHED
 
     def test_a_rejected_one_never_is(self, story):
-        story.tell(ev.Reject(id="cm-1", reason="not tonight"))
+        story.tell(cmd.Reject(id="cm-1", reason="not tonight"))
         assert story.state.reconstructor("cm-1").reason == "not tonight"
-        refused(story, ev.Approve(id="cm-1"), "cm-1 is discarded, not proposed")
+        refused(story, cmd.Approve(id="cm-1"), "cm-1 is discarded, not proposed")
         assert not story.asked(ev.SendMatrix)
 
     def test_a_rejection_without_words_names_the_operator(self, story):
-        story.tell(ev.Reject(id="cm-1"))
+        story.tell(cmd.Reject(id="cm-1"))
         assert story.state.reconstructor("cm-1").reason == "by the operator"
 
-    @pytest.mark.parametrize("command", [ev.Approve, ev.Reject])
+    @pytest.mark.parametrize("command", [cmd.Approve, cmd.Reject])
     def test_only_a_proposal_can_be_decided_on(self, story, command):
         refused(story, command(id="initial"), "initial is applied, not proposed")
         refused(story, command(id="cm-9"), "no reconstructor cm-9", UnknownIdError)
 
-    @pytest.mark.parametrize("command", [ev.Approve, ev.Reject])
+    @pytest.mark.parametrize("command", [cmd.Approve, cmd.Reject])
     def test_what_the_gate_refused_cannot_be_approved(self, story, command):
         story.make("cm-2", MatrixState.REFUSED)
         refused(story, command(id="cm-2"), "cm-2 is refused, not proposed")
 
     def test_nothing_is_sent_while_no_rtc_is_there(self, story):
         story.tell(ev.RtcVanished())
-        refused(story, ev.Approve(id="cm-1"), "cannot be sent: no RTC is there")
+        refused(story, cmd.Approve(id="cm-1"), "cannot be sent: no RTC is there")
 
     @pytest.mark.parametrize("name", ["second-rtc", "basis-mismatch", "instrument-mismatch"])
     def test_nothing_is_sent_to_an_rtc_that_may_be_the_wrong_one(self, story, name):
         story.tell(ev.Trouble(name=name, text="two of them"))
-        refused(story, ev.Approve(id="cm-1"), "cm-1 cannot be sent: two of them")
+        refused(story, cmd.Approve(id="cm-1"), "cm-1 cannot be sent: two of them")
 
 
 class TestRefit:
     def test_it_computes_for_as_many_modes_as_are_controlled(self, story):
-        assert story.tell(ev.Refit())[0] == ev.MakeMatrix(n_modes=400, why="the operator asked")
+        assert story.tell(cmd.Refit())[0] == ev.MakeMatrix(n_modes=400, why="the operator asked")
 
     def test_or_for_as_many_as_asked(self, story):
-        assert story.tell(ev.Refit(n_modes=594))[0].n_modes == 594
+        assert story.tell(cmd.Refit(n_modes=594))[0].n_modes == 594
 
     def test_it_works_in_hold_too_and_the_result_waits_for_approval(self, story):
-        story.tell(ev.Refit())
+        story.tell(cmd.Refit())
         story.make("cm-2")
         assert story.matrix_state("cm-2") is MatrixState.PROPOSED
 
     def test_more_modes_than_the_basis_has_are_refused(self, story):
-        refused(story, ev.Refit(n_modes=595), "found 595 modes; expected 1 to 594")
+        refused(story, cmd.Refit(n_modes=595), "found 595 modes; expected 1 to 594")
 
     def test_one_at_a_time(self, story):
-        story.tell(ev.Refit())
-        refused(story, ev.Refit(), "being computed; wait")
+        story.tell(cmd.Refit())
+        refused(story, cmd.Refit(), "being computed; wait")
 
     def test_it_needs_a_registration_and_an_rtc(self):
         story = Story()
-        refused(story, ev.Refit(), "no RTC is there")
-        refused(story.meet(), ev.Refit(), "α is not known yet; start a dither")
+        refused(story, cmd.Refit(), "no RTC is there")
+        refused(story.meet(), cmd.Refit(), "α is not known yet; start a dither")
 
 
 class TestGoingBack:
@@ -105,44 +106,44 @@ class TestGoingBack:
         return story.use("cm-1").use("cm-2", 500)
 
     def test_a_rollback_copies_the_last_one_superseded_and_holds(self, story):
-        (copied,) = of_kind(story.tell(ev.Rollback()), ev.CopyMatrix)
+        (copied,) = of_kind(story.tell(cmd.Rollback()), ev.CopyMatrix)
         assert copied.source == "cm-1"
         assert story.state.mode is Mode.HOLD
 
     def test_the_copy_is_sent_without_further_approval(self, story):
-        story.tell(ev.Rollback())
+        story.tell(cmd.Rollback())
         (sent,) = of_kind(story.make("cm-3", wanted=True, parent="cm-1"), ev.SendMatrix)
         assert (sent.id, sent.n_modes) == ("cm-3", 400)
         assert sent.gains == (0.4,) * 400 + (0.0,) * 194
 
     def test_unless_the_gate_refuses_it(self, story):
-        story.tell(ev.Rollback())
+        story.tell(cmd.Rollback())
         assert not of_kind(story.make("cm-3", MatrixState.REFUSED, wanted=True), ev.SendMatrix)
 
     def test_nothing_replaces_it_by_itself(self, story):
-        story.tell(ev.Rollback())
+        story.tell(cmd.Rollback())
         story.use("cm-3")
         before = len(story.asked(ev.MakeMatrix))
         story.see(n_windows=60)
         assert len(story.asked(ev.MakeMatrix)) == before
 
     def test_any_known_reconstructor_can_be_published_again(self, story):
-        (copied,) = of_kind(story.tell(ev.Publish(id="initial")), ev.CopyMatrix)
+        (copied,) = of_kind(story.tell(cmd.Publish(id="initial")), ev.CopyMatrix)
         assert copied.source == "initial"
         assert story.state.mode is Mode.HOLD
 
     def test_but_no_unknown_one(self, story):
-        refused(story, ev.Publish(id="cm-9"), "no reconstructor cm-9", UnknownIdError)
+        refused(story, cmd.Publish(id="cm-9"), "no reconstructor cm-9", UnknownIdError)
 
     def test_while_the_gate_cannot_judge_only_what_has_been_in_use_is_sent(self, story):
         story.make("cm-3", MatrixState.REFUSED)
         story.state = replace(story.state, registration=None)
-        refused(story, ev.Publish(id="cm-3"), "α is not known yet")
-        assert of_kind(story.tell(ev.Publish(id="cm-1")), ev.CopyMatrix)
+        refused(story, cmd.Publish(id="cm-3"), "α is not known yet")
+        assert of_kind(story.tell(cmd.Publish(id="cm-1")), ev.CopyMatrix)
 
     def test_what_the_gate_could_not_judge_is_sent_and_said_to_be(self, story):
         story.state = replace(story.state, registration=None)
-        story.tell(ev.Rollback())
+        story.tell(cmd.Rollback())
         why = "the operator goes back to cm-1; the gate could not judge it: α is unknown"
         effects = story.make("cm-3", wanted=True, gate=None, judged=None, alpha=None, reason=why)
         assert of_kind(effects, ev.SendMatrix)
@@ -156,21 +157,21 @@ class TestGoingBack:
             assert story.state.reconstructor("cm-3").reason == why
 
     def test_of_what_it_judged_nothing_of_the_kind_is_said(self, story):
-        story.tell(ev.Rollback())
+        story.tell(cmd.Rollback())
         story.make("cm-3", wanted=True, reason="the operator goes back to cm-1")
         assert story.state.log[-1].text == "cm-3 sent to the RTC"
         story.acknowledge("cm-3")
         assert story.state.reconstructor("cm-3").reason == ""
 
     def test_there_must_be_something_to_go_back_to(self):
-        refused(Story().meet(), ev.Rollback(), "no earlier reconstructor has been in use")
+        refused(Story().meet(), cmd.Rollback(), "no earlier reconstructor has been in use")
 
-    @pytest.mark.parametrize("command", [ev.Rollback(), ev.Publish(id="cm-1")])
+    @pytest.mark.parametrize("command", [cmd.Rollback(), cmd.Publish(id="cm-1")])
     def test_it_waits_for_a_computation_under_way(self, story, command):
-        story.tell(ev.Refit())
+        story.tell(cmd.Refit())
         refused(story, command, "being computed; wait")
 
-    @pytest.mark.parametrize("command", [ev.Rollback(), ev.Publish(id="cm-1")])
+    @pytest.mark.parametrize("command", [cmd.Rollback(), cmd.Publish(id="cm-1")])
     def test_it_needs_an_rtc(self, story, command):
         story.tell(ev.RtcVanished())
         refused(story, command, "no RTC is there")
@@ -179,22 +180,22 @@ class TestGoingBack:
 class TestDither:
     def test_stopped_it_stays_stopped_until_started(self):
         story = Story().meet()
-        assert story.tell(ev.StopDither()) == (stopping(story),)
+        assert story.tell(cmd.StopDither()) == (stopping(story),)
         story.wait(30)
         assert story.state.dither is None
         assert len(story.asked(DitherRequest)) == 1
-        story.tell(ev.StartDither())
+        story.tell(cmd.StartDither())
         assert len(story.asked(DitherRequest)) == 2
 
     def test_stopping_needs_nothing(self):
         story = Story()
-        assert story.tell(ev.StopDither()) == (stopping(story),)
+        assert story.tell(cmd.StopDither()) == (stopping(story),)
 
     def test_what_is_asked_for_is_what_the_rtc_is_asked(self):
         story = Story().meet()
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         story.tell(
-            ev.StartDither(
+            cmd.StartDither(
                 modes=(3, 5), amplitude_m=2e-9, frequency_hz=(220.0, 260.0), duration_s=10.0
             )
         )
@@ -206,32 +207,31 @@ class TestDither:
 
     def test_one_at_a_time(self):
         story = Story().meet()
-        refused(story, ev.StartDither(), "is running; stop it first")
+        refused(story, cmd.StartDither(), "is running; stop it first")
 
     def test_it_needs_a_closed_loop(self):
-        refused(Story(), ev.StartDither(), "needs an RTC with its loop closed")
-        refused(Story().meet(loop="open"), ev.StartDither(), "needs an RTC with its loop closed")
+        refused(Story(), cmd.StartDither(), "needs an RTC with its loop closed")
+        refused(Story().meet(loop="open"), cmd.StartDither(), "needs an RTC with its loop closed")
 
     @pytest.mark.parametrize(
         ("command", "match"),
         [
-            (ev.StartDither(modes=(3,), frequency_hz=(5.0,)), "room for the side bins"),
-            (ev.StartDither(modes=(3,), frequency_hz=(495.0,)), "room for the side bins"),
-            (ev.StartDither(modes=(3, 4), frequency_hz=(200.0, 200.5)), "closer than 4 bins"),
-            (ev.StartDither(modes=(3, 4), frequency_hz=(200.0,)), "differ in length"),
+            (cmd.StartDither(modes=(3,), frequency_hz=(5.0,)), "room for the side bins"),
+            (cmd.StartDither(modes=(3,), frequency_hz=(495.0,)), "room for the side bins"),
+            (cmd.StartDither(modes=(3, 4), frequency_hz=(200.0, 200.5)), "closer than 4 bins"),
         ],
     )
     def test_lines_that_cannot_be_told_apart_are_refused(self, command, match):
         story = Story().meet()
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         refused(story, command, match)
 
     def test_modes_the_basis_does_not_have_are_refused(self):
         story = Story().meet()
-        story.tell(ev.StopDither())
-        refused(story, ev.StartDither(modes=(594,), frequency_hz=(250.0,)), "594")
+        story.tell(cmd.StopDither())
+        refused(story, cmd.StartDither(modes=(594,), frequency_hz=(250.0,)), "594")
 
 
 def test_a_status_of_500_modes_makes_refit_compute_500(story):
     story.tell(rtc(500))
-    assert story.tell(ev.Refit())[0].n_modes == 500
+    assert story.tell(cmd.Refit())[0].n_modes == 500

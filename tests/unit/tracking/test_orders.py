@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Level, Mode, TrackerState
@@ -35,7 +36,7 @@ def rolled_back():
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=3)
     story.use("cm-1").use("cm-2")
-    story.tell(ev.Rollback())
+    story.tell(cmd.Rollback())
     story.make("copy", alpha=ALPHA, wanted=True)
     story.acknowledge("copy")
     assert story.state.mode is Mode.HOLD
@@ -64,9 +65,9 @@ class TestTheMode:
         assert restarted(again, Mode.AUTO).state.mode is Mode.AUTO
 
     def test_what_was_said_last_counts(self, rolled_back):
-        rolled_back.tell(ev.SetMode(mode=Mode.PROPOSE))
+        rolled_back.tell(cmd.SetMode(mode=Mode.PROPOSE))
         assert restarted(rolled_back).state.mode is Mode.PROPOSE
-        rolled_back.tell(ev.SetMode(mode=Mode.AUTO))
+        rolled_back.tell(cmd.SetMode(mode=Mode.AUTO))
         again = restarted(rolled_back)
         assert again.state.mode is Mode.AUTO
         assert "mode" not in again.logged
@@ -82,20 +83,20 @@ class TestTheMode:
 class TestTheDither:
     def test_off_it_stays_off_until_the_operator_wants_it(self):
         story = Story().meet()
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         again = restarted(story)
         again.meet()
         again.wait(60)
         assert not again.asked(DitherRequest)
         assert again.state.dithering.reason == "stopped by the operator"
         assert "before the restart; POST /v1/dither" in again.state.log[0].text
-        assert of_kind(again.tell(ev.StartDither()), DitherRequest)
+        assert of_kind(again.tell(cmd.StartDither()), DitherRequest)
         assert not restarted(again).state.dither_stopped
 
     def test_what_the_dead_service_left_on_the_mirror_is_stopped(self):
         story = Story().meet()
         dither = replace(story.state.dither, start_seq=1000, asked_ns_utc=0)
-        story.tell(ev.StopDither())
+        story.tell(cmd.StopDither())
         again = restarted(story).meet(dither_id=dither.id, dither=dither)
         assert again.asked(DitherStop)
         assert again.state.dither is None
@@ -103,20 +104,20 @@ class TestTheDither:
 
 @pytest.mark.parametrize("changes", [{"basis_id": "kl-300"}, {"config_id": "binned"}])
 def test_orders_stand_where_alpha_does_not_fit(rolled_back, changes):
-    rolled_back.tell(ev.StopDither())
+    rolled_back.tell(cmd.StopDither())
     again = restarted(rolled_back, **changes)
     assert again.state.registration is None
     assert (again.state.mode, again.state.dither_stopped) == (Mode.HOLD, True)
 
 
 def test_those_for_another_system_are_none(rolled_back):
-    rolled_back.tell(ev.StopDither())
+    rolled_back.tell(cmd.StopDither())
     again = restarted(rolled_back, system="other")
     assert (again.state.mode, again.state.dither_stopped) == (Mode.AUTO, False)
 
 
 def test_a_new_session_of_the_rtc_undoes_none(rolled_back):
-    rolled_back.tell(ev.StopDither())
+    rolled_back.tell(cmd.StopDither())
     rolled_back.tell(ev.SessionStarted(session="s2"))
     rolled_back.tell(rtc(session="s2"))
     assert (rolled_back.state.mode, rolled_back.state.dither_stopped) == (Mode.HOLD, True)

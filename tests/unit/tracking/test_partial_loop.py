@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.loop import extended_gains
 from service.tracking.products import MeasureState
@@ -76,8 +77,8 @@ def test_modes_above_those_that_were_taken_out_are_not_tried(last_gain):
 
 def test_a_measurement_that_found_it_partial_is_over_when_it_is_partial_again():
     story = Story().meet(loop="partial", gains=ONE_STILL)
-    story.tell(ev.StopDither())
-    story.tell(ev.Measure(id="im-1", pattern="hadamard"))
+    story.tell(cmd.StopDither())
+    story.tell(cmd.Measure(id="im-1", pattern="hadamard"))
     asked = story.state.measuring
     record = replace(asked, state=MeasureState.RUNNING, start_seq=10)
     story.tell(ev.MatrixMeasured(record=record))

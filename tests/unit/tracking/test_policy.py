@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import ModelError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import lock_in_plan, plan_dither
 from service.tracking.products import MatrixState
@@ -135,7 +136,7 @@ class TestMargin:
     def test_not_while_a_reconstructor_is_being_computed(self):
         story = Story(Mode.HOLD).meet()
         story.see(n_windows=2)
-        story.tell(ev.Refit())
+        story.tell(cmd.Refit())
         assert not of_kind(story.wait(30), ev.JudgeMatrix)
 
 
@@ -229,7 +230,7 @@ class TestUpdate:
         story = Story(Mode.PROPOSE).meet()
         story.see(n_windows=2)
         story.make("cm-1")
-        story.tell(ev.Reject(id="cm-1"))
+        story.tell(cmd.Reject(id="cm-1"))
         assert not of_kind(story.wait(29), ev.MakeMatrix)
         assert of_kind(story.wait(1), ev.MakeMatrix)
 
@@ -263,7 +264,7 @@ class TestProposals:
     def test_in_auto_a_proposal_left_behind_stops_nothing(self):
         story = self.proposed()
         story.wait(10)
-        assert of_kind(story.tell(ev.SetMode(mode=Mode.AUTO)), ev.MakeMatrix)
+        assert of_kind(story.tell(cmd.SetMode(mode=Mode.AUTO)), ev.MakeMatrix)
 
     def test_a_matrix_made_while_the_rtc_was_away_does_not_stop_the_next(self):
         story = Story(Mode.AUTO).meet()

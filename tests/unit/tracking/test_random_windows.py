@@ -7,6 +7,7 @@ import pytest
 
 from service.errors import CommandError
 from service.telemetry.random_dither import RandomEstimate
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import total_m
 from service.tracking.products import ModeSet
@@ -90,8 +91,8 @@ def test_a_jump_seen_by_random_signs_needs_a_second_window():
 
 def test_an_operator_may_dither_every_mode_of_the_basis():
     story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
-    command = ev.StartDither(
-        kind=DitherKind.BINARY, modes=ModeSet.ALL, total_m=5e-9, duration_s=60.0
+    command = cmd.StartDither(
+        kind=DitherKind.BINARY, modes=ModeSet.ALL, total_amplitude_m=5e-9, duration_s=60.0
     )
     (asked,) = of_kind(story.tell(command), DitherRequest)
     assert asked.modes == tuple(range(594))
@@ -101,7 +102,7 @@ def test_an_operator_may_dither_every_mode_of_the_basis():
 
 def test_random_signs_over_the_budget_must_be_meant():
     story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
-    command = ev.StartDither(kind=DitherKind.BINARY, total_m=20e-9, duration_s=60.0)
+    command = cmd.StartDither(kind=DitherKind.BINARY, total_amplitude_m=20e-9, duration_s=60.0)
     with pytest.raises(CommandError, match="20 nm RMS in all, budget 8 nm"):
         story.tell(command)
     assert of_kind(story.tell(replace(command, over_budget=True)), DitherRequest)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
@@ -56,7 +57,7 @@ def test_a_service_that_is_not_the_first_stands_by_until_the_first_has_gone(stor
     story.see(n_windows=3)
     story.wait(120.0)
     assert not story.effects
-    for command in (ev.Refit(), ev.Rollback(), ev.StopDither(), ev.SetLoop(closed=False)):
+    for command in (cmd.Refit(), cmd.Rollback(), cmd.StopDither(), cmd.SetLoop(loop="open")):
         with pytest.raises(CommandError, match="another service drives the RTC"):
             story.tell(command)
     story.tell(ev.ServicesMet(drives=True, others=()))
@@ -70,7 +71,7 @@ def test_the_first_of_two_services_drives_on_and_says_so(story):
     story.tell(ev.ServicesMet(drives=True, others=("abc",)))
     assert "second-service" in story.alarms
     assert "standing-by" not in story.alarms
-    assert story.tell(ev.StopDither()) == (stopping(story),)
+    assert story.tell(cmd.StopDither()) == (stopping(story),)
 
 
 def test_an_open_loop_is_an_alarm_until_it_is_closed(story):
@@ -181,13 +182,13 @@ def test_a_staged_reconstructor_that_is_never_applied_fails_too(story):
 
 
 def test_a_computation_that_never_ends_is_given_up_after_a_minute(story):
-    story.tell(ev.Refit())
+    story.tell(cmd.Refit())
     story.wait(60)
     assert story.state.making_since_ns_utc is not None
     story.wait(1)
     assert story.state.making_since_ns_utc is None
     assert "reconstructor.lost" in story.logged
-    story.tell(ev.Refit())
+    story.tell(cmd.Refit())
 
 
 @pytest.mark.parametrize("name", ["second-rtc", "basis-mismatch"])

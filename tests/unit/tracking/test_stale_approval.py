@@ -7,6 +7,7 @@ import pytest
 
 from service.errors import CommandError
 from service.tracker import step
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.registration import Registration
@@ -35,7 +36,7 @@ def proposed(alpha):
 
 
 def test_a_proposal_for_the_present_registration_is_sent():
-    state, effects = step(proposed(ALPHA), ev.Approve(id="cm-1"), POLICY, START_NS)
+    state, effects = step(proposed(ALPHA), cmd.Approve(id="cm-1"), POLICY, START_NS)
     assert state.reconstructor("cm-1").state is MatrixState.PUBLISHED
     assert any(isinstance(effect, ev.SendMatrix) for effect in effects)
 
@@ -43,11 +44,11 @@ def test_a_proposal_for_the_present_registration_is_sent():
 def test_a_proposal_for_a_registration_left_behind_is_refused_and_still_there():
     state = proposed(moved(ALPHA, shift_x_subap=0.1))
     with pytest.raises(CommandError, match="refit"):
-        step(state, ev.Approve(id="cm-1"), POLICY, START_NS)
+        step(state, cmd.Approve(id="cm-1"), POLICY, START_NS)
     assert state.reconstructor("cm-1").state is MatrixState.PROPOSED
 
 
 def test_a_change_below_the_update_threshold_does_not_make_it_stale():
     state = proposed(replace(ALPHA, shift_x_subap=ALPHA.shift_x_subap + 0.005))
-    state, _ = step(state, ev.Approve(id="cm-1"), POLICY, START_NS)
+    state, _ = step(state, cmd.Approve(id="cm-1"), POLICY, START_NS)
     assert state.reconstructor("cm-1").state is MatrixState.PUBLISHED

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
@@ -72,7 +73,7 @@ class TestSuspicion:
         assert not of_kind(story.make("cm-1"), ev.SendMatrix)
         assert story.matrix_state("cm-1") is MatrixState.PROPOSED
         with pytest.raises(CommandError, match="jump is suspected"):
-            story.tell(ev.Approve(id="cm-1"))
+            story.tell(cmd.Approve(id="cm-1"))
 
     def test_one_that_is_made_while_it_jumps_is_not_sent_and_another_is_made_at_once(self, story):
         assert story.state.making_since_ns_utc is not None

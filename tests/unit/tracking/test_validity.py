@@ -1,10 +1,11 @@
 """What α is worth as time passes and the telescope moves."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.loop import separation_deg
 from service.tracking.products import MatrixState
@@ -37,7 +38,7 @@ def story():
 
 
 def point(story, pointing):
-    return story.tell(ev.SetPointing(pointing=pointing))
+    return story.tell(cmd.SetPointing(**asdict(pointing)))
 
 
 def worth(story):

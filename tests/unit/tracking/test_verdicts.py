@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
@@ -40,7 +41,7 @@ def judge(story, *, accepted=True, **changes):
 
 
 def test_a_proposal_judged_for_this_loop_and_alpha_is_sent_at_once(waiting):
-    assert of_kind(waiting.tell(ev.Approve(id="cm-1")), ev.SendMatrix)
+    assert of_kind(waiting.tell(cmd.Approve(id="cm-1")), ev.SendMatrix)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +54,7 @@ def test_a_proposal_judged_for_this_loop_and_alpha_is_sent_at_once(waiting):
 )
 def test_one_judged_for_another_loop_is_judged_again_with_the_gains_of_now(waiting, changes, words):
     waiting.tell(rtc(**changes))
-    effects = waiting.tell(ev.Approve(id="cm-1"))
+    effects = waiting.tell(cmd.Approve(id="cm-1"))
     assert not of_kind(effects, ev.SendMatrix)
     (asked,) = of_kind(effects, ev.JudgeProposal)
     assert (asked.id, asked.gains) == ("cm-1", waiting.state.rtc.gains[:400])
@@ -66,7 +67,7 @@ def test_gains_that_follow_the_seeing_by_a_few_percent_change_no_verdict(waiting
         gains = (gain,) * 400 + (0.0,) * (N_MODES - 400)
         waiting.tell(rtc(gains=gains), after_s=1.0)
     assert len(waiting.asked(ev.JudgeMatrix)) == before
-    assert of_kind(waiting.tell(ev.Approve(id="cm-1")), ev.SendMatrix)
+    assert of_kind(waiting.tell(cmd.Approve(id="cm-1")), ev.SendMatrix)
 
 
 def test_so_is_one_whose_alpha_is_known_much_worse_by_now(waiting):
@@ -74,12 +75,12 @@ def test_so_is_one_whose_alpha_is_known_much_worse_by_now(waiting):
         waiting.state,
         registration=replace(waiting.state.registration, grown=np.array([0.03, 0.03, 0, 0]) ** 2),
     )
-    assert of_kind(waiting.tell(ev.Approve(id="cm-1")), ev.JudgeProposal)
+    assert of_kind(waiting.tell(cmd.Approve(id="cm-1")), ev.JudgeProposal)
 
 
 def test_it_is_sent_when_it_passes_anew(waiting):
     waiting.tell(rtc(gains=HIGH))
-    waiting.tell(ev.Approve(id="cm-1"))
+    waiting.tell(cmd.Approve(id="cm-1"))
     assert of_kind(judge(waiting), ev.SendMatrix)
     assert waiting.matrix_state("cm-1") is MatrixState.PUBLISHED
     waiting.acknowledge("cm-1")
@@ -88,7 +89,7 @@ def test_it_is_sent_when_it_passes_anew(waiting):
 
 def test_and_refused_with_the_gates_words_when_it_does_not(waiting):
     waiting.tell(rtc(gains=HIGH))
-    waiting.tell(ev.Approve(id="cm-1"))
+    waiting.tell(cmd.Approve(id="cm-1"))
     assert not of_kind(judge(waiting, accepted=False), ev.SendMatrix)
     assert waiting.matrix_state("cm-1") is MatrixState.REFUSED
     assert waiting.state.reconstructor("cm-1").reason == "too little margin"
@@ -96,7 +97,7 @@ def test_and_refused_with_the_gates_words_when_it_does_not(waiting):
 
 def test_what_changes_while_it_is_judged_keeps_it_from_being_sent(waiting):
     waiting.tell(rtc(gains=HIGH))
-    waiting.tell(ev.Approve(id="cm-1"))
+    waiting.tell(cmd.Approve(id="cm-1"))
     waiting.tell(rtc(leak=0.99, gains=HIGH))
     assert not of_kind(judge(waiting, leak=0.999), ev.SendMatrix)
     assert waiting.matrix_state("cm-1") is MatrixState.PROPOSED
@@ -105,22 +106,22 @@ def test_what_changes_while_it_is_judged_keeps_it_from_being_sent(waiting):
 
 def test_approved_twice_it_is_sent_once(waiting):
     waiting.tell(rtc(gains=HIGH))
-    waiting.tell(ev.Approve(id="cm-1"))
-    waiting.tell(ev.Approve(id="cm-1"))
+    waiting.tell(cmd.Approve(id="cm-1"))
+    waiting.tell(cmd.Approve(id="cm-1"))
     assert of_kind(judge(waiting), ev.SendMatrix)
     assert not of_kind(judge(waiting), ev.SendMatrix)
 
 
 def test_an_open_loop_does_not_tell_its_gains_so_the_verdict_stands(waiting):
     waiting.tell(rtc(loop="open", gains=(0.0,) * N_MODES))
-    assert of_kind(waiting.tell(ev.Approve(id="cm-1")), ev.SendMatrix)
+    assert of_kind(waiting.tell(cmd.Approve(id="cm-1")), ev.SendMatrix)
 
 
 def test_nor_can_one_be_judged_there_that_was_made_before_the_service_restarted(waiting):
     waiting.make("cm-1", judged=None)
     waiting.tell(rtc(loop="open", gains=(0.0,) * N_MODES))
     with pytest.raises(CommandError, match="close it first"):
-        waiting.tell(ev.Approve(id="cm-1"))
+        waiting.tell(cmd.Approve(id="cm-1"))
 
 
 def test_one_must_be_able_to_go_back_with_the_loop_open(waiting):
@@ -139,7 +140,7 @@ def test_with_an_invalid_alpha_nothing_can_be_judged(waiting):
     waiting.see(moved(shift_x_subap=0.3))
     waiting.wait(61)
     with pytest.raises(CommandError, match="α is invalid"):
-        waiting.tell(ev.Approve(id="cm-1"))
+        waiting.tell(cmd.Approve(id="cm-1"))
 
 
 class TestAuto:
@@ -191,7 +192,7 @@ def test_a_matrix_an_operator_wants_back_is_judged_again_after_a_jump():
 
 
 def test_an_acknowledgement_of_a_matrix_judged_for_another_loop_is_no_margin(waiting):
-    waiting.tell(ev.Approve(id="cm-1"))
+    waiting.tell(cmd.Approve(id="cm-1"))
     waiting.tell(rtc(gains=HIGH))
     waiting.acknowledge("cm-1")
     assert waiting.state.margin is None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.control.expected_gain import ExpectedGain
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Mode
 from service.tracking.worth import CALMING_S
@@ -125,7 +126,7 @@ def test_a_jump_that_a_verdict_still_reaches_asks_for_none(story):
 
 
 def test_in_hold_nothing_is_worth_it(story):
-    story.tell(ev.SetMode(mode=Mode.HOLD))
+    story.tell(cmd.SetMode(mode=Mode.HOLD))
     assert not judged(story, told(loss_m=5e-9))
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
@@ -51,7 +52,7 @@ def test_another_sum_than_was_sent_is_an_alarm_and_nothing_is_published_any_more
     assert story.state.in_use != "cm-1"
     story.make("cm-2", MatrixState.PROPOSED)
     with pytest.raises(CommandError, match="cm-1"):
-        story.tell(ev.Approve(id="cm-2"))
+        story.tell(cmd.Approve(id="cm-2"))
     story.wait(60.0)
     assert not story.asked(ev.SendMatrix)
     assert not story.asked(ev.MakeMatrix)
@@ -124,20 +125,20 @@ def test_after_a_restart_a_known_matrix_is_read_back_before_it_is_believed():
     assert not story.asked(ev.FetchMatrix)
 
 
-@pytest.mark.parametrize("order", [ev.Rollback(), ev.Publish(id="cm-1")])
+@pytest.mark.parametrize("order", [cmd.Rollback(), cmd.Publish(id="cm-1")])
 def test_nothing_is_sent_to_an_rtc_whose_matrix_is_being_read_back(order):
     story = restarted()
     story.tell(order)
     story.make("cm-2", wanted=True)
     assert not story.asked(ev.SendMatrix)
     with pytest.raises(CommandError, match="read back"):
-        story.tell(ev.Approve(id="cm-2"))
+        story.tell(cmd.Approve(id="cm-2"))
     story.tell(ev.MatrixFetched(record=record("cm-1", sha256=SUM)))
-    story.tell(ev.Approve(id="cm-2"))
+    story.tell(cmd.Approve(id="cm-2"))
     assert story.asked(ev.SendMatrix)
 
 
-@pytest.mark.parametrize("order", [ev.Rollback(), ev.Publish(id="cm-1")])
+@pytest.mark.parametrize("order", [cmd.Rollback(), cmd.Publish(id="cm-1")])
 def test_other_numbers_under_a_known_id_forbid_all_sending(order):
     story = restarted()
     story.tell(ev.MatrixFetched(record=record("cm-1", sha256=OTHER)))
@@ -147,7 +148,7 @@ def test_other_numbers_under_a_known_id_forbid_all_sending(order):
     story.tell(order)
     story.make("cm-2", wanted=True)
     with pytest.raises(CommandError, match="other numbers"):
-        story.tell(ev.Approve(id="cm-2"))
+        story.tell(cmd.Approve(id="cm-2"))
     assert not story.asked(ev.SendMatrix)
 
 
@@ -157,7 +158,7 @@ def test_an_rtc_that_does_not_offer_its_matrix_is_believed_by_the_id():
     story.tell(ev.JobFailed(effect=fetch, text="no answer on rtc/cm/applied"))
     story.tell(rtc(cm_id="cm-1", session="s2"))
     assert story.state.in_use == "cm-1"
-    story.tell(ev.Rollback())
+    story.tell(cmd.Rollback())
 
 
 # ---------------------------------------------------------------- a matrix without a name

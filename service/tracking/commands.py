@@ -1,0 +1,405 @@
+"""What operators can ask, and the observatory tell: each command once, with what it may hold.
+
+REST reads JSON straight into these. What no state of the service could make sense of is refused
+when a command is made; what needs something of the present state, where it is carried out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar, Literal
+
+from annotated_types import Ge, Gt, Le, Len, MaxLen
+from typing_extensions import override
+
+from service.tracking.products import ModeSet
+from service.tracking.state import Mode
+from service.wire import DitherKind, Pattern, Pointing
+
+MOST_SINES = 64
+MOST_MODES = 100_000
+MOST_GROUPS = 1000
+LONGEST_NOISY_S = 3600.0
+
+Positive = Annotated[float, Gt(0.0)]
+Count = Annotated[int, Ge(1)]
+BasisMode = Annotated[int, Ge(0)]
+BasisModes = Annotated[tuple[BasisMode, ...], Len(1, MOST_MODES)]
+Lines = Annotated[tuple[Positive, ...], Len(1, MOST_MODES)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Instruction:
+    """What may be said with every command."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = {
+        "extra": "forbid",
+        "strict": True,
+        "allow_inf_nan": False,
+    }
+
+    reason: Annotated[str, MaxLen(500)] = ""
+    """Why it is asked for; kept in the audit trail."""
+
+    by: Annotated[str, MaxLen(100)] = ""
+    """Who asks; empty: known by the address alone."""
+
+    def __post_init__(self) -> None:
+        """Refuse what would act on the terminal it is shown on.
+
+        Raises
+        ------
+        ValueError
+            If it makes no sense in any state.
+        """
+        for name, text in (("reason", self.reason), ("by", self.by)):
+            unseen = next((char for char in text if not char.isprintable()), None)
+            if unseen is not None:
+                raise ValueError(f"found {unseen!r} in {name}, expected printable characters")
+
+    def said(self) -> dict[str, Any]:
+        """Return the fields by name, for a command that says the same and more."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetMode(Instruction):
+    """Choose how much the service may do by itself."""
+
+    mode: Mode
+    """"auto", "propose" or "hold"."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refit(Instruction):
+    """Compute a reconstructor for the current α now; it still passes the gate and the mode."""
+
+    n_modes: Count | None = None
+    """Modes to control; None: as many as now."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RandomSigns(Instruction):
+    """What random signs on many modes at once may cost."""
+
+    total_amplitude_m: Positive | None = None
+    """RMS of all modes of random signs together, metres OPD."""
+
+    over_budget: bool = False
+    """More than the budget of the settings is meant."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartDither(RandomSigns):
+    """Start a dither; what is left out, the service chooses."""
+
+    action: Literal["start"] = "start"
+    kind: DitherKind = DitherKind.SINE
+    """"sine", or "binary": random signs, on hundreds of modes if need be."""
+
+    modes: BasisModes | ModeSet | None = None
+    """0-based basis indices, none twice; of random signs also "controlled" or "all"."""
+
+    amplitude_m: Positive | None = None
+    """RMS of each mode of a sine, metres OPD."""
+
+    frequency_hz: Lines | None = None
+    """One for each mode of a sine."""
+
+    duration_s: Positive | None = None
+
+    @override
+    def __post_init__(self) -> None:
+        Instruction.__post_init__(self)
+        n_modes = _each_once(self.modes)
+        if self.kind is DitherKind.BINARY:
+            if self.amplitude_m is not None or self.frequency_hz is not None:
+                raise ValueError(
+                    "no amplitude_m and no frequency_hz with binary: total_amplitude_m"
+                )
+            return
+        if isinstance(self.modes, ModeSet) or n_modes > MOST_SINES:
+            raise ValueError(f"at most {MOST_SINES} modes with sine")
+        if self.total_amplitude_m is not None:
+            raise ValueError("no total_amplitude_m with sine: amplitude_m of each mode")
+        _a_line_each(self.frequency_hz, n_modes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopDither(Instruction):
+    """Stop the dither and do not start another until told to."""
+
+    action: Literal["stop"] = "stop"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Approve(Instruction):
+    """Publish a proposed reconstructor."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reject(Instruction):
+    """Discard a proposed reconstructor; the reason is kept with it."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Publish(Instruction):
+    """Send a known reconstructor again, under a new id, unless the gate refuses it now."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rollback(Instruction):
+    """Go back to the reconstructor that was in use before the present one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasureChoice(Instruction):
+    """How the RTC is to measure an interaction matrix; what is left out, the service chooses.
+
+    All patterns but "sine" open the loop meanwhile.
+    """
+
+    pattern: Pattern = Pattern.PUSH_PULL_MODAL
+    modes: BasisModes | None = None
+    """0-based basis indices, none twice; None: the controlled ones."""
+
+    amplitude_m: Positive | None = None
+    """RMS of each mode's stroke, metres OPD."""
+
+    n_average: Annotated[int, Ge(1), Le(10_000)] | None = None
+    """Pushes, and as many pulls, of each shape; None for a sine."""
+
+    frequency_hz: Lines | None = None
+    """One for each of ``modes``; only of a sine."""
+
+    duration_s: Positive | None = None
+    """Only of a sine."""
+
+    @override
+    def __post_init__(self) -> None:
+        Instruction.__post_init__(self)
+        n_modes = _each_once(self.modes)
+        if self.pattern is Pattern.SINE and self.n_average is not None:
+            raise ValueError("no n_average with a sine: its duration_s does the averaging")
+        given = self.frequency_hz is not None or self.duration_s is not None
+        if self.pattern is not Pattern.SINE and given:
+            raise ValueError(f"no frequency_hz and no duration_s with {self.pattern}")
+        _a_line_each(self.frequency_hz, n_modes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measure(MeasureChoice):
+    """Have the RTC measure an interaction matrix."""
+
+    id: str
+    """Of the matrix to come; never used before."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GiveUp(Instruction):
+    """Wait no longer for an interaction matrix; the wire has no way to stop the RTC's work."""
+
+    id: str
+    """Of the measurement."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoisyChoice(RandomSigns):
+    """How a noisy interaction matrix is to be measured; what is left out, the service chooses.
+
+    The loop stays closed: random signs on all its modes at once, a few nanometres altogether.
+    """
+
+    modes: BasisModes | ModeSet = ModeSet.CONTROLLED
+    """0-based basis indices, none twice, or "controlled" or "all"."""
+
+    duration_s: Annotated[float, Gt(0.0), Le(LONGEST_NOISY_S)] | None = None
+    """Of telemetry; the RTC's time."""
+
+    @override
+    def __post_init__(self) -> None:
+        Instruction.__post_init__(self)
+        _each_once(self.modes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasureNoisy(NoisyChoice):
+    """Measure a noisy interaction matrix, loop closed."""
+
+    id: str
+    """Of the matrix to come, and of its dither; never used before."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GiveUpNoisy(Instruction):
+    """End a noisy interaction matrix under way, and its dither; nothing of it is kept."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetPointing(Instruction):
+    """Say where the telescope looks."""
+
+    elevation_deg: Annotated[float, Ge(-90.0), Le(90.0)]
+    """Above the horizon, degrees."""
+
+    azimuth_deg: Annotated[float, Ge(-720.0), Le(720.0)]
+    """From north over east, degrees; only differences count."""
+
+    @property
+    def pointing(self) -> Pointing:
+        """The direction."""
+        return Pointing(elevation_deg=self.elevation_deg, azimuth_deg=self.azimuth_deg)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModeGroup:
+    """A range of modes."""
+
+    first: BasisMode
+    """0-based basis index of the first mode."""
+
+    last: BasisMode
+    """Of the last one; it belongs to the group."""
+
+    def __post_init__(self) -> None:
+        """Refuse a range that is none.
+
+        Raises
+        ------
+        ValueError
+            If it ends before it begins.
+        """
+        if self.last < self.first:
+            raise ValueError(f"first <= last: first {self.first}, last {self.last}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GainGroup(ModeGroup):
+    """One gain for a range of modes."""
+
+    gain: Annotated[float, Ge(0.0)]
+    """Loop gain; 0 leaves these modes alone."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetLoop(Instruction):
+    """Change the loop; what is left out stays as it is."""
+
+    loop: Literal["open", "closed"] | None = None
+    """Opening zeroes the integrator, and the RTC begins a new session."""
+
+    gains: Annotated[tuple[GainGroup, ...], Len(1, MOST_GROUPS)] | None = None
+    """Groups of modes, none twice; modes in no group keep their gain."""
+
+    leak: Annotated[float, Ge(0.0), Le(1.0)] | None = None
+    """Per frame; 1 forgets nothing."""
+
+    n_controlled: Count | None = None
+    """Takes effect with the next reconstructor of that many modes."""
+
+    effective_gain: Annotated[float, Gt(0.0), Le(2.0)] | None = None
+    """Gains that act as this on every mode, by the table of optical gains (``GET /v1/gains``);
+    the gate must accept the reconstructor in use with them."""
+
+    @override
+    def __post_init__(self) -> None:
+        Instruction.__post_init__(self)
+        changes = (self.loop, self.gains, self.leak, self.n_controlled, self.effective_gain)
+        if all(change is None for change in changes):
+            raise ValueError("at least one of loop, gains, leak, n_controlled, effective_gain")
+        if self.gains is not None and self.effective_gain is not None:
+            raise ValueError("gains or effective_gain, not both")
+        _none_twice(self.gains or ())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ramp(Instruction):
+    """Have the RTC try gains on one group of modes after the other.
+
+    What is left out, the service chooses.
+    """
+
+    groups: Annotated[tuple[ModeGroup, ...], Len(1, MOST_GROUPS)] | None = None
+    """In the order they are tried; None: tip and tilt, to mode 99, the other controlled ones."""
+
+    gains: Annotated[tuple[Positive, ...], Len(1, 100)] | None = None
+    """Tried in this order on every group; None: 0.1 to 0.6."""
+
+    step_s: Annotated[float, Gt(0.0), Le(60.0)] | None = None
+    """How long each gain is tried, at the nominal frame rate, settling included; None: 1."""
+
+    @override
+    def __post_init__(self) -> None:
+        Instruction.__post_init__(self)
+        _none_twice(self.groups or ())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acquire(Instruction):
+    """Find the registration from nothing: open the loop, look, and close it step by step.
+
+    Its reconstructors need no further approval, in any mode.
+    """
+
+    action: Literal["start"] = "start"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AbortAcquisition(Instruction):
+    """End an acquisition under way.
+
+    The loop is left as it was found if that held, else open or closed on a matrix that has passed
+    the gate.
+    """
+
+    action: Literal["abort"] = "abort"
+
+
+Command = (
+    Acquire
+    | AbortAcquisition
+    | SetMode
+    | Refit
+    | StartDither
+    | StopDither
+    | Approve
+    | Reject
+    | Publish
+    | Rollback
+    | Measure
+    | GiveUp
+    | MeasureNoisy
+    | GiveUpNoisy
+    | SetLoop
+    | SetPointing
+    | Ramp
+)
+
+
+def _each_once(modes: tuple[int, ...] | ModeSet | None) -> int:
+    """Return how many modes are listed, each of them once."""
+    if modes is None or isinstance(modes, ModeSet):
+        return 0
+    if len(set(modes)) < len(modes):
+        raise ValueError("modes without any of them twice")
+    return len(modes)
+
+
+def _a_line_each(lines_hz: tuple[float, ...] | None, n_modes: int) -> None:
+    if lines_hz is not None and len(lines_hz) != n_modes:
+        raise ValueError(f"one frequency_hz for each of modes: {len(lines_hz)} given for {n_modes}")
+
+
+def _none_twice(groups: tuple[ModeGroup, ...]) -> None:
+    for before, after in pairwise(sorted((group.first, group.last) for group in groups)):
+        if after[0] <= before[1]:
+            raise ValueError(f"no mode in two groups: mode {after[0]} is")

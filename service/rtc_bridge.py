@@ -31,6 +31,7 @@ from service.wire import (
     CHUNK_LIMIT,
     MESSAGE_LIMIT,
     STATUS_LIMIT,
+    Acknowledgement,
     AckState,
     AlarmMessage,
     Command,
@@ -40,11 +41,8 @@ from service.wire import (
     Reply,
     Role,
     StateMessage,
-    decode_acknowledgement,
-    decode_reply,
-    encode_alarm,
-    encode_manifest,
-    encode_state,
+    decode,
+    encode,
     layout_of,
     split,
 )
@@ -246,11 +244,11 @@ class Bridge:
 
     def publish_state(self, message: StateMessage) -> None:
         """Tell whoever listens what the service knows; dropped while the network is slow."""
-        self._tell(self._keys.state, encode_state(message), Encodings.STATE)
+        self._tell(self._keys.state, encode(message), Encodings.STATE)
 
     def publish_alarm(self, message: AlarmMessage) -> None:
         """Tell whoever listens that an alarm came or went; dropped while the network is slow."""
-        self._tell(self._keys.alarm, encode_alarm(message), Encodings.ALARM)
+        self._tell(self._keys.alarm, encode(message), Encodings.ALARM)
 
     def _declare(self, session: zenoh.Session) -> None:
         keys = self._keys
@@ -305,7 +303,7 @@ class Bridge:
 
     def _on_ack(self, sample: zenoh.Sample) -> None:
         data = link.bytes_of(sample.payload, MESSAGE_LIMIT, "an acknowledgement")
-        acknowledgement = decode_acknowledgement(data)
+        acknowledgement = decode(Acknowledgement, data)
         matrix_id = acknowledgement.id
         known = matrix_id is None or self._outbox.knows(matrix_id)
         if matrix_id is not None and acknowledgement.state is AckState.APPLIED:
@@ -343,7 +341,7 @@ class Bridge:
             )
         offer = Offer(
             manifest=manifest,
-            commit=encode_manifest(manifest),
+            commit=encode(manifest),
             parts=tuple(split(matrix, layout.chunk_bytes)),
             offered_s=time.monotonic(),
         )
@@ -365,7 +363,7 @@ class Bridge:
     def _command(self, command: Command) -> Reply:
         answer = link.send_command(self._driven(), self._endpoint, command)
         try:
-            reply = decode_reply(answer)
+            reply = decode(Reply, answer)
         except WireError as error:
             self._intake.malformed("reply", error)
             raise LinkError(f"the reply to command {command.id} is unusable: {error}") from error

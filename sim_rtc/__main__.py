@@ -18,8 +18,8 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.errors import ConfigurationError, PyrcalError
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import Ahead, message_frames
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch, FrameClock, Pace
 from sim_rtc.faults import ComputerFaults, FaultPlan
 from sim_rtc.link.link import Link

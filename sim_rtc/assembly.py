@@ -15,9 +15,9 @@ from service.model.instrument import Instrument, KarhunenLoeve, TabulatedModes
 from service.model.modes import ModalBasis, analytic_basis, mirror_surface
 from service.model.slopes import Normalisation, Orientation, SlopeOrder
 from service.prepared import Prepared, usual_folder
-from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
 from sim_rtc.computer.gains import by_group
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.reconstructors import identity_of, initial_reconstructor
 from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
 from sim_rtc.options import Options

@@ -23,7 +23,7 @@ from typing_extensions import override
 
 from service.wire import FrameHeader, Loop, LoopRequest, encode_frames
 from sim_rtc.arguments import refusal
-from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import FrameClock, Pace, new_session
 
 _log = structlog.get_logger("sim_rtc")

@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.wire import MeasureRequest, Pattern
 from sim_rtc.assembly import build_telescope
-from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.measure import product
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Identity
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.linear import LinearOptics

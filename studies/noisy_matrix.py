@@ -36,7 +36,7 @@ from service.tracking.products import MeasureState, NoisyRecord
 from service.wire import DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.feed import Ahead
 from sim_rtc.options import parse_options
 from sim_rtc.truth import WavefrontError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter, deque
@@ -25,8 +26,9 @@ from service.wire import (
     Acknowledgement,
     FrameBatch,
     FrameHeader,
+    Status,
+    decode,
     decode_frames,
-    decode_status,
     essentials,
 )
 
@@ -59,74 +61,6 @@ PLACED: Final = {
 """What becomes of frames in the sequence besides being used, and what is then wrong with them."""
 
 
-class Bursts:
-    """Lets the first of a burst of equal complaints through."""
-
-    __slots__ = ("_last",)
-
-    def __init__(self) -> None:
-        self._last: dict[str, float] = {}
-
-    def opens(self, kind: str, now_s: float) -> bool:
-        """Return whether this complaint is due again."""
-        last = self._last.get(kind)
-        if last is not None and now_s - last < BURST_S:
-            return False
-        self._last = {k: s for k, s in self._last.items() if now_s - s < BURST_S}
-        self._last[kind] = now_s
-        return True
-
-
-class EventQueue:
-    """Events on their way from zenoh's threads to the consumer; the oldest give way."""
-
-    __slots__ = ("_events", "_lock", "dropped")
-
-    def __init__(self, length: int = QUEUE_LENGTH) -> None:
-        self._events: deque[LinkEvent] = deque(maxlen=length)
-        self._lock = threading.Lock()
-        self.dropped = 0
-
-    def put(self, event: LinkEvent) -> None:
-        """Add an event."""
-        with self._lock:
-            self.dropped += len(self._events) == self._events.maxlen
-            self._events.append(event)
-
-    def take(self) -> list[LinkEvent]:
-        """Return what has come since the last call, oldest first."""
-        with self._lock:
-            events = list(self._events)
-            self._events.clear()
-        return events
-
-
-class Wakeup:
-    """Rings at most once between two visits of the consumer, from whatever thread."""
-
-    __slots__ = ("_callback", "_rung")
-
-    def __init__(self) -> None:
-        self._callback: Callable[[], object] | None = None
-        self._rung = False
-
-    def connect(self, callback: Callable[[], object] | None) -> None:
-        """Call ``callback`` from now on; None: nothing."""
-        self._callback = callback
-        self._rung = False
-
-    def ring(self) -> None:
-        """Say that something new is there."""
-        callback = self._callback
-        if callback is not None and not self._rung:
-            self._rung = True
-            callback()
-
-    def answer(self) -> None:
-        """Say that the consumer is about to look: what comes from now on rings again."""
-        self._rung = False
-
-
 class Intake:
     """Takes what zenoh's threads bring; every method may be called from any thread."""
 
@@ -143,9 +77,10 @@ class Intake:
         self._endpoint = endpoint
         self._clock = clock
         self._lock = threading.Lock()
-        self._queue = EventQueue()
-        self._bursts = Bursts()
-        self._wakeup = Wakeup()
+        self._events: deque[LinkEvent] = deque(maxlen=QUEUE_LENGTH)
+        self._callback: Callable[[], object] | None = None
+        self._rung = False
+        self._complained_s: dict[str, float] = {}
         self._sessions = SessionWatch()
         self._ring: FrameRing | None = None
         self._patience_s = endpoint.reorder_s
@@ -171,7 +106,14 @@ class Intake:
 
     def set_wakeup(self, callback: Callable[[], object] | None) -> None:
         """Call ``callback``, from zenoh's threads, when something new is there."""
-        self._wakeup.connect(callback)
+        self._callback, self._rung = callback, False
+
+    def _wake(self) -> None:
+        """Say that something new is there, at most once between two visits of the consumer."""
+        callback = self._callback
+        if callback is not None and not self._rung:
+            self._rung = True
+            callback()
 
     def frames(
         self,
@@ -207,7 +149,7 @@ class Intake:
                 self._latency_s.append(latency_s)
             if self._belongs(batch.header, now_s):
                 self._store(batch, now_s)
-        self._wakeup.ring()
+        self._wake()
 
     def status(self, data: bytes) -> None:
         """Take the RTC's account of its loop; of a flood of them as many as are of use.
@@ -226,7 +168,7 @@ class Intake:
                 return
             self._spared = None
         self._take_status(data, found)
-        self._wakeup.ring()
+        self._wake()
 
     def _superfluous(self, found: tuple[object, ...], now_s: float) -> bool:
         """Return whether a status may give way to the next one."""
@@ -240,7 +182,7 @@ class Intake:
         return self._changes > CHANGES
 
     def _take_status(self, data: bytes, found: tuple[object, ...]) -> None:
-        status = decode_status(data)
+        status = decode(Status, data)
         now_s = self._clock()
         with self._lock:
             if not self._admit("status", status.session, 1, now_s):
@@ -250,7 +192,7 @@ class Intake:
             self._last_status_s = now_s
             self._expected(status.basis_id, status.config_id, now_s)
             self._shape = (status.n_slopes, status.n_modes)
-            self._queue.put(status)
+            self._put(status)
 
     def acknowledgement(self, acknowledgement: Acknowledgement, *, known: bool) -> None:
         """Take the RTC's word on a reconstructor."""
@@ -259,8 +201,8 @@ class Intake:
             self._counted["unknown"] += not known
             if self._admit("ack", acknowledgement.session, 1, now_s):
                 self._tally.add("ack", USED, 1, now_s)
-                self._queue.put(acknowledgement)
-        self._wakeup.ring()
+                self._put(acknowledgement)
+        self._wake()
 
     def liveliness(self, *, alive: bool) -> None:
         """Take the appearance or disappearance of the RTC's token."""
@@ -276,7 +218,7 @@ class Intake:
         now_s = self._clock()
         with self._lock:
             self._tally.add(kind, MALFORMED, 1, now_s, str(error))
-            due = self._bursts.opens(f"malformed {kind}", now_s)
+            due = self._is_news(f"malformed {kind}", now_s)
         if due:
             text = f"{kind}: {error}"
             self.event(ev.Noted(name="message.malformed", text=text, level=Level.WARNING))
@@ -285,16 +227,29 @@ class Intake:
         """Count a fault of the service itself; return whether it is the first of a burst."""
         with self._lock:
             self._counted["failed"] += 1
-            return self._bursts.opens(f"failed {kind}", self._clock())
+            return self._is_news(f"failed {kind}", self._clock())
 
     def event(self, event: LinkEvent) -> None:
         """Queue an event and wake the consumer."""
-        self._queue.put(event)
-        self._wakeup.ring()
+        with self._lock:
+            self._put(event)
+        self._wake()
+
+    def _put(self, event: LinkEvent) -> None:
+        self._counted["dropped"] += len(self._events) == QUEUE_LENGTH
+        self._events.append(event)
+
+    def _is_news(self, complaint: str, now_s: float) -> bool:
+        """Return whether a complaint is the first of a burst of equal ones."""
+        if now_s - self._complained_s.get(complaint, -math.inf) < BURST_S:
+            return False
+        recent = {kind: s for kind, s in self._complained_s.items() if now_s - s < BURST_S}
+        self._complained_s = recent | {complaint: now_s}
+        return True
 
     def drain(self) -> list[FrameBlock]:
         """Return copies of the frames that are due, in order; see :meth:`FrameRing.take`."""
-        self._wakeup.answer()
+        self._rung = False
         blocks: list[FrameBlock] = []
         while True:
             with self._lock:
@@ -308,9 +263,12 @@ class Intake:
 
     def events(self) -> list[LinkEvent]:
         """Return what has happened since the last call, oldest first."""
-        self._wakeup.answer()
+        self._rung = False
         self._take_spared()
-        return self._queue.take()
+        with self._lock:
+            events = list(self._events)
+            self._events.clear()
+        return events
 
     def _take_spared(self) -> None:
         """Take the last of a flood of statuses in, once it is due."""
@@ -347,7 +305,7 @@ class Intake:
                 statuses_received=sum(tally.of("status", but=(MALFORMED,)).values()),
                 acknowledgements_received=sum(tally.of("ack", but=(MALFORMED,)).values()),
                 acknowledgements_unknown=self._counted["unknown"],
-                events_dropped=self._queue.dropped,
+                events_dropped=self._counted["dropped"],
                 callback_errors=self._counted["failed"],
                 frame_age_s=_age_s(self._last_frame_s, now_s),
                 fates=tally.fates(now_s),
@@ -416,14 +374,14 @@ class Intake:
             self._shape, self._begun_s = None, now_s
             self._last_status_s, self._essentials = None, ()
             self._tally.begin()
-            self._queue.put(ev.SessionStarted(session=session))
+            self._put(ev.SessionStarted(session=session))
         if not admission.accepted:
             text = f"session {session}, while session {current} sends"
             self._tally.add(kind, "session", n, now_s, text)
         rival = admission.rival
-        if rival is not None and current and self._bursts.opens(f"second {rival}", now_s):
+        if rival is not None and current and self._is_news(f"second {rival}", now_s):
             told = f"two RTCs send at once, sessions {current} and {rival}: stop one of them"
-            self._queue.put(ev.Trouble(name=SECOND_RTC, text=told))
+            self._put(ev.Trouble(name=SECOND_RTC, text=told))
         return admission.accepted
 
     def _expected(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
@@ -432,16 +390,16 @@ class Intake:
             self._basis_id = self._basis_id or basis_id
             self._config_id = self._config_id or config_id
             told = f"basis {self._basis_id}, configuration {self._config_id}"
-            self._queue.put(ev.Noted(name="ids.adopted", text=told))
+            self._put(ev.Noted(name="ids.adopted", text=told))
         expected, found = (self._basis_id, self._config_id), (basis_id, config_id)
         if found == expected:
             return None
-        if self._bursts.opens("ids", now_s):
+        if self._is_news("ids", now_s):
             told = (
                 f"the RTC's basis and configuration are {' and '.join(found)}, expected "
                 f"{' and '.join(expected)}: no estimate, no publication until they agree"
             )
-            self._queue.put(ev.Trouble(name=OTHER_BASIS, text=told))
+            self._put(ev.Trouble(name=OTHER_BASIS, text=told))
         which = "basis" if basis_id != self._basis_id else "config"
         return which, f"{' and '.join(found)}, expected {' and '.join(expected)}"
 

@@ -18,7 +18,7 @@ from service.wire import (
     Manifest,
     MeasuredManifest,
     chunk_index,
-    decode_measured_manifest,
+    decode,
 )
 
 OFFERS: Final = 8
@@ -198,7 +198,7 @@ class MeasuredIntake:
         return self._finished(name)
 
     def _checked(self, name: str, data: bytes) -> MeasuredManifest:
-        manifest = decode_measured_manifest(data)
+        manifest = decode(MeasuredManifest, data)
         if (manifest.id, manifest.system) != (name, self._keys.system):
             raise WireError(
                 f"id: the manifest of {manifest.id} of system {manifest.system} came on the key "

@@ -28,9 +28,8 @@ from service.wire import (
     Manifest,
     Reply,
     command_kind,
-    decode_manifest,
-    encode_command,
-    encode_reply,
+    decode,
+    encode,
 )
 
 HISTORY_S = 0.5
@@ -294,7 +293,7 @@ def send_command(session: zenoh.Session, endpoint: Endpoint, command: Command) -
     LinkError
         If there is none after all attempts.
     """
-    payload, kind = encode_command(command), command_kind(command)
+    payload, kind = encode(command), command_kind(command)
     selector = Keys(endpoint.system).command(kind)
     for attempt in range(endpoint.command_attempts):
         if attempt:
@@ -306,7 +305,7 @@ def send_command(session: zenoh.Session, endpoint: Endpoint, command: Command) -
         # zenoh ends a query at once that nobody serves
         if kind in OPTIONAL and time.monotonic() - began_s < timeout_s / 2:
             reason = f"unsupported: the RTC offers no {kind}"
-            return encode_reply(Reply(id=command.id, accepted=False, reason=reason, start_seq=None))
+            return encode(Reply(id=command.id, accepted=False, reason=reason, start_seq=None))
     raise LinkError(
         f"no answer from the RTC to {kind} command {command.id} after "
         f"{endpoint.command_attempts} attempts: whether it was carried out is unknown"
@@ -323,7 +322,7 @@ def fetch_applied(session: zenoh.Session, keys: Keys) -> tuple[Manifest, NDArray
     LinkError
         If the RTC does not answer or has none.
     """
-    manifest = decode_manifest(_asked(session, keys.applied))
+    manifest = decode(Manifest, _asked(session, keys.applied))
     assembler = ChunkAssembler()
     assembler.announce(manifest.layout)
     for index in range(manifest.layout.n_chunks):

@@ -1,12 +1,12 @@
 """Bytes <-> records: version 1 of the contract between the RTC and the service.
 
-``encode_x`` turns a frozen record into bytes, ``decode_x`` does the reverse and refuses whatever
-breaks the contract with a :class:`~service.errors.WireError`. The refusal's text begins with
-``missing``, ``v``, ``id`` or ``range``, so an RTC can put it into the ``reason`` of a reply.
-Nothing here knows zenoh, and nothing is ever unpickled.
+``encode(record)`` turns a frozen record into bytes, ``decode(kind, data)`` does the reverse and
+refuses whatever breaks the contract with a :class:`~service.errors.WireError`. The refusal's text
+begins with ``missing``, ``v``, ``id`` or ``range``, so an RTC can put it into the ``reason`` of a
+reply. Nothing here knows zenoh, and nothing is ever unpickled.
 """
 
-from service.wire.codec import MESSAGE_LIMIT, TEXT_LIMIT, VERSION
+from service.wire.codec import MESSAGE_LIMIT, TEXT_LIMIT, VERSION, decode, encode
 from service.wire.commands import (
     Command,
     CommandKind,
@@ -22,9 +22,6 @@ from service.wire.commands import (
     command_id,
     command_kind,
     decode_command,
-    decode_reply,
-    encode_command,
-    encode_reply,
 )
 from service.wire.frames import (
     ATTACHMENT_LIMIT,
@@ -43,10 +40,6 @@ from service.wire.matrices import (
     MatrixLayout,
     MeasuredManifest,
     checksum,
-    decode_manifest,
-    decode_measured_manifest,
-    encode_manifest,
-    encode_measured_manifest,
     layout_of,
     split,
 )
@@ -59,13 +52,5 @@ from service.wire.status import (
     Pointing,
     StateMessage,
     Status,
-    decode_acknowledgement,
-    decode_alarm,
-    decode_state,
-    decode_status,
-    encode_acknowledgement,
-    encode_alarm,
-    encode_state,
-    encode_status,
     essentials,
 )

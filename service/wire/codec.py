@@ -1,16 +1,17 @@
 """Records <-> msgpack maps: each key is present, of its type and in its range.
 
 The types of a record's fields say what its keys may hold; a refusal names the key, what was found
-and what was expected. Here are the types that messages share.
+and what was expected. A :class:`Form` says what else a kind of message asks for. Here are the types
+that messages share.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar
 
 import msgpack
 import msgspec
@@ -99,45 +100,110 @@ class FourNumbers:
     """1: as the instrument file says."""
 
 
-def pack(record: DataclassInstance, omit: tuple[str, ...] = (), **replaced: object) -> bytes:
-    """Return the msgpack map of a record whose fields are named like the keys, with its ``v``.
+Map = dict[str, Any]
+"""A message, or a part of one, as msgpack has it."""
 
-    Parameters
-    ----------
-    record
-        The record.
-    omit
-        Fields that are no keys.
-    **replaced
-        Keys that are no fields, or whose field travels in another form.
+
+def _untouched(keys: Map, _where: str = "") -> Map:
+    return keys
+
+
+def _no_more(_record: object, _where: str) -> None:
+    """Ask for no more than the types of the fields do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Form(Generic[_R]):
+    """How one kind of message travels, as far as the fields of its record do not say it."""
+
+    kind: type[_R]
+    """Of the record: its fields are the keys."""
+
+    where: str
+    """What a message is called in refusals."""
+
+    extensions: tuple[str, ...] = ()
+    """Keys that came after the contract: who does not know them need not send them."""
+
+    opened: Callable[[bytes, str], Map] | None = None
+    """Bytes to keys; None: a map of at most :data:`MESSAGE_LIMIT` bytes."""
+
+    keys: Callable[[Map], Map] = _untouched
+    """Fields to keys, where they differ."""
+
+    fields: Callable[[Map, str], Map] = _untouched
+    """Keys to fields, where they differ."""
+
+    check: Callable[[_R, str], None] = _no_more
+    """What fields must be together."""
+
+    held: bool = True
+    """Whether what is sent is held against the contract first; not what an RTC ignores."""
+
+
+_FORMS: dict[type, Form[Any]] = {}
+
+
+def travels(form: Form[Any]) -> None:
+    """Let records of a kind travel."""
+    _FORMS[form.kind] = form
+
+
+def encode(record: DataclassInstance) -> bytes:
+    """Return the bytes of a message.
+
+    Raises
+    ------
+    WireError
+        If the record breaks the contract.
     """
-    values = {f.name: getattr(record, f.name) for f in fields(record) if f.name not in omit}
-    data: bytes = msgpack.packb({"v": VERSION, **values, **replaced}, default=_plain)
+    form = _FORMS[type(record)]
+    keys = {field.name: getattr(record, field.name) for field in fields(record)}
+    data: bytes = msgpack.packb({"v": VERSION, **form.keys(keys)}, default=_plain)
+    if form.held:
+        decode(form.kind, data)
     return data
 
 
-def checked(data: bytes, decode: Callable[[bytes], object]) -> bytes:
-    """Return a message that whoever receives it can decode.
+def decode(kind: type[_R], data: bytes) -> _R:
+    """Return the record that a message is.
+
+    Raises
+    ------
+    WireError
+        If it breaks the contract; the text is fit for the ``reason`` of a reply.
+    """
+    form: Form[_R] = _FORMS[kind]
+    values = (form.opened or unpack)(data, form.where)
+    return of_map(kind, of_this_version(values, form.where), form.where)
+
+
+def of_map(kind: type[_R], values: Map, where: str) -> _R:
+    """Return the record of a map, be it a message or a part of one.
 
     Raises
     ------
     WireError
         If it breaks the contract.
     """
-    decode(data)
-    return data
+    form: Form[_R] = _FORMS[kind]
+    record = read(form.fields(values, where), kind, where, form.extensions)
+    form.check(record, where)
+    return record
 
 
 def _plain(value: object) -> object:
-    """Turn numpy scalars and arrays into what msgpack knows."""
+    """Turn numpy scalars, arrays and records into what msgpack knows."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
     if isinstance(value, Mapping):
         return dict(value)
     raise WireError(f"range: {value!r:.80} of type {type(value).__name__} cannot travel")
 
 
-def unpack(data: bytes, where: str, limit: int = MESSAGE_LIMIT) -> dict[str, Any]:
+def unpack(data: bytes, where: str, limit: int = MESSAGE_LIMIT) -> Map:
     """Return the map that a message is.
 
     Parameters
@@ -163,7 +229,7 @@ def unpack(data: bytes, where: str, limit: int = MESSAGE_LIMIT) -> dict[str, Any
     return as_map(values, where)
 
 
-def as_map(values: object, where: str) -> dict[str, Any]:
+def as_map(values: object, where: str) -> Map:
     """Return what must be a map.
 
     Raises
@@ -176,7 +242,7 @@ def as_map(values: object, where: str) -> dict[str, Any]:
     return values
 
 
-def of_this_version(values: dict[str, Any], where: str) -> dict[str, Any]:
+def of_this_version(values: Map, where: str) -> Map:
     """Return a map whose ``v`` is the version this code speaks.
 
     Raises
@@ -190,7 +256,7 @@ def of_this_version(values: dict[str, Any], where: str) -> dict[str, Any]:
     return values
 
 
-def get(values: dict[str, Any], key: str, where: str) -> Any:  # noqa: ANN401  as msgpack made it
+def get(values: Map, key: str, where: str) -> Any:  # noqa: ANN401  as msgpack made it
     """Return the value of a key that must be present.
 
     Raises
@@ -203,9 +269,7 @@ def get(values: dict[str, Any], key: str, where: str) -> Any:  # noqa: ANN401  a
     return values[key]
 
 
-def read(
-    values: dict[str, Any], kind: type[_R], where: str, extensions: tuple[str, ...] = ()
-) -> _R:
+def read(values: Map, kind: type[_R], where: str, extensions: tuple[str, ...] = ()) -> _R:
     """Return the record of a map whose keys are named like the fields.
 
     Parameters
@@ -237,7 +301,7 @@ def read(
     return record
 
 
-def read_four(values: dict[str, Any], key: str, where: str) -> dict[str, float] | None:
+def read_four(values: Map, key: str, where: str) -> dict[str, float] | None:
     """Return the four numbers of a registration below a key, None where it is nil.
 
     Raises
@@ -266,6 +330,11 @@ def applicable(record: DataclassInstance, where: str, **applies: bool) -> None:
             raise refusal(key, value, expected_of(type(record), key), where)
         if not does and value is not None:
             raise refusal(key, value, "nil, it does not apply", where)
+
+
+def reason_or_none(values: Map, _where: str) -> Map:
+    """Return a map in which a reason that is nil is an empty one."""
+    return values | {"reason": ""} if values.get("reason", "") is None else values
 
 
 def refusal(key: str, value: object, expected: str, where: str) -> WireError:

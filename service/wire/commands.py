@@ -5,26 +5,27 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from msgspec import Meta
 
 from service.errors import WireError
 from service.wire.codec import (
     Count,
+    Form,
     Id,
+    Map,
     Positive,
     Text,
     above,
     applicable,
-    checked,
+    decode,
     get,
     integer,
     number,
-    of_this_version,
-    pack,
-    read,
+    reason_or_none,
     refusal,
+    travels,
     unpack,
 )
 from service.wire.keys import checked_id
@@ -229,20 +230,6 @@ def command_id(data: bytes) -> str | None:
         return None
 
 
-def encode_command(command: Command) -> bytes:
-    """Return the payload of a command's query.
-
-    Raises
-    ------
-    WireError
-        If the record breaks the contract.
-    """
-    data = pack(command)
-    if isinstance(command, DitherRequest | DitherStop):
-        data = pack(command, action=_START if isinstance(command, DitherRequest) else _STOP)
-    return checked(data, lambda data: decode_command(command_kind(command), data))
-
-
 def decode_command(kind: CommandKind, data: bytes) -> Command:
     """Return the command a query on ``cmd/rtc/{kind}`` carries.
 
@@ -253,37 +240,34 @@ def decode_command(kind: CommandKind, data: bytes) -> Command:
     WireError
         If a key is missing or out of range; the text is fit for the reply's ``reason``.
     """
-    where = f"a {kind} command"
-    values = of_this_version(unpack(data, where), where)
-    if kind is CommandKind.DITHER:
-        stops = values.get("action") == _STOP
-        return read(values, DitherStop, where) if stops else read_dither(values, where)
-    record = next(record for record, of_kind in _KINDS.items() if of_kind is kind)
-    command = read(values, record, where)
-    if isinstance(command, MeasureRequest):
-        sine = command.pattern is Pattern.SINE
-        applicable(command, where, n_average=not sine, frequency_hz=sine, duration_s=sine)
-        _check_modes(command, where)
-    elif isinstance(command, RampRequest):
-        _check_ramp(command, where)
-    return command
+    match kind:
+        case CommandKind.DITHER:
+            stops = unpack(data, "a dither command").get("action") == _STOP
+            return decode(DitherStop, data) if stops else decode(DitherRequest, data)
+        case CommandKind.LOOP:
+            return decode(LoopRequest, data)
+        case CommandKind.MEASURE:
+            return decode(MeasureRequest, data)
+        case CommandKind.RAMP:
+            return decode(RampRequest, data)
 
 
-def read_dither(values: dict[str, Any], where: str) -> DitherRequest:
-    """Return the dither that a map asks for.
-
-    Raises
-    ------
-    WireError
-        If a key is missing or out of range.
-    """
+def _starts(values: Map, where: str) -> Map:
     if get(values, "action", where) != _START:
         raise refusal("action", values["action"], f"{_START} or {_STOP}", where)
-    command = read(values, DitherRequest, where)
+    return values
+
+
+def _check_dither(command: DitherRequest, where: str) -> None:
     sine = command.kind is DitherKind.SINE
     applicable(command, where, frequency_hz=sine, seed=not sine)
     _check_modes(command, where)
-    return command
+
+
+def _check_measurement(command: MeasureRequest, where: str) -> None:
+    sine = command.pattern is Pattern.SINE
+    applicable(command, where, n_average=not sine, frequency_hz=sine, duration_s=sine)
+    _check_modes(command, where)
 
 
 def _check_modes(command: DitherRequest | MeasureRequest, where: str) -> None:
@@ -307,26 +291,23 @@ def _check_ramp(command: RampRequest, where: str) -> None:
         raise refusal("gains", command.gains, "one or more gains to try", where)
 
 
-def encode_reply(reply: Reply) -> bytes:
-    """Return the payload of the reply to a command.
-
-    Raises
-    ------
-    WireError
-        If the record breaks the contract.
-    """
-    return checked(pack(reply), decode_reply)
-
-
-def decode_reply(data: bytes) -> Reply:
-    """Return the RTC's answer to a command.
-
-    Raises
-    ------
-    WireError
-        If a key is missing or out of range.
-    """
-    values = of_this_version(unpack(data, "a reply"), "a reply")
-    if values.get("reason", "") is None:
-        values["reason"] = ""
-    return read(values, Reply, "a reply")
+travels(
+    Form(
+        kind=DitherRequest,
+        where="a dither command",
+        keys=lambda keys: {**keys, "action": _START},
+        fields=_starts,
+        check=_check_dither,
+    )
+)
+travels(
+    Form(
+        kind=DitherStop,
+        where="a dither command",
+        keys=lambda keys: {**keys, "action": _STOP},
+    )
+)
+travels(Form(kind=LoopRequest, where="a loop command"))
+travels(Form(kind=MeasureRequest, where="a measure command", check=_check_measurement))
+travels(Form(kind=RampRequest, where="a ramp command", check=_check_ramp))
+travels(Form(kind=Reply, where="a reply", fields=reason_or_none))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import WireError
-from service.wire.codec import Id, Opaque, integer, of_this_version, pack, read, unpack
+from service.wire.codec import Form, Id, Opaque, decode, encode, integer, travels, unpack
 
 BATCH_LIMIT: Final = 4_000_000
 """Bytes: a longer payload is refused unread."""
@@ -21,7 +21,6 @@ FRAMES_PER_BATCH: Final = 50
 """Most frames in one batch."""
 
 COLUMN_LIMIT: Final = BATCH_LIMIT // 4
-WHERE: Final = "the attachment of a frame batch"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,8 +118,8 @@ def encode_frames(header: FrameHeader, rows: NDArray[np.float32]) -> tuple[bytes
             f"range: frame rows have shape {rows.shape}, expected {(header.n, header.n_columns)}"
         )
     payload = np.ascontiguousarray(rows, dtype="<f4").tobytes()
-    attachment = pack(header)
-    _check_sizes(payload, decode_header(attachment))
+    attachment = encode(header)
+    _check_sizes(payload, header)
     return payload, attachment
 
 
@@ -140,22 +139,19 @@ def decode_frames(payload: bytes, attachment: bytes | None) -> FrameBatch:
         raise WireError(
             f"range: a frame batch has {len(payload)} bytes, expected at most {BATCH_LIMIT}"
         )
-    header = decode_header(attachment)
+    header = decode(FrameHeader, attachment)
     _check_sizes(payload, header)
     rows = np.frombuffer(payload, dtype="<f4").reshape(header.n, header.n_columns)
     return FrameBatch(header=header, rows=rows)
 
 
-def decode_header(attachment: bytes) -> FrameHeader:
-    """Return what an attachment says.
-
-    Raises
-    ------
-    WireError
-        If a key is missing or out of range, or the attachment is too long.
-    """
-    values = of_this_version(unpack(attachment, WHERE, ATTACHMENT_LIMIT), WHERE)
-    return read(values, FrameHeader, WHERE)
+travels(
+    Form(
+        kind=FrameHeader,
+        where="the attachment of a frame batch",
+        opened=lambda data, where: unpack(data, where, ATTACHMENT_LIMIT),
+    )
+)
 
 
 def _check_sizes(payload: bytes, header: FrameHeader) -> None:

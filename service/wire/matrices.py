@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 from msgspec import Meta
@@ -16,20 +16,19 @@ from service.errors import WireError
 from service.wire.codec import (
     SHA256_EXPECTED,
     Count,
+    Form,
     Id,
+    Map,
     Opaque,
     Positive,
     Text,
     applicable,
-    checked,
     get,
     integer,
-    of_this_version,
-    pack,
     read,
     read_four,
     refusal,
-    unpack,
+    travels,
 )
 from service.wire.commands import Pattern
 
@@ -153,73 +152,34 @@ class MeasuredManifest:
     """When it was measured, nanoseconds since the Unix epoch, UTC."""
 
 
-def encode_manifest(manifest: Manifest) -> bytes:
-    """Return the payload of a ``commit``.
-
-    Raises
-    ------
-    WireError
-        If the record breaks the contract.
-    """
-    return checked(_pack_with_layout(manifest), decode_manifest)
+def _with_keys_of_layout(keys: Map) -> Map:
+    layout = asdict(keys.pop("layout"))
+    return {**keys, "dtype": DTYPE, **layout}
 
 
-def decode_manifest(data: bytes) -> Manifest:
-    """Return the manifest of a reconstructor.
-
-    Raises
-    ------
-    WireError
-        If a key is missing or out of range, or the message is too long.
-    """
-    where = "the manifest of a reconstructor"
-    values = of_this_version(unpack(data, where), where)
+def _manifest_fields(values: Map, where: str) -> Map:
     values = _with_layout(values, where)
     alpha, sigma = (read_four(values, key, where) for key in ("alpha", "sigma"))
     if alpha is not None and alpha["magnification"] <= 0.0:
         inside = f"'alpha' of {where}"
         raise refusal("magnification", alpha["magnification"], "a finite number > 0", inside)
-    return read({**values, "alpha": alpha, "sigma": sigma}, Manifest, where)
+    return {**values, "alpha": alpha, "sigma": sigma}
 
 
-def encode_measured_manifest(manifest: MeasuredManifest) -> bytes:
-    """Return the payload of an ``im`` commit.
-
-    Raises
-    ------
-    WireError
-        If the record breaks the contract.
-    """
-    return checked(_pack_with_layout(manifest), decode_measured_manifest)
-
-
-def decode_measured_manifest(data: bytes) -> MeasuredManifest:
-    """Return the manifest of a measured interaction matrix.
-
-    Raises
-    ------
-    WireError
-        If a key is missing or out of range, or the message is too long.
-    """
-    where = "the manifest of a measured matrix"
-    values = of_this_version(unpack(data, where), where)
+def _measured_fields(values: Map, where: str) -> Map:
     values = _with_layout(values, where, may_fail=True)
-    if values["layout"]["n_chunks"]:
-        values["reason"] = None
-    manifest = read(values, MeasuredManifest, where)
+    return values | {"reason": None} if values["layout"]["n_chunks"] else values
+
+
+def _check_measured(manifest: MeasuredManifest, where: str) -> None:
     layout, n_modes = manifest.layout, len(manifest.modes)
     applicable(manifest, where, reason=not layout.n_chunks)
     if len(manifest.amplitude_m) != n_modes or (layout.n_chunks and n_modes != layout.shape[1]):
         expected = f"one for each of {layout.shape[1]} measured modes"
         raise refusal("amplitude_m", manifest.amplitude_m, expected, where)
-    return manifest
 
 
-def _pack_with_layout(manifest: Manifest | MeasuredManifest) -> bytes:
-    return pack(manifest, omit=("layout",), dtype=DTYPE, **asdict(manifest.layout))
-
-
-def _with_layout(values: dict[str, Any], where: str, *, may_fail: bool = False) -> dict[str, Any]:
+def _with_layout(values: Map, where: str, *, may_fail: bool = False) -> Map:
     """Return the map of a manifest with its layout, whose keys are among its own, below one."""
     if get(values, "dtype", where) != DTYPE:
         raise refusal("dtype", values["dtype"], repr(DTYPE), where)
@@ -235,6 +195,25 @@ def _with_layout(values: dict[str, Any], where: str, *, may_fail: bool = False) 
     if not layout.sha256 and not failed:
         raise refusal("sha256", layout.sha256, SHA256_EXPECTED, where)
     return {**values, "layout": asdict(layout)}
+
+
+travels(
+    Form(
+        kind=Manifest,
+        where="the manifest of a reconstructor",
+        keys=_with_keys_of_layout,
+        fields=_manifest_fields,
+    )
+)
+travels(
+    Form(
+        kind=MeasuredManifest,
+        where="the manifest of a measured matrix",
+        keys=_with_keys_of_layout,
+        fields=_measured_fields,
+        check=_check_measured,
+    )
+)
 
 
 def layout_of(matrix: NDArray[np.float32], chunk_bytes: int) -> MatrixLayout:

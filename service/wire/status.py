@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from typing import Annotated, Any, Final
+from itertools import compress
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,24 +17,25 @@ from service.wire.codec import (
     MESSAGE_LIMIT,
     Count,
     Finite,
+    Form,
     Id,
+    Map,
     Opaque,
     Sha256,
     Text,
     above,
     as_map,
-    checked,
     get,
     integer,
     number,
-    of_this_version,
-    pack,
-    read,
+    of_map,
     read_four,
+    reason_or_none,
     refusal,
+    travels,
     unpack,
 )
-from service.wire.commands import DitherRequest, Loop, read_dither
+from service.wire.commands import DitherRequest, Loop
 
 STATUS_LIMIT: Final = MESSAGE_LIMIT + 16 * 512**2
 """Bytes: a longer status is refused unread; its images come on top of what a message may have."""
@@ -153,7 +155,7 @@ class Status:
         """
         if self.loop == Loop.OPEN:
             return ()
-        return tuple(i for i, gain in enumerate(self.gains[: self.n_controlled]) if gain)
+        return tuple(compress(range(self.n_controlled), self.gains))
 
     @property
     def flux_images(self) -> NDArray[np.float32] | None:
@@ -245,44 +247,6 @@ class AlarmMessage:
     """What was found, and what to do."""
 
 
-def encode_status(status: Status) -> bytes:
-    """Return the payload of a status message.
-
-    Raises
-    ------
-    WireError
-        If the record breaks the contract.
-    """
-    playing = status.dither
-    dither = None
-    if playing is not None:
-        dither = {**asdict(playing.request), "action": "start", "start_seq": playing.start_seq}
-    pointing = None if status.pointing is None else asdict(status.pointing)
-    return checked(pack(status, dither=dither, pointing=pointing), decode_status)
-
-
-def decode_status(data: bytes) -> Status:
-    """Return the RTC's account of its loop.
-
-    Raises
-    ------
-    WireError
-        If a key is missing or out of range, or the message is too long.
-    """
-    values = of_this_version(_unpack_status(data), WHERE)
-    playing = get(values, "dither", WHERE)
-    status = read({**values, "dither": None}, Status, WHERE, extensions=("pointing",))
-    if len(status.gains) != status.n_modes:
-        raise refusal("gains", status.gains, f"one for each of {status.n_modes} modes", WHERE)
-    if status.n_controlled > status.n_modes:
-        expected = f"an integer from 0 to {status.n_modes}"
-        raise refusal("n_controlled", status.n_controlled, expected, WHERE)
-    flux = status.flux
-    if flux is not None and 16 * math.isqrt(len(flux) // 16) ** 2 != len(flux):
-        raise refusal("flux", flux, "bytes of four square float32 images", WHERE)
-    return status if playing is None else replace(status, dither=_dither(playing))
-
-
 def essentials(data: bytes) -> tuple[object, ...]:
     """Return what of a status must not be missed, unchecked; two that differ in it both count.
 
@@ -291,13 +255,13 @@ def essentials(data: bytes) -> tuple[object, ...]:
     WireError
         If the message is no map, or too long.
     """
-    values = _unpack_status(data)
+    values = _opened(data, WHERE)
     return tuple(values.get(key) for key in ESSENTIAL)
 
 
-def _unpack_status(data: bytes) -> dict[str, Any]:
+def _opened(data: bytes, where: str) -> Map:
     """Return the map of a status that is no longer than its limit, its images left aside."""
-    values = unpack(data, WHERE, STATUS_LIMIT)
+    values = unpack(data, where, STATUS_LIMIT)
     flux = values.get("flux")
     n_bytes = len(data) - (len(flux) if isinstance(flux, bytes) else 0)
     if n_bytes > MESSAGE_LIMIT:
@@ -308,78 +272,72 @@ def _unpack_status(data: bytes) -> dict[str, Any]:
     return values
 
 
-def _dither(playing: object) -> DitherStatus:
-    inside = f"'dither' of {WHERE}"
-    values = as_map(playing, inside)
-    request = asdict(read_dither(values, inside))
-    return read({**values, "request": request}, DitherStatus, inside)
+def _status_keys(keys: Map) -> Map:
+    playing = keys["dither"]
+    if playing is None:
+        return keys
+    action = {"action": "start", "start_seq": playing.start_seq}
+    return {**keys, "dither": {**asdict(playing.request), **action}}
 
 
-def encode_acknowledgement(acknowledgement: Acknowledgement) -> bytes:
-    """Return the payload of an acknowledgement.
-
-    Raises
-    ------
-    WireError
-        If the record breaks the contract.
-    """
-    return checked(pack(acknowledgement), decode_acknowledgement)
+def _status_fields(values: Map, where: str) -> Map:
+    playing, inside = get(values, "dither", where), f"'dither' of {where}"
+    if playing is None:
+        return values
+    request = of_map(DitherRequest, as_map(playing, inside), inside)
+    start_seq = get(playing, "start_seq", inside)
+    return {**values, "dither": {"request": asdict(request), "start_seq": start_seq}}
 
 
-def decode_acknowledgement(data: bytes) -> Acknowledgement:
-    """Return the RTC's word on one reconstructor.
+def _check_status(status: Status, where: str) -> None:
+    if len(status.gains) != status.n_modes:
+        raise refusal("gains", status.gains, f"one for each of {status.n_modes} modes", where)
+    if status.n_controlled > status.n_modes:
+        expected = f"an integer from 0 to {status.n_modes}"
+        raise refusal("n_controlled", status.n_controlled, expected, where)
+    flux = status.flux
+    if flux is not None and 16 * math.isqrt(len(flux) // 16) ** 2 != len(flux):
+        raise refusal("flux", flux, "bytes of four square float32 images", where)
 
-    Raises
-    ------
-    WireError
-        If a key is missing or out of range.
-    """
-    where = "an acknowledgement"
-    values = of_this_version(unpack(data, where), where)
-    if values.get("reason", "") is None:
-        values["reason"] = ""
-    said = read(values, Acknowledgement, where)
+
+def _check_acknowledgement(said: Acknowledgement, where: str) -> None:
     if (said.frame_seq is not None) != (said.state is AckState.APPLIED):
         raise refusal("frame_seq", said.frame_seq, "a number if and only if applied", where)
     if said.state is not AckState.REJECTED and (said.id is None or said.sha256 is None):
         raise refusal("id, sha256", (said.id, said.sha256), "both, unless rejected", where)
-    return said
 
 
-def encode_state(message: StateMessage) -> bytes:
-    """Return the payload of a state message."""
-    return pack(message)
+def _state_fields(values: Map, where: str) -> Map:
+    four = {key: read_four(values, key, where) for key in ("alpha", "sigma")}
+    return {**values, **four, "waiting_for": values.get("waiting_for") or ()}
 
 
-def decode_state(data: bytes) -> StateMessage:
-    """Return what the service said it knows.
-
-    Raises
-    ------
-    WireError
-        If a key is missing or out of range.
-    """
-    where = "a state message"
-    values = of_this_version(unpack(data, where), where)
-    if values.get("waiting_for") is None:
-        values["waiting_for"] = ()
-    for key in ("alpha", "sigma"):
-        values[key] = read_four(values, key, where)
-    return read(values, StateMessage, where, extensions=("validity",))
-
-
-def encode_alarm(message: AlarmMessage) -> bytes:
-    """Return the payload of an alarm message."""
-    return pack(message)
-
-
-def decode_alarm(data: bytes) -> AlarmMessage:
-    """Return an alarm the service raised or took back.
-
-    Raises
-    ------
-    WireError
-        If a key is missing or out of range.
-    """
-    where = "an alarm message"
-    return read(of_this_version(unpack(data, where), where), AlarmMessage, where)
+travels(
+    Form(
+        kind=Status,
+        where=WHERE,
+        extensions=("pointing",),
+        opened=_opened,
+        keys=_status_keys,
+        fields=_status_fields,
+        check=_check_status,
+    )
+)
+travels(
+    Form(
+        kind=Acknowledgement,
+        where="an acknowledgement",
+        fields=reason_or_none,
+        check=_check_acknowledgement,
+    )
+)
+travels(
+    Form(
+        kind=StateMessage,
+        where="a state message",
+        extensions=("validity",),
+        fields=_state_fields,
+        held=False,
+    )
+)
+travels(Form(kind=AlarmMessage, where="an alarm message", held=False))

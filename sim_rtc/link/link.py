@@ -21,9 +21,9 @@ import zenoh
 import zenoh.ext
 from typing_extensions import override
 
-from service.wire import Encodings, Keys, Role, encode_manifest, encode_status, split
-from sim_rtc.computer.computer import RealTimeComputer
+from service.wire import Encodings, Keys, Role, encode, split
 from sim_rtc.computer.feed import Background
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of
 from sim_rtc.faults import FaultPlan, WireFaults
 from sim_rtc.link.matrices import Matrices
@@ -160,7 +160,7 @@ class Link(Background):
         self._recorded_cm_id = cm_id
         active = self._computer.reconstructor
         matrix = b"".join(split(active.matrix, active.manifest.layout.chunk_bytes))
-        self._record(Kind.MATRIX, matrix, encode_manifest(active.manifest))
+        self._record(Kind.MATRIX, matrix, encode(active.manifest))
 
     def _record(self, kind: Kind, payload: bytes, attachment: bytes = b"") -> None:
         if self._recorder is not None:
@@ -175,7 +175,7 @@ class Link(Background):
     def _status(self) -> bytes:
         time_s = self._plan.now_s
         status = self._clock.stamped(self._computer.status())
-        return encode_status(
+        return encode(
             replace(
                 status,
                 basis_id=self._faults.basis_id(status.basis_id, time_s),

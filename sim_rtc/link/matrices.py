@@ -20,14 +20,13 @@ from service.wire import (
     Keys,
     Manifest,
     Role,
-    decode_manifest,
-    encode_acknowledgement,
-    encode_measured_manifest,
+    decode,
+    encode,
     split,
 )
-from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import Background
 from sim_rtc.computer.measure import Measurement, product
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.reconstructors import Outcome, Staging
 from sim_rtc.computer.telemetry import Reconstructor
 from sim_rtc.faults import Fault, FaultKind, FaultPlan
@@ -152,7 +151,7 @@ class Matrices(Background):
         if self._plan.active(FaultKind.DEAF):
             return
         try:
-            manifest = decode_manifest(data)
+            manifest = decode(Manifest, data)
             if manifest.id != self._keys.matrix_id_of(key):
                 raise WireError(f"id: {manifest.id} in the manifest at {key}")
         except WireError as error:
@@ -181,7 +180,7 @@ class Matrices(Background):
         if data is None:
             return
         try:
-            manifest = decode_manifest(data)
+            manifest = decode(Manifest, data)
         except WireError as error:
             _log.warning("reconstructor.refused", reason=str(error))
             return
@@ -238,7 +237,7 @@ class Matrices(Background):
         )
         if self._plan.active(FaultKind.MUTE):
             return
-        data = encode_acknowledgement(said)
+        data = encode(said)
         if self._recorder is not None:
             self._recorder.put(Kind.ACKNOWLEDGEMENT, data)
         acknowledge(self._session, self._keys, data)
@@ -257,7 +256,7 @@ class Matrices(Background):
             )
         self._session.put(
             self._keys.measured_commit(manifest.id),
-            encode_measured_manifest(manifest),
+            encode(manifest),
             encoding=Encodings.MEASURED_COMMIT,
             congestion_control=zenoh.CongestionControl.BLOCK,
             priority=zenoh.Priority.DATA_HIGH,

@@ -23,12 +23,12 @@ from service.wire import (
     AckState,
     CommandKind,
     Keys,
+    Manifest,
     Reply,
     Status,
     command_id,
-    decode_manifest,
-    decode_status,
-    encode_acknowledgement,
+    decode,
+    encode,
 )
 from sim_rtc.link.link import Token, frames_publisher, open_session, status_publisher
 from sim_rtc.link.record import Kind, Message, Recording
@@ -99,7 +99,7 @@ class Replay:
                     case Kind.FRAMES:
                         frames.put(message.payload, attachment=message.attachment)
                     case Kind.STATUS:
-                        self._status = decode_status(message.payload)
+                        self._status = decode(Status, message.payload)
                         status.put(message.payload)
                     case Kind.ACKNOWLEDGEMENT:
                         acknowledge(session, self._keys, message.payload)
@@ -126,13 +126,13 @@ class Replay:
         matrix = self._matrix
         if matrix is None:
             return None
-        size = decode_manifest(matrix.attachment).layout.chunk_bytes
+        size = decode(Manifest, matrix.attachment).layout.chunk_bytes
         starts = range(0, len(matrix.payload), size)
         return matrix.attachment, [matrix.payload[start : start + size] for start in starts]
 
     def _on_commit(self, sample: zenoh.Sample) -> None:
         try:
-            manifest = decode_manifest(sample.payload.to_bytes())
+            manifest = decode(Manifest, sample.payload.to_bytes())
         except WireError as error:
             _log.warning("reconstructor.refused", reason=str(error))
             return
@@ -150,7 +150,7 @@ class Replay:
                 reason=REFUSAL,
                 frame_seq=None,
             )
-            acknowledge(session, self._keys, encode_acknowledgement(refused))
+            acknowledge(session, self._keys, encode(refused))
 
 
 def _refuse(_kind: CommandKind, data: bytes) -> Reply:

@@ -22,11 +22,10 @@ from service.wire import (
     Reply,
     command_id,
     decode_command,
-    encode_manifest,
-    encode_reply,
+    encode,
     split,
 )
-from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -61,7 +60,7 @@ class Replies:
     def _applied(self) -> tuple[bytes, list[bytes]]:
         active = self._computer.reconstructor
         chunks = split(active.matrix, active.manifest.layout.chunk_bytes)
-        return encode_manifest(active.manifest), chunks
+        return encode(active.manifest), chunks
 
 
 def answer_commands(
@@ -73,7 +72,7 @@ def answer_commands(
         def answer(query: zenoh.Query) -> None:
             with query:
                 data = b"" if query.payload is None else query.payload.to_bytes()
-                said = encode_reply(reply(kind, data))
+                said = encode(reply(kind, data))
                 query.reply(keys.command(kind), said, encoding=Encodings.REPLY)
 
         return answer

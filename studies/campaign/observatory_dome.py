@@ -15,7 +15,7 @@ from typing_extensions import override
 from service.config import load_instrument
 from service.model.misregistration import Misregistration
 from service.telemetry.frames import FrameBlock
-from service.wire import Command, Reply, Status, decode_status, encode_status
+from service.wire import Command, Reply, Status, decode, encode
 from sim_rtc.assembly import build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.telemetry import Batch, FrameClock, Reconstructor
@@ -150,7 +150,7 @@ class Dome:
             magnitude=self.magnitude,
             flux=self.telescope.detector.flux(self.computer.images),
         )
-        return decode_status(encode_status(status))
+        return decode(Status, encode(status))
 
     def _moment(self, batches: list[Batch]) -> Moment:
         last = batches[-1]

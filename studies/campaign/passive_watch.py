@@ -27,7 +27,7 @@ from service.telemetry.passive import Passive, accumulate
 from service.telemetry.windows import WindowRefused
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
-from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from studies.campaign.night import loop_of
 from studies.campaign.small import bench_of
 from studies.campaign.telemetry import LINE_FRACTIONS, SETTLING_S, blocks_of

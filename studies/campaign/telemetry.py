@@ -17,7 +17,7 @@ from service.telemetry.random_dither import Correlated, RandomDither, RandomPlan
 from service.telemetry.windows import WindowRefused
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
-from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch
 from sim_rtc.truth import WavefrontError
 from studies.campaign.plan import Estimator, Night

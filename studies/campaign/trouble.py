@@ -10,7 +10,7 @@ import numpy as np
 
 from service.telemetry.frames import FrameBlock
 from service.wire import Loop, LoopRequest
-from sim_rtc.computer.computer import RealTimeComputer
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 
 GAPS = 0.05
 """Share of frames that never come."""

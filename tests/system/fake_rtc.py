@@ -29,14 +29,10 @@ from service.wire import (
     Role,
     Status,
     command_id,
+    decode,
     decode_command,
-    decode_manifest,
-    encode_acknowledgement,
+    encode,
     encode_frames,
-    encode_manifest,
-    encode_measured_manifest,
-    encode_reply,
-    encode_status,
     split,
 )
 from tests.system.pace import patience
@@ -170,7 +166,7 @@ class FakeRtc:
 
     def send_status(self, **changes):
         """Send a status message."""
-        self.zenoh.put(self.keys.status, encode_status(self.status(**changes)))
+        self.zenoh.put(self.keys.status, encode(self.status(**changes)))
 
     def send_bytes(self, key, data):
         """Put anything anywhere."""
@@ -182,7 +178,7 @@ class FakeRtc:
         block = zenoh.CongestionControl.BLOCK
         for index, part in enumerate(parts):
             if index == 1:
-                data = encode_measured_manifest(manifest)
+                data = encode(manifest)
                 key = self.keys.measured_commit(manifest.id)
                 self.zenoh.put(key, data, congestion_control=block)
             key = self.keys.measured_chunk(manifest.id, index)
@@ -200,7 +196,7 @@ class FakeRtc:
         )
         self.zenoh.put(
             self.keys.acknowledgement,
-            encode_acknowledgement(message),
+            encode(message),
             encoding=Encodings.ACKNOWLEDGEMENT,
             congestion_control=zenoh.CongestionControl.BLOCK,
             priority=zenoh.Priority.DATA_HIGH,
@@ -216,7 +212,7 @@ class FakeRtc:
 
     def fetch_current(self):
         """Come late: ask for the manifest, then for each part."""
-        manifest = decode_manifest(self.fetch(self.keys.current))
+        manifest = decode(Manifest, self.fetch(self.keys.current))
         assembler = ChunkAssembler()
         assembler.announce(manifest.layout)
         for index in assembler.missing():
@@ -231,7 +227,7 @@ class FakeRtc:
             if index is not None:
                 assembler.add(index, data)
             else:
-                manifest = decode_manifest(data)
+                manifest = decode(Manifest, data)
                 assembler.announce(manifest.layout)
                 self.waiting[name][1] = manifest
             manifest = self.waiting[name][1]
@@ -257,7 +253,7 @@ class FakeRtc:
                 query.reply_err(b"no matrix in use")
                 return
             manifest, part = self.applied["manifest"], query.parameters.get("chunk")
-            data = encode_manifest(manifest)
+            data = encode(manifest)
             if part is not None:
                 data = split(self.applied["matrix"], manifest.layout.chunk_bytes)[int(part)]
             query.reply(query.key_expr, data)
@@ -281,7 +277,7 @@ class FakeRtc:
             else:
                 self.commands.append(command)
                 reply = Reply(id=command.id, accepted=True, reason="", start_seq=77)
-            query.reply(query.key_expr, encode_reply(reply))
+            query.reply(query.key_expr, encode(reply))
 
 
 def main(endpoint, system, session, n_slopes, n_modes, rate_hz, per_batch):

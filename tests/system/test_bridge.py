@@ -32,12 +32,9 @@ from service.wire import (
     Role,
     StateMessage,
     Status,
-    decode_alarm,
-    decode_state,
+    decode,
+    encode,
     encode_frames,
-    encode_measured_manifest,
-    encode_reply,
-    encode_state,
     layout_of,
 )
 from tests.system.cable import free_port
@@ -257,20 +254,14 @@ def test_malformed_batches_are_counted_reported_once_and_survived(bridge, rtc):
         rtc.send_raw(payload, attachment)
     rtc.send(0)
     header = rtc.header(10)
-    rtc.send_raw(payload[:-4], attachment=_attachment(header))
-    rtc.send_raw(b"\0" * 4_000_004, attachment=_attachment(header))
+    rtc.send_raw(payload[:-4], attachment=encode(header))
+    rtc.send_raw(b"\0" * 4_000_004, attachment=encode(header))
     rtc.send(10)
     assert sequence(drained(bridge, 20)) == list(range(20))
     wait_until(lambda: bridge.statistics().messages_malformed.get("frames") == 7)
     assert seen.first(Noted, **MALFORMED).text.startswith("frames: ")
     assert sum(getattr(e, "name", "") == "message.malformed" for e in seen.events) == 1
     assert bridge.statistics().callback_errors == 0
-
-
-def _attachment(header):
-    from service.wire.codec import pack
-
-    return pack(header)
 
 
 def test_frames_of_another_basis_or_configuration_are_refused(bridge, rtc):
@@ -523,7 +514,7 @@ def test_a_service_that_opens_its_link_anew_is_there_again_and_drives(bridge, rt
 
 def test_a_later_service_that_gives_no_name_is_known_by_its_state(bridge, rtc):
     state = StateMessage(system=SYSTEM, t_ns=1, mode="auto", alpha=None, sigma=None, in_use=None)
-    rtc.send_bytes(rtc.keys.state, encode_state(state))
+    rtc.send_bytes(rtc.keys.state, encode(state))
     event = Seen(bridge).first(ServicesMet)
     assert (event.drives, event.others) == (True, ("one that gives no name",))
 
@@ -657,7 +648,7 @@ def test_a_measurement_that_failed_says_why(bridge, rtc):
     matrix = np.zeros((6, 4), np.float32)
     layout = replace(layout_of(matrix, 64), n_chunks=0, sha256="")
     manifest = measured(rtc, matrix, layout=layout, reason="no light")
-    rtc.send_bytes(rtc.keys.measured_commit("im-1"), encode_measured_manifest(manifest))
+    rtc.send_bytes(rtc.keys.measured_commit("im-1"), encode(manifest))
     event = Seen(bridge).first(MeasuredMatrix)
     assert event.matrix is None
     assert event.manifest.reason == "no light"
@@ -665,7 +656,7 @@ def test_a_measurement_that_failed_says_why(bridge, rtc):
 
 def test_a_measured_matrix_under_another_name_is_refused(bridge, rtc):
     manifest = measured(rtc, np.zeros((6, 4), np.float32))
-    rtc.send_bytes(rtc.keys.measured_commit("im-2"), encode_measured_manifest(manifest))
+    rtc.send_bytes(rtc.keys.measured_commit("im-2"), encode(manifest))
     event = Seen(bridge).first(Noted, **MALFORMED)
     assert "the manifest of im-1 of system bench came on the key of im-2" in event.text
 
@@ -704,7 +695,7 @@ async def test_a_command_without_an_answer_is_repeated_with_the_same_id(bridge, 
 
 
 async def test_a_reply_that_is_unusable_or_not_to_this_command_is_a_link_error(bridge, rtc):
-    rtc.answers = [b"junk", encode_reply(Reply(id="x", accepted=True, reason="", start_seq=1))]
+    rtc.answers = [b"junk", encode(Reply(id="x", accepted=True, reason="", start_seq=1))]
     with pytest.raises(LinkError, match="reply to command l-1 is unusable: range"):
         await bridge.command(LoopRequest(id="l-1", leak=0.98))
     with pytest.raises(LinkError, match="answered command l-2 with a reply to x"):
@@ -730,8 +721,8 @@ def test_state_and_alarm_reach_those_who_listen_and_those_who_come_late(bridge, 
     alarm = AlarmMessage(system=SYSTEM, t_ns=2, name="rtc.vanished", active=True, text="gone")
     bridge.publish_state(state)
     bridge.publish_alarm(alarm)
-    assert decode_state(_last_value(rtc, rtc.keys.state)) == state
-    assert decode_alarm(_last_value(rtc, rtc.keys.alarm)) == alarm
+    assert decode(StateMessage, _last_value(rtc, rtc.keys.state)) == state
+    assert decode(AlarmMessage, _last_value(rtc, rtc.keys.alarm)) == alarm
 
 
 def _last_value(rtc, key):

@@ -17,6 +17,7 @@ import zenoh
 
 from benchmarks.plant import measure_linear
 from service.wire import (
+    Acknowledgement,
     CommandKind,
     DitherKind,
     DitherRequest,
@@ -26,14 +27,12 @@ from service.wire import (
     Manifest,
     MeasureRequest,
     Pattern,
+    Reply,
     Role,
-    decode_acknowledgement,
+    Status,
+    decode,
     decode_frames,
-    decode_manifest,
-    decode_reply,
-    decode_status,
-    encode_command,
-    encode_manifest,
+    encode,
     layout_of,
     split,
 )
@@ -84,7 +83,7 @@ class Listener:
         self.session.declare_subscriber(
             KEYS.acknowledgement,
             lambda sample: self.acknowledgements.put(
-                decode_acknowledgement(sample.payload.to_bytes())
+                decode(Acknowledgement, sample.payload.to_bytes())
             ),
         )
         self.session.liveliness().declare_subscriber(
@@ -97,7 +96,7 @@ class Listener:
             self.batches.append(batch)
 
     def _on_status(self, sample: zenoh.Sample) -> None:
-        status = decode_status(sample.payload.to_bytes())
+        status = decode(Status, sample.payload.to_bytes())
         with self.lock:
             self.statuses.append(status)
 
@@ -131,10 +130,10 @@ class Listener:
 
     def command(self, kind: CommandKind, command):
         replies = self.session.get(
-            KEYS.command(kind), payload=encode_command(command), timeout=patience(5.0)
+            KEYS.command(kind), payload=encode(command), timeout=patience(5.0)
         )
         (reply,) = [r.ok.payload.to_bytes() for r in replies if r.ok is not None]
-        return decode_reply(reply)
+        return decode(Reply, reply)
 
     def rest(self) -> None:
         """Leave nothing of the test before: no dither, a closed loop, no answers to matrices."""
@@ -152,14 +151,14 @@ class Listener:
         return reply.ok.payload.to_bytes()
 
     def applied(self) -> tuple[Manifest, np.ndarray]:
-        manifest = decode_manifest(self.fetch(KEYS.applied))
+        manifest = decode(Manifest, self.fetch(KEYS.applied))
         data = b"".join(
             self.fetch(f"{KEYS.applied}?chunk={k}") for k in range(manifest.layout.n_chunks)
         )
         return manifest, np.frombuffer(data, "<f4").reshape(manifest.layout.shape)
 
     def commit(self, manifest: Manifest) -> None:
-        self.session.put(KEYS.commit(manifest.id), encode_manifest(manifest))
+        self.session.put(KEYS.commit(manifest.id), encode(manifest))
 
     def send_chunks(self, manifest: Manifest, matrix: np.ndarray, leave_out=()) -> None:
         for k, data in enumerate(split(matrix, manifest.layout.chunk_bytes)):
@@ -173,7 +172,7 @@ class Listener:
         def answer(query: zenoh.Query) -> None:
             with query:
                 wanted = query.parameters.get("chunk")
-                data = encode_manifest(manifest) if wanted is None else parts[int(wanted)]
+                data = encode(manifest) if wanted is None else parts[int(wanted)]
                 query.reply(query.key_expr, data)
 
         self.session.declare_queryable(KEYS.current, answer)
@@ -380,7 +379,7 @@ def test_commands_it_cannot_carry_out_are_refused_with_a_reason(rtc, kind, comma
 
 def test_an_unreadable_command_is_answered(rtc):
     (reply,) = rtc.session.get(KEYS.command("dither"), payload=b"\x01nonsense", timeout=5.0)
-    refused = decode_reply(reply.ok.payload.to_bytes())
+    refused = decode(Reply, reply.ok.payload.to_bytes())
     assert not refused.accepted
     assert refused.id is None
 

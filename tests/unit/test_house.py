@@ -58,8 +58,6 @@ CALLED_FROM_ELSEWHERE = {
     "capture_signals",  # uvicorn
     "collect",  # prometheus_client
     "send_400_response",  # uvicorn
-    "decode_state",  # whoever listens to the service
-    "decode_alarm",
 }
 
 WORDS_TOO = {"acquisition", "archive-failed", "dither", "margin"}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.errors import UnknownIdError, WireError
-from service.link.intake import EventQueue, Intake
+from service.link.intake import QUEUE_LENGTH, Intake
 from service.link.matrices import OFFERS, MeasuredIntake, Offer, Outbox
 from service.link.ring import ROOM
 from service.link.rivals import Order, SessionWatch
@@ -18,9 +18,8 @@ from service.wire import (
     Loop,
     Manifest,
     Status,
+    encode,
     encode_frames,
-    encode_manifest,
-    encode_status,
     layout_of,
 )
 
@@ -263,7 +262,7 @@ def say(intake, **changes):
         "magnitude": None,
         "flux": None,
     }
-    intake.status(encode_status(Status(**(values | changes))))
+    intake.status(encode(Status(**(values | changes))))
 
 
 def test_frames_of_another_shape_than_the_status_says_cost_themselves_only(intake):
@@ -465,14 +464,14 @@ def test_the_age_of_the_last_frame_is_told_by_arrival(intake, clock):
     assert intake.statistics().frame_age_s == 3.0
 
 
-def test_the_event_queue_drops_the_oldest_and_counts_it():
-    queue = EventQueue(length=2)
-    for name in ("a", "b", "c"):
-        queue.put(ev.Noted(name=name, text=""))
-    queue.put(ev.RtcVanished())
-    assert queue.take() == [ev.Noted(name="c", text=""), ev.RtcVanished()]
-    assert queue.dropped == 2
-    assert queue.take() == []
+def test_of_too_many_events_the_oldest_give_way_and_are_counted(intake):
+    for number in range(QUEUE_LENGTH + 1):
+        intake.event(ev.Noted(name=f"{number}", text=""))
+    intake.event(ev.RtcVanished())
+    events = intake.events()
+    assert (len(events), events[0].name, events[-1]) == (QUEUE_LENGTH, "2", ev.RtcVanished())
+    assert intake.statistics().events_dropped == 2
+    assert intake.events() == []
 
 
 # ---------------------------------------------------------------- offers
@@ -494,7 +493,7 @@ def offer(name, offered_s=0.0, value=1.0):
     )
     return Offer(
         manifest=manifest,
-        commit=encode_manifest(manifest),
+        commit=encode(manifest),
         parts=(b"1234", b"5678"),
         offered_s=offered_s,
     )

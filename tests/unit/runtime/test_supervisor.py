@@ -133,7 +133,7 @@ async def test_cancelled_in_the_very_moment_a_bell_rings_it_ends(supervisor, bri
     await until(lambda: supervisor.snapshot().ready, 30.0)
     await asyncio.sleep(0.01)  # it listens now
     bridge.events()  # the bell may ring again
-    bridge._intake._wakeup.ring()
+    bridge._intake._wake()
     for _ in range(turns):
         await asyncio.sleep(0)
     task.cancel()

@@ -14,16 +14,17 @@ from service.wire import (
     Loop,
     LoopRequest,
     Manifest,
+    MeasuredManifest,
     MeasureRequest,
     Pattern,
-    decode_measured_manifest,
-    encode_measured_manifest,
+    decode,
+    encode,
     layout_of,
 )
 from sim_rtc.assembly import build_telescope
-from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import OpenLoopBlock
 from sim_rtc.computer.measure import MeasurementRules, product
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.strokes import (
     PushPull,
     frames_per_shape,
@@ -329,7 +330,7 @@ def test_a_frame_of_nan_is_left_out():
 
 def test_the_manifest_says_how_it_was_measured_and_survives_the_wire():
     manifest, matrix, _ = measured(computer_on(sky()), push_pull(n_average=3))
-    assert decode_measured_manifest(encode_measured_manifest(manifest)) == manifest
+    assert decode(MeasuredManifest, encode(manifest)) == manifest
     assert manifest.layout.shape == matrix.shape == (N_SLOPES, N_MODES)
     assert (manifest.id, manifest.n_average) == ("im-1", 3)
     assert manifest.pattern is Pattern.PUSH_PULL_MODAL
@@ -346,7 +347,7 @@ def test_a_measurement_that_determines_nothing_says_why():
     assert matrix is None
     assert manifest.layout.n_chunks == 0
     assert manifest.reason
-    assert decode_measured_manifest(encode_measured_manifest(manifest)) == manifest
+    assert decode(MeasuredManifest, encode(manifest)) == manifest
 
 
 def test_a_restart_ends_the_measurement_and_says_so():

@@ -12,8 +12,8 @@ from service.wire import (
     Manifest,
     layout_of,
 )
-from sim_rtc.computer.computer import RealTimeComputer
 from sim_rtc.computer.feed import OpenLoopBlock
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
 from sim_rtc.link.replies import ReplyCache
 from sim_rtc.telescope.linear import LinearOptics

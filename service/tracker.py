@@ -129,8 +129,6 @@ def _react_to_answer(turn: Turn) -> None:  # noqa: C901 - one line for each even
             reconstructors.on_acknowledgement(turn, acknowledged)
         case ev.MatrixMeasured(record=measured):
             measuring.on_measured(turn, measured)
-        case ev.NoisyMade(record=noisy):
-            measuring.on_noisy_made(turn, noisy)
         case ev.Answered() as answered:
             _react_to_reply(turn, answered.request, answered.reply)
         case ev.DitherSilent() as silent:
@@ -164,9 +162,9 @@ def _react_to_reply(turn: Turn, request: Request, reply: Reply) -> None:
 def _react_to_failure(turn: Turn, effect: Effect, text: str) -> None:
     match effect:
         case ev.Ask(request=MeasureRequest(id=name)):
-            measuring.measurement_failed(turn, name, text)
+            measuring.fail_by_id(turn, name, text)
         case ev.FinishNoisy(record=noisy):
-            measuring.noisy_failed(turn, noisy, text)
+            measuring.fail(turn, noisy, text)
         case ev.Ask(request=LoopRequest(id=command) | RampRequest(id=command)):
             operator.on_loop_answer(turn, command, CommandState.FAILED, text)
         case _:
@@ -193,12 +191,10 @@ def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
             dither.stop_by_operator(turn)
         case cmd.Measure() as command:
             measuring.measure(turn, command)
-        case cmd.GiveUp(id=name):
-            measuring.give_up_measuring(turn, name)
+        case cmd.GiveUp() | cmd.GiveUpNoisy() as command:
+            measuring.give_up(turn, command)
         case cmd.MeasureNoisy() as command:
             measuring.measure_noisy(turn, command)
-        case cmd.GiveUpNoisy(id=name):
-            measuring.give_up_noisy(turn, name)
         case _:
             _obey_about_matrices(turn)
 

@@ -22,7 +22,7 @@ from service.control.expected_gain import noise_of_counts
 from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
-from service.control.reconstructor import Method, Prior, Recipe, reconstruct
+from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
@@ -76,12 +76,12 @@ def candidates(
     gains = CalibrationGains.of_modes(fit.gains, np.arange(N_MEASURED), n_basis)
     tuned = gains.tuned(synthetic)
     prior = Prior(variance_m2=model.basis.variance_m2, slope_noise=np.full(len(synthetic), noise))
-    sources = [("measured", measured, Method.SVD, N_MEASURED)]
-    sources += [("synthetic, gains 1", synthetic, Method.SVD, N_MEASURED)]
+    sources = [("measured", measured, InversionMethod.SVD, N_MEASURED)]
+    sources += [("synthetic, gains 1", synthetic, InversionMethod.SVD, N_MEASURED)]
     for n_modes in (N_MEASURED, 500, n_basis):
-        sources += [("synthetic, tuned", tuned, method, n_modes) for method in Method]
+        sources += [("synthetic, tuned", tuned, method, n_modes) for method in InversionMethod]
     for name, matrix, method, n_modes in sources:
-        recipe = Recipe(n_modes=n_modes, prior=prior if method is Method.MAP else None)
+        recipe = Recipe(n_modes=n_modes, prior=prior if method is InversionMethod.MAP else None)
         made = reconstruct(matrix, recipe)
         yield Candidate(
             name=f"{name}, {method} {n_modes}",

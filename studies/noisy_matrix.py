@@ -32,12 +32,12 @@ from service.telemetry.random_dither import (
     noisy_matrix,
 )
 from service.telemetry.windows import WindowRefused
-from service.tracking.products import MeasureState, NoisyRecord
+from service.tracking.products import MeasurementRecord, MeasureState
 from service.wire import DitherKind, DitherRequest
 from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.feed import Ahead
+from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.options import parse_options
 from sim_rtc.truth import WavefrontError
 from studies.campaign.telemetry import blocks_of
@@ -191,11 +191,12 @@ def _archive(
 ) -> None:
     """Archive the matrix as the service does, and draw it."""
     found, instrument = work_out(bench, total, start), load_instrument("flao-lbt")
-    record = NoisyRecord(
+    record = MeasurementRecord(
         id=f"noisy-mag{given.magnitude:g}",
         state=MeasureState.FINISHING,
+        pattern=None,
         modes=total.plan.modes,
-        total_m=1e-9 * given.total_nm,
+        amplitude_m=total.plan.amplitude_m,
         duration_s=given.window_s * given.windows,
         window_s=given.window_s,
         seed=given.seed,

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Self
 
-from service.archive.index import AuditEntry, Index
+from service.archive.index import AuditEntry, Index, begun_ns_utc
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
 from service.archive.records import TrackingFile
 from service.errors import ArchiveError, StorageError
-from service.tracking.products import ReconstructorRecord
+from service.tracking.products import MeasurementRecord, ReconstructorRecord
 
 
 class Archive:
@@ -110,6 +110,11 @@ class Archive:
         for record in records:
             self.reconstructors.write_fate(record)
         self._index.record(records, entries)
+
+    def measurements(self) -> tuple[MeasurementRecord, ...]:
+        """Return what is known of each measured interaction matrix, oldest first."""
+        both = (*self.measured.records(), *self.noisy.records())
+        return tuple(sorted(both, key=begun_ns_utc))
 
     def probe(self) -> None:
         """Write a file as large as the largest matrix so far, and remove it.

@@ -12,9 +12,9 @@ from typing import TypeVar
 
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError
-from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
+from service.tracking.products import MeasurementRecord, ReconstructorRecord
 
-Product = ReconstructorRecord | MeasurementRecord | NoisyRecord
+Product = ReconstructorRecord | MeasurementRecord
 Indexed = TypeVar("Indexed", bound=Product)
 
 _VERSION = 2
@@ -196,9 +196,8 @@ class Index:
 
 def begun_ns_utc(record: Product) -> int:
     """Return when a product was made or, where that is not known, asked for."""
-    if isinstance(record, NoisyRecord):
-        return record.asked_ns_utc
-    return record.created_ns_utc or 0
+    asked_ns = record.asked_ns_utc if isinstance(record, MeasurementRecord) else None
+    return record.created_ns_utc or asked_ns or 0
 
 
 def _storable(text: str) -> str:

@@ -22,7 +22,6 @@ from service.tracking.products import (
     MeasurementRecord,
     MeasureState,
     NoisyFinding,
-    NoisyRecord,
     ReconstructorRecord,
 )
 from service.tracking.registration import table_of
@@ -204,7 +203,7 @@ class NoisyNumbers:
     """``(n_modes,)`` RMS signal of a column's elements over their noise."""
 
 
-class NoisyArchive(Store[NoisyRecord]):
+class NoisyArchive(Store[MeasurementRecord]):
     """Noisy interaction matrices: nothing that publishes a reconstructor can find one."""
 
     def __init__(self, directory: Path, index: Index) -> None:
@@ -212,9 +211,9 @@ class NoisyArchive(Store[NoisyRecord]):
             "(n_slopes, n_modes), slope per metre OPD, optical gain included: a measurement to fit "
             "a model to, never one to control with"
         )
-        super().__init__(directory, index, NoisyRecord, "noisy matrix", description)
+        super().__init__(directory, index, MeasurementRecord, "noisy matrix", description)
 
-    def store(self, record: NoisyRecord, numbers: NoisyNumbers, instrument: str) -> None:
+    def store(self, record: MeasurementRecord, numbers: NoisyNumbers, instrument: str) -> None:
         """Write one for good.
 
         Parameters
@@ -254,7 +253,7 @@ class NoisyArchive(Store[NoisyRecord]):
 
 def _fill(
     file: h5py.File,
-    record: NoisyRecord,
+    record: MeasurementRecord,
     finding: NoisyFinding,
     numbers: NoisyNumbers,
     instrument: str,
@@ -273,17 +272,17 @@ def _fill(
     file.attrs.update(
         {
             "modes": np.array(record.modes, dtype=np.int64),
-            "amplitude_m": record.amplitude_m,
+            "amplitude_m": record.each_m,
             "total_m": record.total_m,
-            "seed": record.seed,
-            "duration_s": record.duration_s,
+            "seed": record.seed or 0,
+            "duration_s": record.duration_s or 0.0,
             "n_frames": finding.n_frames,
             "n_missing": finding.n_missing,
             "element_snr": finding.snr,
             "session": finding.session,
             "cm_id": finding.cm_id or "",
-            "basis_id": record.basis_id,
-            "config_id": record.config_id,
+            "basis_id": record.basis_id or "",
+            "config_id": record.config_id or "",
             "created_ns": finding.created_ns_utc,
             "instrument": instrument,
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import threading
 from dataclasses import fields, is_dataclass
@@ -27,6 +28,8 @@ _OF_THIS_RUN = "judged"
 _NUMERIC = tuple(field.name for field in fields(Misregistration))
 _RADIANS, _DEGREES, _DEGREES_PER_RADIAN = "rotation_rad", "rotation_deg", float(BOUNDARY_SCALE[2])
 
+_TOTAL = "total_m"
+
 _Record = TypeVar("_Record")
 
 
@@ -45,7 +48,7 @@ def from_json(text: str, kind: type[_Record]) -> _Record:
     ValueError, KeyError, TypeError, ModelError
         If the text is something else.
     """
-    values = json.loads(text, object_hook=_in_radians)
+    values = json.loads(text, object_hook=_as_now)
     record = msgspec.convert(values, kind, dec_hook=_array)
     refuse_unknown(values, record)
     return record
@@ -100,9 +103,13 @@ def _in_degrees(value: Any) -> Any:  # noqa: ANN401  any value of a record
     return found
 
 
-def _in_radians(values: dict[str, Any]) -> dict[str, Any]:
+def _as_now(values: dict[str, Any]) -> dict[str, Any]:
     if _DEGREES in values:
         values[_RADIANS] = values.pop(_DEGREES) / _DEGREES_PER_RADIAN
+    if _TOTAL in values:  # written when a noisy matrix had a record of its own
+        n_modes = len(values["modes"])
+        each_m = values.pop(_TOTAL) / math.sqrt(n_modes)
+        values |= {"pattern": None, "amplitude_m": [each_m] * n_modes}
     return values
 
 

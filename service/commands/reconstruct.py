@@ -19,7 +19,7 @@ from service.archive.store import write_whole
 from service.commands.arguments import say, show_progress
 from service.config import load_instrument
 from service.control.gains import CalibrationGains
-from service.control.reconstructor import Method, Prior, Provenance, Recipe, reconstruct
+from service.control.reconstructor import InversionMethod, Prior, Provenance, Recipe, reconstruct
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import file_sha256
 from service.files.light import read_light
@@ -161,7 +161,7 @@ def _inverted(
 
 def _recipe(options: argparse.Namespace, model: RtcInteractionModel) -> Recipe:
     prior = None
-    if options.method == Method.MAP:
+    if options.method == InversionMethod.MAP:
         prior = Prior(
             variance_m2=model.basis.variance_m2,
             slope_noise=np.full(model.n_slopes, options.slope_noise),

@@ -32,7 +32,7 @@ from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
-from service.tracking.measuring import MEASUREMENTS_KEPT, NOISY_KEPT
+from service.tracking.measuring import MEASUREMENTS_KEPT
 from service.tracking.resume import restored
 from service.tracking.state import Mode, TrackerState
 
@@ -179,8 +179,7 @@ def _supervisor(
         system=system,
         mode=Mode(settings.service.mode),
         reconstructors=restored(archive.reconstructors.records()),
-        measurements=archive.measured.records()[-MEASUREMENTS_KEPT:],
-        noisy=archive.noisy.records()[-NOISY_KEPT:],
+        measurements=archive.measurements()[-MEASUREMENTS_KEPT:],
         basis_id=instrument.basis_id,
         config_id=instrument.config_id,
     )

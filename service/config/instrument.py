@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +28,9 @@ from service.model.instrument import (
     LoopFacts,
     Mirror,
     Pyramid,
-    Stop,
     TabulatedModes,
 )
-from service.model.slopes import Normalisation, Orientation, SlopeOrder, SlopeRecipe
+from service.model.slopes import Orientation, SlopeRecipe
 
 _SEPARATION_TOLERANCE = 0.1
 
@@ -63,11 +62,7 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     )
     modes = _modes(tables.modes, mirror, path)
     return Instrument(
-        name=about.name,
-        diameter_m=about.diameter_m,
-        obscuration_ratio=about.obscuration_ratio,
-        stop=Stop(about.stop),
-        double_pass=about.double_pass,
+        **about.model_dump(),
         wfs=wfs,
         mirror=mirror,
         modes=modes,
@@ -75,8 +70,6 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         frames=_frames(tables.wfs, path),
         loop=_loop(tables.loop, modes.n_modes, path),
         remarks=remarks,
-        basis_id=about.basis_id,
-        config_id=about.config_id,
     )
 
 
@@ -121,9 +114,7 @@ def _slopes(tables: InstrumentFile, path: Path) -> SlopeRecipe:
         sign_x, sign_y = table.orientation.sign
         orientation = Orientation(**flips, sign_x=sign_x, sign_y=sign_y)
     return SlopeRecipe(
-        order=SlopeOrder(table.order),
-        orientation=orientation,
-        normalisation=Normalisation(table.normalisation),
+        order=table.order, orientation=orientation, normalisation=table.normalisation
     )
 
 
@@ -177,15 +168,9 @@ def _pyramid(table: WfsTable, path: Path) -> Pyramid:
                 "(wfs.valid_subapertures): remove one of the two"
             )
         mask = _mask(table, path)
-    return Pyramid(
-        n_subapertures=table.n_subapertures,
-        wavelength_m=table.wavelength_m,
-        modulation_lambda_over_d=table.modulation_lambda_over_d,
-        pupil_separation_subap=separation,
-        pupil_diameter_subap=table.pupil_diameter_subap,
-        flux_threshold=table.flux_threshold,
-        valid_subapertures=mask,
-    )
+    kept = {field.name for field in fields(Pyramid)}
+    found = {"pupil_separation_subap": separation, "valid_subapertures": mask}
+    return Pyramid(**table.model_dump(include=kept) | found)
 
 
 def _separation(table: WfsTable, path: Path) -> float:

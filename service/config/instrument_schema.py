@@ -7,8 +7,10 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from service.config.sources import Id, Table, in_file, read_toml, validated
+from service.config.sources import Id, Named, Table, in_file, read_toml, validated
 from service.errors import ConfigurationError
+from service.model.instrument import BasisKind, Influence, Stop
+from service.model.slopes import Normalisation, SlopeOrder
 
 Positive = Annotated[float, Field(gt=0.0)]
 Count = Annotated[int, Field(ge=1)]
@@ -51,7 +53,7 @@ class AboutTable(Table):
     obscuration_ratio: float = Field(default=0.0, ge=0.0, lt=1.0)
     """Linear central obscuration."""
 
-    stop: Literal["mirror", "telescope"]
+    stop: Named[Stop]
     """Which element limits the beam."""
 
     double_pass: bool = False
@@ -124,7 +126,7 @@ class MirrorTable(Table):
     positions: str | None = None
     """Positions only: ``path:/dataset`` of ``(n_actuators, 2)``, x and y in metres."""
 
-    influence: Literal["thin-plate", "gaussian"] = "thin-plate"
+    influence: Named[Influence] = Influence.THIN_PLATE
     """Shape of an influence function."""
 
     coupling: float = Field(default=0.35, gt=0.0, lt=1.0)
@@ -133,7 +135,7 @@ class MirrorTable(Table):
     mode_to_actuator: str | None = None
     """``path:/dataset`` of the user's modes, ``(n_actuators, n_modes)``."""
 
-    basis: Literal["KL", "zonal"] = "KL"
+    basis: Named[BasisKind] = BasisKind.KARHUNEN_LOEVE
     """Modes of an analytic mirror without ``mode_to_actuator``."""
 
     nominal_rotation_deg: float | None = None
@@ -184,9 +186,9 @@ class OrientationTable(Table):
 class SlopesTable(Table):
     """``[slopes]``: the RTC's own order, sign and recipe."""
 
-    order: Literal["xy", "yx", "interleaved"] = "xy"
+    order: Named[SlopeOrder] = SlopeOrder.XY
     orientation: Annotated[OrientationTable | None, BeforeValidator(_auto_is_none)] = None
-    normalisation: Literal["global", "local"] = "global"
+    normalisation: Named[Normalisation] = Normalisation.GLOBAL
 
 
 class LoopTable(Table):

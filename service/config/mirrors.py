@@ -141,9 +141,9 @@ def _analytic(file: MirrorFile) -> Mirror:
     return Mirror(
         positions_m=positions,
         pitch_m=table.pitch_m or typical_pitch(positions),
-        influence=Influence(table.influence),
+        influence=table.influence,
         coupling=table.coupling,
-        basis=BasisKind(table.basis),
+        basis=table.basis,
         mode_to_actuator=_mode_to_actuator(file, len(positions)),
         **_mount(table),
     )
@@ -158,7 +158,7 @@ def _check_layout_keys(file: MirrorFile) -> None:
             f"{file.where(key)}: belongs to layout = {' or '.join(owners)}, "
             f'found layout = "{table.layout}"'
         )
-    if "coupling" in table.model_fields_set and table.influence != "gaussian":
+    if "coupling" in table.model_fields_set and table.influence is not Influence.GAUSSIAN:
         raise ConfigurationError(
             f"{file.where('coupling')}: belongs to influence = "
             f'"gaussian", found influence = "{table.influence}"'
@@ -327,7 +327,7 @@ def _tabulated(file: MirrorFile) -> tuple[TabulatedModes, tuple[str, ...]]:
 
 def _combined(file: MirrorFile, cube: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the modes that influence functions make."""
-    if file.table.basis == "zonal":
+    if file.table.basis is BasisKind.ZONAL:
         return cube
     strokes = _mode_to_actuator(file, len(cube))
     if strokes is None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config.settings import Settings
-from service.control.reconstructor import Method
+from service.control.reconstructor import InversionMethod
 from service.model.misregistration import BOUNDARY_SCALE
 from service.prepared import usual_folder
 from service.tracking.policy import Policy
@@ -98,7 +98,7 @@ def compute_of(settings: Settings) -> Compute:
         pupil_sampling=table.pupil_sampling,
         detector_nodes=table.detector_nodes,
         working_point_modes=table.working_point_modes,
-        method=Method(settings.control.method),
+        method=InversionMethod(settings.control.method),
         max_condition=settings.control.max_condition,
         slope_noise=settings.control.slope_noise,
         wind_m_s=settings.control.wind_m_s,

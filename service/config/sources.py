@@ -12,7 +12,14 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, StringConstraints, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+)
 from pydantic_core import ErrorDetails
 
 from service.errors import ConfigurationError, MatrixError
@@ -50,6 +57,9 @@ Tuple = Annotated[tuple[Item, ...], BeforeValidator(_as_tuple)]
 
 Id = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
 """An id as the wire allows it."""
+
+Named = Annotated[Item, Field(strict=False)]
+"""One of a list of names."""
 
 Schema = TypeVar("Schema", bound=Table)
 Place = Callable[[tuple[str, ...]], str]

@@ -66,7 +66,7 @@ class Schedule:
     """From the start of a burst to the start of the next; ``window_s``: no pause."""
 
     sigma: Array
-    """``(4,)`` 1 σ of α just before each burst, which is when it is worst."""
+    """``(4,)`` 1 σ of α just before each burst, which is when it is worst, numeric units."""
 
     sufficient: bool
     """Whether that is what was asked for; otherwise the budget is spent and it is the best."""

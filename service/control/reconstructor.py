@@ -172,7 +172,7 @@ def invert_with_prior(interaction_matrix: NDArray[Any], n_modes: int, prior: Pri
     )
 
 
-class Method(StrEnum):
+class InversionMethod(StrEnum):
     """How an interaction matrix is inverted."""
 
     SVD = "svd"
@@ -196,9 +196,9 @@ class Recipe:
     """What is known of modes and noise; None: nothing."""
 
     @property
-    def method(self) -> Method:
+    def method(self) -> InversionMethod:
         """How it is done: what is known beforehand is used."""
-        return Method.SVD if self.prior is None else Method.MAP
+        return InversionMethod.SVD if self.prior is None else InversionMethod.MAP
 
 
 def reconstruct(interaction_matrix: NDArray[Any], recipe: Recipe) -> Inversion:

@@ -175,8 +175,8 @@ async def noisy_matrices(service: ServiceDep) -> Response:
 @noisy.get("/noisy-matrix/{id}", responses={200: shows(views.NOISY), **UNKNOWN})
 async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return what is known of one, or how far it is."""
-    record = service.snapshot().tracker.noisy_matrix(noisy_id)
-    return answer(known(record, f"noisy matrix {noisy_id}"))
+    record = service.snapshot().tracker.measurement(noisy_id)
+    return answer(known(record, f"noisy matrix {noisy_id}"), views.NOISY)
 
 
 @noisy.delete("/noisy-matrix/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})

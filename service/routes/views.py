@@ -44,7 +44,6 @@ from service.tracking.products import (
     MeasurementRecord,
     ModeLimit,
     NoisyFinding,
-    NoisyRecord,
     ReconstructorRecord,
 )
 from service.tracking.registration import HistoryEntry, ModeGain, Watchdog
@@ -271,8 +270,10 @@ def _without_none(kind: Any) -> Any:  # noqa: ANN401  a type
 @cache
 def _facts(record: type) -> tuple[dict[str, Any], dict[str, str]]:
     """Return types and descriptions of a record's fields and properties, by name."""
-    hints = get_type_hints(record) if is_dataclass(record) else {}
-    texts = {}
+    if record is object:
+        return {}, {}
+    hints, texts = (dict(facts) for facts in _facts(record.__mro__[1]))
+    hints |= get_type_hints(record) if is_dataclass(record) else {}
     for statement, after in pairwise([*_statements(record), ast.Pass()]):
         match statement, after:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(
@@ -405,7 +406,7 @@ MEASUREMENT = view(
     "start_seq created_ns_utc n_slopes double_pass session basis_id config_id sha256",
 )
 MEASUREMENTS = view(
-    "MeasurementsView", TrackerState, "measurements", "Measured interaction matrices."
+    "MeasurementsView", TrackerState, "measurements=by_rtc", "Measured interaction matrices."
 )
 MEASURING = view(
     "MeasuringView",
@@ -421,16 +422,20 @@ view(
 )
 NOISY = view(
     "NoisyView",
-    NoisyRecord,
-    "id state reason n_modes modes total_m amplitude_m duration_s window_s seed asked_ns_utc "
-    "basis_id config_id finding",
+    MeasurementRecord,
+    "id state reason n_modes modes total_m amplitude_m=each_m duration_s window_s seed "
+    "asked_ns_utc basis_id config_id finding",
 )
 NOISY_MATRICES = view(
-    "NoisyListView", TrackerState, "noisy_matrices=noisy", "Noisy interaction matrices."
+    "NoisyListView",
+    TrackerState,
+    "noisy_matrices=noisy",
+    "Noisy interaction matrices.",
+    noisy_matrices=NOISY,
 )
 GATHERING = view(
     "GatheringView",
-    NoisyRecord,
+    MeasurementRecord,
     "id state total_m duration_s asked_ns_utc",
     "The noisy interaction matrix under way: ``/v1/noisy-matrix/{id}`` says more.",
 )

@@ -17,18 +17,16 @@ from service.control.loop import ControlLoop
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
-from service.model.misregistration import at_boundary
 from service.runtime.estimates import NoisySums
 from service.runtime.ports import RtcPort, StorePort, WorkerPort
 from service.tracking import events as ev
 from service.tracking.alarms import Act, forbidding
 from service.tracking.events import Effect, Event
-from service.tracking.loop import CommandState, commanded_gains, extended_gains, same_gains
+from service.tracking.loop import commanded_gains, extended_gains, same_gains
 from service.tracking.products import (
     Judged,
     MatrixState,
     MeasurementRecord,
-    MeasureState,
     ReconstructorRecord,
 )
 from service.tracking.registration import Registration, table_of
@@ -37,12 +35,6 @@ from service.wire import Command as Request
 from service.wire import (
     DitherStop,
     LoopRequest,
-    Manifest,
-    MatrixLayout,
-    MeasuredManifest,
-    MeasureRequest,
-    Pattern,
-    RampRequest,
     Reply,
     Status,
     checksum,
@@ -149,7 +141,7 @@ class Actions:
         matrix = self.matrix(record.id)
         layout = layout_of(matrix, self._publishing.chunk_bytes)
         system = self._publishing.system
-        self._bridge.offer(manifest_of(record, layout, state.rtc, system), matrix)
+        self._bridge.offer(record.manifest(layout, state.rtc, system), matrix)
         self._bridge.set_current(record.id)
 
     async def keep_measured(self, heard: MeasuredMatrix) -> Event:
@@ -160,7 +152,7 @@ class Actions:
         ArchiveError
             If it cannot be written, or another one has its id.
         """
-        record = _measurement_of(heard.manifest)
+        record = MeasurementRecord.sent(heard.manifest)
         if heard.matrix is not None:
             instrument = self.instrument.name
             store = self._archive.measured.store
@@ -296,7 +288,7 @@ class Actions:
         manifest, matrix = await self._bridge.fetch_applied()
         if matrix_id not in {None, manifest.id}:
             raise LinkError(f"the RTC offers {manifest.id}, its status says it uses {matrix_id}")
-        record = record_of(manifest)
+        record = ReconstructorRecord.brought(manifest)
         known = state.reconstructor(record.id)
         if known is not None and known.sha256 not in {"", record.sha256}:
             return ev.MatrixFetched(record=record)  # the tracker says what that means
@@ -314,7 +306,7 @@ class Actions:
         if effect.gains is not None or commanded != effect.n_modes:
             await self._command_modes(effect)
         layout = layout_of(matrix, self._publishing.chunk_bytes)
-        manifest = manifest_of(record, layout, rtc, self._publishing.system)
+        manifest = record.manifest(layout, rtc, self._publishing.system)
         await self._bridge.publish(manifest, matrix)
         return None
 
@@ -435,35 +427,6 @@ def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None
     return n_modes if same_gains(gains[:n_modes], rtc.gains[:n_modes]) else None
 
 
-def why_not(effects: tuple[Effect, ...], state: TrackerState) -> Exception | None:
-    """Return what whoever gave a command should know of the RTC's answer to it, or None."""
-    for effect in effects:
-        match effect:
-            case ev.Ask(request=MeasureRequest(id=name)):
-                record = state.measurement(name)
-                if record is not None and record.state is MeasureState.REFUSED:
-                    return CommandError(f"the RTC refused: {record.reason}")
-                if record is not None and record.state is MeasureState.FAILED:
-                    return LinkError(record.reason)
-            case ev.Ask(request=LoopRequest(id=command) | RampRequest(id=command)):
-                last = state.loop_command
-                if last is not None and last.id == command:
-                    return _refusal(last.state, last.reason)
-            case _:
-                pass
-    return None
-
-
-def _refusal(outcome: CommandState, reason: str) -> Exception | None:
-    match outcome:
-        case CommandState.REFUSED:
-            return CommandError(f"the RTC refused: {reason}")
-        case CommandState.FAILED:
-            return LinkError(reason)
-        case _:
-            return None
-
-
 def _there(state: TrackerState) -> Status:
     if state.rtc is None:
         raise LinkError("no RTC is there")
@@ -474,57 +437,3 @@ def _registered(state: TrackerState) -> Registration:
     if state.registration is None:
         raise CommandError("α is not known")
     return state.registration
-
-
-def manifest_of(
-    record: ReconstructorRecord, layout: MatrixLayout, rtc: Status, system: str
-) -> Manifest:
-    """Return the manifest a reconstructor travels with."""
-    return Manifest(
-        id=record.id,
-        layout=layout,
-        alpha=None if record.alpha is None else record.alpha.to_boundary(),
-        sigma=None if record.sigma is None else at_boundary(record.sigma),
-        im_id=None,
-        parent=record.parent,
-        basis_id=rtc.basis_id,
-        config_id=rtc.config_id,
-        system=system,
-        created_ns=record.created_ns_utc,
-    )
-
-
-def record_of(manifest: Manifest) -> ReconstructorRecord:
-    """Return what is known of a matrix the RTC brought with it.
-
-    Its manifest may name an α, but nobody here can vouch for it.
-    """
-    return ReconstructorRecord(
-        id=manifest.id,
-        state=MatrixState.APPLIED,
-        n_modes=manifest.layout.shape[0],
-        created_ns_utc=manifest.created_ns,
-        sha256=manifest.layout.sha256,
-        reason="brought by the RTC",
-    )
-
-
-def _measurement_of(manifest: MeasuredManifest) -> MeasurementRecord:
-    """Return what is known of an interaction matrix the RTC sends, or of why there is none."""
-    there = manifest.reason is None
-    return MeasurementRecord(
-        id=manifest.id,
-        state=MeasureState.STORED if there else MeasureState.FAILED,
-        pattern=manifest.pattern,
-        modes=manifest.modes,
-        amplitude_m=manifest.amplitude_m,
-        n_average=None if manifest.pattern is Pattern.SINE else manifest.n_average,
-        reason=manifest.reason or "",
-        created_ns_utc=manifest.created_ns,
-        n_slopes=manifest.layout.shape[0],
-        double_pass=manifest.double_pass,
-        session=manifest.session,
-        basis_id=manifest.basis_id,
-        config_id=manifest.config_id,
-        sha256=manifest.layout.sha256,
-    )

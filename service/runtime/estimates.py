@@ -27,7 +27,12 @@ from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
 from service.tracking.events import Event
 from service.tracking.evidence import fit_begins_at
 from service.tracking.loop import loop_numbers
-from service.tracking.products import MeasureState, NoisyFinding, NoisyRecord, ReconstructorRecord
+from service.tracking.products import (
+    MeasurementRecord,
+    MeasureState,
+    NoisyFinding,
+    ReconstructorRecord,
+)
 from service.tracking.state import Level, TrackerState
 from service.wire import checksum
 from service.worker import OpticsWorker, run_job
@@ -251,7 +256,7 @@ class NoisySums:
         except ModelError:  # the RTC has started anew: what came before is of another loop
             self._total = window
 
-    async def finish(self, record: NoisyRecord, state: TrackerState) -> Event:
+    async def finish(self, record: MeasurementRecord, state: TrackerState) -> Event:
         """Fit what has been summed, archive it and return what came of it.
 
         Raises
@@ -270,7 +275,7 @@ class NoisySums:
         record = finished(record, total, found)
         store = self._archive.noisy.store
         await asyncio.to_thread(store, record, found.numbers, self._instrument.name)
-        return ev.NoisyMade(record=record)
+        return ev.MatrixMeasured(record=record)
 
 
 def work_out(bench: OpticsWorker, total: Correlated, start: Misregistration | None) -> Found:
@@ -302,7 +307,7 @@ def _single(values: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.ascontiguousarray(values, np.float32)
 
 
-def finished(record: NoisyRecord, total: Correlated, found: Found) -> NoisyRecord:
+def finished(record: MeasurementRecord, total: Correlated, found: Found) -> MeasurementRecord:
     """Return the record of a matrix that is ready for the archive."""
     estimate = found.estimate
     finding = NoisyFinding(

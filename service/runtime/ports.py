@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
-from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
+from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.wire import Command, Manifest, Reply
 from service.worker import Done, OpticsWorker
 
@@ -59,7 +59,7 @@ class MeasuredPort(Protocol):
 class NoisyPort(Protocol):
     """Where noisy interaction matrices are kept."""
 
-    def store(self, record: NoisyRecord, numbers: NoisyNumbers, name: str, /) -> None:
+    def store(self, record: MeasurementRecord, numbers: NoisyNumbers, name: str, /) -> None:
         """Keep one of the instrument of that name."""
 
 

@@ -14,11 +14,11 @@ import structlog
 from numpy.typing import NDArray
 
 from service.archive import Archive
-from service.errors import LinkError, PyrcalError, StorageError, WorkerError
+from service.errors import CommandError, LinkError, PyrcalError, StorageError, WorkerError
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
-from service.runtime.actions import Actions, why_not
+from service.runtime.actions import Actions
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.recording import Recorder
@@ -31,11 +31,12 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
+from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.policy import Policy
-from service.tracking.products import MeasureState
+from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import Level, TrackerState, Waiting
 from service.tracking.turn import new_lines
-from service.wire import TEXT_LIMIT, AlarmMessage
+from service.wire import TEXT_LIMIT, AlarmMessage, LoopRequest, MeasureRequest, RampRequest
 from service.worker import Description, OpticsWorker
 
 POLL_S = 0.1
@@ -152,9 +153,7 @@ class Supervisor:
             asked = self._running - running
             if asked:
                 await asyncio.wait(asked)
-            refusal = why_not(effects, self._engine.state)
-            if refusal is not None:
-                raise refusal
+            _refuse_as_the_rtc_did(effects, self._engine.state)
         return effects
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
@@ -377,8 +376,10 @@ class Supervisor:
 
     async def _keep_measured(self, heard: MeasuredMatrix) -> None:
         known = self._engine.state.measurement(heard.manifest.id)
-        if known is not None and known.state is MeasureState.GIVEN_UP:
-            text = f"{known.id} came after it had been given up: it is not kept"
+        given_up = known is not None and known.state is MeasureState.GIVEN_UP
+        if known is not None and (given_up or known.pattern is None):
+            why = "it had been given up" if given_up else "a noisy one had this id"
+            text = f"{known.id} came after {why}: it is not kept"
             self._note("measurement.ignored", text, Level.INFO)
             return
         try:
@@ -397,3 +398,22 @@ class Supervisor:
         for entry in entries:
             getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text)
         self._recorder.changed(before, self._engine.state, entries)
+
+
+def _refuse_as_the_rtc_did(effects: tuple[Effect, ...], state: TrackerState) -> None:
+    """Tell whoever gave a command that the RTC will not carry it out, or did not answer."""
+    asked: MeasurementRecord | LoopCommand | None
+    for effect in effects:
+        match effect:
+            case ev.Ask(request=MeasureRequest(id=name)):
+                asked = state.measurement(name)
+            case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):
+                asked = state.loop_command
+            case _:
+                continue
+        if asked is None or asked.id != name:
+            continue
+        if asked.state in {MeasureState.REFUSED, CommandState.REFUSED}:
+            raise CommandError(f"the RTC refused: {asked.reason}")
+        if asked.state in {MeasureState.FAILED, CommandState.FAILED}:
+            raise LinkError(asked.reason)

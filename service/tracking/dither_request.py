@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.control.dither import (
     SPAN,
+    Schedule,
     clear_of,
     most_telling,
 )
@@ -258,50 +259,58 @@ COMFORTABLE = 2.0
 """Windows are longer by this than they have to be for so many modes."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RandomChoice:
-    """What a random dither is to be like."""
+def plan_random(
+    rtc: Status,
+    policy: Policy,
+    now_ns: int,
+    *,
+    dither_id: str,
+    modes: tuple[int, ...] | ModeSet,
+    total_m: float,
+    duration_s: float,
+) -> Dither:
+    """Return random signs to ask for; their windows, all alike, fill their whole length.
 
-    id: str
-    modes: tuple[int, ...] | ModeSet
-    total_m: float
-    """RMS of all modes together, metres OPD."""
-
-    duration_s: float
-    """Of telemetry, settling not included."""
-
-
-def plan_random(asked: RandomChoice, rtc: Status, policy: Policy, now_ns: int) -> Dither:
-    """Return the dither to ask for; its windows, all alike, fill its whole length.
+    Parameters
+    ----------
+    rtc, policy, now_ns
+        The RTC, the settings and the time.
+    dither_id
+        Of the request.
+    modes
+        0-based basis indices, or which they are.
+    total_m
+        RMS of all modes together, metres OPD.
+    duration_s
+        Of telemetry, settling not included.
 
     Raises
     ------
     CommandError
         If the RTC would not play it, or no window fits into it.
     """
-    modes = _modes(asked.modes, rtc)
-    amplitude_m = float(asked.total_m / np.sqrt(len(modes)))
+    modes = _modes(modes, rtc)
+    amplitude_m = float(total_m / np.sqrt(len(modes)))
     if amplitude_m > rtc.max_dither_m:
         raise CommandError(
             f"dither: found {1e9 * amplitude_m:.3g} nm on each of {len(modes)} modes, the RTC "
             f"takes at most {1e9 * rtc.max_dither_m:.3g} nm"
         )
     least_s = max(policy.window_s, COMFORTABLE * FRAMES_PER_MODE * len(modes) / rtc.frame_rate_hz)
-    n_windows = int(asked.duration_s / least_s * (1.0 + 1e-9))
+    n_windows = int(duration_s / least_s * (1.0 + 1e-9))
     if n_windows < 1:
         raise CommandError(
-            f"dither: found {asked.duration_s:g} s; {len(modes)} modes need windows of "
-            f"{least_s:.3g} s"
+            f"dither: found {duration_s:g} s; {len(modes)} modes need windows of {least_s:.3g} s"
         )
     request = DitherRequest(
-        id=asked.id,
+        id=dither_id,
         kind=DitherKind.BINARY,
         modes=modes,
         amplitude_m=(amplitude_m,) * len(modes),
         seed=now_ns % (1 << 31),
-        duration_s=SETTLING_S + asked.duration_s + SPARE_S,
+        duration_s=SETTLING_S + duration_s + SPARE_S,
     )
-    return Dither(request=request, asked_ns_utc=now_ns, window_s=asked.duration_s / n_windows)
+    return Dither(request=request, asked_ns_utc=now_ns, window_s=duration_s / n_windows)
 
 
 def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:
@@ -367,26 +376,11 @@ class Precision:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DitherPlan:
+class DitherPlan(Schedule):
     """The dither that is wanted in the present state."""
-
-    total_m: float
-    """RMS of all lines together on the mirror, metres OPD."""
 
     window_s: float
     """Telemetry in one estimate, seconds."""
-
-    interval_s: float
-    """From one sitting to the next, seconds; ``window_s``: no pause."""
-
-    sigma: NDArray[np.float64]
-    """``(4,)`` 1 σ of α that is to be expected just before each sitting, numeric units."""
-
-    sufficient: bool
-    """Whether that is what was asked for."""
-
-    mean_cost_m: float
-    """Quadratic mean of it over time, pauses included, metres OPD."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -16,7 +16,6 @@ from service.tracking.commands import Command
 from service.tracking.products import (
     Judged,
     MeasurementRecord,
-    NoisyRecord,
     ReconstructorRecord,
 )
 from service.tracking.state import Level
@@ -95,7 +94,7 @@ class Ask:
 class FinishNoisy:
     """Fit and archive what has been summed of a noisy interaction matrix."""
 
-    record: NoisyRecord
+    record: MeasurementRecord
 
 
 Effect = (
@@ -302,13 +301,6 @@ class MatrixMeasured:
     record: MeasurementRecord
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NoisyMade:
-    """A noisy interaction matrix has been archived."""
-
-    record: NoisyRecord
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobFailed:
     """Something that was to be done could not be."""
@@ -341,6 +333,5 @@ Event = (
     | DitherMeasured
     | Vibrations
     | MatrixMeasured
-    | NoisyMade
     | JobFailed
 )

@@ -128,7 +128,7 @@ def pair_surprise(known: Registration, reading: Reading, policy: Policy) -> Dist
 def window_before(known: Registration) -> Seen | None:
     """Return the window before the present one: held, or the last that entered."""
     if known.candidate is not None:
-        return known.candidate.seen
+        return known.candidate
     return None if known.earlier is None else known.earlier.then
 
 

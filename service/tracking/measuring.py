@@ -6,7 +6,6 @@ Of a noisy one the sums are kept where the telemetry comes in; here is only how 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -14,15 +13,13 @@ from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither import ask_for, ask_to_stop, drop, make_way_for_noisy
-from service.tracking.dither_request import RANDOM_TOTAL_M, RandomChoice, plan_random, total_m
+from service.tracking.dither_request import RANDOM_TOTAL_M, plan_random
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import MeasurementRecord, MeasureState, NoisyRecord
+from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
 from service.wire import DitherRequest, MeasureRequest, Pattern, Reply, Status
-
-NOISY_KEPT = 100
 
 DURATION_S = 30.0
 """Where none is asked for: an element is worth its noise by then, on a bright star."""
@@ -33,7 +30,7 @@ FREE_WITHIN_S = 15.0
 MADE_WITHIN_S = 120.0
 """For the fit and the archive."""
 
-MEASUREMENTS_KEPT = 200
+MEASUREMENTS_KEPT = 300
 
 STROKE_M = 20e-9
 """RMS of a push or pull, metres OPD: small enough for a pyramid, far above its noise."""
@@ -57,8 +54,6 @@ LONGEST_S = 3600.0
 """Of any measurement."""
 
 MEASURING = "an interaction matrix is being measured: these frames are no ordinary telemetry"
-
-_R = TypeVar("_R", MeasurementRecord, NoisyRecord)
 
 
 def measure(turn: Turn, command: cmd.Measure) -> None:
@@ -85,7 +80,7 @@ def measure(turn: Turn, command: cmd.Measure) -> None:
         ev.Ask(
             request=MeasureRequest(
                 id=record.id,
-                pattern=record.pattern,
+                pattern=command.pattern,
                 modes=record.modes,
                 amplitude_m=record.amplitude_m,
                 n_average=record.n_average,
@@ -96,10 +91,10 @@ def measure(turn: Turn, command: cmd.Measure) -> None:
     )
 
 
-def give_up_measuring(turn: Turn, measurement_id: str) -> None:
-    """Wait no longer; close the loop again if the measurement has opened it.
+def give_up(turn: Turn, command: cmd.GiveUp | cmd.GiveUpNoisy) -> None:
+    """Wait no longer for a matrix; its random signs end, a loop that it has opened is closed again.
 
-    The wire has no way to end a measurement: the RTC may go on, and until it is done refuse.
+    The wire has no way to end a measurement by the RTC: it may go on, and until it is done refuse.
 
     Raises
     ------
@@ -108,10 +103,23 @@ def give_up_measuring(turn: Turn, measurement_id: str) -> None:
     UnknownIdError
         If nobody has heard of it.
     """
-    record = _under_way(turn.state.measurement(measurement_id), f"measurement {measurement_id}")
+    record = turn.state.measurement(command.id)
+    if record is None:
+        what = "measurement" if isinstance(command, cmd.GiveUp) else "noisy matrix"
+        raise UnknownIdError(f"{what} {command.id}: nobody has heard of it")
+    if not record.under_way:
+        raise CommandError(f"{record.id} is {record.state}: there is nothing to give up")
+    given_up = replace(record, state=MeasureState.GIVEN_UP)
+    if record.pattern is None:
+        _keep(turn, replace(given_up, reason="by the operator"))
+        turn.log("noisy-matrix.given-up", record.id)
+        if turn.dither is not None and turn.dither.id == record.id:
+            drop(turn)
+            ask_to_stop(turn)
+        return
     text = "given up by the operator; the RTC may go on with it, what it sends is ignored"
-    _keep(turn, replace(record, state=MeasureState.GIVEN_UP, reason=text))
-    turn.log("measurement.given-up", f"{measurement_id}: {text}")
+    _keep(turn, replace(given_up, reason=text))
+    turn.log("measurement.given-up", f"{record.id}: {text}")
     if record.opens_loop and record.closed_before:
         begin_closing(turn)
         return
@@ -121,22 +129,13 @@ def give_up_measuring(turn: Turn, measurement_id: str) -> None:
     turn.put_off(dither_s=left_s, make_s=left_s)
 
 
-def _under_way(record: _R | None, name: str) -> _R:
-    """Return a record that can be given up."""
-    if record is None:
-        raise UnknownIdError(f"{name}: nobody has heard of it")
-    if not record.under_way:
-        raise CommandError(f"{record.id} is {record.state}: there is nothing to give up")
-    return record
-
-
 def watch_measurement(turn: Turn) -> None:
     """Give up a matrix that cannot come any more, before anybody else sees the event."""
     record, rtc = turn.state.measuring, turn.rtc
     if record is None:
         return
     if isinstance(turn.event, ev.RtcVanished):
-        _fail(turn, record, "the RTC vanished")
+        fail(turn, record, "the RTC vanished")
     elif isinstance(turn.event, ev.Tick):
         closed = rtc is not None and rtc.loop != "open"
         _give_up_overdue(turn, record, closed=closed)
@@ -167,15 +166,18 @@ def on_measured(turn: Turn, record: MeasurementRecord) -> None:
             start_seq=known.start_seq if record.start_seq is None else record.start_seq,
         )
     if record.state is MeasureState.FAILED:
-        _fail(turn, record, record.reason)
+        fail(turn, record, record.reason)
         return
     _keep(turn, record)
-    name = f"measurement.{record.state}"
+    name, found = f"{_kind(record)}.{record.state}", record.finding
     match record.state:
         case MeasureState.RUNNING:
             turn.log(name, f"{record.id} starts at frame {record.start_seq}")
         case MeasureState.REFUSED:
             turn.warn(name, f"{record.id}: the RTC refused: {record.reason}")
+        case MeasureState.STORED if found is not None:
+            text = f"{found.n_frames} frames, signal / noise of an element {found.snr:.2f}"
+            turn.log(name, f"{record.id}: {text}")
         case MeasureState.STORED:
             n_slopes, n_modes = record.n_slopes, len(record.modes)
             turn.log(name, f"{record.id}: {n_slopes} slopes, {n_modes} modes")
@@ -183,32 +185,38 @@ def on_measured(turn: Turn, record: MeasurementRecord) -> None:
             turn.log(name, record.id)
 
 
-def measurement_failed(turn: Turn, measurement_id: str, text: str) -> None:
+def fail_by_id(turn: Turn, measurement_id: str, text: str) -> None:
     """Note why there is no matrix, unless nobody waits for it any more."""
     record = turn.state.measurement(measurement_id)
     if record is not None:
-        _fail(turn, record, text)
+        fail(turn, record, text)
 
 
-def _fail(turn: Turn, record: MeasurementRecord, text: str) -> None:
+def fail(turn: Turn, record: MeasurementRecord, text: str) -> None:
+    """Note why there is no matrix, unless nobody waits for it any more."""
     known = turn.state.measurement(record.id)
     if known is None or known.state is not MeasureState.GIVEN_UP:
         _keep(turn, replace(record, state=MeasureState.FAILED, reason=text))
-        turn.warn("measurement.failed", f"{record.id}: {text}")
+        turn.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")
+
+
+def _kind(record: MeasurementRecord) -> str:
+    """Return the first word of its lines in the log."""
+    return "noisy-matrix" if record.pattern is None else "measurement"
 
 
 def _give_up_overdue(turn: Turn, record: MeasurementRecord, *, closed: bool) -> None:
     """Give up a matrix that does not come although everything looks as if it were over."""
     asked_ns = record.asked_ns_utc or turn.now_ns
     if turn.now_ns - asked_ns > LONGEST_S * SECOND_NS:
-        _fail(turn, record, f"no matrix came within {LONGEST_S:.0f} s")
+        fail(turn, record, f"no matrix came within {LONGEST_S:.0f} s")
     elif not (record.opens_loop and closed and record.start_seq is not None):
         _keep(turn, replace(record, overdue_since_ns_utc=None))
     else:
         since_ns = record.overdue_since_ns_utc or turn.now_ns
         if turn.now_ns - since_ns > OVERDUE_S * SECOND_NS:
             text = f"the loop has been closed for {OVERDUE_S:.0f} s and no matrix came"
-            _fail(turn, record, text)
+            fail(turn, record, text)
         else:
             _keep(turn, replace(record, overdue_since_ns_utc=since_ns))
 
@@ -255,7 +263,7 @@ def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
     rtc = turn.rtc
     if rtc is None or rtc.loop == "open":
         raise CommandError("noisy matrix: it needs an RTC with its loop closed")
-    if turn.state.noisy_matrix(command.id) is not None:
+    if turn.state.measurement(command.id) is not None:
         text = f"{command.id} was measured before; ids are never reused"
         raise CommandError(f"noisy matrix: {text}")
     duration_s, budget_m = command.duration_s or DURATION_S, turn.policy.dither_budget_m
@@ -265,21 +273,29 @@ def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
             f"noisy matrix: {1e9 * total:.3g} nm RMS in all, budget {1e9 * budget_m:.3g} nm; say "
             "over_budget if that is meant"
         )
-    choice = RandomChoice(id=command.id, modes=command.modes, total_m=total, duration_s=duration_s)
-    dither = plan_random(choice, rtc, turn.policy, turn.now_ns)
-    record = NoisyRecord(
+    dither = plan_random(
+        rtc,
+        turn.policy,
+        turn.now_ns,
+        dither_id=command.id,
+        modes=command.modes,
+        total_m=total,
+        duration_s=duration_s,
+    )
+    record = MeasurementRecord(
         id=command.id,
         state=MeasureState.WAITING,
+        pattern=None,
         modes=dither.request.modes,
-        total_m=total_m(dither.request),
+        amplitude_m=dither.request.amplitude_m,
         duration_s=duration_s,
-        window_s=dither.window_s or duration_s,
-        seed=dither.request.seed or 0,
+        window_s=dither.window_s,
+        seed=dither.request.seed,
         asked_ns_utc=turn.now_ns,
         basis_id=rtc.basis_id,
         config_id=rtc.config_id,
     )
-    _keep_noisy(turn, record)
+    _keep(turn, record)
     text = (
         f"{record.id}: {len(record.modes)} modes, {1e9 * record.total_m:.3g} nm RMS in all, "
         f"{duration_s:g} s"
@@ -291,30 +307,12 @@ def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
         make_way_for_noisy(turn)
 
 
-def give_up_noisy(turn: Turn, noisy_id: str) -> None:
-    """End a noisy matrix under way, and its dither.
-
-    Raises
-    ------
-    CommandError
-        If it is over.
-    UnknownIdError
-        If nobody has heard of it.
-    """
-    record = _under_way(turn.state.noisy_matrix(noisy_id), f"noisy matrix {noisy_id}")
-    _keep_noisy(turn, replace(record, state=MeasureState.GIVEN_UP, reason="by the operator"))
-    turn.log("noisy-matrix.given-up", noisy_id)
-    if turn.dither is not None and turn.dither.id == noisy_id:
-        drop(turn)
-        ask_to_stop(turn)
-
-
 def follow_noisy(turn: Turn) -> None:
     """Go on with the one under way: start its dither, note that it plays, or that it is over."""
     record, rtc = turn.state.gathering, turn.rtc
     if record is None:
         return
-    waited_s = (turn.now_ns - record.asked_ns_utc) / SECOND_NS
+    waited_s = (turn.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
     match record.state:
         case MeasureState.WAITING if isinstance(turn.event, cmd.StopDither):
             cut_off(turn, "the operator stopped the dither")
@@ -327,7 +325,7 @@ def follow_noisy(turn: Turn) -> None:
             _follow_playing(turn, record)
         case _:
             # a simulated RTC may be ten times slower than its timestamps
-            if waited_s >= 10.0 * (record.duration_s + FREE_WITHIN_S + MADE_WITHIN_S):
+            if waited_s >= 10.0 * ((record.duration_s or 0.0) + FREE_WITHIN_S + MADE_WITHIN_S):
                 cut_off(turn, "the worker did not answer")
 
 
@@ -335,7 +333,7 @@ def cut_off(turn: Turn, why: str) -> None:
     """End the one under way, if there is one, without a matrix."""
     record = turn.state.gathering
     if record is not None:
-        noisy_failed(turn, record, why)
+        fail(turn, record, why)
 
 
 def awaits_its_dither(state: TrackerState) -> bool:
@@ -344,67 +342,44 @@ def awaits_its_dither(state: TrackerState) -> bool:
     return record is not None and record.state is MeasureState.WAITING
 
 
-def on_noisy_made(turn: Turn, record: NoisyRecord) -> None:
-    """Note that a noisy matrix is in the archive, unless nobody wanted it any more."""
-    known, found = turn.state.noisy_matrix(record.id), record.finding
-    if found is None or (known is not None and known.state is MeasureState.GIVEN_UP):
-        return
-    _keep_noisy(turn, record)
-    text = f"{record.id}: {found.n_frames} frames, signal / noise of an element {found.snr:.2f}"
-    turn.log("noisy-matrix.stored", text)
-
-
-def noisy_failed(turn: Turn, record: NoisyRecord, text: str) -> None:
-    """Note why there is no noisy matrix, unless nobody wanted it any more."""
-    known = turn.state.noisy_matrix(record.id)
-    if known is None or known.state is not MeasureState.GIVEN_UP:
-        _keep_noisy(turn, replace(record, state=MeasureState.FAILED, reason=text))
-        turn.warn("noisy-matrix.failed", f"{record.id}: {text}")
-
-
-def _begin_noisy(turn: Turn, record: NoisyRecord, rtc: Status) -> None:
-    choice = RandomChoice(
-        id=record.id, modes=record.modes, total_m=record.total_m, duration_s=record.duration_s
-    )
+def _begin_noisy(turn: Turn, record: MeasurementRecord, rtc: Status) -> None:
     try:
-        dither = plan_random(choice, rtc, turn.policy, turn.now_ns)
+        dither = plan_random(
+            rtc,
+            turn.policy,
+            turn.now_ns,
+            dither_id=record.id,
+            modes=record.modes,
+            total_m=record.total_m,
+            duration_s=record.duration_s or DURATION_S,
+        )
     except CommandError as error:  # the RTC is another than when it was asked for
-        noisy_failed(turn, record, str(error))
+        fail(turn, record, str(error))
         return
-    asked = replace(
-        record,
-        state=MeasureState.ASKED,
-        window_s=dither.window_s or record.duration_s,
-        seed=dither.request.seed or 0,
-    )
-    _keep_noisy(turn, asked)
+    window_s, seed = dither.window_s, dither.request.seed
+    _keep(turn, replace(record, state=MeasureState.ASKED, window_s=window_s, seed=seed))
     ask_for(turn, dither)
 
 
-def _follow_playing(turn: Turn, record: NoisyRecord) -> None:
+def _follow_playing(turn: Turn, record: MeasurementRecord) -> None:
     match turn.event:
         case ev.Answered(
             request=DitherRequest(id=record.id), reply=Reply(accepted=False, reason=reason)
         ):
-            noisy_failed(turn, record, f"the RTC refused the dither: {reason}")
+            fail(turn, record, f"the RTC refused the dither: {reason}")
             return
         case ev.JobFailed(effect=ev.Ask(request=DitherRequest(id=record.id)), text=text):
-            noisy_failed(turn, record, text)
+            fail(turn, record, text)
             return
         case _:
             pass
     dither, asked = turn.dither, record.state is MeasureState.ASKED
     if dither is not None and dither.id == record.id:
         if asked and dither.start_seq is not None:
-            _keep_noisy(turn, replace(record, state=MeasureState.RUNNING))
+            _keep(turn, replace(record, state=MeasureState.RUNNING))
     elif asked:
-        noisy_failed(turn, record, "its dither never began")
+        fail(turn, record, "its dither never began")
     else:
         record = replace(record, state=MeasureState.FINISHING)
-        _keep_noisy(turn, record)
+        _keep(turn, record)
         turn.ask(ev.FinishNoisy(record=record))
-
-
-def _keep_noisy(turn: Turn, record: NoisyRecord) -> None:
-    others = tuple(r for r in turn.state.noisy if r.id != record.id)
-    turn.state = replace(turn.state, noisy=(*others, record)[-NOISY_KEPT:])

@@ -15,7 +15,6 @@ from service.tracking.dither_request import (
     RANDOM_TOTAL_M,
     Choice,
     Dither,
-    RandomChoice,
     plan_dither,
     plan_random,
     total_m,
@@ -196,14 +195,16 @@ def _planned(
     CommandError
         If it could not be played, or not be read.
     """
-    if command.kind is DitherKind.BINARY or isinstance(command.modes, ModeSet):  # for the types
-        asked = RandomChoice(
-            id=f"{ASKED_DITHER}{now_ns}",
+    if command.kind is DitherKind.BINARY or isinstance(command.modes, ModeSet):
+        return plan_random(
+            rtc,
+            policy,
+            now_ns,
+            dither_id=f"{ASKED_DITHER}{now_ns}",
             modes=command.modes or ModeSet.CONTROLLED,
             total_m=command.total_amplitude_m or min(RANDOM_TOTAL_M, policy.dither_budget_m),
             duration_s=command.duration_s or policy.dither_duration_s,
         )
-        return plan_random(asked, rtc, policy, now_ns)
     dither = plan_dither(
         rtc,
         policy,

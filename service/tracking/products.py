@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Misregistration, at_boundary
 from service.tracking.registration import ModeGain
-from service.wire import Pattern
+from service.wire import Manifest, MatrixLayout, MeasuredManifest, Pattern, Status
 
 
 class MatrixState(StrEnum):
@@ -112,6 +112,36 @@ class ReconstructorRecord:
     applied_frame_seq: int | None = None
     """First frame whose slopes it multiplied; None: not applied, or before this service came."""
 
+    @classmethod
+    def brought(cls, manifest: Manifest) -> ReconstructorRecord:
+        """Return what is known of a matrix the RTC brought with it.
+
+        Its manifest may name an α, but nobody here can vouch for it.
+        """
+        return cls(
+            id=manifest.id,
+            state=MatrixState.APPLIED,
+            n_modes=manifest.layout.shape[0],
+            created_ns_utc=manifest.created_ns,
+            sha256=manifest.layout.sha256,
+            reason="brought by the RTC",
+        )
+
+    def manifest(self, layout: MatrixLayout, rtc: Status, system: str) -> Manifest:
+        """Return the manifest it travels with."""
+        return Manifest(
+            id=self.id,
+            layout=layout,
+            alpha=None if self.alpha is None else self.alpha.to_boundary(),
+            sigma=None if self.sigma is None else at_boundary(self.sigma),
+            im_id=None,
+            parent=self.parent,
+            basis_id=rtc.basis_id,
+            config_id=rtc.config_id,
+            system=system,
+            created_ns=self.created_ns_utc,
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assessment:
@@ -184,84 +214,9 @@ class MeasureState(StrEnum):
         }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MeasurementRecord:
-    """All that is known of one measured interaction matrix but its numbers."""
-
-    id: str
-    """Never reused."""
-
-    state: MeasureState
-    pattern: Pattern
-    modes: tuple[int, ...]
-    """0-based basis indices, one for each column."""
-
-    amplitude_m: tuple[float, ...]
-    """RMS of each mode's stroke, metres OPD."""
-
-    n_average: int | None
-    """Repetitions averaged; None: the pattern has none."""
-
-    frequency_hz: tuple[float, ...] | None = None
-    """Of each mode; None: not a sine, or asked for by somebody else."""
-
-    duration_s: float | None = None
-    """Of a sine; None as above."""
-
-    asked_ns_utc: int | None = None
-    """When the service asked for it; None: it did not."""
-
-    start_seq: int | None = None
-    """First frame that contained a stroke; None: not known."""
-
-    closed_before: bool = False
-    """Whether the loop was closed when it was asked for."""
-
-    overdue_since_ns_utc: int | None = None
-    """Since when everything looks as if it were over, but no matrix has come."""
-
-    reason: str = ""
-    """Why there is no matrix."""
-
-    created_ns_utc: int | None = None
-    """When it was measured, by the RTC's clock; None: it was not, or not yet."""
-
-    n_slopes: int | None = None
-    double_pass: bool | None = None
-    """Whether the light saw the mirror twice: the matrix is then twice as large."""
-
-    session: str | None = None
-    """The RTC's session."""
-
-    basis_id: str | None = None
-    config_id: str | None = None
-    sha256: str = ""
-    """Of the matrix as it travels, 64 lower-case hex digits."""
-
-    @property
-    def opens_loop(self) -> bool:
-        """Whether the loop is open while it is measured."""
-        return self.pattern is not Pattern.SINE
-
-    @property
-    def under_way(self) -> bool:
-        """Whether the service waits for the matrix."""
-        return self.state.under_way
-
-
-class ModeSet(StrEnum):
-    """Modes by what they are, instead of by index."""
-
-    CONTROLLED = "controlled"
-    """Those in the loop."""
-
-    ALL = "all"
-    """Those of the basis."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoisyFinding:
-    """What came of one."""
+    """What came of random signs on all modes: a noisy interaction matrix."""
 
     n_slopes: int
     n_frames: int
@@ -301,40 +256,99 @@ class NoisyFinding:
         return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NoisyRecord:
-    """All that is known of one noisy interaction matrix but its numbers.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasurementRecord:
+    """All that is known of one measured interaction matrix but its numbers.
 
     Nothing of it can become a reconstructor: it is a measurement to fit a model to.
     """
 
     id: str
-    """Never reused; also that of its dither."""
+    """Never reused."""
 
     state: MeasureState
+    pattern: Pattern | None
+    """None: random signs on all modes at once, loop closed, summed by the service itself."""
+
     modes: tuple[int, ...]
     """0-based basis indices, one for each column."""
 
-    total_m: float
-    """RMS of all modes together, metres OPD."""
+    amplitude_m: tuple[float, ...]
+    """RMS of each mode's stroke, metres OPD."""
 
-    duration_s: float
-    """Of telemetry asked for."""
+    n_average: int | None = None
+    """Repetitions averaged; None: the pattern has none."""
 
-    window_s: float
-    """Of the windows it is summed from."""
+    frequency_hz: tuple[float, ...] | None = None
+    """Of each mode; None: not a sine, or asked for by somebody else."""
 
-    seed: int
-    """Of the dither's signs."""
+    duration_s: float | None = None
+    """Of a sine, or of the telemetry with random signs; None as above."""
 
-    asked_ns_utc: int
-    basis_id: str
-    config_id: str
+    window_s: float | None = None
+    """Of the windows that random signs are summed from."""
+
+    seed: int | None = None
+    """Of random signs, whose dither has the id of the matrix."""
+
+    asked_ns_utc: int | None = None
+    """When the service asked for it; None: it did not."""
+
+    start_seq: int | None = None
+    """First frame that contained a stroke; None: not known."""
+
+    closed_before: bool = False
+    """Whether the loop was closed when it was asked for."""
+
+    overdue_since_ns_utc: int | None = None
+    """Since when everything looks as if it were over, but no matrix has come."""
+
     reason: str = ""
-    """Why there is none, or what is missing."""
+    """Why there is no matrix, or what is missing."""
+
+    created_ns_utc: int | None = None
+    """When it was measured, by the RTC's clock; None: it was not, or not yet."""
+
+    n_slopes: int | None = None
+    double_pass: bool | None = None
+    """Whether the light saw the mirror twice: the matrix is then twice as large."""
+
+    session: str | None = None
+    """The RTC's session."""
+
+    basis_id: str | None = None
+    config_id: str | None = None
+    sha256: str = ""
+    """Of the matrix as it travels, 64 lower-case hex digits."""
 
     finding: NoisyFinding | None = None
-    """None: not finished."""
+    """What came of random signs; None: not finished, or another pattern."""
+
+    @classmethod
+    def sent(cls, manifest: MeasuredManifest) -> MeasurementRecord:
+        """Return what is known of a matrix the RTC sends, or of why there is none."""
+        there = manifest.reason is None
+        return cls(
+            id=manifest.id,
+            state=MeasureState.STORED if there else MeasureState.FAILED,
+            pattern=manifest.pattern,
+            modes=manifest.modes,
+            amplitude_m=manifest.amplitude_m,
+            n_average=None if manifest.pattern is Pattern.SINE else manifest.n_average,
+            reason=manifest.reason or "",
+            created_ns_utc=manifest.created_ns,
+            n_slopes=manifest.layout.shape[0],
+            double_pass=manifest.double_pass,
+            session=manifest.session,
+            basis_id=manifest.basis_id,
+            config_id=manifest.config_id,
+            sha256=manifest.layout.sha256,
+        )
+
+    @property
+    def opens_loop(self) -> bool:
+        """Whether the loop is open while it is measured."""
+        return self.pattern not in {None, Pattern.SINE}
 
     @property
     def n_modes(self) -> int:
@@ -342,11 +356,26 @@ class NoisyRecord:
         return len(self.modes)
 
     @property
-    def amplitude_m(self) -> float:
-        """RMS of each mode, metres OPD."""
-        return float(self.total_m / np.sqrt(len(self.modes)))
+    def total_m(self) -> float:
+        """RMS of all modes together, metres OPD."""
+        return float(np.sqrt(np.sum(np.square(self.amplitude_m))))
+
+    @property
+    def each_m(self) -> float:
+        """RMS of each mode, metres OPD, where all have the same."""
+        return self.amplitude_m[0]
 
     @property
     def under_way(self) -> bool:
-        """Whether the service still works on it."""
+        """Whether the service waits for the matrix, or works on it."""
         return self.state.under_way
+
+
+class ModeSet(StrEnum):
+    """Modes by what they are, instead of by index."""
+
+    CONTROLLED = "controlled"
+    """Those in the loop."""
+
+    ALL = "all"
+    """Those of the basis."""

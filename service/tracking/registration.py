@@ -86,19 +86,12 @@ class Seen:
     """``(4, 4)`` from its own data, numeric units."""
 
     t_ns_utc: int
-    """End of the window."""
+    """End of the telemetry it is of, the RTC's clock."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Earlier:
+class Earlier(Seen):
     """What was known before the last measurement: a jump inside that one is seen from here."""
-
-    alpha: Misregistration
-    covariance: Array
-    """``(4, 4)`` at ``t_ns_utc``, numeric units."""
-
-    t_ns_utc: int
-    """End of the telemetry that had entered, the RTC's clock."""
 
     pointing: Pointing | None
     """Of the telescope then; None: not known."""
@@ -137,26 +130,14 @@ class PassiveBias:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Candidate:
+class Candidate(Seen):
     """A window far from all before, held until the next one says which of them was right."""
-
-    alpha: Misregistration
-    covariance: Array
-    """``(4, 4)`` from its own data, numeric units."""
-
-    t_ns_utc: int
-    """End of the window."""
 
     held_ns_utc: int
     """When it was put aside, by the service's clock."""
 
     innovation: float
     """Normalised innovation squared (4 degrees of freedom)."""
-
-    @property
-    def seen(self) -> Seen:
-        """What was measured."""
-        return Seen(alpha=self.alpha, covariance=self.covariance, t_ns_utc=self.t_ns_utc)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

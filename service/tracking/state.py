@@ -16,7 +16,6 @@ from service.tracking.products import (
     Assessment,
     MeasurementRecord,
     ModeLimit,
-    NoisyRecord,
     ReconstructorRecord,
 )
 from service.tracking.registration import HistoryEntry, Registration, Watchdog
@@ -298,9 +297,6 @@ class TrackerState:
     measurements: tuple[MeasurementRecord, ...] = ()
     """Of interaction matrices, oldest first, bounded."""
 
-    noisy: tuple[NoisyRecord, ...] = ()
-    """Noisy interaction matrices, oldest first, bounded."""
-
     in_use: str | None = None
     """Id of the matrix the RTC multiplies with; None: unknown."""
 
@@ -409,19 +405,29 @@ class TrackerState:
         """Return the record of this measured matrix, or None."""
         return next((r for r in reversed(self.measurements) if r.id == measurement_id), None)
 
-    def noisy_matrix(self, noisy_id: str) -> NoisyRecord | None:
-        """Return the record of this noisy interaction matrix, or None."""
-        return next((r for r in reversed(self.noisy) if r.id == noisy_id), None)
+    @property
+    def by_rtc(self) -> tuple[MeasurementRecord, ...]:
+        """Interaction matrices the RTC has measured or measures, oldest first."""
+        return tuple(r for r in self.measurements if r.pattern is not None)
 
     @property
-    def gathering(self) -> NoisyRecord | None:
-        """The noisy interaction matrix under way, or None."""
-        return next((r for r in reversed(self.noisy) if r.under_way), None)
+    def noisy(self) -> tuple[MeasurementRecord, ...]:
+        """Noisy interaction matrices, by random signs on sky, oldest first."""
+        return tuple(r for r in self.measurements if r.pattern is None)
 
     @property
     def measuring(self) -> MeasurementRecord | None:
-        """The measurement under way, or None."""
-        return next((r for r in reversed(self.measurements) if r.under_way), None)
+        """The measurement by the RTC that is under way, or None."""
+        return self._under_way(noisy=False)
+
+    @property
+    def gathering(self) -> MeasurementRecord | None:
+        """The noisy interaction matrix under way, or None."""
+        return self._under_way(noisy=True)
+
+    def _under_way(self, *, noisy: bool) -> MeasurementRecord | None:
+        of_kind = (r for r in reversed(self.measurements) if (r.pattern is None) is noisy)
+        return next((r for r in of_kind if r.under_way), None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,7 +15,7 @@ from service.control.dither import information
 from service.control.expected_gain import ExpectedGain, Sky, beyond_m2, expected_gain, noise_of_star
 from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
-from service.control.reconstructor import Method, Prior, Recipe, reconstruct
+from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.fit.dialect import LIKELY, Dialect, of_answer, of_reconstructor
 from service.fit.light import far_starts
 from service.fit.orientation import Setting
@@ -363,7 +363,7 @@ class OpticsWorker:
 
     def _recipe(self, n_modes: int) -> Recipe:
         prior = None
-        if self._compute.method is Method.MAP:
+        if self._compute.method is InversionMethod.MAP:
             prior = Prior(
                 variance_m2=self._model.basis.variance_m2,
                 slope_noise=np.full(self._model.n_slopes, self._compute.slope_noise),

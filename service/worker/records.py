@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
-from service.control.reconstructor import MAX_CONDITION, Method
+from service.control.reconstructor import MAX_CONDITION, InversionMethod
 from service.errors import ModelError
 from service.model.instrument import Influence, Instrument, Mirror
 from service.model.interaction import RtcInteractionModel
@@ -42,7 +42,7 @@ class Compute:
     """Telemetry is compared with the response of a loop that controls this many modes at the
     instrument's r0; None: with that of a flat wavefront."""
 
-    method: Method = Method.SVD
+    method: InversionMethod = InversionMethod.SVD
     """How interaction matrices are inverted."""
 
     max_condition: float = MAX_CONDITION

@@ -110,7 +110,7 @@ def seen_by_operator(state: TrackerState, now_ns: int) -> dict[str, Json]:
         "validity": None if known is None else known.standing.validity.value,
         "in use": state.in_use,
         "matrices": {record.id: record.state.value for record in state.reconstructors},
-        "measured": {record.id: record.state.value for record in state.measurements},
+        "measured": {record.id: record.state.value for record in state.by_rtc},
         "noisy": {record.id: record.state.value for record in state.noisy},
         "dither": None if state.dither is None else state.dither.id,
         "phase": [state.dithering.phase.value, state.dithering.reason],

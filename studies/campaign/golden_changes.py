@@ -1,11 +1,12 @@
 """Nights that were recorded with earlier records, as they would be written today.
 
 Earlier the tracker had records of its own for the RTC's status, for dithers and for each kind of
-question and answer; now they are the wire's.
+question and answer; now they are the wire's. A noisy interaction matrix had one of its own, too.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 from studies.campaign.golden_codec import Json
@@ -39,6 +40,8 @@ class Renewal:
             "StartDither": _total,
             "MeasureNoisy": _total,
             "SetPointing": lambda old: old.get("pointing", old) | {"is": "SetPointing"},
+            "NoisyMade": lambda old: old | {"is": "MatrixMeasured"},
+            "NoisyRecord": _measurement,
         }
 
     def entry(self, entry: Record) -> Record:
@@ -142,3 +145,10 @@ def _dither_request(view: Record) -> Record:
 def _measure_request(record: Record) -> Record:
     names = ("id", "pattern", "modes", "amplitude_m", "n_average", "frequency_hz", "duration_s")
     return {"is": "MeasureRequest"} | {name: record[name] for name in names if name in record}
+
+
+def _measurement(noisy: Record) -> Record:
+    n_modes = len(noisy["modes"])
+    each_m = noisy["total_m"] / math.sqrt(n_modes)
+    changed = {"is": "MeasurementRecord", "pattern": None, "amplitude_m": [each_m] * n_modes}
+    return {name: value for name, value in noisy.items() if name != "total_m"} | changed

@@ -15,7 +15,7 @@ from service.tracking import events as ev
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
-from service.tracking.products import MatrixState, MeasureState, NoisyFinding, NoisyRecord
+from service.tracking.products import MatrixState, MeasurementRecord, MeasureState, NoisyFinding
 from service.tracking.state import Mode, TrackerState
 from service.wire import Acknowledgement, DitherRequest, Reply
 from service.wire import Command as Order
@@ -232,7 +232,7 @@ class GoldenNight(Observatory):
     @override
     def _do(self, effect: Effect, state: TrackerState) -> None:
         if isinstance(effect, ev.FinishNoisy) and not self.worker.broken:
-            event = ev.NoisyMade(record=self._finished(effect.record))
+            event = ev.MatrixMeasured(record=self._finished(effect.record))
             self._in(self.latencies.make_s, partial(self._post, event))
             return
         super()._do(effect, state)
@@ -248,11 +248,11 @@ class GoldenNight(Observatory):
         if not (told and Mischief.NO_ACK in self.dome.mischief):
             super()._hear(event)
 
-    def _finished(self, record: NoisyRecord) -> NoisyRecord:
+    def _finished(self, record: MeasurementRecord) -> MeasurementRecord:
         """Return a noisy matrix as if it had been fitted: only that it was matters here."""
         finding = NoisyFinding(
             n_slopes=self._n_slopes,
-            n_frames=round(record.duration_s * self.dome.rate_hz),
+            n_frames=round((record.duration_s or 0.0) * self.dome.rate_hz),
             n_missing=0,
             snr=1.2,
             alpha=None,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.errors import PyrcalError, UnknownIdError, WorkerError
-from service.tracking.products import MeasurementRecord, NoisyRecord, ReconstructorRecord
+from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
 from service.worker import Done, OpticsWorker
 from sim_rtc.computer.reconstructors import Outcome, Staging
@@ -112,11 +112,11 @@ class Kept:
     """Keeps interaction matrices in memory."""
 
     def __init__(self) -> None:
-        self.records: list[MeasurementRecord | NoisyRecord] = []
+        self.records: list[MeasurementRecord] = []
 
     def store(
         self,
-        record: MeasurementRecord | NoisyRecord,
+        record: MeasurementRecord,
         numbers: NDArray[np.float32] | NoisyNumbers,
         name: str,
     ) -> None:

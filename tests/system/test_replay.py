@@ -13,14 +13,14 @@ from service.config import load_instrument
 from service.link.intake import Intake
 from service.link.session import Endpoint
 from service.model.misregistration import PARAMETERS, Misregistration
-from service.runtime.actions import record_of
 from service.runtime.engine import Engine
 from service.telemetry.lockin import WindowEstimate
 from service.telemetry.windows import ClosedLoop as FitLoop
 from service.tracking import events as ev
 from service.tracking.policy import Policy
+from service.tracking.products import ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
-from service.wire import DitherRequest, decode_manifest
+from service.wire import DitherRequest, Manifest, decode
 from service.worker import Compute, OpticsWorker
 from sim_rtc.link.record import Kind, Recording
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
@@ -65,10 +65,10 @@ class Tracker:
             self.look()
 
     def keep(self, message):
-        manifest = decode_manifest(message.attachment)
+        manifest = decode(Manifest, message.attachment)
         matrix = np.frombuffer(message.payload, "<f4").reshape(manifest.layout.shape)
         self.matrices[manifest.id] = matrix
-        self.engine.post(ev.MatrixFetched(record=record_of(manifest)))
+        self.engine.post(ev.MatrixFetched(record=ReconstructorRecord.brought(manifest)))
 
     def look(self):
         for heard in self.intake.events():

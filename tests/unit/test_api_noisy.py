@@ -13,15 +13,16 @@ from service.model.misregistration import Misregistration
 from service.routes.views import GATHERING, picture
 from service.snapshot import Snapshot
 from service.tracking.commands import GiveUpNoisy, MeasureNoisy
-from service.tracking.products import MeasureState, ModeSet, NoisyFinding, NoisyRecord
+from service.tracking.products import MeasurementRecord, MeasureState, ModeSet, NoisyFinding
 from service.tracking.state import TrackerState
 
 FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"
-STORED = NoisyRecord(
+STORED = MeasurementRecord(
     id="noisy-1",
     state=MeasureState.STORED,
+    pattern=None,
     modes=(0, 7, 3),
-    total_m=5e-9,
+    amplitude_m=(5e-9 / 3**0.5,) * 3,
     duration_s=30.0,
     window_s=5.0,
     seed=77,
@@ -56,7 +57,7 @@ class FakeService:
 
     def snapshot(self):
         return Snapshot(
-            tracker=TrackerState(system="flao-lbt", noisy=(STORED, RUNNING)),
+            tracker=TrackerState(system="flao-lbt", measurements=(STORED, RUNNING)),
             link=None,
             now_ns=1_763_696_400_250_000_000,
             started_ns=0,
@@ -200,6 +201,6 @@ async def test_no_route_publishes_one(client, service, action):
 async def test_the_state_shows_the_one_under_way(client):
     shown = (await client.get("/v1/noisy-matrix/noisy-2")).json()
     assert shown["state"] == "running"
-    state = picture(TrackerState(system="x", noisy=(RUNNING,)).gathering, GATHERING)
+    state = picture(TrackerState(system="x", measurements=(RUNNING,)).gathering, GATHERING)
     found = (state["id"], state["state"], state["duration_s"])
     assert found == ("noisy-2", MeasureState.RUNNING, 30.0)

@@ -12,7 +12,7 @@ from service.archive.records import from_json, to_json
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.files.container import read_recorded
 from service.model.misregistration import Misregistration
-from service.tracking.products import MeasureState, NoisyFinding, NoisyRecord
+from service.tracking.products import MeasurementRecord, MeasureState, NoisyFinding
 from service.wire import checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3) * 1e6
@@ -41,11 +41,12 @@ def record_of(name="noisy-1", matrix=MATRIX, **changes):
         created_ns_utc=1_000,
         sha256=checksum(matrix),
     )
-    record = NoisyRecord(
+    record = MeasurementRecord(
         id=name,
         state=MeasureState.STORED,
+        pattern=None,
         modes=(0, 7, 3),
-        total_m=5e-9,
+        amplitude_m=(5e-9 / 3**0.5,) * 3,
         duration_s=30.0,
         window_s=5.0,
         seed=77,
@@ -74,12 +75,12 @@ def same(one, other):
 
 
 def test_a_record_survives_its_json():
-    again = from_json(to_json(record_of()), NoisyRecord)
+    again = from_json(to_json(record_of()), MeasurementRecord)
     np.testing.assert_allclose(again.finding.covariance, record_of().finding.covariance)
     np.testing.assert_allclose(again.finding.alpha.vector, record_of().finding.alpha.vector)
     assert (again.modes, again.state, again.seed) == ((0, 7, 3), MeasureState.STORED, 77)
     without = record_of(finding=replace(record_of().finding, alpha=None, covariance=None))
-    assert from_json(to_json(without), NoisyRecord).finding.alpha is None
+    assert from_json(to_json(without), MeasurementRecord).finding.alpha is None
 
 
 def test_the_file_says_how_it_was_measured_and_what_it_says(archive, tmp_path):

@@ -3,7 +3,6 @@
 import numpy as np
 
 from service.model.misregistration import Misregistration
-from service.runtime.actions import manifest_of
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
 from service.wire import Reply, layout_of
@@ -48,7 +47,7 @@ class HandmadeBridge:
         self.offered = []
         self.current = None
         self.refusal = None
-        self.applied = (manifest_of(foreign(), layout_of(BROUGHT, 4096), RTC, "small"), BROUGHT)
+        self.applied = (foreign().manifest(layout_of(BROUGHT, 4096), RTC, "small"), BROUGHT)
 
     async def publish(self, manifest, matrix):
         self.published.append((manifest, matrix))

@@ -7,9 +7,8 @@ import pytest
 
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.model.misregistration import Misregistration
-from service.runtime.actions import manifest_of, record_of
 from service.tracking import events as ev
-from service.tracking.products import MatrixState
+from service.tracking.products import MatrixState, ReconstructorRecord
 from service.wire import (
     DitherKind,
     DitherRequest,
@@ -191,7 +190,7 @@ async def test_the_rtcs_own_matrix_is_fetched_and_archived_once(actions, archive
 async def test_another_matrix_under_a_known_id_is_not_taken_for_the_same(actions, bridge):
     await actions.perform(ev.FetchMatrix(id="initial"), STATE)
     other = BROUGHT * 2
-    bridge.applied = (manifest_of(foreign(), layout_of(other, 4096), RTC, "small"), other)
+    bridge.applied = (foreign().manifest(layout_of(other, 4096), RTC, "small"), other)
     with pytest.raises(LinkError, match="not the one archived under that id"):
         await actions.perform(ev.FetchMatrix(id="initial"), STATE)
 
@@ -200,7 +199,7 @@ async def test_other_numbers_under_an_id_the_tracker_knows_are_for_it_to_distrus
     event = await actions.perform(ev.FetchMatrix(id="initial"), STATE)
     state = replace(STATE, reconstructors=(event.record,))
     other = BROUGHT * 2
-    bridge.applied = (manifest_of(foreign(), layout_of(other, 4096), RTC, "small"), other)
+    bridge.applied = (foreign().manifest(layout_of(other, 4096), RTC, "small"), other)
     found = await actions.perform(ev.FetchMatrix(id="initial"), state)
     assert found.record.sha256 != event.record.sha256
     np.testing.assert_array_equal(actions.matrix("initial"), BROUGHT)
@@ -279,7 +278,7 @@ class TestDither:
 
 def test_a_manifest_carries_the_registration_in_boundary_units():
     matrix = np.zeros((400, 6), np.float32)
-    manifest = manifest_of(record("cm-1"), layout_of(matrix, 4096), rtc(), "flao")
+    manifest = record("cm-1").manifest(layout_of(matrix, 4096), rtc(), "flao")
     assert manifest.alpha["rotation_deg"] == pytest.approx(0.2)
     assert manifest.sigma["rotation_deg"] == pytest.approx(np.rad2deg(9e-5))
     assert (manifest.basis_id, manifest.system, manifest.parent) == ("kl-594", "flao", "initial")
@@ -287,9 +286,9 @@ def test_a_manifest_carries_the_registration_in_boundary_units():
 
 def test_a_matrix_of_the_rtc_is_for_no_registration_we_can_vouch_for():
     matrix = np.zeros((3, 6), np.float32)
-    sent = manifest_of(record("cm-1"), layout_of(matrix, 4096), rtc(), "flao")
-    brought = record_of(sent)
+    sent = record("cm-1").manifest(layout_of(matrix, 4096), rtc(), "flao")
+    brought = ReconstructorRecord.brought(sent)
     assert (brought.alpha, brought.parent, brought.n_modes) == (None, None, 3)
     assert brought.state is MatrixState.APPLIED
-    manifest = manifest_of(foreign(), layout_of(matrix, 4096), rtc(), "flao")
+    manifest = foreign().manifest(layout_of(matrix, 4096), rtc(), "flao")
     assert (manifest.alpha, manifest.sigma) == (None, None)

@@ -13,7 +13,7 @@ from service.runtime.estimates import NoisySums
 from service.telemetry.frames import FrameBlock
 from service.telemetry.random_dither import RandomDither, RandomPlan, accumulate
 from service.tracking import events as ev
-from service.tracking.products import MeasureState, NoisyRecord
+from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import Alarm, TrackerState
 from service.worker import OpticsWorker
 from tests.unit.runtime.small import COMPUTE, small_instrument
@@ -26,11 +26,12 @@ MODES = tuple(range(0, 60, 2))
 TOTAL_M = 5e-9
 DIVERGING = Alarm(name="loop-diverging", since_ns_utc=0, text="it does")
 N_FRAMES = 1000
-RUNNING = NoisyRecord(
+RUNNING = MeasurementRecord(
     id="noisy-1",
     state=MeasureState.RUNNING,
+    pattern=None,
     modes=MODES,
-    total_m=TOTAL_M,
+    amplitude_m=(TOTAL_M / len(MODES) ** 0.5,) * len(MODES),
     duration_s=2.0,
     window_s=1.0,
     seed=3,
@@ -38,7 +39,7 @@ RUNNING = NoisyRecord(
     basis_id="kl",
     config_id="b1",
 )
-STATE = TrackerState(system="small", noisy=(RUNNING,))
+STATE = TrackerState(system="small", measurements=(RUNNING,))
 
 
 class NearCrew:
@@ -94,7 +95,7 @@ async def finish(desk, workers, **changes):
 
 async def test_windows_become_an_archived_matrix_and_the_registration_in_it(desk, workers, archive):
     made = await finish(desk, workers)
-    assert isinstance(made, ev.NoisyMade)
+    assert isinstance(made, ev.MatrixMeasured)
     record = made.record
     assert (record.state, record.reason) == (MeasureState.STORED, "")
     found = record.finding
@@ -120,7 +121,7 @@ async def test_windows_of_another_dither_or_of_a_loop_out_of_hand_do_not_count(d
     (other,) = windows(workers, n=1, modes=MODES[:5])
     desk.take(other, STATE)
     (window,) = windows(workers, n=1)
-    desk.take(window, replace(STATE, noisy=()))
+    desk.take(window, replace(STATE, measurements=()))
     desk.take(window, replace(STATE, alarms=(DIVERGING,)))
     with pytest.raises(CommandError, match="no window of its dither was whole"):
         await desk.finish(RUNNING, STATE)

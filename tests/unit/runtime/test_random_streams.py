@@ -11,7 +11,7 @@ from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn
 from service.telemetry.random_dither import Correlated
 from service.telemetry.windows import WindowRefused
-from service.tracking.dither_request import Dither, RandomChoice, plan_random
+from service.tracking.dither_request import Dither, plan_random
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest
 from service.worker import Description
@@ -30,6 +30,7 @@ REQUEST = DitherRequest(
     seed=5,
     duration_s=1.2,
 )
+ASKED = {"dither_id": "noisy-1", "total_m": 5e-9, "duration_s": 30.0}
 DITHER = Dither(request=REQUEST, window_s=0.4, start_seq=0, asked_ns_utc=0)
 
 
@@ -107,12 +108,7 @@ def test_a_new_reconstructor_inside_a_window_cuts_it_short(streams):
 
 def test_all_modes_of_a_basis_may_share_a_few_nanometres():
     """5 nm on 594 modes: 0.205 nm each; windows of 594 modes at 1 kHz last 4.75 s at least."""
-    dither = plan_random(
-        RandomChoice(id="noisy-1", modes=ModeSet.ALL, total_m=5e-9, duration_s=30.0),
-        rtc(),
-        POLICY,
-        77,
-    )
+    dither = plan_random(rtc(), POLICY, 77, modes=ModeSet.ALL, **ASKED)
     request = dither.request
     assert request.modes == tuple(range(594))
     assert np.sqrt(np.sum(np.square(request.amplitude_m))) == pytest.approx(5e-9)
@@ -122,8 +118,8 @@ def test_all_modes_of_a_basis_may_share_a_few_nanometres():
 
 
 def test_the_controlled_modes_are_those_in_the_loop():
-    asked = RandomChoice(id="n", modes=ModeSet.CONTROLLED, total_m=5e-9, duration_s=30.0)
-    assert plan_random(asked, rtc(), POLICY, 0).request.modes == tuple(range(400))
+    dither = plan_random(rtc(), POLICY, 0, modes=ModeSet.CONTROLLED, **ASKED)
+    assert dither.request.modes == tuple(range(400))
 
 
 @pytest.mark.parametrize(
@@ -135,12 +131,11 @@ def test_the_controlled_modes_are_those_in_the_loop():
     ],
 )
 def test_a_dither_that_cannot_be_played_is_refused_before_it_is_asked_for(changes, words):
-    values = {"id": "n", "modes": ModeSet.CONTROLLED, "total_m": 5e-9, "duration_s": 30.0}
+    values = {"modes": ModeSet.CONTROLLED} | ASKED
     with pytest.raises(CommandError, match=words):
-        plan_random(RandomChoice(**(values | changes)), rtc(), POLICY, 0)
+        plan_random(rtc(), POLICY, 0, **(values | changes))
 
 
 def test_more_modes_than_the_rtc_dithers_are_refused():
-    asked = RandomChoice(id="n", modes=ModeSet.ALL, total_m=5e-9, duration_s=30.0)
     with pytest.raises(CommandError, match="found 594 modes; the RTC dithers at most 64"):
-        plan_random(asked, rtc(max_dither_modes=64), POLICY, 0)
+        plan_random(rtc(max_dither_modes=64), POLICY, 0, modes=ModeSet.ALL, **ASKED)

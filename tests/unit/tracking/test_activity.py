@@ -177,7 +177,6 @@ def strands(world):
     """What has neither ended nor goes on."""
     state = world.state
     left = [f"{r.id} {r.state}" for r in state.measurements if r.under_way]
-    left += [f"{r.id} {r.state}" for r in state.noisy if r.under_way]
     left += [f"{r.id} {r.state}" for r in state.reconstructors if r.state in SENT]
     if state.acquisition.under_way:
         left.append(state.acquisition.text)

@@ -64,7 +64,7 @@ def status(story, **changes):
 
 
 def state_of(story, noisy_id="noisy-1"):
-    return story.state.noisy_matrix(noisy_id).state
+    return story.state.measurement(noisy_id).state
 
 
 def begun(story):
@@ -102,7 +102,7 @@ def test_a_dither_that_does_not_make_way_ends_the_wait(dithering):
     status(dithering, dither=own)
     dithering.wait(FREE_WITHIN_S + 2.0)
     assert state_of(dithering) is MeasureState.FAILED
-    assert "did not end within" in dithering.state.noisy_matrix("noisy-1").reason
+    assert "did not end within" in dithering.state.measurement("noisy-1").reason
 
 
 def test_it_runs_from_when_the_rtc_has_accepted(story):
@@ -124,7 +124,7 @@ def finished(story):
     begun(story)
     status(story, dither_id=None, seq=1100 + 31_000)
     record = replace(story.state.gathering, state=MeasureState.STORED, finding=FINDING)
-    story.tell(ev.NoisyMade(record=record))
+    story.tell(ev.MatrixMeasured(record=record))
     return story
 
 
@@ -157,7 +157,7 @@ def test_a_dither_that_never_begins_is_a_failure_with_its_reason(story, event, w
         event = ev.JobFailed(effect=ev.Ask(request=asked), text=words)
     story.tell(event)
     assert state_of(story) is MeasureState.FAILED
-    assert story.state.noisy_matrix("noisy-1").reason == words
+    assert story.state.measurement("noisy-1").reason == words
 
 
 def test_a_fit_that_fails_is_a_failure_with_its_reason(story):
@@ -173,7 +173,7 @@ def test_one_given_up_ends_its_dither_and_stays_given_up(story):
     assert of_kind(effects, DitherStop)
     assert story.state.dither is None
     record = replace(story.state.noisy[-1], state=MeasureState.STORED, finding=FINDING)
-    story.tell(ev.NoisyMade(record=record))
+    story.tell(ev.MatrixMeasured(record=record))
     assert state_of(story) is MeasureState.GIVEN_UP
 
 

@@ -228,7 +228,9 @@ class World(Story):
                     session=f"s{self.session}",
                 )
             case ev.FinishNoisy(record=asked):
-                yield ev.NoisyMade(record=replace(asked, state=MeasureState.STORED, finding=FOUND))
+                yield ev.MatrixMeasured(
+                    record=replace(asked, state=MeasureState.STORED, finding=FOUND)
+                )
             case _:
                 raise TypeError(f"nobody answers {effect!r}")
 

@@ -16,6 +16,7 @@ from typing_extensions import override
 
 from service import __version__
 from service.routes import (
+    audit,
     commands,
     fits,
     health,
@@ -105,6 +106,7 @@ def create_app(
     problems.install(app)
     routers = [
         reading.router,
+        audit.router,
         stream.router,
         page.router,
         commands.router,

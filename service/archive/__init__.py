@@ -12,6 +12,6 @@
 """
 
 from service.archive.archive import Archive
-from service.archive.index import AuditEntry
+from service.archive.index import AuditEntry, Range
 
-__all__ = ["Archive", "AuditEntry"]
+__all__ = ["Archive", "AuditEntry", "Range"]

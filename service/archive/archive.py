@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Self
 
-from service.archive.index import AuditEntry, Index, begun_ns_utc
+from service.archive.index import AuditEntry, Index, Range, begun_ns_utc
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
 from service.archive.records import TrackingFile
 from service.errors import ArchiveError, StorageError
@@ -135,9 +135,9 @@ class Archive:
         finally:
             path.unlink(missing_ok=True)
 
-    def audit_trail(self, limit: int = 100) -> tuple[AuditEntry, ...]:
-        """Return the last ``limit`` entries of the audit trail, oldest first."""
-        return self._index.audit_trail(limit)
+    def audit_trail(self, part: Range | None = None) -> tuple[AuditEntry, ...]:
+        """Return the entries of a part of the audit trail, oldest first; None: the last ones."""
+        return self._index.audit_trail(part or Range())
 
 
 def _locked(path: Path) -> IO[str]:

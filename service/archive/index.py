@@ -6,7 +6,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,7 +17,7 @@ from service.tracking.products import MeasurementRecord, ReconstructorRecord
 Product = ReconstructorRecord | MeasurementRecord
 Indexed = TypeVar("Indexed", bound=Product)
 
-_VERSION = 2
+_VERSION = 3
 
 _PRODUCTS = """
 CREATE TABLE IF NOT EXISTS {} (
@@ -29,15 +29,19 @@ CREATE TABLE IF NOT EXISTS {} (
 """
 """A table for each kind."""
 
+_OF_ORDERS = ("address", "whence", "why", "answer")
+"""Columns of the audit trail that are there since version 3."""
+
 _SCHEMA = f"""
-BEGIN;
 {"".join(map(_PRODUCTS.format, ("reconstructor", "measurement", "noisy_matrix")))}
 CREATE TABLE IF NOT EXISTS audit (
     t_ns_utc INTEGER NOT NULL,
     who TEXT NOT NULL,
     name TEXT NOT NULL,
-    text TEXT NOT NULL
+    text TEXT NOT NULL,
+    {", ".join(f"{column} TEXT NOT NULL DEFAULT ''" for column in _OF_ORDERS)}
 );
+CREATE INDEX IF NOT EXISTS audit_by_time ON audit (t_ns_utc);
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_entries BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_words BEFORE UPDATE ON audit
@@ -55,13 +59,44 @@ class AuditEntry:
     """When, nanoseconds since the Unix epoch."""
 
     who: str
-    """An operator, the service or the RTC."""
+    """Who gave the order: a name, else the address; "service" for what it does by itself."""
 
     name: str
-    """Machine-readable, like ``reconstructor.applied``."""
+    """Machine-readable, like ``reconstructor.applied``; an order has two lines: ``Approve`` when
+    it came, ``Approve.answered`` or ``Approve.refused`` when that was known."""
 
     text: str
-    """What happened."""
+    """What happened, or what was asked for."""
+
+    address: str = ""
+    """Of the client that gave the order."""
+
+    whence: str = ""
+    """"page", "rest" or "cli"; empty: no order."""
+
+    why: str = ""
+    """The reason given with the order."""
+
+    answer: str = ""
+    """What the order was answered."""
+
+    id: int = 0
+    """Place in the trail, from 1 on, growing; 0: not written yet."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Range:
+    """A part of the audit trail."""
+
+    since_ns: int = 0
+    until_ns: int = (1 << 63) - 1
+    """Both of them belong to it; nanoseconds since the Unix epoch."""
+
+    after: int | None = None
+    """The first entries after this id; None: the last ones."""
+
+    limit: int = 100
+    """Most entries."""
 
 
 class Index:
@@ -95,7 +130,8 @@ class Index:
                     raise ArchiveError(
                         f"{self._path}: found version {version}, expected {_VERSION}"
                     )
-                connection.executescript(_SCHEMA)
+                older = _widened() if 0 < version < _VERSION else ""
+                connection.executescript(f"BEGIN;{older}{_SCHEMA}")
                 return bool(version == 0)
         except sqlite3.OperationalError as error:
             raise ArchiveError(f"{self._path}: cannot be opened: {error}") from error
@@ -135,8 +171,8 @@ class Index:
                 [(r.id, r.created_ns_utc, to_json(r)) for r in records],
             )
             connection.executemany(
-                "INSERT INTO audit VALUES (?, ?, ?, ?)",
-                [(e.t_ns_utc, e.who, e.name, _storable(e.text)) for e in entries],
+                f"INSERT INTO audit ({_COLUMNS}) VALUES ({', '.join('?' * _N_COLUMNS)})",
+                [tuple(map(_storable, astuple(entry)[:_N_COLUMNS])) for entry in entries],
             )
             connection.execute("COMMIT")
 
@@ -163,16 +199,19 @@ class Index:
                 wrong[name] = f"{self._path}: record of {table} {name} not understood: {error!r}"
         return understood, wrong
 
-    def audit_trail(self, limit: int) -> tuple[AuditEntry, ...]:
-        """Return the last ``limit`` entries, oldest first."""
+    def audit_trail(self, part: Range) -> tuple[AuditEntry, ...]:
+        """Return the entries of a part, oldest first."""
+        order = "DESC" if part.after is None else "ASC"
         with self._use() as connection:
             rows = connection.execute(
-                "SELECT t_ns_utc, who, name, text FROM audit ORDER BY rowid DESC LIMIT ?", (limit,)
+                f"SELECT {_COLUMNS}, rowid FROM audit"
+                " WHERE t_ns_utc BETWEEN ? AND ? AND rowid > ?"
+                f" ORDER BY rowid {order} LIMIT ?",
+                (part.since_ns, part.until_ns, part.after or 0, part.limit),
             ).fetchall()
-        return tuple(
-            AuditEntry(t_ns_utc=t, who=who, name=name, text=text)
-            for t, who, name, text in reversed(rows)
-        )
+        names = [field.name for field in fields(AuditEntry)]
+        found = [AuditEntry(**dict(zip(names, row, strict=True))) for row in rows]
+        return tuple(sorted(found, key=lambda entry: entry.id))
 
     @contextmanager
     def _use(self) -> Iterator[sqlite3.Connection]:
@@ -200,6 +239,23 @@ def begun_ns_utc(record: Product) -> int:
     return record.created_ns_utc or asked_ns or 0
 
 
-def _storable(text: str) -> str:
-    """Return a text that UTF-8 can hold: half a surrogate pair would be refused for ever."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+_N_COLUMNS = len(fields(AuditEntry)) - 1
+_COLUMNS = ", ".join(field.name for field in fields(AuditEntry)[:_N_COLUMNS])
+
+
+def _widened() -> str:
+    """Return what gives an older trail the columns it lacks."""
+    return "".join(
+        f"ALTER TABLE audit ADD COLUMN {column} TEXT NOT NULL DEFAULT '';" for column in _OF_ORDERS
+    )
+
+
+def _storable(value: str | int) -> str | int:
+    """Return a text that acts on no terminal, and that UTF-8 can hold.
+
+    Half a surrogate pair would be refused for ever.
+    """
+    if isinstance(value, int):
+        return value
+    seen = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in value)
+    return "".join(seen)

@@ -6,14 +6,16 @@ is seen in the state and in the events.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Depends, Request
 from pydantic import BaseModel, ConfigDict, Discriminator
 
 from service.routes.orders import Said, about, body
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.views import MatrixId, ServiceDep
+from service.runtime.recording import Caller, Whence
 from service.runtime.supervisor import Supervisor
 from service.tracking.commands import (
     AbortAcquisition,
@@ -60,10 +62,35 @@ class AcceptedView(BaseModel):
     """Where to look for what becomes of it."""
 
 
-async def accepted(service: Supervisor, command: Command, **links: str) -> AcceptedView:
-    """Hand a command on; say what was set in motion and where to look for what becomes of it."""
-    text = await service.submit(command)
-    return AcceptedView(text=text, links={"state": "/v1/state", "events": "/v1/events", **links})
+@dataclass(frozen=True, slots=True)
+class Client:
+    """Whoever gives orders in a request."""
+
+    service: Supervisor
+    """That is to obey."""
+
+    caller: Caller
+
+    async def orders(self, command: Command, **links: str) -> AcceptedView:
+        """Hand a command on; say what was done, and where to look for what becomes of it."""
+        text = await self.service.submit(command, self.caller)
+        links = {"state": "/v1/state", "events": "/v1/events", **links}
+        return AcceptedView(text=text, links=links)
+
+
+def _client_of(request: Request, service: ServiceDep) -> Client:
+    sent = request.headers
+    if "origin" in sent or "sec-fetch-site" in sent:  # only browsers say so
+        whence = Whence.PAGE
+    else:
+        from_us = sent.get("user-agent", "").startswith("pyrcal")
+        whence = Whence.CLI if from_us else Whence.REST
+    address = "" if request.client is None else request.client.host
+    return Client(service, Caller(address=address, whence=whence))
+
+
+ClientDep = Annotated[Client, Depends(_client_of)]
+"""Whoever gives the order."""
 
 
 def _link(matrix_id: str) -> str:
@@ -74,18 +101,18 @@ _ALL = "/v1/reconstructors"
 
 
 @router.post("/refit", status_code=202)
-async def refit(service: ServiceDep, command: Annotated[Refit, body(Refit)]) -> AcceptedView:
+async def refit(client: ClientDep, command: Annotated[Refit, body(Refit)]) -> AcceptedView:
     """Compute a reconstructor for the current registration; gate and mode apply as always."""
-    return await accepted(service, command, reconstructors=_ALL)
+    return await client.orders(command, reconstructors=_ALL)
 
 
 @router.post("/dither", status_code=202)
 async def dither(
-    service: ServiceDep, command: Annotated[StartDither | StopDither, _DITHER]
+    client: ClientDep, command: Annotated[StartDither | StopDither, _DITHER]
 ) -> AcceptedView:
     """Start or stop the dither."""
-    answer = await accepted(service, command)
-    state = service.snapshot().tracker
+    answer = await client.orders(command)
+    state = client.service.snapshot().tracker
     if isinstance(command, StopDither) or state.dither is None:
         return answer
     cost = f"{1e9 * total_m(state.dither.request):.3g} nm RMS in all"
@@ -94,83 +121,81 @@ async def dither(
 
 
 @router.post("/reconstructors/{id}/approve", status_code=202, responses={**UNKNOWN})
-async def approve(service: ServiceDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
+async def approve(client: ClientDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
     """Publish a proposed reconstructor."""
     command = about(Approve, said, id=matrix_id)
-    return await accepted(service, command, reconstructor=_link(matrix_id))
+    return await client.orders(command, reconstructor=_link(matrix_id))
 
 
 @router.post("/reconstructors/{id}/reject", status_code=202, responses={**UNKNOWN})
-async def reject(service: ServiceDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
+async def reject(client: ClientDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
     """Discard a proposed reconstructor; the reason is kept with it."""
     command = about(Reject, said, id=matrix_id)
-    return await accepted(service, command, reconstructor=_link(matrix_id))
+    return await client.orders(command, reconstructor=_link(matrix_id))
 
 
 @router.post("/reconstructors/{id}/publish", status_code=202, responses={**UNKNOWN})
-async def publish(service: ServiceDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
+async def publish(client: ClientDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
     """Send a known reconstructor again, under a new id, unless the gate refuses it now.
 
     What has been in use is sent even where the gate cannot judge it: α unknown, or the loop open.
     """
-    return await accepted(service, about(Publish, said, id=matrix_id), reconstructors=_ALL)
+    return await client.orders(about(Publish, said, id=matrix_id), reconstructors=_ALL)
 
 
 @router.post("/rollback", status_code=202)
-async def rollback(
-    service: ServiceDep, command: Annotated[Rollback, body(Rollback)]
-) -> AcceptedView:
+async def rollback(client: ClientDep, command: Annotated[Rollback, body(Rollback)]) -> AcceptedView:
     """Go back to the one in use before, unless the gate refuses it.
 
     It is sent even where the gate cannot judge it: α unknown, or the loop open.
     """
-    return await accepted(service, command, reconstructors=_ALL)
+    return await client.orders(command, reconstructors=_ALL)
 
 
 @router.put("/mode", status_code=202)
-async def mode(service: ServiceDep, command: Annotated[SetMode, body(SetMode)]) -> AcceptedView:
+async def mode(client: ClientDep, command: Annotated[SetMode, body(SetMode)]) -> AcceptedView:
     """Choose how much the service may do by itself."""
-    return await accepted(service, command)
+    return await client.orders(command)
 
 
 @router.post("/loop", status_code=202)
-async def loop(service: ServiceDep, command: Annotated[SetLoop, body(SetLoop)]) -> AcceptedView:
+async def loop(client: ClientDep, command: Annotated[SetLoop, body(SetLoop)]) -> AcceptedView:
     """Open or close the loop, set gains by groups of modes, its leak, how many modes it controls.
 
     The answer comes when the RTC has accepted; 409 with its reason when it refuses. The state shows
     the loop as the RTC's next status tells it.
     """
-    return await accepted(service, command)
+    return await client.orders(command)
 
 
 @router.post("/loop/ramp", status_code=202)
-async def ramp(service: ServiceDep, command: Annotated[Ramp, body(Ramp)]) -> AcceptedView:
+async def ramp(client: ClientDep, command: Annotated[Ramp, body(Ramp)]) -> AcceptedView:
     """Have the RTC find, for each group of modes, the gain of least residual slopes.
 
     The answer comes when the RTC has begun; 409 with its reason when it refuses. What it chose is
     seen in the gains of the state, which change while it tries, too.
     """
-    return await accepted(service, command)
+    return await client.orders(command)
 
 
 @router.post("/acquisition", status_code=202)
 async def acquisition(
-    service: ServiceDep, command: Annotated[Acquire | AbortAcquisition, _ACQUISITION]
+    client: ClientDep, command: Annotated[Acquire | AbortAcquisition, _ACQUISITION]
 ) -> AcceptedView:
     """Find the registration from nothing, in any mode: its matrices need no further approval.
 
     The loop is opened, smooth modes are dithered to find the mirror and others to confirm it, and
     the loop closes on as many modes as the gate allows, then on more.
     """
-    return await accepted(service, command)
+    return await client.orders(command)
 
 
 @observatory.put("/pointing", status_code=202)
 async def pointing(
-    service: ServiceDep, command: Annotated[SetPointing, body(SetPointing)]
+    client: ClientDep, command: Annotated[SetPointing, body(SetPointing)]
 ) -> AcceptedView:
     """Say where the telescope looks, at least whenever it has moved by a degree.
 
     The registration moves with it. An RTC that says so in its status overrules this.
     """
-    return await accepted(service, command)
+    return await client.orders(command)

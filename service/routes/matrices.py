@@ -15,7 +15,7 @@ from fastapi import APIRouter, Path, Query, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.routes import views
-from service.routes.commands import AcceptedView, accepted
+from service.routes.commands import AcceptedView, ClientDep
 from service.routes.orders import Said, about, body
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.reading import Parameters, describes_numbers, numbers_of
@@ -96,14 +96,14 @@ async def _file(file_of: Callable[[str], bytes], matrix_id: str) -> Response:
 
 @router.post("/measurements", status_code=202, responses={**COMMAND})
 async def measure(
-    service: ServiceDep, choice: Annotated[MeasureChoice, body(MeasureChoice)]
+    client: ClientDep, choice: Annotated[MeasureChoice, body(MeasureChoice)]
 ) -> MatrixAcceptedView:
     """Have the RTC measure an interaction matrix; 409 with its reason when it will not.
 
     The answer comes when the RTC has begun; the matrix follows seconds to minutes later.
     """
-    command = about(Measure, choice, id=_new_id("im-", service.snapshot()))
-    answered = await accepted(service, command, measurement=f"{_MEASURED}/{command.id}")
+    command = about(Measure, choice, id=_new_id("im-", client.service.snapshot()))
+    answered = await client.orders(command, measurement=f"{_MEASURED}/{command.id}")
     return MatrixAcceptedView(id=command.id, **answered.model_dump())
 
 
@@ -121,7 +121,7 @@ async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Res
 
 
 @router.delete("/measurements/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def give_up(service: ServiceDep, measurement_id: MeasurementId, said: Said) -> AcceptedView:
+async def give_up(client: ClientDep, measurement_id: MeasurementId, said: Said) -> AcceptedView:
     """Wait no longer for a matrix under way; one that is stored stays.
 
     Nothing on the wire ends the RTC's own work: it may go on to the end, and refuse other commands
@@ -129,7 +129,7 @@ async def give_up(service: ServiceDep, measurement_id: MeasurementId, said: Said
     to be closed again if it was closed before.
     """
     command = about(GiveUp, said, id=measurement_id)
-    return await accepted(service, command, measurement=f"{_MEASURED}/{measurement_id}")
+    return await client.orders(command, measurement=f"{_MEASURED}/{measurement_id}")
 
 
 @router.get(
@@ -155,14 +155,14 @@ async def measured_matrix(
 
 @noisy.post("/noisy-matrix", status_code=202, responses={**COMMAND})
 async def measure_noisy(
-    service: ServiceDep, choice: Annotated[NoisyChoice, body(NoisyChoice)]
+    client: ClientDep, choice: Annotated[NoisyChoice, body(NoisyChoice)]
 ) -> MatrixAcceptedView:
     """Measure a noisy interaction matrix on sky, loop closed, by a random dither.
 
     The service's own dither makes way for it; every window of it is fitted like any other.
     """
-    command = about(MeasureNoisy, choice, id=_new_id(NOISY_DITHER, service.snapshot()))
-    answered = await accepted(service, command, matrix=f"{_NOISY}/{command.id}")
+    command = about(MeasureNoisy, choice, id=_new_id(NOISY_DITHER, client.service.snapshot()))
+    answered = await client.orders(command, matrix=f"{_NOISY}/{command.id}")
     return MatrixAcceptedView(id=command.id, **answered.model_dump())
 
 
@@ -180,10 +180,10 @@ async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
 
 
 @noisy.delete("/noisy-matrix/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def give_up_noisy(service: ServiceDep, noisy_id: NoisyId, said: Said) -> AcceptedView:
+async def give_up_noisy(client: ClientDep, noisy_id: NoisyId, said: Said) -> AcceptedView:
     """End one under way, and its dither; one that is stored stays."""
     command = about(GiveUpNoisy, said, id=noisy_id)
-    return await accepted(service, command, matrix=f"{_NOISY}/{noisy_id}")
+    return await client.orders(command, matrix=f"{_NOISY}/{noisy_id}")
 
 
 @noisy.get(

@@ -8,7 +8,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from http import HTTPStatus
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
@@ -49,11 +49,11 @@ class LimitParameters(Parameters):
 
 
 Points = Annotated[int, Field(ge=8, le=2000)]
-Nanoseconds = Annotated[int, Field(ge=0)]
+Nanoseconds = Annotated[int, Field(ge=0, le=(1 << 63) - 1)]
 
 
-class RangeParameters(LimitParameters):
-    """Which part of a history to return."""
+class TimeParameters(Parameters):
+    """A time, from its beginning to its end."""
 
     since_ns: Nanoseconds | None = None
     """From this time on, nanoseconds since the Unix epoch, UTC."""
@@ -67,16 +67,8 @@ class RangeParameters(LimitParameters):
     until: AwareDatetime | None = None
     """``until_ns`` as RFC 3339 says it."""
 
-    after: Nanoseconds | None = None
-    """``t_ns_utc`` of the last entry of the page before: the ``limit`` entries that follow it,
-    instead of the newest ones; one more where two are of the same time."""
-
-    points: Points | None = None
-    """At most so many entries of the whole range, whatever the limit: the lowest and the highest of
-    each parameter in each part of it."""
-
     @model_validator(mode="after")
-    def _consistent(self) -> RangeParameters:
+    def _consistent(self) -> Self:
         both = {self.since_ns, self.since}, {self.until_ns, self.until}
         if any(None not in pair for pair in both):
             raise ValueError("a time in nanoseconds or as RFC 3339, not both")
@@ -93,7 +85,19 @@ class RangeParameters(LimitParameters):
         return first or 0, FOREVER_NS if last is None else last
 
 
-FOREVER_NS = 1 << 63
+class RangeParameters(TimeParameters, LimitParameters):
+    """Which part of a history to return."""
+
+    after: Nanoseconds | None = None
+    """``t_ns_utc`` of the last entry of the page before: the ``limit`` entries that follow it,
+    instead of the newest ones; one more where two are of the same time."""
+
+    points: Points | None = None
+    """At most so many entries of the whole range, whatever the limit: the lowest and the highest of
+    each parameter in each part of it."""
+
+
+FOREVER_NS = (1 << 63) - 1
 """Nobody asks for later."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)

@@ -6,8 +6,11 @@ import asyncio
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+from enum import StrEnum
 from functools import partial
 
+import msgspec
 import structlog
 
 from service.archive import Archive, AuditEntry
@@ -32,6 +35,27 @@ MOST_WAITING = 10_000
 
 BEGINNINGS = (DitherRequest, MeasureRequest, RampRequest)
 """What is not done unless why it is done is on the disk. What ends something never waits."""
+
+
+class Whence(StrEnum):
+    """What an order came through."""
+
+    PAGE = "page"
+    """A browser."""
+
+    REST = "rest"
+    """A program of somebody's own."""
+
+    CLI = "cli"
+    """``pyrcal`` on a command line."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Caller:
+    """Whoever gives an order, besides the name in it."""
+
+    address: str = ""
+    whence: Whence = Whence.REST
 
 
 class Recorder:
@@ -89,7 +113,7 @@ class Recorder:
                 AuditEntry(t_ns_utc=entry.t_ns_utc, who="service", name=entry.name, text=entry.text)
             )
 
-    async def ordered(self, command: Command) -> None:
+    async def ordered(self, command: Command, caller: Caller) -> None:
         """Write down what an operator asks for, before it is done.
 
         Raises
@@ -97,19 +121,34 @@ class Recorder:
         StorageError
             If the disk refuses: it must not be done.
         """
-        self._order(type(command).__name__, str(command))
+        self._order(command, caller)
         try:
             await self.flush()
         except StorageError as error:
-            self.refused(command, error)
+            self.refused(command, caller, error)
             raise
 
-    def refused(self, command: Command, error: Exception) -> None:
-        """Take down why an operator does not get what was asked for."""
-        self._order(f"{type(command).__name__}.refused", f"{command}: {error}")
+    def answered(self, command: Command, caller: Caller, answer: str) -> None:
+        """Take down what an order has led to, as its giver was told."""
+        self._order(command, caller, ".answered", answer)
 
-    def _order(self, name: str, text: str) -> None:
-        self._add(AuditEntry(t_ns_utc=time.time_ns(), who="operator", name=name, text=text))
+    def refused(self, command: Command, caller: Caller, error: Exception) -> None:
+        """Take down why an operator does not get what was asked for."""
+        self._order(command, caller, ".refused", str(error))
+
+    def _order(self, command: Command, caller: Caller, end: str = "", answer: str = "") -> None:
+        self._add(
+            AuditEntry(
+                t_ns_utc=time.time_ns(),
+                who=command.by or caller.address or "operator",
+                name=f"{type(command).__name__}{end}",
+                text=asked_for(command),
+                address=caller.address,
+                whence=caller.whence,
+                why=command.reason,
+                answer=answer,
+            )
+        )
 
     async def before(self, effect: Effect) -> None:
         """Wait until what has led to an effect is on the disk.
@@ -219,6 +258,16 @@ class Recorder:
                 for name, record in records.items():
                     if self._records[name] is record:
                         del self._records[name]
+
+
+def asked_for(command: Command) -> str:
+    """Return the fields of a command that say more than nothing, as JSON."""
+    said = {
+        field.name: getattr(command, field.name)
+        for field in fields(command)
+        if field.name not in {"reason", "by"} and getattr(command, field.name) != field.default
+    }
+    return msgspec.json.encode(said).decode()
 
 
 def _told(lost: int) -> tuple[AuditEntry]:

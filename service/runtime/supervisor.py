@@ -21,7 +21,7 @@ from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
-from service.runtime.recording import Recorder
+from service.runtime.recording import Caller, Recorder
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
 from service.snapshot import Snapshot
@@ -50,6 +50,8 @@ WATCH_INTERVAL_S = 4.0
 
 DESCRIBE_ATTEMPTS = 3
 """Workers that may die while the model is prepared before the service gives up."""
+
+OPERATOR = Caller()
 
 _LEVELS = {Level.INFO: "info", Level.WARNING: "warning", Level.ALARM: "error"}
 
@@ -120,7 +122,7 @@ class Supervisor:
         )
         return waiting_for(facts)
 
-    async def submit(self, command: Command) -> str:
+    async def submit(self, command: Command, caller: Caller = OPERATOR) -> str:
         """Set an operator's command in motion; return one line that says what was.
 
         It is on record before it is done, and so is why it is refused.
@@ -135,15 +137,15 @@ class Supervisor:
             If it cannot be recorded; nothing has been done.
         """
         if isinstance(command, cmd.SetPointing):  # told every second, and decides nothing
-            effects = self._post(command)
-        else:
-            await self._recorder.ordered(command)
-            try:
-                effects = await self._carried_out(command)
-            except PyrcalError as error:
-                self._recorder.refused(command, error)
-                raise
-        return f"{type(command).__name__}: {len(effects)} action(s) under way"
+            return _told(command, self._post(command))
+        await self._recorder.ordered(command, caller)
+        try:
+            answer = _told(command, await self._carried_out(command))
+        except PyrcalError as error:
+            self._recorder.refused(command, caller, error)
+            raise
+        self._recorder.answered(command, caller, answer)
+        return answer
 
     async def _carried_out(self, command: Command) -> tuple[Effect, ...]:
         """Do what is asked; hear what the RTC says to it where that takes but a moment."""
@@ -417,3 +419,7 @@ def _refuse_as_the_rtc_did(effects: tuple[Effect, ...], state: TrackerState) -> 
             raise CommandError(f"the RTC refused: {asked.reason}")
         if asked.state in {MeasureState.FAILED, CommandState.FAILED}:
             raise LinkError(asked.reason)
+
+
+def _told(command: Command, effects: tuple[Effect, ...]) -> str:
+    return f"{type(command).__name__}: {len(effects)} action(s) under way"

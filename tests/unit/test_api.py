@@ -220,7 +220,7 @@ class FakeService:
     def snapshot(self):
         return self.now
 
-    async def submit(self, command):
+    async def submit(self, command, caller):
         if self.refusal is not None:
             raise self.refusal
         self.commands.append(command)
@@ -825,6 +825,7 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
         "POST /v1/loop",
         "POST /v1/loop/ramp",
         "DELETE /v1/measurements/{id}",
+        "GET /v1/audit",
         "GET /v1/alpha",
         "GET /v1/alpha/history",
         "GET /v1/reconstructors",

@@ -20,7 +20,7 @@ class FakeService:
         self.commands = []
         self.refusal = None
 
-    async def submit(self, command):
+    async def submit(self, command, caller):
         if self.refusal is not None:
             raise self.refusal
         self.commands.append(command)

@@ -34,7 +34,7 @@ class FakeService:
     def snapshot(self):
         return SimpleNamespace(tracker=self.state)
 
-    async def submit(self, command):
+    async def submit(self, command, caller):
         self.commands.append(command)
         return "1 action(s) under way"
 

@@ -65,7 +65,7 @@ class FakeService:
             ready_reason="ready",
         )
 
-    async def submit(self, command):
+    async def submit(self, command, caller):
         if self.refusal is not None:
             raise self.refusal
         self.commands.append(command)

@@ -25,7 +25,7 @@ class FakeService:
             ready_reason="ready",
         )
 
-    async def submit(self, command):
+    async def submit(self, command, caller):
         self.commands.append(command)
         return "StartDither: 1 action(s) under way"
 

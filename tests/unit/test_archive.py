@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
-from service.archive import Archive, AuditEntry
+from service.archive import Archive, AuditEntry, Range
 from service.control.gate import GateVerdict
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.model.misregistration import Misregistration
@@ -271,7 +271,7 @@ def test_an_index_of_a_later_version_is_refused(tmp_path):
     connection = sqlite3.connect(tmp_path / "index.sqlite")
     connection.execute("PRAGMA user_version = 99")
     connection.close()
-    with pytest.raises(ArchiveError, match="found version 99, expected 2"):
+    with pytest.raises(ArchiveError, match="found version 99, expected 3"):
         Archive(tmp_path).open()
 
 
@@ -419,11 +419,30 @@ def test_the_audit_trail_keeps_the_last_entries_oldest_first(archive):
         archive.record(
             (), (AuditEntry(t_ns_utc=i, who="operator", name="mode.set", text=f"entry {i}"),)
         )
-    assert archive.audit_trail(2) == (
-        AuditEntry(t_ns_utc=3, who="operator", name="mode.set", text="entry 3"),
-        AuditEntry(t_ns_utc=4, who="operator", name="mode.set", text="entry 4"),
+    assert archive.audit_trail(Range(limit=2)) == (
+        AuditEntry(t_ns_utc=3, who="operator", name="mode.set", text="entry 3", id=4),
+        AuditEntry(t_ns_utc=4, who="operator", name="mode.set", text="entry 4", id=5),
     )
     assert len(archive.audit_trail()) == 5
+
+
+def test_a_part_of_the_audit_trail_is_a_time_or_what_follows_an_entry(archive):
+    for i in range(6):
+        note(archive, 10 * i, f"entry {i}")
+
+    def texts(**part):
+        return [entry.text for entry in archive.audit_trail(Range(**part))]
+
+    assert texts(since_ns=20, until_ns=40) == ["entry 2", "entry 3", "entry 4"]
+    assert texts(after=0, limit=2) == ["entry 0", "entry 1"]
+    assert texts(after=2, limit=2) == ["entry 2", "entry 3"]
+    assert texts(after=6) == []
+
+
+def test_nothing_in_it_acts_on_a_terminal(archive):
+    note(archive, 1, "a\x1b[2Jb\nc \ud800 α")
+    (entry,) = archive.audit_trail()
+    assert entry.text == r"a\x1b[2Jb\nc \ud800 α"
 
 
 @pytest.mark.parametrize("statement", ["DELETE FROM audit", "UPDATE audit SET who = 'nobody'"])
@@ -455,7 +474,7 @@ WRITER = """
 import sys
 from pathlib import Path
 import numpy as np
-from service.archive import Archive, AuditEntry
+from service.archive import Archive, AuditEntry, Range
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 
 archive = Archive(Path(sys.argv[1]))

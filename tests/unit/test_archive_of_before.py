@@ -1,6 +1,7 @@
 """A service's folder as an earlier version has written it is read: ``tests/data/archive``."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,8 +84,25 @@ def test_noisy_matrices_are_what_they_were(archive):
 
 def test_the_audit_trail_is_there(archive):
     assert archive.audit_trail() == (
-        AuditEntry(t_ns_utc=3, who="operator", name="mode", text="auto α"),
+        AuditEntry(t_ns_utc=3, who="operator", name="mode", text="auto α", id=1),
     )
+
+
+def test_the_audit_trail_goes_on_in_the_same_file_and_is_widened_once(archive, folder):
+    order = AuditEntry(
+        t_ns_utc=4,
+        who="Ada",
+        name="Reject.refused",
+        text='{"id":"cm-1"}',
+        address="10.0.0.7",
+        whence="page",
+        why="too many modes",
+        answer="cm-1 is discarded, not proposed",
+    )
+    archive.record((), (order,))
+    archive.close()
+    assert archive.open() == ()
+    assert archive.audit_trail()[1] == replace(order, id=2)
 
 
 def test_the_registration_and_its_bias_are_what_they_were(archive):

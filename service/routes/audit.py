@@ -1,0 +1,136 @@
+"""The audit trail: who ordered what, when, why and from where, and what it was answered."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from itertools import islice
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+from pydantic import Field
+
+from service.archive import Archive, AuditEntry, Range
+from service.routes.problems import INVALID
+from service.routes.reading import FOREVER_NS, TimeParameters
+from service.routes.views import ServiceDep, answer, picture, shows, view
+
+router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
+
+PAGE = 1000
+"""Entries that are read from the disk at once for an export."""
+
+
+class AuditFormat(StrEnum):
+    """How the audit trail leaves."""
+
+    JSON = "json"
+    JSONL = "jsonl"
+    """One entry on a line, all of the range."""
+
+    CSV = "csv"
+    """The same as a table with a head."""
+
+
+class AuditParameters(TimeParameters):
+    """Which part of the audit trail to return, and how."""
+
+    limit: Annotated[int, Field(ge=1, le=5000)] = 200
+    """At most so many entries; an export has all of them."""
+
+    after: Annotated[int, Field(ge=0, le=FOREVER_NS)] | None = None
+    """``id`` of the last entry of the page before: those that follow; null: the newest ones."""
+
+    format: AuditFormat = AuditFormat.JSON
+    """"json", "jsonl" or "csv"."""
+
+    @property
+    def part(self) -> Range:
+        """The part that is asked for."""
+        first_ns, last_ns = self.between
+        return Range(since_ns=first_ns, until_ns=last_ns, after=self.after, limit=self.limit)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trail:
+    """A part of the audit trail."""
+
+    entries: tuple[AuditEntry, ...]
+    """Oldest first."""
+
+
+ENTRY = view("AuditEntryView", AuditEntry)
+TRAIL = view("AuditView", Trail)
+
+
+@router.get(
+    "/audit",
+    response_class=Response,
+    responses={
+        200: {
+            **shows(TRAIL),
+            "content": {
+                **shows(TRAIL)["content"],
+                "application/jsonl": {"schema": {"type": "string"}},
+                "text/csv": {"schema": {"type": "string"}},
+            },
+        }
+    },
+)
+async def audit(service: ServiceDep, parameters: Annotated[AuditParameters, Query()]) -> Response:
+    """Return the audit trail: the newest entries, those after one, those of a time; or export it.
+
+    ``?after=`` with the ``id`` of the last entry gives the next page; an empty one is the end.
+    """
+    if parameters.format is AuditFormat.JSON:
+        entries = await run_in_threadpool(service.archive.audit_trail, parameters.part)
+        return answer(Trail(entries=entries))
+    kind, lines = {
+        AuditFormat.JSONL: ("application/jsonl", _json_lines),
+        AuditFormat.CSV: ("text/csv", _csv_lines),
+    }[parameters.format]
+    whole = replace(parameters.part, after=parameters.after or 0)
+    name = f"audit.{parameters.format}"
+    return StreamingResponse(
+        lines(_all(service.archive, whole)),
+        media_type=kind,
+        headers={"Content-Disposition": f'attachment; filename="{name}"'},
+    )
+
+
+def _all(archive: Archive, part: Range) -> Iterator[dict[str, Any]]:
+    """Yield all entries of a part as they leave; each page waits for the disk."""
+    page = replace(part, limit=PAGE)
+    while entries := archive.audit_trail(page):
+        yield from map(picture, entries)
+        page = replace(page, after=entries[-1].id)
+
+
+def _json_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
+    for entry in entries:
+        yield json.dumps(entry, ensure_ascii=False) + "\n"
+
+
+def _csv_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
+    """Yield a table; a cell that a spreadsheet would work out is kept from it by an apostrophe."""
+    buffer = io.StringIO()
+    table = csv.DictWriter(buffer, ENTRY.paths)
+    table.writeheader()
+    while True:
+        yield buffer.getvalue()
+        buffer.seek(0)
+        buffer.truncate()
+        rows = list(islice(entries, PAGE))
+        if not rows:
+            return
+        table.writerows({name: _inert(cell) for name, cell in row.items()} for row in rows)
+
+
+def _inert(cell: object) -> object:
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@")) else cell

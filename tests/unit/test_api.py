@@ -908,6 +908,7 @@ DIMENSIONLESS = {
     "gain",
     "gain_scatter",
     "gain_sigma",
+    "id",
     "innovation",
     "last",
     "leak",

@@ -104,6 +104,7 @@ def create_app(
     app.state.service = service
     app.state.stream = stream.Stream(service, over or asyncio.Event())
     problems.install(app)
+    page.install(app)
     routers = [
         reading.router,
         audit.router,

@@ -27,7 +27,11 @@ ORDER = ("tests/unit/", "tests/properties/", "tests/physics/", "tests/system/")
 REAL_TIME = ("tests/system/test_demo.py", "tests/system/test_sim_rtc.py")
 """The full instrument at 1 kHz: one after the other, on one worker."""
 
-SHARED = ("tests/system/test_broken_messages.py", "tests/system/test_rest.py")
+SHARED = (
+    "tests/system/test_broken_messages.py",
+    "tests/system/test_page.py",
+    "tests/system/test_rest.py",
+)
 """Their tests share a service; every other system test has its own, and may run anywhere."""
 
 

@@ -1,13 +1,18 @@
-"""The operator's page: the mirror that it draws."""
+"""The operator's page: its files, served from the package, and the mirror that it draws."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, FastAPI, Response
+from fastapi.responses import FileResponse
 from numpy.typing import NDArray
+from starlette.datastructures import MutableHeaders
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.control.gate import LIMIT_M
 from service.model.instrument import Instrument, Mirror, Stop
@@ -15,6 +20,41 @@ from service.model.misregistration import Misregistration
 from service.routes.views import ServiceDep, answer, shows, view
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"])
+
+FILES: Final = Path(__file__).parent.parent / "dashboard"
+
+HEADERS: Final = {
+    # its own files and its own service: nothing inline, no other host
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    # asked for again each time, 304 while it is the same: never the page of another version
+    "Cache-Control": "no-cache",
+}
+
+
+def install(app: FastAPI) -> None:
+    """Serve the page at ``/``, and what it is made of below ``/dashboard``."""
+
+    @app.get("/", include_in_schema=False)
+    async def page() -> Response:
+        return FileResponse(FILES / "index.html", headers=HEADERS)
+
+    app.mount("/dashboard", _with_headers(StaticFiles(directory=FILES)))
+
+
+def _with_headers(app: ASGIApp) -> ASGIApp:
+    async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
+
+        await app(scope, receive, sent)
+
+    return guarded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,5 +1,6 @@
-"""What the operator's page is made of: the mirror it draws, the history it shows."""
+"""What the operator's page is made of: its files, the mirror it draws, the history it shows."""
 
+import re
 from dataclasses import replace
 
 import httpx
@@ -10,6 +11,7 @@ from service.api import create_app
 from service.config import packaged_instrument
 from service.model.instrument import TabulatedModes
 from service.model.misregistration import PARAMETERS
+from service.routes.page import FILES
 from tests.unit.test_api import (
     ALPHA,
     LINK,
@@ -22,6 +24,8 @@ from tests.unit.test_api import (
     entry,
 )
 from tests.unit.tracking.situations import POLICY
+
+LIMIT_BYTES = 300_000
 
 
 @pytest.fixture
@@ -41,6 +45,59 @@ async def client(service):
     transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
         yield client
+
+
+# --- its files
+
+
+async def test_the_page_is_served_with_all_it_names_and_may_do_nothing_else(client):
+    page = await client.get("/")
+    assert page.status_code == 200
+    assert page.headers["content-type"] == "text/html; charset=utf-8"
+    named = re.findall(r'(?:src|href)="([^"#]+)"', page.text)
+    assert {"dashboard/page.js", "dashboard/page.css", "dashboard/uPlot.iife.min.js"} <= set(named)
+    answers = {name: await client.get(f"/{name}") for name in named}
+    for name, answer in {"/": page, **answers}.items():
+        assert answer.status_code == 200, name
+        policy = answer.headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert answer.headers["cache-control"] == "no-cache"
+    assert not re.search(r"<(script|style)>|\sstyle=|\son[a-z]+=|https?://", page.text)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("page.js", "javascript"),
+        ("page.css", "text/css"),
+        ("icon.svg", "image/svg+xml"),
+        ("uPlot.LICENSE.txt", "text/plain"),
+    ],
+)
+async def test_a_file_says_what_it_is_and_is_sent_once(client, name, kind):
+    answer = await client.get(f"/dashboard/{name}")
+    assert answer.headers["content-type"].split(";")[0].endswith(kind)
+    headers = {"If-None-Match": answer.headers["etag"]}
+    assert (await client.get(f"/dashboard/{name}", headers=headers)).status_code == 304
+
+
+@pytest.mark.parametrize("name", ["nothing.js", "../api.py", "%2e%2e/api.py", ""])
+async def test_nothing_but_its_files_is_served(client, name):
+    assert_problem(await client.get(f"/dashboard/{name}"), 404, "http")
+
+
+async def test_every_module_that_is_imported_is_there_and_nobody_names_another_host():
+    for path in FILES.glob("*.js"):
+        text = path.read_text(encoding="utf-8")
+        for name in re.findall(r'from "\./([^"]+)"', text):
+            assert (FILES / name).exists(), (path.name, name)
+        if path.name != "uPlot.iife.min.js":
+            assert not re.search(r"https?://|innerHTML|eval\(", text), path.name
+
+
+def test_all_of_it_together_is_small():
+    assert sum(path.stat().st_size for path in FILES.iterdir()) < LIMIT_BYTES / 2
 
 
 # --- the mirror

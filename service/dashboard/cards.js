@@ -1,0 +1,135 @@
+// The header, what waits for the operator, the loop, and the reconstructors.
+
+import { margin, described, usable } from "./orders.js";
+import {
+  DASH, TONES, ago, clock, make, milliseconds, nanometres, number, operation, present, put, registrationOf, shortly, span, verdict,
+} from "./words.js";
+
+const $ = (selector) => document.querySelector(selector);
+
+export function showHeader(service, orders) {
+  const { state, fresh, now } = service;
+  const { word, tone, why } = fresh ? operation(state) : { word: "NOT KNOWN", tone: "bad", why: "the connection to the service is lost" };
+  put($("#system"), state?.system ?? "pyrcal");
+  const operational = $("#operation");
+  put(operational, `${TONES[tone]} ${word}`);
+  operational.dataset.tone = tone;
+  operational.title = why;
+  put($("#utc"), `${clock(now)} UTC`);
+  const chosen = $("#mode");
+  if (state && document.activeElement !== chosen) chosen.value = state.mode;
+  chosen.disabled = Boolean(orders.whyNot("mode"));
+  put($("#rtc"), rtcLine(state, fresh));
+  const n = state?.alarms.length ?? 0;
+  const alarms = $("#alarm-count");
+  put(alarms, !fresh ? `alarms ${DASH}` : n ? `■ ${n} alarm${n > 1 ? "s" : ""}` : "○ no alarm");
+  alarms.dataset.tone = fresh && n ? "bad" : "";
+  document.title = `${fresh && n ? `(${n}) ` : ""}${word} ${state?.system ?? "pyrcal"}`;
+}
+
+function rtcLine(state, fresh) {
+  const rtc = state?.rtc;
+  if (!fresh || !state) return `RTC ${DASH}`;
+  if (!rtc) return "waiting for the RTC's status";
+  return `RTC ${number(rtc.frame_rate_hz, 0)} Hz, ${number(rtc.delay_frames, 1).replace(/\.0$/, "")} frames delay, ${state.link.frames_lost} lost`;
+}
+
+// A banner across the page while nothing new comes.
+export function showConnection(service) {
+  const lost = !service.fresh;
+  const banner = $("#lost");
+  if (banner.hidden === lost) banner.hidden = !lost;
+  document.body.classList.toggle("lost", lost);
+  if (!lost) return;
+  const text = service.state
+    ? `■ CONNECTION LOST: nothing below is of now; the last was heard ${span(service.age_s)} ago. Trying again.`
+    : "◐ Waiting for the service: nothing has been heard yet. Trying again.";
+  put(banner, text);
+}
+
+export function showWaiting(service, orders) {
+  const { state, fresh } = service;
+  const bar = $("#waiting");
+  const { proposal } = orders;
+  const others = (state?.waiting_for ?? []).filter((w) => w.name !== "approval");
+  bar.hidden = !fresh || (!proposal && !others.length);
+  bar.dataset.asks = String(Boolean(proposal));
+  put($("#waiting-title"), proposal ? "WAITING FOR YOU" : "WAITING FOR");
+  put($("#proposal"), proposal ? described(proposal, orders.wins) : "");
+  $("#proposal-buttons").hidden = !proposal;
+  const lines = others.slice(0, 3).map((w) => `${w.party}: ${w.text}`);
+  if (others.length > 3) lines.push(`and ${others.length - 3} more`);
+  const list = $("#waits");
+  if (list.dataset.lines !== lines.join("\n")) {
+    list.dataset.lines = lines.join("\n");
+    list.replaceChildren(...lines.map((text) => make("li", { text })));
+  }
+}
+
+export function showLoop(service, mirror) {
+  const { state, fresh } = service;
+  const root = $("#loop");
+  root.classList.toggle("old", !fresh);
+  const rtc = state?.rtc;
+  const expected = state?.assessment?.id === state?.in_use ? state?.assessment?.expected : null;
+  const gains = (state?.registration?.optical_gains ?? []).map((g) => g.gain);
+  put($("#loop-state"), rtc ? `${rtc.loop}, ${rtc.n_controlled} of ${rtc.n_modes} modes` : DASH);
+  put($("#wavefront"), expected ? `${nanometres(expected.wavefront_m)}, and ${nanometres(expected.loss_m)} lost by the matrix in use` : DASH);
+  put($("#optical-gain"), gains.length ? `${number(Math.min(...gains))} to ${number(Math.max(...gains))}, ${gains.length} modes` : DASH);
+  const judged = margin(state?.margin);
+  gauge($("#margin"), judged && judged.radius / judged.bound, judged ? judged.text : DASH);
+  const edge = state?.margin?.edge_motion_m;
+  const limit = mirror?.edge_limit_m;
+  gauge($("#edge"), present(edge) && limit ? edge / limit : null, present(edge) ? `${nanometres(edge)} of ${nanometres(limit)} per unit of slope noise` : DASH);
+  const dither = state?.dithering;
+  put($("#dither"), !rtc && dither ? `${dither.phase}: ${dither.reason}` : dither ? `${dither.phase}, ${nanometres(dither.mean_cost_m)} of ${nanometres(dither.budget_m)}: ${dither.reason}` : DASH);
+  const link = state?.link;
+  put($("#frames"), link ? `${link.frames_received} received, ${link.frames_lost} lost, last ${present(link.frame_age_s) ? `${span(link.frame_age_s)} ago` : DASH}` : DASH);
+}
+
+// A bar with its limit; the words beside it say the same.
+function gauge(root, share, text) {
+  const bar = root.querySelector("meter");
+  bar.hidden = !present(share);
+  if (present(share)) bar.value = Math.min(Math.max(share, 0), 1.2);
+  put(root.querySelector("span"), present(share) && share > 1 ? `▲ ${text}` : text);
+}
+
+export function showProvenance(service, orders) {
+  const { state, now, fresh } = service;
+  const record = orders.inUse;
+  $("#provenance").classList.toggle("old", !fresh);
+  if (!state?.in_use) return put($("#provenance"), `in use: ${DASH} (nobody has told which matrix the RTC multiplies with)`);
+  if (!record) return put($("#provenance"), `in use: ${state.in_use}, of which nothing is known`);
+  const frame = present(record.applied_frame_seq) ? `, applied at frame ${record.applied_frame_seq}` : "";
+  const sent = record.published_ns_utc ? `, sent ${when(record.published_ns_utc, now)}` : "";
+  const made = record.alpha ? `; made ${when(record.created_ns_utc, now)}, for ${shortly(record.alpha, record.sigma)}` : "; the RTC's own, for an unknown registration";
+  return put($("#provenance"), `in use: ${record.id}, ${record.n_modes} modes${frame}${sent}${made}`);
+}
+
+function when(ns, now) {
+  const ms = milliseconds(ns);
+  return `${clock(ms)} UTC, ${ago(ms, now)}`;
+}
+
+export function showReconstructors(service, orders) {
+  const { now } = service;
+  const roles = [["waiting", orders.proposal], ["in use", orders.inUse], ["before", orders.before]];
+  const others = service.reconstructors.filter((r) => !roles.some(([, role]) => role?.id === r.id)).slice(-12).reverse();
+  const rows = [...roles, ...others.map((r) => [r.state, r])].filter(([, r]) => r).map(([role, r]) => make(
+    "tr", { className: role === "in use" ? "in-use" : "" },
+    make("th", { scope: "row", text: role }),
+    make("td", { text: r.id }),
+    make("td", { className: "n", text: String(r.n_modes) }),
+    make("td", { text: shortly(r.alpha, r.sigma), title: registrationOf(r.alpha, r.sigma) }),
+    make("td", { text: verdict(r.gate) }),
+    make("td", { text: r.created_ns_utc > 0 ? ago(milliseconds(r.created_ns_utc), now) : DASH }),
+    make("td", { text: r.reason || DASH }),
+  ));
+  if (!rows.length) rows.push(make("tr", {}, make("td", { colspan: "7", text: "no reconstructor is known yet" })));
+  $("#reconstructors tbody").replaceChildren(...rows);
+}
+
+export function showButtons(orders) {
+  for (const button of document.querySelectorAll("[data-order]")) usable(button, orders.whyNot(button.dataset.order));
+}

@@ -1,0 +1,185 @@
+// The mirror on the sensor: where its actuators should be, and where they are, exaggerated.
+
+import { PARAMETERS, DASH, put, present } from "./words.js";
+
+const COLOURS = {
+  grid: "#2c333c", rim: "#9aa4af", nominal: "#56606b", now: "#6cb6ff", marked: "#f0c674",
+};
+
+export class MirrorOnSensor {
+  #service;
+  #mirror = null;
+  #factor = 10;
+  #places = [];
+  #marked = -1;
+  #alpha = "";
+
+  constructor(service, root) {
+    this.#service = service;
+    this.root = root;
+    this.canvas = root.querySelector("canvas");
+    for (const button of root.querySelectorAll("[data-factor]"))
+      button.addEventListener("click", () => this.#exaggerate(Number(button.dataset.factor)));
+    this.canvas.addEventListener("pointermove", (event) => this.#point(event));
+    this.canvas.addEventListener("pointerleave", () => this.#mark(-1));
+    service.addEventListener("state", () => this.#onState());
+    service.addEventListener("lost", () => this.#onState());
+    new ResizeObserver(() => this.#draw()).observe(this.canvas);
+  }
+
+  get mirror() {
+    return this.#mirror;
+  }
+
+  set mirror(mirror) {
+    this.#mirror = mirror;
+    this.#onState(true);
+  }
+
+  #exaggerate(factor) {
+    this.#factor = factor;
+    for (const button of this.root.querySelectorAll("[data-factor]"))
+      button.setAttribute("aria-pressed", String(Number(button.dataset.factor) === factor));
+    this.#draw();
+  }
+
+  #onState(anew = false) {
+    const { state, fresh } = this.#service;
+    const alpha = fresh ? state?.registration?.alpha ?? null : null;
+    this.root.classList.toggle("old", !fresh);
+    const told = JSON.stringify(alpha);
+    if (!this.#mirror || (!anew && told === this.#alpha)) return;
+    this.#alpha = told;
+    const nominal = this.#mirror.nominal;
+    this.#places = this.#mirror.actuators.map((p) => {
+      const from = onSensor(p, nominal);
+      return { from, to: alpha ? onSensor(p, alpha) : null };
+    });
+    this.#draw();
+    this.#tell(alpha);
+  }
+
+  #tell(alpha) {
+    let text = "where the mirror is, is not known";
+    if (alpha) {
+      const far = this.#places.map(({ from, to }) => Math.hypot(to[0] - from[0], to[1] - from[1]));
+      const most = far.length ? `farthest actuator ${(100 * Math.max(...far)).toFixed(1)} % of a subaperture from its place` : "no actuators are known: modes were measured";
+      text = `${most}`;
+    }
+    put(this.root.querySelector(".summary"), text);
+    this.canvas.setAttribute("aria-label", `Mirror on the sensor: ${text}`);
+  }
+
+  #draw() {
+    const mirror = this.#mirror;
+    if (!mirror || document.hidden) return;
+    const { canvas } = this;
+    const size = Math.min(canvas.clientWidth, canvas.clientHeight);
+    const ratio = window.devicePixelRatio || 1;
+    canvas.width = canvas.clientWidth * ratio;
+    canvas.height = canvas.clientHeight * ratio;
+    const ctx = canvas.getContext("2d");
+    const far = this.#places.flatMap((place) => [place.from, place.to ? this.#shown(place) : place.from]);
+    const most = Math.max(mirror.pupil_diameter_subap / 2, ...far.map(([x, y]) => Math.max(Math.abs(x), Math.abs(y))));
+    const across = 2 * most + 1;
+    const scale = (size / across) * ratio;
+    this.scale = scale / ratio;
+    // x to the right, y upwards
+    ctx.setTransform(scale, 0, 0, -scale, canvas.width / 2, canvas.height / 2);
+    this.#cells(ctx, mirror);
+    this.#rim(ctx, mirror);
+    this.#actuators(ctx);
+  }
+
+  #cells(ctx, { n_subapertures: n, pupil_diameter_subap: across, obscuration_ratio: hole }) {
+    ctx.strokeStyle = COLOURS.grid;
+    ctx.lineWidth = 0.06;
+    ctx.beginPath();
+    for (let row = 0; row < n; row++)
+      for (let column = 0; column < n; column++) {
+        const [x, y] = [column - n / 2, row - n / 2];
+        const radius = Math.hypot(x + 0.5, y + 0.5);
+        if (radius <= across / 2 && radius >= (hole * across) / 2) ctx.rect(x, y, 1, 1);
+      }
+    ctx.stroke();
+  }
+
+  #rim(ctx, { pupil_diameter_subap: across, obscuration_ratio: hole, stop }) {
+    const alpha = this.#service.fresh ? this.#service.state?.registration?.alpha : null;
+    const moves = stop === "mirror" && alpha;
+    const now = moves ? [alpha.shift_x_subap * this.#factor, alpha.shift_y_subap * this.#factor] : [0, 0];
+    for (const [[x, y], colour, width] of [[[0, 0], COLOURS.nominal, 0.06], [now, COLOURS.rim, 0.12]])
+      for (const radius of [across / 2, (hole * across) / 2]) {
+        ctx.strokeStyle = colour;
+        ctx.lineWidth = width;
+        ctx.beginPath();
+        ctx.arc(x, y, radius, 0, 2 * Math.PI);
+        ctx.stroke();
+      }
+  }
+
+  #shown({ from, to }) {
+    return from.map((value, axis) => value + this.#factor * (to[axis] - value));
+  }
+
+  #actuators(ctx) {
+    const dot = this.#places.length > 300 ? 0.16 : 0.14 * Math.sqrt(300 / Math.max(this.#places.length, 30));
+    this.#places.forEach((place, k) => {
+      ctx.fillStyle = COLOURS.nominal;
+      disc(ctx, place.from, dot * 0.7);
+      if (!place.to) return;
+      const now = this.#shown(place);
+      ctx.strokeStyle = ctx.fillStyle = k === this.#marked ? COLOURS.marked : COLOURS.now;
+      ctx.lineWidth = k === this.#marked ? 0.14 : 0.06;
+      ctx.beginPath();
+      ctx.moveTo(...place.from);
+      ctx.lineTo(...now);
+      ctx.stroke();
+      disc(ctx, now, k === this.#marked ? dot * 2 : dot);
+    });
+  }
+
+  #point(event) {
+    if (!this.scale) return;
+    const box = this.canvas.getBoundingClientRect();
+    const x = (event.clientX - box.left - box.width / 2) / this.scale;
+    const y = -(event.clientY - box.top - box.height / 2) / this.scale;
+    let [nearest, least] = [-1, 1.5];
+    this.#places.forEach((place, k) => {
+      const [px, py] = place.to ? this.#shown(place) : place.from;
+      const far = Math.hypot(px - x, py - y);
+      if (far < least) [nearest, least] = [k, far];
+    });
+    this.#mark(nearest);
+  }
+
+  #mark(k) {
+    if (k === this.#marked) return;
+    this.#marked = k;
+    const place = this.#places[k];
+    let text = "point at an actuator";
+    if (place) {
+      const moved = place.to ? place.to.map((value, axis) => 100 * (value - place.from[axis])) : [null, null];
+      const words = moved.map((value) => (present(value) ? `${value >= 0 ? "+" : ""}${value.toFixed(1)}` : DASH));
+      text = `actuator ${k}: ${words[0]} %, ${words[1]} % of a subaperture along x, y`;
+    }
+    put(this.root.querySelector(".actuator"), text);
+    this.#draw();
+  }
+}
+
+// A point of the mirror on the sensor: turned and scaled about the pupil's centre, shifted last.
+function onSensor([x, y], alpha) {
+  const [shiftX, shiftY, rotation, magnification] = PARAMETERS.map((p) => alpha[p.key]);
+  const turn = (rotation * Math.PI) / 180;
+  return [
+    magnification * (x * Math.cos(turn) - y * Math.sin(turn)) + shiftX,
+    magnification * (x * Math.sin(turn) + y * Math.cos(turn)) + shiftY,
+  ];
+}
+
+function disc(ctx, [x, y], radius) {
+  ctx.beginPath();
+  ctx.arc(x, y, radius, 0, 2 * Math.PI);
+  ctx.fill();
+}

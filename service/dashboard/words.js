@@ -1,0 +1,122 @@
+// Numbers, times and states as operators say them. What is absent is a dash, never 0.
+
+export const DASH = "–";
+
+export const PARAMETERS = [
+  { key: "shift_x_subap", label: "shift x", unit: "% of a subaperture", short: "%", scale: 100, zero: 0 },
+  { key: "shift_y_subap", label: "shift y", unit: "% of a subaperture", short: "%", scale: 100, zero: 0 },
+  { key: "rotation_deg", label: "rotation", unit: "degrees", short: "deg", scale: 1, zero: 0 },
+  { key: "magnification", label: "magnification", unit: "ratio", short: "", scale: 1, zero: 1 },
+];
+
+export function present(value) {
+  return typeof value === "number" && Number.isFinite(value);
+}
+
+export function number(value, digits = 2, unit = "") {
+  return present(value) ? `${value.toFixed(digits)}${unit && ` ${unit}`}` : DASH;
+}
+
+export function nanometres(metres) {
+  if (!present(metres)) return DASH;
+  const nm = metres * 1e9;
+  return `${nm.toFixed(Math.abs(nm) < 20 ? 1 : 0)} nm`.replace(/^-0\.0 /, "0.0 ");
+}
+
+// A value rounded to its 1 sigma, which is shown with two digits where it begins with 1.
+export function rounded(value, sigma, parameter) {
+  if (!present(value)) return { value: DASH, sigma: DASH };
+  const scaled = value * parameter.scale;
+  const sign = parameter.zero === 0 && scaled >= 0 ? "+" : "";
+  if (!present(sigma) || sigma <= 0) return { value: `${sign}${scaled.toFixed(3)}`, sigma: DASH };
+  const error = sigma * parameter.scale;
+  const first = error / 10 ** Math.floor(Math.log10(error));
+  const digits = Math.min(6, Math.max(0, -Math.floor(Math.log10(error)) + (first < 1.95 ? 1 : 0)));
+  return { value: `${sign}${scaled.toFixed(digits)}`, sigma: error.toFixed(digits) };
+}
+
+export function clock(ms) {
+  return new Date(ms).toISOString().slice(11, 19);
+}
+
+export function day(ms) {
+  return new Date(ms).toISOString().slice(0, 10);
+}
+
+export function span(seconds) {
+  if (!present(seconds)) return DASH;
+  const s = Math.max(0, seconds);
+  if (s < 10) return `${s.toFixed(1)} s`;
+  if (s < 60) return `${Math.round(s)} s`;
+  if (s < 3600) return `${Math.floor(s / 60)} min ${Math.round(s % 60)} s`;
+  if (s < 86400) return `${Math.floor(s / 3600)} h ${Math.floor((s % 3600) / 60)} min`;
+  return `${Math.floor(s / 86400)} d ${Math.floor((s % 86400) / 3600)} h`;
+}
+
+export function ago(ms, now) {
+  return present(ms) && ms > 0 ? `${span((now - ms) / 1000)} ago` : DASH;
+}
+
+export function milliseconds(ns) {
+  return present(ns) ? ns / 1e6 : null;
+}
+
+// What the service does, in a word; tone is shown as a shape, too.
+export function operation(state) {
+  const worth = state.registration?.validity;
+  if (!state.ready) return { word: "NOT READY", tone: "bad", why: state.ready_reason };
+  if (state.acquisition.under_way)
+    return { word: "ACQUIRING", tone: "busy", why: `${state.acquisition.stage}: ${state.acquisition.text}` };
+  if (state.measuring) return { word: "MEASURING", tone: "busy", why: state.measuring.id };
+  if (state.rtc === null) return { word: "NO RTC", tone: "warn", why: "no RTC is heard" };
+  if (state.rtc.loop !== "closed") return { word: "LOOP OPEN", tone: "warn", why: "the RTC's loop is open" };
+  if (!state.registration) return { word: "SEARCHING", tone: "busy", why: "no window has been accepted yet" };
+  if (worth === "invalid" || worth === "stale")
+    return { word: "DEGRADED", tone: "warn", why: `α is ${worth}: ${state.registration.validity_reason}` };
+  if (state.mode === "hold") return { word: "HOLD", tone: "warn", why: "nothing is made or sent unless asked for" };
+  return { word: "TRACKING", tone: "good", why: "α is known and the loop is closed" };
+}
+
+export const TONES = { good: "●", busy: "◐", warn: "▲", bad: "■" };
+
+export const MODES = {
+  auto: "it makes and sends by itself whatever passes the gate",
+  propose: "it makes matrices, and an operator approves each one",
+  hold: "it measures only: nothing is made or sent unless asked for",
+};
+
+// What the gate found, as a line.
+export function verdict(gate) {
+  if (!gate) return "not judged";
+  const radius = `${number(gate.worst_pole_radius, 3)} of ${number(gate.bound, 2)}`;
+  return gate.accepted ? `stable, ${radius}` : `REFUSED, ${radius}: ${gate.reason}`;
+}
+
+export function registrationOf(four, sigma) {
+  if (!four) return "for an unknown registration";
+  return PARAMETERS.map((p) => {
+    const { value, sigma: error } = rounded(four[p.key], sigma?.[p.key], p);
+    return `${p.label} ${value}${error === DASH ? "" : ` ± ${error}`}${p.short && ` ${p.short}`}`;
+  }).join(", ");
+}
+
+// The same in a line short enough for a table.
+export function shortly(four, sigma) {
+  if (!four) return "unknown";
+  const [x, y, rotation, magnification] = PARAMETERS.map((p) => rounded(four[p.key], sigma?.[p.key], p).value);
+  return `${x}, ${y} %, ${rotation} deg, ${magnification}`;
+}
+
+// Text into an element only where it differs: screen readers and layout are left in peace.
+export function put(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+export function make(tag, { className = "", text = "", ...rest } = {}, ...children) {
+  const element = document.createElement(tag);
+  if (className) element.className = className;
+  if (text) element.textContent = text;
+  for (const [name, value] of Object.entries(rest)) element.setAttribute(name.replaceAll("_", "-"), value);
+  element.append(...children);
+  return element;
+}

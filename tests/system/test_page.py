@@ -1,0 +1,236 @@
+"""The operator's page in a real browser, before a real service and a simulated RTC."""
+
+import shutil
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.system.night import a_night, wait_for
+from tests.system.pace import patience
+
+webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+DRIVER = shutil.which("chromedriver")
+AXE = Path(__file__).parents[1] / "data" / "axe" / "axe.min.js"
+WIDE, NARROW = (1440, 900), (390, 844)
+FIRST_LOAD_BYTES = 300_000
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.timeout(150),
+    pytest.mark.skipif(
+        CHROMIUM is None or DRIVER is None, reason="no chromium and chromedriver: apt install them"
+    ),
+]
+
+
+@contextmanager
+def a_browser():
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for word in ("headless=new", "no-sandbox", "disable-dev-shm-usage", "disable-gpu"):
+        options.add_argument(f"--{word}")
+    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+    try:
+        yield driver
+    finally:
+        driver.quit()
+
+
+class Page:
+    """The page as an operator sees it, and what an operator does with it."""
+
+    def __init__(self, driver, night):
+        self.driver, self.night = driver, night
+        self.url = str(night.client.base_url)
+
+    def open(self, size=WIDE):
+        self.resize(size)
+        self.driver.get(self.url)
+        self.until("document.querySelector('#lost').hidden && document.title.includes('small')")
+
+    def resize(self, size):
+        """Give the page itself this size, narrower than a window can be."""
+        metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+
+    def js(self, script):
+        return self.driver.execute_script(f"return {script}")
+
+    def until(self, condition, timeout_s=10.0):
+        def why():
+            return f"{condition}; {self.text()}"
+
+        return wait_for(lambda: self.js(condition), timeout_s, why, every_s=0.05)
+
+    def text(self, selector="body"):
+        return self.js(f"document.querySelector({selector!r}).innerText")
+
+    def says(self, selector, words, timeout_s=10.0):
+        found = f"document.querySelector({selector!r}).innerText.includes({words!r})"
+        self.until(found, timeout_s)
+
+    def click(self, selector):
+        self.driver.find_element("css selector", selector).click()
+
+    def press(self, keys):
+        """Type with whatever has the focus."""
+        self.driver.switch_to.active_element.send_keys(keys)
+
+    def faults_of_access(self):
+        """Return what axe-core finds, all of its rules."""
+        self.driver.execute_script(AXE.read_text(encoding="utf-8"))
+        found = self.driver.execute_async_script(
+            "const done = arguments[0]; axe.run().then(r => done(r.violations.map("
+            "v => [v.id, v.help, v.nodes.map(n => n.target.join(' '))])))"
+        )
+        return [fault for fault in found if fault]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """A page on a service in mode propose, with an RTC; they are shared by the tests in order."""
+    with a_night(tmp_path_factory.mktemp("night")) as night, a_browser() as driver:
+        night.running = night.service("propose")
+        night.telescope = night.rtc()
+        night.wait_for_rtc(night.telescope)
+        yield Page(driver, night)
+
+
+def proposal(page):
+    """Wait until the page shows a proposal; return its id."""
+    page.until("!document.querySelector('#proposal-buttons').hidden", 40.0)
+    return page.text("#proposal").partition(":")[0]
+
+
+def test_first_load_is_small_and_of_no_other_host(page):
+    page.open()
+    page.says("#rtc", "1000 Hz")
+    page.says("#reconstructors", "in use")
+    sizes = page.js(
+        "performance.getEntries().filter(e => e.transferSize !== undefined)"
+        ".map(e => [e.name, e.transferSize])"
+    )
+    assert {name.split("/")[2] for name, _ in sizes} == {page.url.split("/")[2]}
+    assert len(sizes) > 10
+    assert sum(size for _, size in sizes) < FIRST_LOAD_BYTES
+    logged = [line["message"] for line in page.driver.get_log("browser")]
+    assert logged == []
+
+
+def test_what_is_known_is_seen_with_its_sigma_and_nobody_is_kept_out(page):
+    page.open()
+    page.says("#operation", "TRACKING", 40.0)
+    for word in ("shift x", "shift y", "rotation", "magnification", "±"):
+        page.says("#registration", word)
+    page.says("#mirror .summary", "% of a subaperture")
+    assert page.js("document.querySelectorAll('.plot canvas').length") == 4
+    proposal(page)
+    assert page.faults_of_access() == []
+
+
+def test_on_a_narrow_screen_all_fits_and_state_comes_first(page):
+    page.open(NARROW)
+    proposal(page)
+    assert page.js("document.documentElement.scrollWidth") <= NARROW[0]
+    order = [
+        "header",
+        "#waiting",
+        "#registration",
+        "#mirror",
+        "#loop",
+        "#reconstructors",
+        "#events",
+    ]
+    tops = [page.js(f"document.querySelector({s!r}).getBoundingClientRect().top") for s in order]
+    assert tops == sorted(tops)
+    assert page.faults_of_access() == []
+
+
+def test_on_a_wide_screen_nothing_is_scrolled_for(page):
+    page.open()
+    proposal(page)
+    assert page.js("document.documentElement.scrollHeight") <= WIDE[1]
+    assert page.js("document.querySelector('#events').getBoundingClientRect().bottom") <= WIDE[1]
+
+
+def test_a_click_approves_and_the_answer_is_what_the_rtc_did(page):
+    page.open()
+    name = proposal(page)
+    page.click("[data-order=approve]")
+    page.says("#order", name)
+    page.says("#order", "pole radius")
+    page.click("#order [value=send]")
+    page.says("#answer", f"{name} applied at frame", 20.0)
+    assert page.night.state["in_use"] == name
+    page.says("#provenance", f"in use: {name}")
+
+
+def test_by_keys_alone_one_is_rejected_and_not_without_a_reason(page):
+    page.open()
+    name = proposal(page)
+    page.driver.find_element("css selector", "[data-order=reject]").send_keys("\n")
+    page.says("#order", name)
+    page.driver.find_element("css selector", "#order [value=send]").send_keys("\n")
+    assert page.js("document.querySelector('#order').open")
+    assert page.night.client.get(f"/v1/reconstructors/{name}").json()["state"] == "proposed"
+    page.js("document.querySelector('#order textarea').focus()")
+    page.press("not tonight\t")
+    page.press("\t")
+    page.press("\n")
+    page.says("#answer", f"{name} discarded: not tonight")
+    assert page.night.client.get(f"/v1/reconstructors/{name}").json()["reason"] == "not tonight"
+
+
+def test_by_keys_alone_the_service_goes_back_and_holds(page):
+    page.open()
+    before = page.night.state["in_use"]
+    page.until("document.querySelector('[data-order=rollback]').ariaDisabled === 'false'", 20.0)
+    page.press("r")
+    page.says("#order", "Mode becomes hold")
+    page.press("\n")
+    page.says("#answer", "applied at frame", 20.0)
+    assert page.night.state["in_use"] != before
+    page.says("#operation", "HOLD")
+    page.press("h")
+    page.says("#answer", "mode is hold already")
+    for key in "21":
+        page.press(key)
+        assert page.js(f"document.querySelector('[data-range=\"{key}\"]').ariaPressed") == "true"
+
+
+def test_a_change_is_seen_within_a_second(page):
+    page.open()
+    for mode in ("propose", "hold", "propose"):
+        began_s = time.monotonic()
+        page.night.client.put("/v1/mode", json={"mode": mode}).raise_for_status()
+        page.until(f"document.querySelector('#mode').value === '{mode}'", 1.0)
+        assert time.monotonic() - began_s < patience(1.0)
+
+
+def test_an_rtc_that_is_gone_is_seen_with_what_to_do(page):
+    page.open()
+    page.night.telescope.kill()
+    page.says("#alarms", "rtc-vanished", 10.0)
+    page.says("#alarm-count", "1 alarm")
+    page.says("#rtc", "waiting for the RTC")
+    page.says("#operation", "NO RTC")
+    page.says("#live", "rtc-vanished")
+    assert "cannot be used now: no RTC is there" in page.js(
+        "document.querySelector('[data-order=rollback]').title"
+    )
+    assert page.faults_of_access() == []
+
+
+def test_a_service_that_is_gone_is_a_banner_and_its_return_the_end_of_it(page):
+    page.open()
+    page.night.running.kill()
+    page.says("#lost", "CONNECTION LOST", 10.0)
+    page.says("#operation", "NOT KNOWN")
+    assert page.faults_of_access() == []
+    page.night.running = page.night.service("propose")
+    page.until("document.querySelector('#lost').hidden", 15.0)
+    page.says("#operation", "NO RTC")

@@ -1,7 +1,7 @@
 """What an operator asks of the service, and what the observatory tells it.
 
-Each answer is 202: the command was accepted and set in motion. Whether it has come to its end
-is seen in the state and in the events.
+Each answer is 202 and says in one sentence what was done and, where an RTC answers within some
+seconds, what it said. What takes longer is seen in the state and in the events.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from service.tracking.commands import (
     StartDither,
     StopDither,
 )
-from service.tracking.dither_request import total_m
 
 router = APIRouter(
     prefix="/v1",
@@ -51,12 +50,12 @@ _ACQUISITION = body(Annotated[Acquire | AbortAcquisition, _BY_ACTION])
 
 
 class AcceptedView(BaseModel):
-    """A command that was set in motion."""
+    """What came of an order."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     text: str
-    """What was."""
+    """What was done, and what the RTC has said to it within some seconds."""
 
     links: dict[str, str]
     """Where to look for what becomes of it."""
@@ -111,13 +110,7 @@ async def dither(
     client: ClientDep, command: Annotated[StartDither | StopDither, _DITHER]
 ) -> AcceptedView:
     """Start or stop the dither."""
-    answer = await client.orders(command)
-    state = client.service.snapshot().tracker
-    if isinstance(command, StopDither) or state.dither is None:
-        return answer
-    cost = f"{1e9 * total_m(state.dither.request):.3g} nm RMS in all"
-    budget = f"budget {1e9 * state.dithering.budget_m:.3g} nm"
-    return answer.model_copy(update={"text": f"{answer.text}: {cost}, {budget}"})
+    return await client.orders(command)
 
 
 @router.post("/reconstructors/{id}/approve", status_code=202, responses={**UNKNOWN})

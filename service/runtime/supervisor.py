@@ -14,11 +14,12 @@ import structlog
 from numpy.typing import NDArray
 
 from service.archive import Archive
-from service.errors import CommandError, LinkError, PyrcalError, StorageError, WorkerError
+from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
+from service.runtime.answers import Given
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.recording import Caller, Recorder
@@ -31,12 +32,11 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
-from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.policy import Policy
-from service.tracking.products import MeasurementRecord, MeasureState
+from service.tracking.products import MeasureState
 from service.tracking.state import Level, TrackerState, Waiting
 from service.tracking.turn import new_lines
-from service.wire import TEXT_LIMIT, AlarmMessage, LoopRequest, MeasureRequest, RampRequest
+from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, OpticsWorker
 
 POLL_S = 0.1
@@ -50,6 +50,11 @@ WATCH_INTERVAL_S = 4.0
 
 DESCRIBE_ATTEMPTS = 3
 """Workers that may die while the model is prepared before the service gives up."""
+
+ANSWERED_WITHIN_S = 3.0
+"""For the RTC, or the gate, to answer while whoever gave an order waits."""
+
+ASK_AGAIN_S = 0.02
 
 OPERATOR = Caller()
 
@@ -123,7 +128,7 @@ class Supervisor:
         return waiting_for(facts)
 
     async def submit(self, command: Command, caller: Caller = OPERATOR) -> str:
-        """Set an operator's command in motion; return one line that says what was.
+        """Carry out an operator's command; return one sentence on what came of it.
 
         It is on record before it is done, and so is why it is refused.
 
@@ -137,26 +142,30 @@ class Supervisor:
             If it cannot be recorded; nothing has been done.
         """
         if isinstance(command, cmd.SetPointing):  # told every second, and decides nothing
-            return _told(command, self._post(command))
+            return await self._carried_out(command)
         await self._recorder.ordered(command, caller)
         try:
-            answer = _told(command, await self._carried_out(command))
+            answer = await self._carried_out(command)
         except PyrcalError as error:
             self._recorder.refused(command, caller, error)
             raise
         self._recorder.answered(command, caller, answer)
         return answer
 
-    async def _carried_out(self, command: Command) -> tuple[Effect, ...]:
-        """Do what is asked; hear what the RTC says to it where that takes but a moment."""
-        running = set(self._running)
-        effects = self._post(command)
-        if isinstance(command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
-            asked = self._running - running
-            if asked:
-                await asyncio.wait(asked)
-            _refuse_as_the_rtc_did(effects, self._engine.state)
-        return effects
+    async def _carried_out(self, command: Command) -> str:
+        """Do what is asked, and say what the RTC says to it where that takes but a moment."""
+        before, running = self._engine.state, set(self._running)
+        self._post(command)
+        given = Given(command, before, self._engine.state)
+        asked = self._running - running
+        if asked and isinstance(command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
+            await asyncio.wait(asked)
+        until_s = time.monotonic() + ANSWERED_WITHIN_S
+        while True:
+            answer = given.answer(self._engine.state)
+            if answer.final or time.monotonic() > until_s:
+                return answer.text
+            await asyncio.sleep(ASK_AGAIN_S)
 
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return a reconstructor ``(n_modes, n_slopes)``."""
@@ -400,26 +409,3 @@ class Supervisor:
         for entry in entries:
             getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text)
         self._recorder.changed(before, self._engine.state, entries)
-
-
-def _refuse_as_the_rtc_did(effects: tuple[Effect, ...], state: TrackerState) -> None:
-    """Tell whoever gave a command that the RTC will not carry it out, or did not answer."""
-    asked: MeasurementRecord | LoopCommand | None
-    for effect in effects:
-        match effect:
-            case ev.Ask(request=MeasureRequest(id=name)):
-                asked = state.measurement(name)
-            case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):
-                asked = state.loop_command
-            case _:
-                continue
-        if asked is None or asked.id != name:
-            continue
-        if asked.state in {MeasureState.REFUSED, CommandState.REFUSED}:
-            raise CommandError(f"the RTC refused: {asked.reason}")
-        if asked.state in {MeasureState.FAILED, CommandState.FAILED}:
-            raise LinkError(asked.reason)
-
-
-def _told(command: Command, effects: tuple[Effect, ...]) -> str:
-    return f"{type(command).__name__}: {len(effects)} action(s) under way"

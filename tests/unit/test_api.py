@@ -418,11 +418,6 @@ async def test_a_suspected_jump_and_a_dither_that_is_due_are_seen(client, servic
     assert 'pyrcal_dither_phase{phase="sparse"} 1.0' in metrics
 
 
-async def test_who_starts_a_dither_is_told_what_it_costs(client):
-    answer = await client.post("/v1/dither", json={"action": "start", "over_budget": True})
-    assert answer.json()["text"].endswith("7.07 nm RMS in all, budget 8 nm")
-
-
 async def test_history_is_the_newest_entries_oldest_first(client):
     body = await body_of(client, "/v1/alpha/history", limit=2)
     assert [e["t_ns_utc"] for e in body["entries"]] == [3 * SECOND, 4 * SECOND]

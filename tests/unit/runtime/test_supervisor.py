@@ -78,7 +78,7 @@ async def test_it_is_ready_when_the_model_is(supervisor):
 
 async def test_a_command_changes_the_state_and_enters_the_audit_trail(supervisor, archive):
     text = await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
-    assert text.startswith("SetMode")
+    assert text == "mode is auto"
     assert supervisor.snapshot().tracker.mode is Mode.AUTO
     (entry,) = archive.audit_trail()  # the answer's own line may take its time
     assert (entry.who, entry.name) == ("operator", "SetMode")

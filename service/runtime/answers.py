@@ -1,0 +1,192 @@
+"""What an order has led to, in one sentence, from the state after it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.errors import CommandError, LinkError
+from service.tracking import commands as cmd
+from service.tracking.alarms import NO_DITHER
+from service.tracking.commands import Command
+from service.tracking.dither_request import total_m
+from service.tracking.loop import CommandState
+from service.tracking.products import MatrixState, MeasureState, ReconstructorRecord
+from service.tracking.state import TrackerState
+from service.tracking.turn import new_lines
+
+SILENT = "sent, the RTC has not answered yet"
+
+_ON_ITS_WAY = {
+    MatrixState.PROPOSED: "is being judged again before it is sent",
+    MatrixState.PUBLISHED: SILENT,
+    MatrixState.STAGED: "sent, the RTC holds it and has not applied it yet",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What there is to tell."""
+
+    text: str
+    final: bool = True
+    """Whether waiting for the RTC, or for a verdict, could not tell more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """An order that was carried out, as far as the service can by itself."""
+
+    command: Command
+    before: TrackerState
+    """What was known before it."""
+
+    then: TrackerState
+    """Right after it, before anything was heard of it."""
+
+    def answer(self, now: TrackerState) -> Answer:  # noqa: C901 - one line for each command
+        """Return what has come of it by now.
+
+        Raises
+        ------
+        CommandError
+            If RTC or gate have refused it.
+        LinkError
+            If the RTC did not answer in its time.
+        """
+        match self.command:
+            case cmd.SetMode():
+                return Answer(f"mode is {now.mode}")
+            case cmd.SetPointing():
+                return _pointing(now)
+            case cmd.Acquire():
+                return Answer(f"an acquisition is under way: {now.acquisition.text}")
+            case cmd.AbortAcquisition():
+                return Answer(f"the acquisition has {now.acquisition.text}")
+            case cmd.StartDither():
+                return self._dither(now)
+            case cmd.StopDither():
+                return _no_dither(now)
+            case cmd.SetLoop() | cmd.Ramp():
+                return self._loop(now)
+            case cmd.Measure(id=name) | cmd.MeasureNoisy(id=name):
+                return _measurement(now, name)
+            case cmd.GiveUp(id=name) | cmd.GiveUpNoisy(id=name):
+                record = now.measurement(name)
+                why = "" if record is None else record.reason.removeprefix("given up ")
+                return Answer(f"{name} is given up {why}")
+            case _:
+                return self._of_matrices(now)
+
+    def _of_matrices(self, now: TrackerState) -> Answer:
+        match self.command:
+            case cmd.Refit():
+                return Answer(f"a reconstructor is being computed; mode is {now.mode}")
+            case cmd.Approve(id=name):
+                return self._sent(now, name)
+            case cmd.Reject(id=name):
+                return Answer(f"{name} is discarded")
+            case cmd.Publish(id=name):
+                return self._copied(now, name)
+            case _:
+                used = [r for r in self.before.reconstructors if r.state is MatrixState.SUPERSEDED]
+                return self._copied(now, used[-1].id)
+
+    def _copied(self, now: TrackerState, source: str) -> Answer:
+        """Tell of a reconstructor that goes out again, under an id of its own."""
+        known = {record.id for record in self.before.reconstructors}
+        made = [r for r in now.reconstructors if r.parent == source and r.id not in known]
+        if made:
+            answer = self._sent(now, made[-1].id)
+            return Answer(f"{answer.text}; it is {source} again; mode is {now.mode}", answer.final)
+        if now.making_since_ns_utc is None:
+            failed = [line for line in new_lines(self.then, now) if line.name == "job.failed"]
+            raise CommandError(failed[-1].text if failed else f"no copy of {source} was made")
+        return Answer(f"{source} is being judged before it is sent again", final=False)
+
+    def _sent(self, now: TrackerState, name: str) -> Answer:
+        """Tell how far a reconstructor is on its way to the RTC."""
+        record = now.reconstructor(name)
+        if record is None:
+            raise CommandError(f"{name} is not known any more")
+        for line in new_lines(self.then, now):
+            if line.name == "reconstructor.not-sent" and line.text.startswith(name):
+                raise CommandError(line.text)
+        words = _ON_ITS_WAY.get(record.state)
+        if words is not None:
+            return Answer(f"{name} {words}", final=False)
+        if record.state is MatrixState.FAILED:
+            raise LinkError(record.reason)
+        if record.state not in {MatrixState.APPLIED, MatrixState.SUPERSEDED}:
+            raise CommandError(_why_not(record))
+        return Answer(f"{name} sent, applied at frame {record.applied_frame_seq}")
+
+    def _dither(self, now: TrackerState) -> Answer:
+        asked = self.then.dither
+        name = "" if asked is None else asked.id
+        dither = now.dither
+        if dither is None or dither.id != name:
+            told = (alarm.text for alarm in now.alarms if alarm.name == NO_DITHER)
+            raise CommandError(next(told, f"{name} is not followed any more: see the events"))
+        cost = f"{1e9 * total_m(dither.request):.3g} nm RMS in all"
+        cost = f"{cost}, budget {1e9 * now.dithering.budget_m:.3g} nm"
+        if dither.start_seq is None:
+            return Answer(f"{name} {SILENT}: {cost}", final=False)
+        return Answer(f"{name} plays from frame {dither.start_seq}: {cost}")
+
+    def _loop(self, now: TrackerState) -> Answer:
+        asked, found = self.then.loop_command, now.loop_command
+        if asked is None or found is None or asked.id != found.id:
+            return Answer(f"{SILENT}: another change of the loop came after it")
+        match found.state:
+            case CommandState.ASKED:
+                return Answer(f"{found.text}: {SILENT}", final=False)
+            case CommandState.ACCEPTED:
+                return Answer(f"the RTC has accepted: {found.text}")
+            case CommandState.REFUSED:
+                raise CommandError(f"the RTC refused: {found.reason}")
+            case CommandState.FAILED:
+                raise LinkError(found.reason)
+
+
+def _pointing(now: TrackerState) -> Answer:
+    where = now.pointing
+    if where is None:
+        return Answer("the pointing is not known")
+    return Answer(
+        f"the telescope looks at elevation {where.elevation_deg:g} deg, azimuth "
+        f"{where.azimuth_deg:g} deg"
+    )
+
+
+def _no_dither(now: TrackerState) -> Answer:
+    playing = None if now.rtc is None else now.rtc.dither_id
+    off = "no dither is started until POST /v1/dither with start"
+    if playing is None:
+        return Answer(f"no dither plays; {off}")
+    return Answer(f"the RTC was told to stop {playing}, its status still shows it; {off}", False)
+
+
+def _measurement(now: TrackerState, name: str) -> Answer:
+    record = now.measurement(name)
+    if record is None:
+        raise CommandError(f"{name} is not known any more")
+    match record.state:
+        case MeasureState.REFUSED:
+            raise CommandError(f"the RTC refused: {record.reason}")
+        case MeasureState.FAILED:
+            raise LinkError(record.reason)
+        case MeasureState.WAITING:
+            return Answer(f"{name} waits for the dither that plays to end", final=False)
+        case MeasureState.ASKED:
+            return Answer(f"{name} {SILENT}", final=False)
+        case _ if record.start_seq is None:
+            return Answer(f"{name} is {record.state}")
+        case _:
+            return Answer(f"{name} is {record.state}, from frame {record.start_seq}")
+
+
+def _why_not(record: ReconstructorRecord) -> str:
+    who = {MatrixState.REJECTED: "the RTC", MatrixState.REFUSED: "the gate"}.get(record.state)
+    if who is None:
+        return f"{record.id} is {record.state}: {record.reason}"
+    return f"{who} refused {record.id}: {record.reason}"

@@ -13,7 +13,7 @@ window of dither is. A table says so to begin with, then what the windows show.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import combinations_with_replacement, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,17 +200,20 @@ def _coincides(frequency: float, chosen: list[float], within_hz: float) -> bool:
     """Return whether a line falls on a third-order product of those chosen, or makes one of them.
 
     The pyramid is odd in the wavefront to lowest order, so products of three lines are what it
-    adds.
+    adds. Those chosen are clear of one another's.
     """
-    lines = [*chosen, frequency]
-    for i, first in enumerate(lines):
-        for second in lines[i:]:
-            for third in lines:
-                if third in (first, second):
-                    continue
-                product = first + second - third
-                others = [line for line in lines if line not in (first, second, third)]
-                if any(abs(product - line) < within_hz for line in others):
+    lines = (*chosen, frequency)
+    for first, second in combinations_with_replacement(lines, 2):
+        for third in lines:
+            if third in (first, second):
+                continue
+            product, made_of = first + second - third, (first, second, third)
+            if frequency not in made_of:
+                if abs(product - frequency) < within_hz:
+                    return True
+                continue
+            for line in chosen:
+                if abs(product - line) < within_hz and line not in made_of:
                     return True
     return False
 

@@ -327,7 +327,7 @@ def _make(turn: Turn, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:
     found, state = turn.acquisition.found, turn.state
     if state.making_since_ns_utc is not None or found is None:
         return
-    if turn.now_ns >= state.retries.make_ns_utc:
+    if turn.now_ns >= state.no_making_before_ns_utc:
         effect = ev.MakeMatrix(
             n_modes=n_modes,
             why=f"acquisition: {n_modes} modes",

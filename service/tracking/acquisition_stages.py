@@ -370,7 +370,7 @@ def on_missed(turn: Turn, reason: str) -> None:
 
 def _keep_dithering(turn: Turn, rtc: Status) -> None:
     """Ask for the dither of the stage once no other one runs."""
-    if turn.dither is not None or turn.now_ns < turn.state.retries.dither_ns_utc:
+    if turn.dither is not None or turn.now_ns < turn.state.no_dither_before_ns_utc:
         return
     if rtc.dither_id is not None:
         stopping = rtc.dither_id == turn.dithering.stopped_id

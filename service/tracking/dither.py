@@ -323,7 +323,7 @@ def _begin(turn: Turn, rtc: Status, wish: Wish) -> None:
     if loud_ns and turn.now_ns < loud_ns + round(CALM_S * SECOND_NS):
         _show(turn, DitherPhase.OFF, "the RTC has played the last one too strong")
         return
-    if turn.now_ns < turn.state.retries.dither_ns_utc:
+    if turn.now_ns < turn.state.no_dither_before_ns_utc:
         return
     if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
         # left behind by this service: its window of another length, or to stop

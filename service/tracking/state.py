@@ -258,22 +258,6 @@ class Acquisition:
         return self.stage in UNDER_WAY
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Retries:
-    """Before when nothing of a kind is tried again: what cannot be had holds up nothing else."""
-
-    dither_ns_utc: int = 0
-    make_ns_utc: int = 0
-    """A reconstructor."""
-
-    def later(self, *, dither_ns_utc: int = 0, make_ns_utc: int = 0) -> Retries:
-        """Return them with what is named put off until then at least."""
-        return Retries(
-            dither_ns_utc=max(self.dither_ns_utc, dither_ns_utc),
-            make_ns_utc=max(self.make_ns_utc, make_ns_utc),
-        )
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackerState:
     """Everything the service knows; ``service.tracker.step`` makes the next one."""
@@ -363,8 +347,11 @@ class TrackerState:
     judged_ns_utc: int | None = None
     """When ``margin`` was last asked for."""
 
-    retries: Retries = Retries()
-    """Before when what could not be had is not tried again by itself."""
+    no_dither_before_ns_utc: int = 0
+    """Before when none is asked for again: what cannot be had holds up nothing else."""
+
+    no_making_before_ns_utc: int = 0
+    """Before when no reconstructor is computed again."""
 
     dither_due_since_ns_utc: int | None = None
     """Since when a dithered window is wanted before anything else is believed; None: it is not."""

@@ -10,7 +10,7 @@ from service.tracking.dither_request import Dither, Dithering
 from service.tracking.events import Effect, Event
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
-from service.tracking.state import Acquisition, Alarm, Level, LogEntry, Retries, TrackerState
+from service.tracking.state import Acquisition, Alarm, Level, LogEntry, TrackerState
 from service.wire import Status
 
 LOG_LENGTH = 500
@@ -110,15 +110,19 @@ class Turn:
 
     def put_off(self, *, dither_s: float = 0.0, make_s: float = 0.0) -> None:
         """Ask for no dither, make no reconstructor for so long; 0: that one is not put off."""
-        retries = self.state.retries.later(
-            dither_ns_utc=self.now_ns + round(dither_s * SECOND_NS) if dither_s else 0,
-            make_ns_utc=self.now_ns + round(make_s * SECOND_NS) if make_s else 0,
+        dither_ns, make_ns = (
+            self.now_ns + round(put_off_s * SECOND_NS) if put_off_s else 0
+            for put_off_s in (dither_s, make_s)
         )
-        self.state = replace(self.state, retries=retries)
+        self.state = replace(
+            self.state,
+            no_dither_before_ns_utc=max(self.state.no_dither_before_ns_utc, dither_ns),
+            no_making_before_ns_utc=max(self.state.no_making_before_ns_utc, make_ns),
+        )
 
     def retry_all(self) -> None:
         """Put nothing off any more."""
-        self.state = replace(self.state, retries=Retries())
+        self.state = replace(self.state, no_dither_before_ns_utc=0, no_making_before_ns_utc=0)
 
     def log(self, name: str, text: str, level: Level = Level.INFO) -> None:
         """Add a line to the log; one that repeats is counted instead."""

@@ -93,7 +93,7 @@ def _choose_update(turn: Turn, rtc: Status) -> None:
         return
     if turn.forbidden(Act.SEND_NEW) is not None:
         return
-    first_ns = max(_next_attempt_ns(state, rtc, turn.policy), state.retries.make_ns_utc)
+    first_ns = max(_next_attempt_ns(state, rtc, turn.policy), state.no_making_before_ns_utc)
     in_use = state.reconstructor(state.in_use) if state.in_use else None
     if _busy(state) or now_ns < first_ns or in_use is None:
         return

@@ -129,9 +129,9 @@ class TestOffByTheOperator:
         assert NOT_STOPPED not in story.alarms
 
     def test_an_rtc_that_does_not_answer_keeps_no_matrix_waiting(self, story):
-        before = story.state.retries
+        before = story.state.no_dither_before_ns_utc
         story.tell(ev.JobFailed(effect=stopping(story), text="no answer"))
-        assert story.state.retries == before
+        assert story.state.no_dither_before_ns_utc == before
 
     def test_the_operator_may_have_it_again(self, story):
         dither = story.state.dither

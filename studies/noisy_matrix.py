@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from service.archive import Archive
 from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.runtime.estimates import finished, work_out
+from service.runtime.estimates import work_out
 from service.telemetry import random_dither
 from service.telemetry.random_dither import (
     Correlated,
@@ -190,7 +190,7 @@ def _archive(
     given: argparse.Namespace, total: Correlated, bench: OpticsWorker, start: Misregistration
 ) -> None:
     """Archive the matrix as the service does, and draw it."""
-    found, instrument = work_out(bench, total, start), load_instrument("flao-lbt")
+    instrument = load_instrument("flao-lbt")
     record = MeasurementRecord(
         id=f"noisy-mag{given.magnitude:g}",
         state=MeasureState.FINISHING,
@@ -204,10 +204,11 @@ def _archive(
         basis_id="simulated",
         config_id="simulated",
     )
+    record, numbers = work_out(bench, record, total, start)
     archive = Archive(given.archive)
     archive.open()
     with archive:
-        archive.noisy.store(finished(record, total, found), found.numbers, instrument.name)
+        archive.noisy.store(record, numbers, instrument.name)
     picture = draw(archive.noisy.path_of(record.id), instrument)
     (given.archive / f"{record.id}.png").write_bytes(picture)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -217,18 +217,6 @@ def lost(window: Telemetry, reason: str) -> Event:
     return ev.WindowLost(refused=refused)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Found:
-    """What the worker makes of the sums."""
-
-    numbers: NoisyNumbers
-    estimate: RandomEstimate | None
-    reason: str
-    """Why there is no estimate; empty: there is."""
-
-    snr: float
-
-
 class NoisySums:
     """Sums the windows of the dither that measures a noisy interaction matrix.
 
@@ -271,50 +259,39 @@ class NoisySums:
             raise CommandError("no window of its dither was whole: see the log for the reasons")
         self._id = self._total = None
         start = None if known is None else known.alpha
-        found = await self._workers.call(work_out, total, start)
-        record = finished(record, total, found)
+        record, numbers = await self._workers.call(work_out, record, total, start)
         store = self._archive.noisy.store
-        await asyncio.to_thread(store, record, found.numbers, self._instrument.name)
+        await asyncio.to_thread(store, record, numbers, self._instrument.name)
         return ev.MatrixMeasured(record=record)
 
 
-def work_out(bench: OpticsWorker, total: Correlated, start: Misregistration | None) -> Found:
-    """Return the matrix, its noise, what the model makes of it; runs in the worker."""
+def work_out(
+    bench: OpticsWorker,
+    record: MeasurementRecord,
+    total: Correlated,
+    start: Misregistration | None,
+) -> tuple[MeasurementRecord, NoisyNumbers]:
+    """Return the record of a matrix, ready for the archive, and its numbers; runs in the worker."""
     noisy = noisy_matrix(total)
-    outcome = bench.fit_random(total, start)
+    outcome, reason = bench.fit_random(total, start), ""
+    estimate = None if isinstance(outcome, WindowRefused) else outcome
     if isinstance(outcome, WindowRefused):
-        estimate, reason = None, outcome.reason
-    else:
-        estimate, reason = outcome, ""
+        reason = f"no registration could be fitted: {outcome.reason}"
     unknown = np.full(len(noisy.modes), np.nan)
     alpha = start if estimate is None else estimate.alpha
-    return Found(
-        numbers=NoisyNumbers(
-            matrix=_single(noisy.matrix),
-            noise=_single(noisy.noise),
-            synthetic=_single(bench.response(alpha)[:, list(noisy.modes)]),
-            optical_gain=unknown if estimate is None else estimate.optical_gain,
-            gain_sigma=unknown if estimate is None else estimate.gain_sigma,
-            snr=noisy.snr_of_modes,
-        ),
-        estimate=estimate,
-        reason=reason,
-        snr=noisy.snr,
+    numbers = NoisyNumbers(
+        matrix=_single(noisy.matrix),
+        noise=_single(noisy.noise),
+        synthetic=_single(bench.response(alpha)[:, list(noisy.modes)]),
+        optical_gain=unknown if estimate is None else estimate.optical_gain,
+        gain_sigma=unknown if estimate is None else estimate.gain_sigma,
+        snr=noisy.snr_of_modes,
     )
-
-
-def _single(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    return np.ascontiguousarray(values, np.float32)
-
-
-def finished(record: MeasurementRecord, total: Correlated, found: Found) -> MeasurementRecord:
-    """Return the record of a matrix that is ready for the archive."""
-    estimate = found.estimate
     finding = NoisyFinding(
-        n_slopes=len(found.numbers.matrix),
+        n_slopes=len(numbers.matrix),
         n_frames=total.sums.n_pairs,
         n_missing=total.n_missing,
-        snr=found.snr,
+        snr=noisy.snr,
         alpha=None if estimate is None else estimate.alpha,
         covariance=None if estimate is None else estimate.covariance,
         optical_gain=None if estimate is None else _mean_gain(estimate),
@@ -322,10 +299,14 @@ def finished(record: MeasurementRecord, total: Correlated, found: Found) -> Meas
         cm_id=total.cm_id,
         session=total.session,
         created_ns_utc=total.t_end_ns_utc,
-        sha256=checksum(found.numbers.matrix),
+        sha256=checksum(numbers.matrix),
     )
-    reason = f"no registration could be fitted: {found.reason}" if found.reason else ""
-    return replace(record, state=MeasureState.STORED, reason=reason, finding=finding)
+    record = replace(record, state=MeasureState.STORED, reason=reason, finding=finding)
+    return record, numbers
+
+
+def _single(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values, np.float32)
 
 
 def _mean_gain(estimate: RandomEstimate) -> float:

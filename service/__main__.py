@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.own_process = arguments is None
     try:
         check_files(options)
-        command = import_module(f"service.commands.{options.command}")
+        command = import_module(f"service.commands.{options.command.replace('-', '_')}")
         if arguments is None and options.command != "run":
             signal.signal(signal.SIGINT, signal.default_int_handler)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -4,6 +4,7 @@
 """
 
 import json
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import msgpack
 
 FOLDER = Path(__file__).parents[1] / "docs" / "rtc"
+PAGE = FOLDER.parent / "rtc.md"
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,12 @@ def packed(told):
         else:
             data += packer.pack(value)
     return data
+
+
+def anchors_of(page):
+    """The anchors of a page's headings, as they are linked to."""
+    heads = re.findall(r"^#+ (.+)$", page, flags=re.MULTILINE)
+    return {re.sub(r"[^a-z0-9 -]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
 def vectors():

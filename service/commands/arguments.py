@@ -6,6 +6,7 @@ What the program calls methods, data sets and limits stands here as text; a test
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import re
 import sys
@@ -37,6 +38,7 @@ def command_line() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
     _describe_run(commands.add_parser("run", help="the service"))
     _describe_status(commands.add_parser("status", help="what a running service is doing"))
+    _describe_check(commands.add_parser("check-rtc", help="does an RTC keep the contract?"))
     _describe_fit(commands.add_parser("fit", help="the registration in a measured matrix"))
     _describe_reconstruct(
         commands.add_parser("reconstruct", help="a reconstructor for a known registration")
@@ -71,6 +73,46 @@ def _describe_status(status: argparse.ArgumentParser) -> None:
         help="of the service's REST API, default %(default)s",
     )
     status.add_argument("--json", action="store_true", help="print all that the service tells")
+
+
+_CHECK_EPILOG = """
+One line for each thing that docs/rtc.md asks: what was found, what the contract says, where it
+stands. WRONG breaks the contract, seen is allowed and worth a look, skipped says why. What moves
+anything says so first and asks; where nobody can be asked it is skipped unless --yes. Exit status:
+0 nothing is wrong, 1 something is, 2 nothing could be checked.
+"""
+
+
+def _describe_check(check: argparse.ArgumentParser) -> None:
+    check.description = (
+        "Listen to an RTC in the service's place, ask it things, and say whether it keeps the "
+        "contract of docs/rtc.md. End the service first, or --connect to its router with --passive."
+    )
+    check.epilog = _CHECK_EPILOG
+    check.add_argument(
+        "--instrument", default="flao-lbt", metavar="NAME|FILE", help="default %(default)s"
+    )
+    check.add_argument(
+        "--system", metavar="NAME", help="of the keys, default the instrument's name"
+    )
+    where = check.add_mutually_exclusive_group()
+    where.add_argument("--listen", metavar="ENDPOINT", help="default tcp/127.0.0.1:7447")
+    where.add_argument("--connect", metavar="ENDPOINT", help="a router that is there already")
+    check.add_argument(
+        "--seconds", type=_seconds, default=8.0, metavar="S", help="to listen, default %(default)g"
+    )
+    check.add_argument(
+        "--wait", type=_seconds, default=30.0, metavar="S", help="for the RTC, default %(default)g"
+    )
+    check.add_argument(
+        "--only", type=_names, default=(), metavar="CHECK,...", help="these checks and no others"
+    )
+    check.add_argument("--passive", action="store_true", help="only listen: ask and move nothing")
+    check.add_argument(
+        "--open-loop", action="store_true", help="also what opens the loop: loop, measure"
+    )
+    check.add_argument("--yes", action="store_true", help="move what is said without asking")
+    check.add_argument("--json", action="store_true", help="print one JSON object at the end")
 
 
 _FIT = """
@@ -204,6 +246,20 @@ def _count(text: str) -> int:
     if not text.isdecimal() or int(text) == 0:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number above 0")
     return int(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0.0 < seconds <= 3600.0:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected seconds above 0 and up to 3600")
+    return seconds
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:

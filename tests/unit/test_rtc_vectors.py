@@ -13,7 +13,7 @@ from service.wire.codec import MESSAGE_LIMIT
 from sim_rtc.computer.reconstructors import Staging, Terms
 from sim_rtc.computer.telemetry import Batch, Identity, frames_of
 from studies.contract_tables import MAY_BE_ABSENT, MESSAGES, rows_of
-from tests.vectors import FOLDER, Vector, packed, vectors
+from tests.vectors import FOLDER, PAGE, Vector, anchors_of, packed, vectors
 
 EVERY = vectors()
 GOOD = [vector for vector in EVERY if vector.refused is None]
@@ -172,6 +172,11 @@ def test_the_simulator_stages_the_matrix_and_says_so_in_those_bytes():
     assert wire.encode(applied) == named("ack-applied").message
 
 
+def test_the_simulator_rejects_a_commit_it_cannot_read_in_those_bytes():
+    said = staging().unreadable("missing: key 'shape'")
+    assert wire.encode(said) == named("ack-unreadable").message
+
+
 @pytest.mark.parametrize("name", ["refused-commit-sum", "refused-commit-finite"])
 def test_the_simulator_rejects_what_must_be_refused_in_those_words(name):
     vector = named(name)
@@ -193,7 +198,7 @@ def test_a_status_of_64_subapertures_with_light_and_800_modes_is_read():
 
 
 def test_the_page_has_every_key_and_every_word():
-    page = (FOLDER.parent / "rtc.md").read_text(encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
     for key in (KEYS.frames, KEYS.status, KEYS.current, KEYS.acknowledgement, KEYS.applied):
         assert f"`{key.removeprefix(KEYS.root + '/')}`" in page, key
     for kind in CommandKind:
@@ -203,7 +208,7 @@ def test_the_page_has_every_key_and_every_word():
 
 
 def test_every_alarm_that_the_page_names_is_one():
-    page = (FOLDER.parent / "rtc.md").read_text(encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
     table = page.partition("| alarm | the RTC |")[2].partition("What the service waits for")[0]
     named = re.findall(r"^\| `([a-z-]+)` \|", table, flags=re.MULTILINE)
     assert len(named) > 10
@@ -211,7 +216,5 @@ def test_every_alarm_that_the_page_names_is_one():
 
 
 def test_every_link_into_the_page_leads_somewhere():
-    page = (FOLDER.parent / "rtc.md").read_text(encoding="utf-8")
-    heads = re.findall(r"^#+ (.+)$", page, flags=re.MULTILINE)
-    anchors = {re.sub(r"[^a-z0-9 -]", "", head.lower()).replace(" ", "-") for head in heads}
-    assert set(re.findall(r"\]\(#([^)]+)\)", page)) <= anchors
+    page = PAGE.read_text(encoding="utf-8")
+    assert set(re.findall(r"\]\(#([^)]+)\)", page)) <= anchors_of(page)

@@ -1,0 +1,124 @@
+"""``pyrcal check-rtc``: does an RTC keep the contract? One line for each thing that it asks."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.commands.arguments import say
+from service.config import load_instrument
+from service.conformance.articles import ARTICLES, Checked, Outcome
+from service.conformance.ear import Ear
+from service.conformance.examine import Examination, examine
+from service.conformance.talk import Talk
+from service.conformance.watch import Watch
+from service.errors import ConfigurationError, ModelError, shown
+from service.fit.dialect import Dialect, of_reconstructor
+from service.link.session import Endpoint
+from service.model.instrument import Instrument
+from service.model.interaction import RtcInteractionModel
+from service.prepared import Prepared, usual_folder
+
+KEPT, BROKEN = 0, 1
+
+PAGE = "docs/rtc.md"
+
+
+def main(options: argparse.Namespace) -> int:
+    """Check, tell, and return the exit status: 0 nothing is wrong, 1 something is.
+
+    Raises
+    ------
+    PyrcalError
+        If nothing could be checked: no RTC, no link, or options that make no sense.
+    """
+    unknown = [name for name in options.only if name not in ARTICLES]
+    if unknown:
+        raise ConfigurationError(
+            f"--only: found {', '.join(unknown)}, expected some of {', '.join(ARTICLES)}"
+        )
+    instrument = load_instrument(options.instrument)
+    endpoint = Endpoint(
+        system=options.system or instrument.name,
+        listen=(options.listen,) if options.listen else Endpoint(system="any").listen,
+        connect=(options.connect,) if options.connect else (),
+    )
+    wish = Examination(
+        only=frozenset(options.only),
+        passive=options.passive,
+        open_loop=options.open_loop,
+        listen_s=options.seconds,
+        wait_s=options.wait,
+        basis_id=instrument.basis_id,
+        config_id=instrument.config_id,
+        consent=lambda moved: _agreed(moved, yes=options.yes),
+        dialect=lambda matrix: compared(instrument, matrix),
+    )
+    checks = []
+    with Ear(endpoint, as_service=not options.passive) as ear:
+        for check in examine(Talk(ear, Watch(endpoint, time.monotonic)), wish):
+            checks.append(check)
+            if not options.json:
+                print(shown(line(check)), flush=True)
+    if options.json:
+        print(json.dumps({"checks": [told(check) for check in checks]}, indent=2))
+    broken = [check.name for check in checks if check.outcome is Outcome.WRONG]
+    say(f"{len(checks)} checks, {len(broken)} wrong{': ' if broken else ''}{', '.join(broken)}")
+    return BROKEN if broken else KEPT
+
+
+def line(check: Checked) -> str:
+    """Return a check on one line: what was found, what the contract says, where."""
+    article = check.article
+    return (
+        f"{check.outcome:8}{check.name:12} {check.found} "
+        f"[contract: {article.says}; {PAGE}#{article.anchor}]"
+    )
+
+
+def told(check: Checked) -> dict[str, str]:
+    """Return a check as JSON has it."""
+    article = check.article
+    return {
+        "check": check.name,
+        "outcome": check.outcome.lower(),
+        "found": check.found,
+        "contract": article.says,
+        "where": f"{PAGE}#{article.anchor}",
+        "moves": article.moves.value,
+    }
+
+
+def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> Dialect | str:
+    """Return what the matrix in use says of slopes and commands beside the instrument file."""
+    folder: Path = usual_folder(os.environ)
+    try:
+        basis = Prepared(folder).basis(instrument)
+        model = RtcInteractionModel(instrument, basis, pupil_sampling=3, detector_nodes=3)
+        response = model.interaction_matrix(instrument.start)
+        if matrix.shape[1] != len(response) or len(matrix) > response.shape[1]:
+            return (
+                f"the matrix in use is {list(matrix.shape)}, {instrument.name} has "
+                f"{len(response)} slopes and {response.shape[1]} modes"
+            )
+        return of_reconstructor(matrix, instrument, basis, near=instrument.start, response=response)
+    except ModelError as error:
+        return f"the model of {instrument.name} cannot tell: {error}"
+
+
+def _agreed(moved: tuple[str, ...], *, yes: bool) -> bool:
+    """Say what will be moved, and ask."""
+    for each in moved:
+        say(f"will move: {each}")
+    if yes or not sys.stdin.isatty():
+        return yes
+    sys.stderr.write("go on? [y/N] ")
+    sys.stderr.flush()
+    return sys.stdin.readline().strip().lower() in {"y", "yes"}

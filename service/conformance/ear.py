@@ -1,0 +1,254 @@
+"""The checker's end of the link: keeps what an RTC sends, asks and sends what it is told to."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import LinkError, UnknownIdError, WireError
+from service.link import session as link
+from service.link.matrices import Offer, Outbox
+from service.link.session import Endpoint
+from service.wire import (
+    Command,
+    CommandKind,
+    Encodings,
+    Keys,
+    Manifest,
+    Reply,
+    Role,
+    decode,
+    encode,
+    split,
+)
+
+if TYPE_CHECKING:
+    import zenoh
+
+MOST_WAITING: Final = 20_000
+"""Messages that wait to be looked at; beyond it the oldest are dropped."""
+
+OFFERED_S: Final = 600.0
+"""A matrix can be asked for this long."""
+
+ANSWER_S: Final = 2.0
+"""For the answer to a question of any other kind than a command."""
+
+
+class Topic(StrEnum):
+    """Which key something came on."""
+
+    FRAMES = "frames"
+    STATUS = "status"
+    ACK = "ack"
+    MEASURED = "im"
+    ALIVE = "alive"
+    ASKED = "asked"
+    """The RTC asked for a matrix: the key has which, and which part."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Heard:
+    """One message of an RTC's."""
+
+    topic: Topic
+    key: str
+    at_s: float
+    """When it came, on a monotonic clock."""
+
+    data: bytes = b""
+    attachment: bytes | None = None
+    recoverable: bool = False
+    """Whether its publisher keeps what it has sent."""
+
+    alive: bool = False
+    """Of a token: whether it came; else it went."""
+
+
+class Ear:
+    """A context manager; what zenoh's threads bring waits until it is taken.
+
+    Where no service is there it is one to the RTC: it holds the token, and answers for matrices.
+    """
+
+    def __init__(self, endpoint: Endpoint, *, as_service: bool = True) -> None:
+        self._endpoint = endpoint
+        self.keys = Keys(endpoint.system)
+        self._as_service = as_service
+        self._outbox = Outbox(OFFERED_S)
+        self._heard: deque[Heard] = deque(maxlen=MOST_WAITING)
+        self._session: zenoh.Session | None = None
+        self._held: list[object] = []
+        self._ids = itertools.count()
+        self.other_service = False
+        """Whether a service drives this RTC: then nothing but listening is allowed."""
+
+    def __enter__(self) -> Self:
+        """Open the link."""
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close it."""
+        self.close()
+
+    def open(self) -> None:
+        """Listen, and be there for the RTC.
+
+        Raises
+        ------
+        LinkError
+            If the port is busy or no router answers.
+        """
+        self._session = session = link.open_session(self._endpoint)
+        keys = self.keys
+        self.other_service = bool(link.tokens(session, keys.alive(Role.SERVICE)))
+        self._held = [
+            link.subscribe(session, keys.acknowledgement, self._hear(Topic.ACK)),
+            link.subscribe(session, keys.status, self._hear(Topic.STATUS)),
+            link.subscribe(session, keys.all_measured, self._hear(Topic.MEASURED)),
+            link.watch(session, keys.alive(Role.RTC), self._on_token),
+            link.subscribe_frames(session, keys.frames, self._hear(Topic.FRAMES)),
+        ]
+        if self._as_service and not self.other_service:
+            self._held += [
+                link.serve(session, keys.all_matrices, self._answer),
+                link.announce(session, keys.alive(Role.SERVICE)),
+            ]
+
+    def close(self) -> None:
+        """Leave the network. Closing twice does nothing."""
+        session, self._session = self._session, None
+        self._held.clear()
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+    def take(self) -> list[Heard]:
+        """Return what has come since the last call, oldest first."""
+        taken: list[Heard] = []
+        while self._heard:
+            taken.append(self._heard.popleft())
+        return taken
+
+    @property
+    def own_router(self) -> bool:
+        """Whether the RTC's router is this program."""
+        return not self._endpoint.connect
+
+    def new_id(self, what: str) -> str:
+        """Return an id that was never used."""
+        return f"check-{what}-{time.time_ns()}-{next(self._ids)}"
+
+    def command(self, command: Command) -> Reply:
+        """Return the RTC's reply.
+
+        Raises
+        ------
+        LinkError
+            If there is none, or one that cannot be read.
+        """
+        answer = link.send_command(self._opened, self._endpoint, command)
+        try:
+            return decode(Reply, answer)
+        except WireError as error:
+            raise LinkError(f"the reply is unusable: {error}") from error
+
+    def ask(self, kind: CommandKind, payload: bytes) -> tuple[bytes | None, float]:
+        """Return what is replied to these bytes, and after how long; None: nothing.
+
+        Raises
+        ------
+        LinkError
+            If the reply is an error reply.
+        """
+        began_s = time.monotonic()
+        selector = self.keys.command(kind)
+        answer = link.ask(self._opened, selector, ANSWER_S, payload, Encodings.COMMAND)
+        return answer, time.monotonic() - began_s
+
+    def applied(self) -> tuple[Manifest, NDArray[np.float32]]:
+        """Return the matrix that the RTC says it uses.
+
+        Raises
+        ------
+        WireError
+            If what comes breaks the contract or the checksum differs.
+        LinkError
+            If there is no answer.
+        """
+        return link.fetch_applied(self._opened, self.keys)
+
+    def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+        """Answer for a matrix from now on.
+
+        Raises
+        ------
+        WireError
+            If its id names another one.
+        """
+        parts = tuple(split(matrix, manifest.layout.chunk_bytes))
+        commit = encode(manifest)
+        offered_s = time.monotonic()
+        self._outbox.add(Offer(manifest=manifest, commit=commit, parts=parts, offered_s=offered_s))
+
+    def put_chunk(self, matrix_id: str, index: int, data: bytes) -> None:
+        """Send one part of a matrix."""
+        key = self.keys.chunk(matrix_id, index)
+        link.put(self._opened, key, data, Encodings.BYTES, urgent=False)
+
+    def put_commit(self, matrix_id: str, data: bytes) -> None:
+        """Send a manifest, or what is none."""
+        key = self.keys.commit(matrix_id)
+        link.put(self._opened, key, data, Encodings.COMMIT, urgent=True)
+
+    @property
+    def _opened(self) -> zenoh.Session:
+        if self._session is None:
+            raise LinkError("the link is not open")
+        return self._session
+
+    def _hear(self, topic: Topic) -> Callable[[zenoh.Sample], None]:
+        def hear(sample: zenoh.Sample) -> None:
+            attachment = sample.attachment
+            self._heard.append(
+                Heard(
+                    topic=topic,
+                    key=str(sample.key_expr),
+                    at_s=time.monotonic(),
+                    data=sample.payload.to_bytes(),
+                    attachment=None if attachment is None else attachment.to_bytes(),
+                    recoverable=sample.source_info is not None,
+                )
+            )
+
+        return hear
+
+    def _on_token(self, token: tuple[str, bool]) -> None:
+        key, alive = token
+        self._heard.append(Heard(topic=Topic.ALIVE, key=key, at_s=time.monotonic(), alive=alive))
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            key, part = str(query.key_expr), query.parameters.get("chunk")
+            asked = key if part is None else f"{key}?chunk={part}"
+            self._heard.append(Heard(topic=Topic.ASKED, key=asked, at_s=time.monotonic()))
+            try:
+                data = self._outbox.asked(self.keys, key, part, time.monotonic())
+            except (UnknownIdError, WireError) as error:
+                query.reply_err(str(error).encode())
+            else:
+                query.reply(key, data)

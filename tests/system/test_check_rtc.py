@@ -1,0 +1,96 @@
+"""``pyrcal check-rtc`` on the simulated RTC: healthy, and with each of its faults."""
+
+import json
+
+import pytest
+
+from sim_rtc.faults import FaultKind
+from tests.system.cable import free_port
+from tests.system.night import INSTRUMENT, Process
+from tests.system.pace import patience
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
+
+FLAGGED = {"wrong", "seen"}
+
+LINES = {
+    "lost@3:0.2,100": {"sequence"},
+    "late@3:0.3,100": {"delivery"},
+    "duplicated@3:0.3,100": {"sequence"},
+    "reordered@3:0.3,100": {"sequence"},
+    "nan@3:0.1,100": {"numbers"},
+    "frozen@3:2": {"numbers"},
+    "garbage@3:0.2,100": {"messages", "sequence"},
+    "shape@3:100": {"sizes"},
+    "basis@3:100": {"ids"},
+    "second@3:100": {"session"},
+    "clock@3": {"clock"},
+    "stall@3": {"delivery"},
+    "pause@3": {"clock"},
+    "restart@3": {"connection", "session"},
+    "open@3:2": {"session"},
+    "saturation@3:20,100": {"obedience"},
+    "refuse@0": {"commit"},
+    "mute@0:100": {"commit"},
+    "deaf@0:100": {"commit"},
+    "late-swap@0:4,100": {"commit"},
+    "dither-lost@0:100": {"dither"},
+    "dither-late@0:0.3,100": {"dither"},
+}
+"""Each fault, and the lines that name it."""
+
+
+def checked(folder, *options, faults=()):
+    """Its exit status, the outcome of each check, and all that it says."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    words = ["service", "check-rtc", "--instrument", str(INSTRUMENT), "--listen", endpoint]
+    check = Process("check", [*words, "--json", *options], folder)
+    given = ["sim_rtc", "--connect", endpoint, "--instrument", str(INSTRUMENT), "--mag", "6"]
+    given += ["--n-controlled", "45", "--seed", "3"]
+    given += [word for fault in faults for word in ("--fault", fault)]
+    rtc = Process("rtc", given, folder)
+    try:
+        status = check.ended(patience(90.0))
+    finally:
+        rtc.kill()
+        check.kill()
+    told = json.loads(check.log[check.log.index("{") : check.log.rindex("}") + 1])
+    return status, {one["check"]: one for one in told["checks"]}, check.log
+
+
+def test_a_healthy_rtc_keeps_the_contract_and_is_told_what_was_moved(tmp_path):
+    status, checks, text = checked(tmp_path, "--yes", "--open-loop", "--seconds", "4")
+    assert status == 0, text
+    assert {name: one for name, one in checks.items() if one["outcome"] != "ok"} == {}
+    assert len(checks) == 25
+    assert "will move: loop: THE LOOP IS OPENED" in text
+    assert all(one["where"].startswith("docs/rtc.md#") for one in checks.values())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fault", LINES)
+def test_each_fault_is_named_by_its_line_and_by_no_other(tmp_path, fault):
+    asking = LINES[fault] & {"commit", "dither"}
+    options = ["--yes", "--seconds", "1", "--only", *asking] if asking else ["--passive"]
+    status, checks, text = checked(tmp_path, *options, faults=(fault,))
+    assert {name for name, one in checks.items() if one["outcome"] in FLAGGED} == LINES[fault], text
+    wrong = any(one["outcome"] == "wrong" for one in checks.values())
+    assert status == int(wrong)
+
+
+def test_every_fault_has_its_line():
+    assert {fault.partition("@")[0] for fault in LINES} == set(FaultKind)
+
+
+def test_where_nobody_can_be_asked_nothing_is_moved(tmp_path):
+    status, checks, text = checked(tmp_path, "--seconds", "1", "--only", "dither,commit")
+    assert status == 0, text
+    assert {one["outcome"] for one in checks.values()} == {"skipped"}
+    assert "--yes agrees beforehand" in checks["dither"]["found"]
+
+
+def test_no_rtc_is_neither_right_nor_wrong(tmp_path):
+    words = ["service", "check-rtc", "--wait", "1", "--listen", f"tcp/127.0.0.1:{free_port()}"]
+    check = Process("check", words, tmp_path)
+    assert check.ended(30.0) == 2
+    assert "nothing of an RTC of system flao-lbt was heard within 1 s" in check.log

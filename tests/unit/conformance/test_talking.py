@@ -1,0 +1,234 @@
+"""What an RTC does when it is asked: each check names what is done otherwise, and agrees else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.conformance.articles import ARTICLES, Moves, Outcome
+from service.conformance.examine import Examination, examine
+from service.wire import AckState, CommandKind
+from tests.unit.conformance.pretend import Pretend
+
+ASKING = frozenset(name for name, of in ARTICLES.items() if of.moves is not Moves.NOTHING)
+
+
+def asked(rtc, *names, **wish):
+    """These checks of an RTC, by name."""
+    wish = {"listen_s": 1.0, "consent": lambda _: True, **wish}
+    only = frozenset(names) or ASKING
+    return {one.name: one for one in examine(rtc.talk(), Examination(only=only, **wish))}
+
+
+def test_an_rtc_that_keeps_the_contract_is_told_so_whatever_it_is_asked():
+    checks = asked(Pretend())
+    assert {one.name: one.found for one in checks.values() if one.outcome is not Outcome.OK} == {}
+    assert set(checks) == ASKING
+    assert "slopes lag +0.00 frames" in checks["columns"].found.replace("-0.00", "+0.00")
+    assert "chunk 1, left out, was asked for after 2." in checks["chunks"].found
+    assert "a metre of a mode measures 1.00 and 1.00" in checks["measure"].found
+
+
+def wrong(check, *words):
+    assert check.outcome is Outcome.WRONG, check
+    for word in words:
+        assert word in check.found, check.found
+
+
+# --- replies
+
+
+def test_a_command_that_must_be_refused_and_is_accepted_is_named():
+    rtc = Pretend(reply=lambda _, reply: replace(reply, accepted=True, reason=""))
+    wrong(asked(rtc, "replies")["replies"], "a dither of mode 24 was accepted")
+
+
+def test_refusals_without_their_word_late_ones_and_none_are_named():
+    rtc = Pretend(reply=lambda _, reply: replace(reply, reason="no"))
+    wrong(asked(rtc, "replies")["replies"], "was refused with 'no', expected missing")
+    wrong(asked(Pretend(reply_s=1.5), "replies")["replies"], "took 1.5 s")
+    rtc = Pretend(no_command=("loop",))
+    wrong(asked(rtc, "replies")["replies"], "no answer to one gain more than modes")
+
+
+def test_commands_that_are_optional_may_be_absent():
+    rtc = Pretend(no_command=("ramp", "measure"))
+    check = asked(rtc, "replies")["replies"]
+    assert check.outcome is Outcome.OK
+    assert "it offers no measure and no ramp" in check.found
+
+
+def test_the_same_id_answered_otherwise_is_named():
+    rtc, answers = Pretend(), iter(range(100))
+    rtc.twists["reply"] = lambda _, reply: (
+        replace(reply, reason=f"{reply.reason} {next(answers)}") if reply.reason else reply
+    )
+    wrong(asked(rtc, "replies")["replies"], "the same id was answered otherwise")
+
+
+# --- the dither
+
+
+@pytest.mark.parametrize(
+    ("twists", "words"),
+    [
+        ({"late_dither": 10**9}, "the frames hold none of it"),
+        ({"late_dither": 300}, "301 after the one announced"),
+        ({"dither": {"amplitude_m": (8e-9, 4e-9, 4e-9)}}, "mode 4 carries"),
+        ({"dither": {"modes": (4, 5, 19)}}, "modes nobody asked for (19) carry"),
+        ({"dither": {"frequency_hz": (80.0, 150.0, 239.0)}}, "mode 5 moves at another frequency"),
+        ({"never_stops": True}, "told to stop, it went on"),
+        ({"status": {"dither": None}}, "no status tells it"),
+        ({"no_command": ("dither",)}, "no answer"),
+        ({"status": {"max_dither_m": 1e-7}, "dither": {}}, ""),
+    ],
+)
+def test_a_dither_that_is_not_as_asked_is_named(twists, words):
+    check = asked(Pretend(**twists), "dither")["dither"]
+    if words:
+        wrong(check, words)
+    else:
+        assert check.outcome is Outcome.OK
+
+
+def columns(change):
+    def sent(header, rows):
+        rows = rows.copy()
+        rows[:, : header.n_slopes] = change(rows[:, : header.n_slopes])
+        return [(header, rows)]
+
+    return asked(Pretend(frames=sent), "columns")["columns"]
+
+
+def test_slopes_of_the_other_sign_and_slopes_that_lag_are_told_apart():
+    wrong(columns(np.negative), "the other sign")
+    kept = []
+
+    def late(slopes):
+        kept.append(slopes.copy())
+        before = kept[-2][-2:] if len(kept) > 1 else slopes[:2]
+        return np.concatenate([before, slopes[:-2]])
+
+    wrong(columns(late), "slopes lag +2.0")
+
+
+# --- matrices
+
+
+@pytest.mark.parametrize(
+    ("twists", "words"),
+    [
+        ({"mute": True}, "no acknowledgement within 6 s, though frames name it from"),
+        ({"deaf": True}, "no acknowledgement within 6 s"),
+        ({"swap_s": 4.0}, "more than 2 s"),
+        ({"swap_s": 60.0}, "staged, and not applied within 6 s"),
+        ({"frame_off": 100}, "frames name it from"),
+        ({"status": {"cm_id": "own-1"}}, "the status does not within 1.5 s"),
+    ],
+)
+def test_a_matrix_that_is_not_applied_as_it_should_is_named(twists, words):
+    wrong(asked(Pretend(**twists), "commit")["commit"], words)
+
+
+def test_an_rtc_that_applies_nothing_is_asked_once():
+    checks = asked(Pretend(mute=True), "commit", "chunks", "rejection")
+    assert checks["chunks"].outcome is checks["rejection"].outcome is Outcome.SKIPPED
+
+
+def test_an_rtc_that_never_looks_at_the_sum_is_named_and_keeps_its_numbers():
+    rtc = Pretend(sum=True)
+    before = rtc.matrix.copy()
+    wrong(asked(rtc, "rejection", "commit")["rejection"], "a wrong sum: applied")
+    assert np.array_equal(rtc.matrix, before)
+
+
+def test_staged_may_be_left_out():
+    checks = asked(Pretend(silent_about=(AckState.STAGED,)), "commit", "chunks")
+    assert {one.outcome for one in checks.values()} == {Outcome.OK}
+
+
+def test_what_is_sent_is_always_the_matrix_in_use():
+    rtc = Pretend()
+    before, sent = rtc.matrix.copy(), []
+    put_chunk = rtc.put_chunk
+    rtc.put_chunk = lambda name, k, data: (sent.append((name, k, data)), put_chunk(name, k, data))
+    asked(rtc, "commit", "chunks", "rejection")
+    names = {name for name, _, _ in sent}
+    assert len(names) >= 4
+    for name in names:
+        parts = {k: data for of, k, data in sent if of == name}
+        for k, data in parts.items():
+            assert before.tobytes()[k * len(parts[0]) :].startswith(data)
+
+
+# --- the link and the loop
+
+
+def test_a_session_that_changes_because_the_router_was_away_is_named():
+    wrong(asked(Pretend(new_session_on_return=True), "reconnect")["reconnect"], "s-returned")
+
+
+@pytest.mark.parametrize(
+    ("twists", "words"),
+    [
+        ({"session_when_open": "s-1"}, "opening began no new session"),
+        ({"session_when_closed": "s-closed"}, "closing began session s-closed"),
+        ({"no_command": (CommandKind.LOOP,)}, "it would not open: no answer"),
+    ],
+)
+def test_a_loop_that_opens_otherwise_is_named(twists, words):
+    wrong(asked(Pretend(**twists), "loop")["loop"], words)
+
+
+@pytest.mark.parametrize(
+    ("twists", "words"),
+    [
+        ({"measured": -1.0}, "expected 0.2 to 3: sign or unit"),
+        ({"measured": 1e-9}, "expected 0.2 to 3: sign or unit"),
+        ({"stays_open": True}, "the loop is not as it was before"),
+    ],
+)
+def test_a_measured_matrix_that_is_not_of_metres_is_named(twists, words):
+    wrong(asked(Pretend(**twists), "measure")["measure"], words)
+
+
+def test_an_rtc_that_measures_nothing_is_no_fault():
+    check = asked(Pretend(no_command=("measure",)), "measure")["measure"]
+    assert check.outcome is Outcome.SKIPPED
+
+
+# --- safety
+
+
+def test_nothing_is_asked_of_an_rtc_that_is_only_listened_to():
+    rtc = Pretend()
+    rtc.ask = rtc.put_chunk = rtc.put_commit = rtc.close = lambda *_: pytest.fail("moved")
+    assert set(asked(rtc, passive=True)) == set()
+
+
+def test_what_will_be_moved_is_said_before_and_nothing_is_without_consent():
+    rtc, said = Pretend(), []
+    rtc.ask = rtc.put_chunk = rtc.put_commit = rtc.close = lambda *_: pytest.fail("moved")
+    checks = asked(rtc, consent=lambda moved: said.extend(moved))
+    assert {one.outcome for one in checks.values()} == {Outcome.SKIPPED}
+    assert all("--yes" in one.found for one in checks.values())
+    text = " ".join(said)
+    for word in ("7 nm RMS", "modes 4, 5, 18", "same numbers", "THE LOOP IS OPENED", "20 nm RMS"):
+        assert word in text
+
+
+def test_the_loop_is_not_opened_unless_it_is_asked_for():
+    checks = {
+        o.name for o in examine(Pretend().talk(), Examination(consent=lambda _: True, listen_s=1.0))
+    }
+    assert "commit" in checks
+    assert checks & {"loop", "measure"} == set()
+
+
+def test_beside_a_service_nothing_is_asked():
+    rtc = Pretend()
+    rtc.other_service = True
+    rtc.ask = rtc.put_chunk = lambda *_: pytest.fail("moved")
+    checks = asked(rtc)
+    assert {one.outcome for one in checks.values()} == {Outcome.SKIPPED}
+    assert "a service drives this RTC" in checks["dither"].found

@@ -11,7 +11,7 @@ from service.__main__ import main
 from service.commands.arguments import command_line
 from service.config import Settings, load_settings
 from service.control.reconstructor import MAX_CONDITION, Recipe
-from service.control.reconstructor import Method as MakeMethod
+from service.control.reconstructor import InversionMethod as MakeMethod
 from service.fit.matrix import FitOptions
 from service.fit.matrix import Method as FitMethod
 from service.tracking.state import Mode

@@ -122,9 +122,13 @@ def _frames(watch: Watch, _: About) -> Checked:
 
 
 def _rate_hz(arrivals: list[Arrival]) -> float:
-    """Return frames a second: the median of three spans, for a loop may stand still in one."""
-    n = max(len(arrivals) // 3, 2)
-    spans = [arrivals[k : k + n] for k in range(0, len(arrivals) - n + 1, n)]
+    """Return frames a second: the median of some spans, for a loop may stand still in one.
+
+    What had waited for somebody to listen comes in a burst at first.
+    """
+    later = arrivals[len(arrivals) // 4 :]
+    n = max(len(later) // 3, 2)
+    spans = [later[k : k + n] for k in range(0, len(later) - n + 1, n)]
     rates_hz = [
         (span[-1].stop_seq - span[0].stop_seq) / max(span[-1].at_s - span[0].at_s, 1e-3)
         for span in spans

@@ -120,13 +120,15 @@ def _questions(talk: Talk, status: Status) -> list[_Question]:
         _Question(kind=dithering, payload=b"\xc1", words=("range",), what="bytes of no message"),
         _Question(
             kind=dithering,
-            payload=msgpack.packb({k: v for k, v in told.items() if k != "modes"}),
+            payload=msgpack.packb(
+                {k: v for k, v in told.items() if k != "modes"} | {"id": new("missing")}
+            ),
             words=("missing",),
             what="a dither without the key modes",
         ),
         _Question(
             kind=dithering,
-            payload=msgpack.packb({**told, "v": 2}),
+            payload=msgpack.packb({**told, "v": 2, "id": new("version")}),
             words=("v",),
             what="a dither of version 2",
         ),

@@ -7,7 +7,6 @@ import pytest
 from sim_rtc.faults import FaultKind
 from tests.system.cable import free_port
 from tests.system.night import INSTRUMENT, Process
-from tests.system.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
@@ -41,16 +40,20 @@ LINES = {
 
 
 def checked(folder, *options, faults=()):
-    """Its exit status, the outcome of each check, and all that it says."""
+    """The simulated RTC's exit status, the outcome of each check, and all that is said."""
+    given = ["--instrument", str(INSTRUMENT), "--mag", "6", "--n-controlled", "45", "--seed", "3"]
+    given += [word for fault in faults for word in ("--fault", fault)]
+    return checked_beside(folder, lambda at: ["sim_rtc", "--connect", at, *given], *options)
+
+
+def checked_beside(folder, rtc_words, *options):
+    """The same of an RTC that a module and its words start."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     words = ["service", "check-rtc", "--instrument", str(INSTRUMENT), "--listen", endpoint]
     check = Process("check", [*words, "--json", *options], folder)
-    given = ["sim_rtc", "--connect", endpoint, "--instrument", str(INSTRUMENT), "--mag", "6"]
-    given += ["--n-controlled", "45", "--seed", "3"]
-    given += [word for fault in faults for word in ("--fault", fault)]
-    rtc = Process("rtc", given, folder)
+    rtc = Process("rtc", rtc_words(endpoint), folder)
     try:
-        status = check.ended(patience(90.0))
+        status = check.ended(90.0)
     finally:
         rtc.kill()
         check.kill()

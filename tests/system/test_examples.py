@@ -1,0 +1,63 @@
+"""The programs of examples/ do what they say: an RTC from the contract alone is calibrated."""
+
+import numpy as np
+import pytest
+
+from tests.system.night import ALPHA, N_START, N_TARGET, ROOT, a_night, wait_for
+from tests.system.stranger import small_telescope
+from tests.system.test_check_rtc import checked_beside
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
+
+SYSTEM = "small"
+
+
+@pytest.fixture
+def plant(tmp_path):
+    """A telescope whose mirror lies at ALPHA, and a matrix that thinks it lies at 0."""
+    response, variance_m2 = small_telescope(**ALPHA)
+    assumed, _ = small_telescope()
+    path = tmp_path / "plant.npz"
+    matrix = np.linalg.pinv(assumed[:, :N_START])
+    np.savez(path, response=response, sigma_m=np.sqrt(variance_m2), matrix=matrix)
+    return path
+
+
+def test_they_are_as_short_as_the_page_says():
+    for name, most in (("subscribe", 42), ("rtc", 180)):
+        text = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
+        assert text.count("\n") <= most
+        assert "service" not in {
+            word.split(".")[0]
+            for line in text.splitlines()
+            for word in line.split()[1:2]
+            if line.startswith(("import ", "from "))
+        }
+
+
+def test_the_rtc_is_registered_and_swaps_a_matrix_that_a_subscriber_gets_too(tmp_path, plant):
+    with a_night(tmp_path) as night:
+        night.service("auto")
+        subscriber = night.start("subscribe", ["examples.subscribe", night.zenoh, SYSTEM])
+        rtc = night.start("rtc", ["examples.rtc", night.zenoh, SYSTEM, str(plant)])
+        wait_for(lambda: night.state["link"]["frames_received"], 20.0, lambda: rtc.log)
+        known = wait_for(lambda: night.state["registration"], 30.0, lambda: night.state)
+        for name, truth in ALPHA.items():
+            assert abs(known["alpha"][name] - truth) < 4 * known["sigma"][name], (name, known)
+        night.wait_for_modes(N_TARGET)
+        in_use = night.state["in_use"]
+        wait_for(lambda: night.rtc_says("cm_id") == in_use, 10.0, "its status names it")
+        told = next(line for line in subscriber.log.splitlines() if line.startswith(in_use))
+        assert told.endswith("right")
+        assert f"({N_TARGET}, " in told
+        night.no_frame_is_lost()
+
+
+@pytest.mark.long
+def test_the_rtc_keeps_the_contract(tmp_path, plant):
+    status, checks, text = checked_beside(
+        tmp_path, lambda endpoint: ["examples.rtc", endpoint, SYSTEM, str(plant)], "--yes"
+    )
+    assert status == 0, text
+    flagged = {name for name, one in checks.items() if one["outcome"] != "ok"}
+    assert flagged == {"late-join"}

@@ -2,7 +2,13 @@ from itertools import count
 
 import numpy as np
 import pytest
-from tests.unit.sim_rtc.computer.test_computer import (
+
+from service.wire import Loop, LoopRequest, MeasureRequest, Pattern, RampRequest
+from sim_rtc.computer.feed import OpenLoopBlock
+from sim_rtc.computer.gains import FACTORS
+from sim_rtc.computer.real_time_computer import RealTimeComputer
+from sim_rtc.computer.telemetry import LoopSettings
+from tests.unit.sim_rtc.computer.test_real_time_computer import (
     IDENTITY,
     N_MODES,
     N_SLOPES,
@@ -11,12 +17,6 @@ from tests.unit.sim_rtc.computer.test_computer import (
     dither_request,
     reconstructor,
 )
-
-from service.wire import Loop, LoopRequest, MeasureRequest, Pattern, RampRequest
-from sim_rtc.computer.feed import OpenLoopBlock
-from sim_rtc.computer.gains import FACTORS
-from sim_rtc.computer.real_time_computer import RealTimeComputer
-from sim_rtc.computer.telemetry import LoopSettings
 
 START = (0.4,) * N_MODES
 GAINS = (0.1, 0.3, 0.6, 1.2)

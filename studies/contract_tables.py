@@ -203,7 +203,8 @@ def _range(kind: types.Type) -> str:
     if isinstance(kind, types.UnionType):
         kind = next(each for each in kind.types if not isinstance(each, types.NoneType))
     if isinstance(kind, types.Metadata):
-        return str((kind.extra_json_schema or {})["description"])
+        text = str((kind.extra_json_schema or {})["description"])
+        return text.replace(str(2**63 - 1), "2^63 - 1").replace(str(2**62), "2^62")
     if isinstance(kind, types.EnumType):
         return ", ".join(f"`{each}`" for each in kind.cls)
     if isinstance(kind, types.VarTupleType):

@@ -65,11 +65,13 @@ def loop(talk: Talk, status: Status) -> Checked:
     refused = _told(talk, LoopRequest(id=talk.ear.new_id("open"), loop=Loop.OPEN))
     if refused:
         return wrong("loop", f"it would not open: {refused}")
-    opened = talk.listen(CHANGED_S, lambda: _loop_is(talk, Loop.OPEN))
-    during = talk.watch.status
-    talk.listen(OPEN_S)
+    try:
+        opened = talk.listen(CHANGED_S, lambda: _loop_is(talk, Loop.OPEN))
+        during = talk.watch.status
+        talk.listen(OPEN_S)
+    finally:  # whoever breaks it off wants the loop as it was all the more
+        refused = _told(talk, LoopRequest(id=talk.ear.new_id("close"), loop=Loop.CLOSED))
     problems = _after_opening(talk, status) if opened else ["no status says that it is open"]
-    refused = _told(talk, LoopRequest(id=talk.ear.new_id("close"), loop=Loop.CLOSED))
     closed = talk.listen(CHANGED_S, lambda: not _loop_is(talk, Loop.OPEN))
     talk.listen(OPEN_S)
     after = talk.watch.status

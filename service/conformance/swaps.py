@@ -121,7 +121,7 @@ def rejection(talk: Talk, in_use: MatrixInUse) -> Checked:
         if not said or said[-1][1].state is not AckState.REJECTED:
             problems.append(f"{what}: {_without(talk, name, said)}")
         else:
-            reasons.append(f"{what} ({said[-1][1].reason})")
+            reasons.append(f"{what} ({said[-1][1].reason:.40})")
     problems += _repeated(talk, in_use)
     problems += _unreadable(talk)
     if problems:

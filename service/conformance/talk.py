@@ -260,11 +260,10 @@ def dither(
     if not reply.accepted or reply.start_seq is None:
         found = f"refused: {reply.reason}" if not reply.accepted else "start_seq is nil"
         return [wrong("dither", found), skipped("columns", "there was no dither")]
-    ledger = _played(talk, status, request, reply.start_seq, matrix)
     try:
-        stopped = talk.ear.command(DitherStop(id=talk.ear.new_id("stop")))
-    except LinkError as error:
-        stopped = Reply(id=None, accepted=False, reason=str(error), start_seq=None)
+        ledger = _played(talk, status, request, reply.start_seq, matrix)
+    finally:  # also where it is broken off
+        stopped = _stopped(talk)
     told_seq = ledger.next_seq
     gone = talk.listen(
         _STOPS_S,
@@ -289,6 +288,13 @@ def dither(
         f"{reply.start_seq} as asked for, stopped at {ledger.last_seq}"
     )
     return [fine("dither", found), _columns(ledger, modes, status)]
+
+
+def _stopped(talk: Talk) -> Reply:
+    try:
+        return talk.ear.command(DitherStop(id=talk.ear.new_id("stop")))
+    except LinkError as error:
+        return Reply(id=None, accepted=False, reason=str(error), start_seq=None)
 
 
 def dithered_modes(status: Status) -> tuple[int, ...]:

@@ -61,6 +61,7 @@ class Pretend:
         self.leak, self.gains = 0.99, np.where(np.arange(N_MODES) < N_CONTROLLED, 0.4, 0.0)
         self.matrix, self.next, self.turbulence = MATRIX, np.zeros((2, N_MODES)), np.zeros(N_MODES)
         self.dither = self.told_dither = None
+        self.commands = []
         self.heard, self.due, self.offers, self.away = [], [], {}, False
         self.identity = Identity(system="bench", basis_id="kl-1", config_id="mask-1")
         self.staging = Staging(self._terms, limit_bytes=10**6)
@@ -231,6 +232,7 @@ class Pretend:
             self._hear(Topic.FRAMES, *encode_frames(header, rows))
 
     def _execute(self, command):
+        self.commands.append(command)
         match command:
             case DitherStop():
                 if not self.twists.get("never_stops"):

@@ -232,3 +232,23 @@ def test_beside_a_service_nothing_is_asked():
     checks = asked(rtc)
     assert {one.outcome for one in checks.values()} == {Outcome.SKIPPED}
     assert "a service drives this RTC" in checks["dither"].found
+
+
+@pytest.mark.parametrize(("name", "sleeps"), [("dither", 40), ("loop", 35)])
+def test_who_breaks_a_check_off_finds_mirror_and_loop_as_they_were(name, sleeps):
+    rtc, left = Pretend(), iter(range(sleeps))
+    sleep = rtc.sleep
+
+    def broken_off(seconds):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        sleep(seconds)
+
+    rtc.sleep = broken_off
+    with pytest.raises(KeyboardInterrupt):
+        asked(rtc, name)
+    assert rtc.closed
+    assert rtc.dither is None
+    commands = [command.id for command in rtc.commands]
+    assert len(commands) == 2
+    assert any(word in commands[-1] for word in ("stop", "close"))

@@ -191,8 +191,8 @@ def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
             dither.stop_by_operator(turn)
         case cmd.Measure() as command:
             measuring.measure(turn, command)
-        case cmd.GiveUp() | cmd.GiveUpNoisy() as command:
-            measuring.give_up(turn, command)
+        case cmd.GiveUp(id=name):
+            measuring.give_up(turn, name)
         case cmd.MeasureNoisy() as command:
             measuring.measure_noisy(turn, command)
         case _:

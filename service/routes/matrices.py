@@ -23,7 +23,6 @@ from service.routes.views import ServiceDep, answer, known, shows
 from service.snapshot import Snapshot
 from service.tracking.commands import (
     GiveUp,
-    GiveUpNoisy,
     Measure,
     MeasureChoice,
     MeasureNoisy,
@@ -182,7 +181,7 @@ async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
 @noisy.delete("/noisy-matrix/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
 async def give_up_noisy(client: ClientDep, noisy_id: NoisyId, said: Said) -> AcceptedView:
     """End one under way, and its dither; one that is stored stays."""
-    command = about(GiveUpNoisy, said, id=noisy_id)
+    command = about(GiveUp, said, id=noisy_id)
     return await client.orders(command, matrix=f"{_NOISY}/{noisy_id}")
 
 

@@ -70,7 +70,7 @@ class Given:
                 return self._loop(now)
             case cmd.Measure(id=name) | cmd.MeasureNoisy(id=name):
                 return _measurement(now, name)
-            case cmd.GiveUp(id=name) | cmd.GiveUpNoisy(id=name):
+            case cmd.GiveUp(id=name):
                 record = now.measurement(name)
                 why = "" if record is None else record.reason.removeprefix("given up ")
                 return Answer(f"{name} is given up {why}")

@@ -48,7 +48,6 @@ _ALWAYS = frozenset[type](
     {
         cmd.AbortAcquisition,
         cmd.GiveUp,
-        cmd.GiveUpNoisy,
         cmd.Reject,
         cmd.SetMode,
         cmd.SetPointing,

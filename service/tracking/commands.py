@@ -204,10 +204,13 @@ class Measure(MeasureChoice):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GiveUp(Instruction):
-    """Wait no longer for an interaction matrix; the wire has no way to stop the RTC's work."""
+    """Wait no longer for an interaction matrix.
+
+    The wire has no way to stop the RTC's work; a noisy one ends, and its dither.
+    """
 
     id: str
-    """Of the measurement."""
+    """Of the matrix."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,13 +238,6 @@ class MeasureNoisy(NoisyChoice):
 
     id: str
     """Of the matrix to come, and of its dither; never used before."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GiveUpNoisy(Instruction):
-    """End a noisy interaction matrix under way, and its dither; nothing of it is kept."""
-
-    id: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -378,7 +374,6 @@ Command = (
     | Measure
     | GiveUp
     | MeasureNoisy
-    | GiveUpNoisy
     | SetLoop
     | SetPointing
     | Ramp

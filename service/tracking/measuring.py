@@ -91,7 +91,7 @@ def measure(turn: Turn, command: cmd.Measure) -> None:
     )
 
 
-def give_up(turn: Turn, command: cmd.GiveUp | cmd.GiveUpNoisy) -> None:
+def give_up(turn: Turn, measurement_id: str) -> None:
     """Wait no longer for a matrix; its random signs end, a loop that it has opened is closed again.
 
     The wire has no way to end a measurement by the RTC: it may go on, and until it is done refuse.
@@ -103,10 +103,9 @@ def give_up(turn: Turn, command: cmd.GiveUp | cmd.GiveUpNoisy) -> None:
     UnknownIdError
         If nobody has heard of it.
     """
-    record = turn.state.measurement(command.id)
+    record = turn.state.measurement(measurement_id)
     if record is None:
-        what = "measurement" if isinstance(command, cmd.GiveUp) else "noisy matrix"
-        raise UnknownIdError(f"{what} {command.id}: nobody has heard of it")
+        raise UnknownIdError(f"measurement {measurement_id}: nobody has heard of it")
     if not record.under_way:
         raise CommandError(f"{record.id} is {record.state}: there is nothing to give up")
     given_up = replace(record, state=MeasureState.GIVEN_UP)

@@ -42,6 +42,7 @@ class Renewal:
             "SetPointing": lambda old: old.get("pointing", old) | {"is": "SetPointing"},
             "NoisyMade": lambda old: old | {"is": "MatrixMeasured"},
             "NoisyRecord": _measurement,
+            "GiveUpNoisy": lambda old: old | {"is": "GiveUp"},
         }
 
     def entry(self, entry: Record) -> Record:
@@ -49,6 +50,8 @@ class Renewal:
         self._t_ns = entry["t"]
         if entry.get("event", {}).get("state") == "failed":
             entry = _failed(entry)
+        if entry.get("event", {}).get("is") == "GiveUpNoisy" and "refused" in entry:
+            entry = entry | {"refused": _of_any_matrix(entry["refused"])}
         return {name: self._renewed(item) for name, item in entry.items()}
 
     def _renewed(self, value: Json) -> Json:
@@ -133,6 +136,11 @@ def _total(old: Record) -> Record:
     order = dict(old)
     total_m = order.pop("total_m", None)
     return order if total_m is None else order | {"total_amplitude_m": total_m}
+
+
+def _of_any_matrix(refused: str) -> str:
+    """Return the refusal to give up a noisy matrix, as it is told of every measured one."""
+    return refused.replace("GiveUpNoisy", "GiveUp").replace(": noisy matrix ", ": measurement ")
 
 
 def _dither_request(view: Record) -> Record:

@@ -178,7 +178,7 @@ EVERYTHING: tuple[Command, ...] = (
     cmd.SetLoop(leak=0.99),
     cmd.MeasureNoisy(id="noisy-late", duration_s=NOISY),
     cmd.GiveUp(id="im-1"),
-    cmd.GiveUpNoisy(id="noisy-1"),
+    cmd.GiveUp(id="noisy-1"),
     ABORT,
     cmd.Approve(id="nobody"),
     cmd.Reject(id="nobody"),
@@ -194,7 +194,7 @@ def everything(begin_s: float, step_s: float = 0.1, *, ending: bool = False) -> 
     return tuple((begin_s + k * step_s, ask(command)) for k, command in enumerate(given))
 
 
-_ENDING = (cmd.GiveUp, cmd.GiveUpNoisy, cmd.AbortAcquisition)
+_ENDING = (cmd.GiveUp, cmd.AbortAcquisition)
 
 
 def dither(name: str) -> DitherRequest:

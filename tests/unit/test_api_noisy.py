@@ -12,7 +12,7 @@ from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.routes.views import GATHERING, picture
 from service.snapshot import Snapshot
-from service.tracking.commands import GiveUpNoisy, MeasureNoisy
+from service.tracking.commands import GiveUp, MeasureNoisy
 from service.tracking.products import MeasurementRecord, MeasureState, ModeSet, NoisyFinding
 from service.tracking.state import TrackerState
 
@@ -153,7 +153,7 @@ async def test_a_refusal_arrives_in_its_own_words(client, service):
 async def test_one_can_be_given_up(client, service):
     response = await client.delete("/v1/noisy-matrix/noisy-2")
     assert response.status_code == 202, response.text
-    assert service.commands == [GiveUpNoisy(id="noisy-2")]
+    assert service.commands == [GiveUp(id="noisy-2")]
 
 
 async def test_they_are_listed_oldest_first(client):

@@ -48,7 +48,7 @@ def told(order, world):
         (idle, cmd.Acquire(), "an acquisition is under way: opening the loop"),
         (acquiring, cmd.AbortAcquisition(), "the acquisition has ended by the operator; the loop"),
         (measuring, cmd.GiveUp(id="im-1"), "im-1 is given up by the operator; the RTC"),
-        (gathering, cmd.GiveUpNoisy(id="noisy-1"), "noisy-1 is given up by the operator"),
+        (gathering, cmd.GiveUp(id="noisy-1"), "noisy-1 is given up by the operator"),
         (idle, cmd.StopDither(), "no dither plays; no dither is started until"),
     ],
 )

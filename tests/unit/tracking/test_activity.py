@@ -153,7 +153,7 @@ COMMANDS = [
     cmd.Measure(id="im-9", pattern=Pattern.SINE),
     cmd.GiveUp(id="im-1"),
     cmd.MeasureNoisy(id="noisy-9", duration_s=30.0),
-    cmd.GiveUpNoisy(id="noisy-1"),
+    cmd.GiveUp(id="noisy-1"),
     cmd.SetLoop(loop="open"),
     cmd.SetLoop(gains=(cmd.GainGroup(first=0, last=399, gain=0.3),)),
     cmd.SetPointing(elevation_deg=60.0, azimuth_deg=0.0),

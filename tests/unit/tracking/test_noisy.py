@@ -169,7 +169,7 @@ def test_a_fit_that_fails_is_a_failure_with_its_reason(story):
 
 def test_one_given_up_ends_its_dither_and_stays_given_up(story):
     begun(story)
-    effects = story.tell(cmd.GiveUpNoisy(id="noisy-1"))
+    effects = story.tell(cmd.GiveUp(id="noisy-1"))
     assert of_kind(effects, DitherStop)
     assert story.state.dither is None
     record = replace(story.state.noisy[-1], state=MeasureState.STORED, finding=FINDING)
@@ -180,9 +180,9 @@ def test_one_given_up_ends_its_dither_and_stays_given_up(story):
 def test_one_that_is_over_cannot_be_given_up(story):
     finished(story)
     with pytest.raises(CommandError, match="noisy-1 is stored"):
-        story.tell(cmd.GiveUpNoisy(id="noisy-1"))
+        story.tell(cmd.GiveUp(id="noisy-1"))
     with pytest.raises(UnknownIdError, match="noisy-9"):
-        story.tell(cmd.GiveUpNoisy(id="noisy-9"))
+        story.tell(cmd.GiveUp(id="noisy-9"))
 
 
 @pytest.mark.parametrize(

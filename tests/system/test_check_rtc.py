@@ -85,6 +85,7 @@ def test_every_fault_has_its_line():
     assert {fault.partition("@")[0] for fault in LINES} == set(FaultKind)
 
 
+@pytest.mark.long
 def test_where_nobody_can_be_asked_nothing_is_moved(tmp_path):
     status, checks, text = checked(tmp_path, "--seconds", "1", "--only", "dither,commit")
     assert status == 0, text

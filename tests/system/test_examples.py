@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.system.night import ALPHA, N_START, N_TARGET, ROOT, a_night, wait_for
+from tests.system.night import ALPHA, INSTRUMENT, N_START, N_TARGET, ROOT, a_night, wait_for
 from tests.system.stranger import small_telescope
 from tests.system.test_check_rtc import checked_beside
 
@@ -51,6 +51,12 @@ def test_the_rtc_is_registered_and_swaps_a_matrix_that_a_subscriber_gets_too(tmp
         assert told.endswith("right")
         assert f"({N_TARGET}, " in told
         night.no_frame_is_lost()
+
+        where = ["--connect", night.zenoh, "--instrument", str(INSTRUMENT), "--seconds", "2"]
+        check = night.start("check", ["service", "check-rtc", *where, "--yes"])
+        assert check.ended(40.0) == 0, check.log
+        assert "a service drives this RTC: end it first" in check.log
+        assert night.state["in_use"] == in_use
 
 
 @pytest.mark.long

@@ -47,6 +47,8 @@ N_SLOPES, N_MODES, N_CONTROLLED, RATE_HZ, BATCH = 60, 24, 16, 1000.0, 50
 RESPONSE = 1e6 * np.random.default_rng(1).standard_normal((N_SLOPES, N_MODES))
 MATRIX = np.linalg.pinv(RESPONSE[:, :N_CONTROLLED]).astype(np.float32)
 ENDPOINT = Endpoint(system="bench")
+RECORDED = {}
+"""Batches of a loop that nothing has disturbed since its first frame: they are always the same."""
 
 
 class Pretend:
@@ -61,7 +63,7 @@ class Pretend:
         self.leak, self.gains = 0.99, np.where(np.arange(N_MODES) < N_CONTROLLED, 0.4, 0.0)
         self.matrix, self.next, self.turbulence = MATRIX, np.zeros((2, N_MODES)), np.zeros(N_MODES)
         self.dither = self.told_dither = None
-        self.commands = []
+        self.commands, self.quiet = [], True
         self.heard, self.due, self.offers, self.away = [], [], {}, False
         self.identity = Identity(system="bench", basis_id="kl-1", config_id="mask-1")
         self.staging = Staging(self._terms, limit_bytes=10**6)
@@ -204,14 +206,14 @@ class Pretend:
             dithers += 0.0 if played is None else played
             if self.seq >= self.dither.stop_seq:
                 self.dither = self.told_dither = None
-        for k in range(BATCH):
-            self.turbulence += 1e-9 * self.rng.standard_normal(N_MODES) - 0.005 * self.turbulence
-            commands[k] = self.next[0] + dithers[k]
-            slopes[k] = RESPONSE @ (commands[k] + self.turbulence)
-            slopes[k] += 1e-3 * self.rng.standard_normal(N_SLOPES)
-            after = self.leak * self.next[1]
-            after[:N_CONTROLLED] -= self.gains[:N_CONTROLLED] * (self.matrix @ slopes[k])
-            self.next = np.stack([self.next[1], after if self.closed else np.zeros(N_MODES)])
+        self.quiet = self.quiet and self.dither is None and self.closed
+        known = RECORDED.get(self.seq) if self.quiet else None
+        if known is not None:
+            slopes, commands, self.next, self.turbulence = known
+        else:
+            self._run(slopes, commands, dithers)
+        if self.quiet:
+            RECORDED[self.seq] = slopes, commands, self.next, self.turbulence
         header = FrameHeader(
             session=self.session,
             seq0=self.seq,
@@ -230,6 +232,17 @@ class Pretend:
         sent = self.twists.get("frames", lambda header, rows: [(header, rows)])(header, rows)
         for header, rows in sent:
             self._hear(Topic.FRAMES, *encode_frames(header, rows))
+
+    def _run(self, slopes, commands, dithers):
+        for k in range(BATCH):
+            kick = 1e-9 * self.rng.standard_normal(N_MODES)
+            self.turbulence = 0.995 * self.turbulence + kick
+            commands[k] = self.next[0] + dithers[k]
+            slopes[k] = RESPONSE @ (commands[k] + self.turbulence)
+            slopes[k] += 1e-3 * self.rng.standard_normal(N_SLOPES)
+            after = self.leak * self.next[1]
+            after[:N_CONTROLLED] -= self.gains[:N_CONTROLLED] * (self.matrix @ slopes[k])
+            self.next = np.stack([self.next[1], after if self.closed else np.zeros(N_MODES)])
 
     def _execute(self, command):
         self.commands.append(command)

@@ -17,7 +17,7 @@ from tests.vectors import PAGE, anchors_of
 def checked(rtc, **wish):
     """Every check of an RTC that is only listened to, by name."""
     talk = rtc.talk()
-    wish = {"passive": True, "listen_s": 4.0, **wish}
+    wish = {"passive": True, "listen_s": 3.0, **wish}
     return {one.name: one for one in examine(talk, Examination(**wish))}
 
 

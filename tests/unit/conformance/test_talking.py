@@ -172,6 +172,7 @@ def test_a_session_that_changes_because_the_router_was_away_is_named():
     ("twists", "words"),
     [
         ({"session_when_open": "s-1"}, "opening began no new session"),
+        ({"integrator_stays": True}, "nm, not 0"),
         ({"session_when_closed": "s-closed"}, "closing began session s-closed"),
         ({"no_command": (CommandKind.LOOP,)}, "it would not open: no answer"),
     ],

@@ -1,6 +1,8 @@
 """The bytes of docs/rtc: what three writers make of them, and what must be refused."""
 
 import re
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -183,6 +185,16 @@ def test_the_simulator_rejects_what_must_be_refused_in_those_words(name):
     (said,) = taken(vector, staging())
     rejected = wire.decode(wire.Acknowledgement, said)
     assert (rejected.state, rejected.reason) == ("rejected", vector.refused)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_the_example_in_c_writes_those_bytes(tmp_path):
+    source = FOLDER.parents[1] / "examples" / "telemetry.c"
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run(["cc", *strict, str(source), "-o", str(tmp_path / "telemetry")], check=True)
+    subprocess.run([str(tmp_path / "telemetry"), str(tmp_path)], check=True)
+    for name in ("frames.bin", "frames.msgpack", "status-minimal.msgpack"):
+        assert (tmp_path / name).read_bytes() == (FOLDER / name).read_bytes(), name
 
 
 def test_a_status_of_64_subapertures_with_light_and_800_modes_is_read():

@@ -108,7 +108,7 @@ def _as_now(values: dict[str, Any]) -> dict[str, Any]:
         values[_RADIANS] = values.pop(_DEGREES) / _DEGREES_PER_RADIAN
     if _TOTAL in values:  # written when a noisy matrix had a record of its own
         n_modes = len(values["modes"])
-        each_m = values.pop(_TOTAL) / math.sqrt(n_modes)
+        each_m = values.pop(_TOTAL) / math.sqrt(max(n_modes, 1))
         values |= {"pattern": None, "amplitude_m": [each_m] * n_modes}
     return values
 

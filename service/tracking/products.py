@@ -363,7 +363,7 @@ class MeasurementRecord:
     @property
     def each_m(self) -> float:
         """RMS of each mode, metres OPD, where all have the same."""
-        return self.total_m / max(len(self.amplitude_m), 1) ** 0.5
+        return float(self.total_m / np.sqrt(max(len(self.amplitude_m), 1)))
 
     @property
     def under_way(self) -> bool:

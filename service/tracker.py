@@ -14,6 +14,7 @@ from service.tracking import (
     operator,
     reconstructors,
     rtc,
+    stopping,
 )
 from service.tracking import events as ev
 from service.tracking.acquisition import abort_on_command, acquire, acquire_on_command
@@ -68,6 +69,9 @@ def _go_on(turn: Turn) -> None:
     if turn.state.measuring is not None:
         return
     fetch_in_use(turn)
+    if turn.state.stopped_because:
+        stopping.keep_stopped(turn)
+        return
     acquire(turn)
     if turn.acquisition.under_way:
         return
@@ -181,6 +185,10 @@ def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
             operator.set_loop(turn, command)
         case cmd.Ramp() as command:
             operator.ramp(turn, command)
+        case cmd.StopEverything() as command:
+            stopping.stop(turn, command)
+        case cmd.Resume() as command:
+            stopping.resume(turn, command)
         case cmd.Acquire():
             acquire_on_command(turn)
         case cmd.AbortAcquisition():

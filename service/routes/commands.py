@@ -26,12 +26,14 @@ from service.tracking.commands import (
     Ramp,
     Refit,
     Reject,
+    Resume,
     Rollback,
     SetLoop,
     SetMode,
     SetPointing,
     StartDither,
     StopDither,
+    StopEverything,
 )
 
 router = APIRouter(
@@ -143,6 +145,25 @@ async def rollback(client: ClientDep, command: Annotated[Rollback, body(Rollback
     It is sent even where the gate cannot judge it: α unknown, or the loop open.
     """
     return await client.orders(command, reconstructors=_ALL)
+
+
+@router.post("/stop", status_code=202)
+async def stop(
+    client: ClientDep, command: Annotated[StopEverything, body(StopEverything)]
+) -> AcceptedView:
+    """Stop everything: whatever runs is ended, no dither, nothing made or sent until released.
+
+    The service goes on to look at telemetry. A restart releases nothing. Of the RTC nothing is
+    asked but that a dither ends and, at once, what gives back a loop that was opened for an
+    acquisition. It is carried out even where the disk refuses to record it.
+    """
+    return await client.orders(command)
+
+
+@router.post("/resume", status_code=202)
+async def resume(client: ClientDep, command: Annotated[Resume, body(Resume)]) -> AcceptedView:
+    """Release what was stopped: mode and dither are as they were ordered before."""
+    return await client.orders(command)
 
 
 @router.put("/mode", status_code=202)

@@ -458,13 +458,13 @@ view(
 STATE = view(
     "StateView",
     Snapshot,
-    "tracker.system tracker.mode ready ready_reason now_ns uptime_s registration=alpha "
-    "tracker.in_use tracker.margin tracker.assessment tracker.mode_limit rtc tracker.pointing "
-    "tracker.basis_id tracker.config_id tracker.dither tracker.dithering tracker.vibrations_hz "
-    "tracker.measuring tracker.gathering tracker.acquisition tracker.loop_command "
-    "tracker.dither_due_since_ns_utc tracker.dither_due_reason tracker.watchdog tracker.unwatched "
-    "waiting_for tracker.alarms tracker.windows_accepted tracker.windows_refused "
-    "tracker.windows_outlying pace link",
+    "tracker.system tracker.mode tracker.stopped_because ready ready_reason now_ns uptime_s "
+    "registration=alpha tracker.in_use tracker.margin tracker.assessment tracker.mode_limit rtc "
+    "tracker.pointing tracker.basis_id tracker.config_id tracker.dither tracker.dithering "
+    "tracker.vibrations_hz tracker.measuring tracker.gathering tracker.acquisition "
+    "tracker.loop_command tracker.dither_due_since_ns_utc tracker.dither_due_reason "
+    "tracker.watchdog tracker.unwatched waiting_for tracker.alarms tracker.windows_accepted "
+    "tracker.windows_refused tracker.windows_outlying pace link",
     "What the service knows, at one glance.",
     measuring=MEASURING,
     gathering=GATHERING,

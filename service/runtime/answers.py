@@ -56,6 +56,11 @@ class Given:
         match self.command:
             case cmd.SetMode():
                 return Answer(f"mode is {now.mode}")
+            case cmd.StopEverything():
+                return _stopped(now)
+            case cmd.Resume():
+                off = "; no dither is started until POST /v1/dither with start"
+                return Answer(f"released: mode is {now.mode}{off if now.dither_stopped else ''}")
             case cmd.SetPointing():
                 return _pointing(now)
             case cmd.Acquire():
@@ -156,6 +161,14 @@ def _pointing(now: TrackerState) -> Answer:
         f"the telescope looks at elevation {where.elevation_deg:g} deg, azimuth "
         f"{where.azimuth_deg:g} deg"
     )
+
+
+def _stopped(now: TrackerState) -> Answer:
+    playing = None if now.rtc is None else now.rtc.dither_id
+    text = f"{now.stopped_because}; nothing is dithered, made or sent until POST /v1/resume"
+    if playing is None:
+        return Answer(text)
+    return Answer(f"{text}; the RTC's status still shows {playing}, it was told to stop it", False)
 
 
 def _no_dither(now: TrackerState) -> Answer:

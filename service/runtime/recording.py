@@ -122,11 +122,7 @@ class Recorder:
             If the disk refuses: it must not be done.
         """
         self._order(command, caller)
-        try:
-            await self.flush()
-        except StorageError as error:
-            self.refused(command, caller, error)
-            raise
+        await self.flush()
 
     def answered(self, command: Command, caller: Caller, answer: str) -> None:
         """Take down what an order has led to, as its giver was told."""
@@ -221,6 +217,13 @@ class Recorder:
                 await asyncio.sleep(RETRY_S)
             except ArchiveError as error:  # it has been put aside: the next attempt finds none
                 self._log.error("archive.failed", text=str(error))
+
+    async def keep_orders(self) -> None:
+        """Keep what was ordered for the service after this one now, if the disk lets it."""
+        try:
+            await asyncio.to_thread(leave, self._archive, self._state(), time.time_ns())
+        except ArchiveError as error:  # :meth:`save` tries again, and raises the alarm
+            self._log.error("archive.failed", text=str(error))
 
     def close(self) -> None:
         """Write what still waits and what the next service needs; blocks."""

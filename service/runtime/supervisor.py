@@ -143,13 +143,20 @@ class Supervisor:
         """
         if isinstance(command, cmd.SetPointing):  # told every second, and decides nothing
             return await self._carried_out(command)
-        await self._recorder.ordered(command, caller)
+        try:
+            await self._recorder.ordered(command, caller)
+        except StorageError as error:
+            if not isinstance(command, cmd.StopEverything):  # that one waits for no disk
+                self._recorder.refused(command, caller, error)
+                raise
         try:
             answer = await self._carried_out(command)
         except PyrcalError as error:
             self._recorder.refused(command, caller, error)
             raise
         self._recorder.answered(command, caller, answer)
+        if isinstance(command, cmd.StopEverything | cmd.Resume):
+            await self._recorder.keep_orders()
         return answer
 
     async def _carried_out(self, command: Command) -> str:

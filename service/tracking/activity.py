@@ -29,8 +29,9 @@ ANSWERED_WITHIN_S = 30.0
 
 
 class Activity(StrEnum):
-    """What may run."""
+    """What may run, or keep everything from running."""
 
+    STOPPED = "an operator has stopped everything"
     MEASURING = "an interaction matrix is being measured"
     GATHERING = "a noisy interaction matrix is being measured"
     RAMPING = "a gain ramp is under way"
@@ -49,14 +50,17 @@ _ALWAYS = frozenset[type](
         cmd.AbortAcquisition,
         cmd.GiveUp,
         cmd.Reject,
+        cmd.Resume,
         cmd.SetMode,
         cmd.SetPointing,
+        cmd.StopEverything,
         cmd.StopDither,
     }
 )
 """What ends something, and what disturbs nothing."""
 
 ALLOWS: dict[Activity, frozenset[type]] = {
+    Activity.STOPPED: _ALWAYS,
     Activity.MEASURING: _ALWAYS,
     # a swap costs it a window, and must not wait for minutes
     Activity.GATHERING: _ALWAYS | {cmd.Refit, cmd.Approve, cmd.Publish, cmd.Rollback},
@@ -65,7 +69,9 @@ ALLOWS: dict[Activity, frozenset[type]] = {
     # it makes way for what needs the loop, and an RTC measures under no dither
     Activity.OWN_DITHER: _ALL - {cmd.Measure, cmd.StartDither},
     Activity.OTHER_DITHER: _ALL - {cmd.Measure, cmd.StartDither, cmd.MeasureNoisy},
-    Activity.STANDING_BY: frozenset[type]({cmd.Reject, cmd.SetMode, cmd.SetPointing}),
+    Activity.STANDING_BY: frozenset[type](
+        {cmd.Reject, cmd.SetMode, cmd.SetPointing, cmd.StopEverything, cmd.Resume}
+    ),
     Activity.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish, cmd.Rollback},
     Activity.SENDING: _ALL - {cmd.Measure},
 }
@@ -121,6 +127,9 @@ def _exclusive(state: TrackerState, now_ns: int) -> tuple[Running, ...]:
         for alarm in state.alarms
         if alarm.name == STANDING_BY
     ]
+    if state.stopped_because:
+        text = f"{state.stopped_because}; POST /v1/resume releases it"
+        found.append(Running(Activity.STOPPED, text))
     if state.measuring is not None:
         text = (
             f"interaction matrix {state.measuring.id} is being measured; wait for it, or give it up"

@@ -15,6 +15,7 @@ import msgspec
 
 from service.tracking.state import Alarm, Party, TrackerState
 
+STOPPED = "stopped"
 ACQUISITION = "acquisition"
 VANISHED = "rtc-vanished"
 LOOP_OPEN = "loop-open"

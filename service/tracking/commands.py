@@ -360,8 +360,20 @@ class AbortAcquisition(Instruction):
     action: Literal["abort"] = "abort"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopEverything(Instruction):
+    """Stop everything: whatever runs is ended, no dither, nothing made or sent until released."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Resume(Instruction):
+    """Release what was stopped: mode and dither are as they were ordered before."""
+
+
 Command = (
-    Acquire
+    StopEverything
+    | Resume
+    | Acquire
     | AbortAcquisition
     | SetMode
     | Refit

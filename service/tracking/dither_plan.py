@@ -311,6 +311,8 @@ def why_unwanted(state: TrackerState, rtc: Status, policy: Policy) -> str | None
     running = rtc.dither_id
     if running is None or not running.startswith(OUR_DITHERS):
         return None
+    if state.stopped_because:
+        return "everything is stopped"
     followed = state.dither is not None and state.dither.id == running
     if state.dither_stopped and not followed:
         return "the operator wants no dither"

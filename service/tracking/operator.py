@@ -49,6 +49,7 @@ def orders_of(state: TrackerState) -> Orders:
         mode=None if state.settings_mode is None else state.mode,
         settings_mode=state.settings_mode,
         dither_stopped=state.dither_stopped,
+        stopped=state.stopped_because,
     )
 
 
@@ -341,7 +342,7 @@ def begin_closing(turn: Turn) -> None:
 def close_again(turn: Turn) -> None:
     """Close the loop that a measurement opened which was then given up, as often as it takes."""
     since_ns, rtc = turn.state.close_since_ns_utc, turn.rtc
-    if since_ns is None or rtc is None:
+    if since_ns is None or rtc is None or turn.state.stopped_because:
         return
     waited_s = (turn.now_ns - since_ns) / SECOND_NS
     # a measurement only just asked for may open it yet

@@ -11,6 +11,7 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import thinned
 from service.tracking.state import Orders, Saved, TrackerState
+from service.tracking.stopping import stay_stopped
 from service.tracking.turn import Turn
 from service.tracking.validity import age, restore
 
@@ -79,6 +80,7 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
     turn = Turn(state, Tick(), policy, now_ns)
     if saved.orders is not None and saved.system == state.system:
         obey(turn, saved.orders)
+        stay_stopped(turn, saved.orders)
     reason = _why_not(state, saved, now_ns)
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"

@@ -375,6 +375,9 @@ class TrackerState:
     unwatched: str = ""
     """Why ordinary telemetry says nothing of α now; empty: it does, or was not looked at yet."""
 
+    stopped_because: str = ""
+    """Who has stopped everything, and why; empty: nobody, or it was released."""
+
     alarms: tuple[Alarm, ...] = ()
     log: tuple[LogEntry, ...] = ()
     """Oldest first, bounded."""
@@ -428,6 +431,8 @@ class Orders:
     """What the settings said then; where they say something else now, they have the last word."""
 
     dither_stopped: bool = False
+    stopped: str = ""
+    """Who has stopped everything, and why; empty: nobody."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

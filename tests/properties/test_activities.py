@@ -7,6 +7,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.activity import ALLOWS, Activity, under_way
+from service.tracking.products import MeasureState
+from service.wire import DitherStop
 from tests.unit.tracking.test_activity import (
     ACTIVITIES,
     COMMANDS,
@@ -18,6 +20,13 @@ from tests.unit.tracking.test_activity import (
 OWNERS = {Activity.MEASURING, Activity.GATHERING, Activity.RAMPING, Activity.ACQUIRING}
 """Each has the mirror and the loop to itself. A dither is not one of them: it makes way."""
 
+
+def harmless(effect):
+    """Whether it may be done though everything is stopped: a question, or the end of a dither."""
+    stop = isinstance(effect, ev.Ask) and isinstance(effect.request, DitherStop)
+    return stop or isinstance(effect, ev.FetchMatrix)
+
+
 TROUBLES = ["loop-diverging", "commands-off-loop", "basis-mismatch", "matrix-mismatch"]
 
 
@@ -27,6 +36,7 @@ class Operators(RuleBasedStateMachine):
     @initialize(running=st.sampled_from(ACTIVITIES))
     def begin(self, running):
         self.world = running()
+        self.quiet_from = None
 
     @rule(command=st.sampled_from(COMMANDS))
     def ask(self, command):
@@ -34,7 +44,7 @@ class Operators(RuleBasedStateMachine):
         refusal = refused(self.world, command)
         assert "\n" not in refusal
         forbidding = [one.text for one in running if type(command) not in ALLOWS[one.activity]]
-        opens = isinstance(command, cmd.SetLoop) and command.closed is False
+        opens = isinstance(command, cmd.SetLoop) and command.loop == "open"
         if forbidding and not opens:
             assert refusal == f"{type(command).__name__}: {forbidding[0]}"
 
@@ -57,9 +67,34 @@ class Operators(RuleBasedStateMachine):
         owners = [one.text for one in running if one.activity in OWNERS]
         assert len(owners) <= 1, owners
 
+    @rule()
+    def stop(self):
+        assert refused(self.world, cmd.StopEverything(by="Ada")) == ""
+        assert self.world.state.stopped_because
+        assert "everything was stopped" in str(self.world.state.alarms)
+
+    @rule()
+    def release(self):
+        was_stopped = bool(self.world.state.stopped_because)
+        assert (refused(self.world, cmd.Resume()) == "") is was_stopped
+        assert not self.world.state.stopped_because
+
+    @invariant()
+    def what_is_stopped_stays_so_and_asks_for_nothing_but_the_end_of_a_dither(self):
+        stopped, effects = bool(self.world.state.stopped_because), self.world.effects
+        if stopped and self.quiet_from is not None:
+            assert not [one for one in effects[self.quiet_from :] if not harmless(one)]
+            running = under_way(self.world.state, self.world.now_ns)
+            assert not [one for one in running if one.activity in OWNERS - {Activity.RAMPING}]
+        self.quiet_from = len(effects) if stopped else None
+
     @invariant()
     def nothing_was_asked_of_an_rtc_that_was_at_something_else(self):
-        assert not [entry.text for entry in self.world.state.log if "busy: " in entry.text]
+        """One that goes on with a measurement that was given up is: nothing can end that."""
+        state = self.world.state
+        given_up = [one for one in state.measurements if one.state is MeasureState.GIVEN_UP]
+        busy = [entry.text for entry in state.log if "busy: " in entry.text]
+        assert given_up or not busy, busy
 
     def teardown(self):
         for name in TROUBLES:

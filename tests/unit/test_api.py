@@ -817,6 +817,8 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
     assert set(operations) == {
         "GET /v1/state",
         "POST /v1/acquisition",
+        "POST /v1/stop",
+        "POST /v1/resume",
         "POST /v1/loop",
         "POST /v1/loop/ramp",
         "DELETE /v1/measurements/{id}",

@@ -122,8 +122,15 @@ def sending():
     return world
 
 
+def stopped():
+    world = own_dither()
+    world.tell(cmd.StopEverything(by="Ada", reason="someone is on the platform"))
+    return world
+
+
 ACTIVITIES = [
     idle,
+    stopped,
     measuring,
     measuring_sines,
     waiting_for_a_noisy_one,
@@ -137,6 +144,8 @@ ACTIVITIES = [
     sending,
 ]
 COMMANDS = [
+    cmd.StopEverything(),
+    cmd.Resume(),
     cmd.Acquire(),
     cmd.AbortAcquisition(),
     cmd.SetMode(mode=Mode.AUTO),

@@ -1,0 +1,176 @@
+"""Stop everything: whatever runs is ended, nothing else is begun or sent until it is released."""
+
+import pytest
+
+from service.errors import CommandError
+from service.tracking import commands as cmd
+from service.tracking import events as ev
+from service.tracking.activity import ALLOWS, under_way
+from service.tracking.products import MatrixState, MeasureState
+from service.tracking.resume import resumed, saved_of
+from service.tracking.state import AcquisitionStage, Mode, TrackerState
+from service.wire import DitherStop, Loop, LoopRequest
+from tests.unit.tracking.situations import POLICY, of_kind
+from tests.unit.tracking.test_activity import (
+    ACTIVITIES,
+    acquiring,
+    gathering,
+    idle,
+    making,
+    measuring,
+    own_dither,
+    ramping,
+    sending,
+)
+from tests.unit.tracking.world import World
+
+STOP = cmd.StopEverything(by="Ada", reason="someone is on the platform")
+
+
+def harmless(effect):
+    stop = isinstance(effect, ev.Ask) and isinstance(effect.request, DitherStop)
+    return stop or isinstance(effect, ev.FetchMatrix)
+
+
+def stopped(world):
+    """Stop everything; from here on only effects of afterwards are in the list."""
+    world.tell(STOP)
+    world.effects.clear()
+    return world
+
+
+def alarm(world):
+    return next((one for one in world.state.alarms if one.name == "stopped"), None)
+
+
+def test_it_is_allowed_whatever_runs_and_so_is_its_end():
+    assert all({cmd.StopEverything, cmd.Resume} <= allowed for allowed in ALLOWS.values())
+
+
+@pytest.mark.parametrize("activity", ACTIVITIES, ids=lambda activity: activity.__name__)
+def test_nothing_is_asked_of_the_rtc_any_more_but_that_dithers_end(activity):
+    world = activity()
+    world.tell(cmd.SetMode(mode=Mode.AUTO))
+    stopped(world).pass_(120.0)
+    assert [one for one in world.effects if not harmless(one)] == []
+    assert world.playing is None or world.playing.request.id == "of-another-program"
+    assert "by Ada (someone is on the platform)" in alarm(world).text
+    assert "POST /v1/resume" in alarm(world).text
+
+
+def test_a_dither_ends_at_once():
+    assert stopped(own_dither()).pass_(1.0).playing is None
+
+
+def test_an_acquisition_gives_back_the_loop_and_does_not_begin_again():
+    world = acquiring()
+    assert world.loop == "open"
+    effects = world.tell(STOP)
+    assert [one.loop for one in of_kind(effects, LoopRequest)] == [Loop.CLOSED]
+    world.pass_(60.0)
+    assert world.state.acquisition.stage is AcquisitionStage.ABORTED
+    assert world.state.acquisition.held_off
+    assert world.loop == "closed"
+
+
+def test_measurements_are_given_up():
+    world = stopped(measuring())
+    assert world.state.measurement("im-1").state is MeasureState.GIVEN_UP
+    world.pass_(10.0)
+    assert world.effects == [one for one in world.effects if harmless(one)]
+    noisy = stopped(gathering())
+    assert noisy.state.measurement("noisy-1").state is MeasureState.GIVEN_UP
+    assert noisy.pass_(1.0).playing is None
+
+
+def test_a_gain_ramp_is_the_rtcs_and_named():
+    world = stopped(ramping())
+    assert "is the RTC's and ends by itself" in alarm(world).text
+    assert world.pass_(30.0).loop == "closed"
+
+
+def test_a_matrix_that_was_being_made_is_kept_and_not_sent():
+    world = making()
+    world.tell(cmd.SetMode(mode=Mode.AUTO))
+    stopped(world).pass_(10.0)
+    assert world.state.reconstructors[-1].state is MatrixState.PROPOSED
+    assert world.state.in_use == "cm-1"
+
+
+def test_one_that_is_on_its_way_cannot_be_called_back():
+    world = sending()
+    name = world.state.reconstructors[-1].id
+    stopped(world).pass_(3.0)
+    assert world.state.in_use == name
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        cmd.Refit(),
+        cmd.StartDither(),
+        cmd.Acquire(),
+        cmd.Rollback(),
+        cmd.SetLoop(loop="open"),
+        cmd.Measure(id="im-9"),
+    ],
+)
+def test_a_command_is_refused_with_who_stopped_it_and_how_it_is_released(command):
+    with pytest.raises(CommandError, match=r"stopped by Ada \(someone.*POST /v1/resume"):
+        stopped(idle()).tell(command)
+
+
+def test_released_it_goes_on_as_it_was_ordered_before():
+    world = World(Mode.AUTO)
+    world.pass_(6.0)
+    assert world.playing is not None
+    stopped(world).pass_(20.0)
+    assert world.playing is None
+    world.tell(cmd.Resume(by="Ada"))
+    assert alarm(world) is None
+    assert world.state.mode is Mode.AUTO
+    world.pass_(6.0)
+    assert world.playing is not None
+
+
+def test_only_what_is_stopped_is_released():
+    with pytest.raises(CommandError, match="nothing is stopped"):
+        idle().tell(cmd.Resume())
+
+
+def test_who_stopped_it_first_is_remembered():
+    world = stopped(idle())
+    world.tell(cmd.StopEverything(by="Bob"))
+    assert "Ada" in world.state.stopped_because
+
+
+def test_a_restart_releases_nothing():
+    world = stopped(idle())
+    saved = saved_of(world.state, world.now_ns)
+    fresh = TrackerState(system=world.state.system, mode=Mode.AUTO)
+    world.state = resumed(fresh, saved, POLICY, world.now_ns)
+    assert "Ada" in alarm(world).text
+    world.pass_(30.0)
+    assert [one for one in world.effects if not harmless(one)] == []
+    world.tell(cmd.Resume())
+    assert not world.state.stopped_because
+    assert not [one for one in under_way(world.state, world.now_ns) if "stopped" in one.text]
+
+
+def test_it_stays_so_while_the_rtc_is_away_and_comes_back():
+    world = stopped(own_dither())
+    world.tell(ev.RtcVanished())
+    world.tell(STOP)
+    world.begin_session()
+    world.pass_(20.0)
+    assert alarm(world) is not None
+    assert [one for one in world.effects if not harmless(one)] == []
+
+
+def test_released_at_once_it_takes_no_dither_for_its_own_that_is_about_to_end():
+    world = own_dither()
+    world.tell(STOP)
+    world.tell(cmd.Resume())
+    world.pass_(20.0)
+    assert not [entry.text for entry in world.state.log if "busy: " in entry.text]
+    assert world.playing is not None

@@ -204,3 +204,16 @@ async def test_the_state_shows_the_one_under_way(client):
     state = picture(TrackerState(system="x", measurements=(RUNNING,)).gathering, GATHERING)
     found = (state["id"], state["state"], state["duration_s"])
     assert found == ("noisy-2", MeasureState.RUNNING, 30.0)
+
+
+async def test_it_is_a_measured_matrix_of_no_pattern_an_rtc_could_be_asked_for(client, service):
+    body = (await client.get("/v1/measurements/noisy-2")).json()
+    assert (body["id"], body["pattern"], body["amplitude_m"]) == (
+        "noisy-2",
+        None,
+        pytest.approx([5e-9 / np.sqrt(3)] * 3),
+    )
+    assert (await client.get("/v1/measurements")).json()["measurements"] == []
+    response = await client.delete("/v1/measurements/noisy-2")
+    assert response.status_code == 202, response.text
+    assert service.commands == [GiveUp(id="noisy-2")]

@@ -29,6 +29,7 @@ from service.routes import (
     views,
 )
 from service.routes.admission import Admission, Hosts, server_config
+from service.routes.once import Once
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 
@@ -100,6 +101,7 @@ def create_app(
         generate_unique_id_function=_operation_id,
         responses=problems.EVERYWHERE,
     )
+    app.add_middleware(Once)
     app.add_middleware(Admission, hosts=hosts or Hosts())
     app.state.service = service
     app.state.stream = stream.Stream(service, over or asyncio.Event())

@@ -10,6 +10,8 @@
     ├── LinkError            the zenoh session cannot be opened or an RTC does not answer
     ├── CommandError         an operator's request that cannot be carried out now
     │   ├── UnknownIdError   a reconstructor, session or product nobody has heard of
+    │   ├── StaleError       what it was decided on has changed since
+    │   ├── UntaggedError    strictness was asked for, and not what it was decided on
     │   ├── TooLargeError    a request or an upload beyond the limit
     │   ├── TooSlowError     a request or an upload that does not come in time
     │   └── BusyError        too much under way already: try again later
@@ -74,6 +76,14 @@ class CommandError(PyrcalError):
 
 class UnknownIdError(CommandError):
     """The id names nothing this service knows."""
+
+
+class StaleError(CommandError):
+    """What somebody has decided on has changed since they saw it."""
+
+
+class UntaggedError(CommandError):
+    """Somebody asks for strictness, and does not say what they have decided on."""
 
 
 class TooLargeError(CommandError):

@@ -114,7 +114,7 @@ class Admission:
                 return await known_problem(request, error)(scope, receive, send)
             if body is None:
                 return None
-            receive = _again(body, receive)
+            receive = again(body, receive)
         return await self._app(scope, receive, send)
 
     def _stranger(self, request: Request) -> tuple[HTTPStatus, str, str] | None:
@@ -200,7 +200,7 @@ def _too_large(found: str) -> TooLargeError:
     return TooLargeError(f"body: found {found}, expected at most {MOST_BODY_BYTES / 1e6:.1f} MB")
 
 
-def _again(body: bytes, receive: Receive) -> Receive:
+def again(body: bytes, receive: Receive) -> Receive:
     """Return a ``receive`` that begins with this body."""
     first = True
 

@@ -6,15 +6,17 @@ seconds, what it said. What takes longer is seen in the state and in the events.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Discriminator
 
+from service.errors import StaleError, UntaggedError
 from service.routes.orders import Said, about, body
-from service.routes.problems import COMMAND, INVALID, UNKNOWN
-from service.routes.views import MatrixId, ServiceDep
+from service.routes.problems import COMMAND, DECISION, INVALID, UNKNOWN
+from service.routes.views import RECONSTRUCTORS, MatrixId, ServiceDep, known, tagged
 from service.runtime.recording import Caller, Whence
 from service.runtime.supervisor import Supervisor
 from service.tracking.commands import (
@@ -35,6 +37,7 @@ from service.tracking.commands import (
     StopDither,
     StopEverything,
 )
+from service.tracking.state import TrackerState
 
 router = APIRouter(
     prefix="/v1",
@@ -71,10 +74,36 @@ class Client:
     """That is to obey."""
 
     caller: Caller
+    seen: str | None
+    """ETags of what the order was decided on; None: not told."""
+
+    strict: bool
+    """Whether an order that decides about something is refused without them."""
 
     async def orders(self, command: Command, **links: str) -> AcceptedView:
         """Hand a command on; say what was done, and where to look for what becomes of it."""
-        text = await self.service.submit(command, self.caller)
+        return await self._orders(command, self.caller, links)
+
+    async def decides(
+        self, command: Command, shown: Callable[[TrackerState], Response], **links: str
+    ) -> AcceptedView:
+        """Do the same, if what is ``shown`` is still what whoever decides has seen."""
+        caller = replace(self.caller, check=lambda: self._check(shown))
+        return await self._orders(command, caller, links)
+
+    def _check(self, shown: Callable[[TrackerState], Response]) -> None:
+        if self.seen is None:
+            if self.strict:
+                raise UntaggedError("found no If-Match, expected the ETag of what is decided on")
+            return
+        now = shown(self.service.snapshot().tracker).headers["ETag"]
+        if self.seen != "*" and now not in {tag.strip() for tag in self.seen.split(",")}:
+            raise StaleError(f"found If-Match {self.seen:.80}, it is {now} now: look again")
+
+    async def _orders(
+        self, command: Command, caller: Caller, links: dict[str, str]
+    ) -> AcceptedView:
+        text = await self.service.submit(command, caller)
         links = {"state": "/v1/state", "events": "/v1/events", **links}
         return AcceptedView(text=text, links=links)
 
@@ -87,7 +116,9 @@ def _client_of(request: Request, service: ServiceDep) -> Client:
         from_us = sent.get("user-agent", "").startswith("pyrcal")
         whence = Whence.CLI if from_us else Whence.REST
     address = "" if request.client is None else request.client.host
-    return Client(service, Caller(address=address, whence=whence))
+    strict = "handling=strict" in sent.get("prefer", "").replace(" ", "").lower()
+    caller = Caller(address=address, whence=whence)
+    return Client(service, caller, sent.get("if-match"), strict)
 
 
 ClientDep = Annotated[Client, Depends(_client_of)]
@@ -115,36 +146,49 @@ async def dither(
     return await client.orders(command)
 
 
-@router.post("/reconstructors/{id}/approve", status_code=202, responses={**UNKNOWN})
+def _one(matrix_id: str) -> Callable[[TrackerState], Response]:
+    """Return what shows a reconstructor."""
+    return lambda state: tagged(known(state.reconstructor(matrix_id), f"reconstructor {matrix_id}"))
+
+
+def _all(state: TrackerState) -> Response:
+    return tagged(state, RECONSTRUCTORS)
+
+
+_DECIDES: dict[int | str, Any] = {**UNKNOWN, **DECISION}
+
+
+@router.post("/reconstructors/{id}/approve", status_code=202, responses=_DECIDES)
 async def approve(client: ClientDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
     """Publish a proposed reconstructor."""
     command = about(Approve, said, id=matrix_id)
-    return await client.orders(command, reconstructor=_link(matrix_id))
+    return await client.decides(command, _one(matrix_id), reconstructor=_link(matrix_id))
 
 
-@router.post("/reconstructors/{id}/reject", status_code=202, responses={**UNKNOWN})
+@router.post("/reconstructors/{id}/reject", status_code=202, responses=_DECIDES)
 async def reject(client: ClientDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
     """Discard a proposed reconstructor; the reason is kept with it."""
     command = about(Reject, said, id=matrix_id)
-    return await client.orders(command, reconstructor=_link(matrix_id))
+    return await client.decides(command, _one(matrix_id), reconstructor=_link(matrix_id))
 
 
-@router.post("/reconstructors/{id}/publish", status_code=202, responses={**UNKNOWN})
+@router.post("/reconstructors/{id}/publish", status_code=202, responses=_DECIDES)
 async def publish(client: ClientDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
     """Send a known reconstructor again, under a new id, unless the gate refuses it now.
 
     What has been in use is sent even where the gate cannot judge it: α unknown, or the loop open.
     """
-    return await client.orders(about(Publish, said, id=matrix_id), reconstructors=_ALL)
+    command = about(Publish, said, id=matrix_id)
+    return await client.decides(command, _one(matrix_id), reconstructors=_ALL)
 
 
-@router.post("/rollback", status_code=202)
+@router.post("/rollback", status_code=202, responses={**DECISION})
 async def rollback(client: ClientDep, command: Annotated[Rollback, body(Rollback)]) -> AcceptedView:
     """Go back to the one in use before, unless the gate refuses it.
 
     It is sent even where the gate cannot judge it: α unknown, or the loop open.
     """
-    return await client.orders(command, reconstructors=_ALL)
+    return await client.decides(command, _all, reconstructors=_ALL)
 
 
 @router.post("/stop", status_code=202)

@@ -19,16 +19,20 @@ from service.errors import (
     LinkError,
     MatrixError,
     PyrcalError,
+    StaleError,
     StorageError,
     TooLargeError,
     TooSlowError,
     UnknownIdError,
+    UntaggedError,
 )
 
 MEDIA_TYPE = "application/problem+json"
 
 _OF_ERROR: dict[type[PyrcalError], tuple[HTTPStatus, str]] = {
     UnknownIdError: (HTTPStatus.NOT_FOUND, "unknown-id"),
+    StaleError: (HTTPStatus.PRECONDITION_FAILED, "stale"),
+    UntaggedError: (HTTPStatus.PRECONDITION_REQUIRED, "if-match"),
     TooLargeError: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large"),
     TooSlowError: (HTTPStatus.REQUEST_TIMEOUT, "too-slow"),
     BusyError: (HTTPStatus.SERVICE_UNAVAILABLE, "busy"),
@@ -95,6 +99,10 @@ EVERYWHERE: Responses = {
     421: problem_response("Asked for under a name this service does not know"),
 }
 UNKNOWN: Responses = {404: problem_response("No such thing")}
+DECISION: Responses = {
+    412: problem_response("It has changed since it was seen: If-Match names another ETag"),
+    428: problem_response("Prefer: handling=strict was sent, and no If-Match"),
+}
 COMMAND: Responses = {
     409: problem_response("Cannot be carried out in the present state"),
     504: problem_response("The RTC does not answer"),

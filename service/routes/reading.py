@@ -19,7 +19,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, model_validato
 from service.errors import CommandError
 from service.routes import views
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
-from service.routes.views import GainTableShown, MatrixId, ServiceDep, answer, known, shows
+from service.routes.views import GainTableShown, MatrixId, ServiceDep, answer, known, shows, tagged
 from service.tracking.registration import HistoryEntry, ModeGain, table_of
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
@@ -230,14 +230,14 @@ def thinned(history: History, n_points: int) -> History:
 @router.get("/reconstructors", responses={200: shows(views.RECONSTRUCTORS)})
 async def reconstructors(service: ServiceDep) -> Response:
     """Return the reconstructors the service remembers, oldest first."""
-    return answer(service.snapshot().tracker, views.RECONSTRUCTORS)
+    return tagged(service.snapshot().tracker, views.RECONSTRUCTORS)
 
 
 @router.get("/reconstructors/{id}", responses={200: shows(views.RECONSTRUCTOR), **UNKNOWN})
 async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return what is known of one reconstructor."""
     record = service.snapshot().tracker.reconstructor(matrix_id)
-    return answer(known(record, f"reconstructor {matrix_id}"))
+    return tagged(known(record, f"reconstructor {matrix_id}"))
 
 
 @router.get(

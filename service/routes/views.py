@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import cache
+from hashlib import blake2b
 from itertools import pairwise
 from operator import attrgetter
 from types import NoneType, UnionType
@@ -119,6 +120,13 @@ def picture(record: object, of: View | None = None) -> dict[str, Any]:
 def answer(record: object, of: View | None = None) -> JSONResponse:
     """Return the answer that shows a record."""
     return JSONResponse(picture(record, of))
+
+
+def tagged(record: object, of: View | None = None) -> JSONResponse:
+    """Return the answer that shows a record, with an ETag that changes when it does."""
+    shown = answer(record, of)
+    shown.headers["ETag"] = f'"{blake2b(shown.body, digest_size=12).hexdigest()}"'
+    return shown
 
 
 def known(record: Record | None, what: str) -> Record:

@@ -56,6 +56,8 @@ class Caller:
 
     address: str = ""
     whence: Whence = Whence.REST
+    check: Callable[[], None] = lambda: None
+    """Raises where what the order was decided on has changed."""
 
 
 class Recorder:

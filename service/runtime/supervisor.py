@@ -150,6 +150,7 @@ class Supervisor:
                 self._recorder.refused(command, caller, error)
                 raise
         try:
+            caller.check()
             answer = await self._carried_out(command)
         except PyrcalError as error:
             self._recorder.refused(command, caller, error)

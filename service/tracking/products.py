@@ -203,15 +203,14 @@ class MeasureState(StrEnum):
     GIVEN_UP = "given-up"
     """An operator waits for it no longer; the RTC may go on, what it sends is ignored."""
 
-    @property
-    def under_way(self) -> bool:
-        """Whether the service still waits for the matrix, or works on it."""
-        return self in {
-            MeasureState.WAITING,
-            MeasureState.ASKED,
-            MeasureState.RUNNING,
-            MeasureState.FINISHING,
-        }
+
+_MEASURING = (
+    MeasureState.RUNNING,
+    MeasureState.WAITING,
+    MeasureState.ASKED,
+    MeasureState.FINISHING,
+)
+"""A tuple: looked at hundreds of times a second, for every record, and faster than a set."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -368,7 +367,7 @@ class MeasurementRecord:
     @property
     def under_way(self) -> bool:
         """Whether the service waits for the matrix, or works on it."""
-        return self.state.under_way
+        return self.state in _MEASURING
 
 
 class ModeSet(StrEnum):

@@ -416,8 +416,8 @@ class TrackerState:
         return self._under_way(noisy=True)
 
     def _under_way(self, *, noisy: bool) -> MeasurementRecord | None:
-        of_kind = (r for r in reversed(self.measurements) if (r.pattern is None) is noisy)
-        return next((r for r in of_kind if r.under_way), None)
+        going_on = (r for r in reversed(self.measurements) if r.under_way)
+        return next((r for r in going_on if (r.pattern is None) is noisy), None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,7 +5,7 @@
  * Sent with zenoh-c 1.x (https://github.com/eclipse-zenoh/zenoh-c):
  *     cc -std=c99 -DWITH_ZENOH telemetry.c -lzenohc -o telemetry && ./telemetry ENDPOINT SYSTEM
  *
- * The machine is little-endian, as the floats of a payload are.
+ * The tests compile the first only. The machine is little-endian, as the floats of a payload are.
  */
 #include <stdbool.h>
 #include <stdint.h>

@@ -27,6 +27,12 @@ STROKE_M: Final = 20e-9
 """RMS of a push or pull, metres OPD: the service's own."""
 
 MEASURED_S: Final = 20.0
+_STANDING: Final = 5
+"""Batches with one and the same command: it stands."""
+
+NOISY: Final = 0.3
+"""What other modes measure, over a mode's own, from which on it tells nothing."""
+
 LIKELY: Final = (0.2, 3.0)
 """What a mode measures of itself by the matrix in use: optical gain, double pass."""
 
@@ -95,8 +101,10 @@ def _after_opening(talk: Talk, before: Status) -> list[str]:
         problems.append("opening began no new session")
     elif not later:
         problems.append("no frame is of the new session")
-    elif later[0].largest_m > 0.0:
-        problems.append(f"the first command is {1e9 * later[0].largest_m:.3g} nm, not 0")
+    last_m = [arrival.largest_m for arrival in later[-_STANDING:]]
+    # what is played on the mirror moves, a mirror that lags comes to rest
+    if len(last_m) == _STANDING and last_m[0] > 0.0 and len(set(last_m)) == 1:
+        problems.append(f"a command of {1e9 * last_m[0]:.3g} nm stands: the integrator is not 0")
     return problems
 
 
@@ -158,7 +166,11 @@ def _measured(found: MeasuredMatrix, request: MeasureRequest, in_use: MatrixInUs
         return wrong(
             "measure", f"it has {matrix.shape[0]} rows for {in_use.matrix.shape[1]} slopes"
         )
-    of_itself = np.diag(in_use.matrix[list(modes)] @ matrix)
+    by_modes = in_use.matrix @ matrix
+    of_itself = np.diag(by_modes[list(modes)])
+    noise = float(np.median(np.abs(np.delete(by_modes, modes, axis=0))))
+    if noise > NOISY * np.abs(of_itself).max():
+        return skipped("measure", f"{list(matrix.shape)}; too noisy to compare: {noise:.2g}")
     own = " and ".join(f"{share:.2f}" for share in of_itself)
     text = f"{list(matrix.shape)}; by the matrix in use a metre of a mode measures {own}"
     if (of_itself < LIKELY[0]).any() or (of_itself > LIKELY[1]).any():

@@ -242,7 +242,8 @@ class Pretend:
             slopes[k] += 1e-3 * self.rng.standard_normal(N_SLOPES)
             after = self.leak * self.next[1]
             after[:N_CONTROLLED] -= self.gains[:N_CONTROLLED] * (self.matrix @ slopes[k])
-            self.next = np.stack([self.next[1], after if self.closed else np.zeros(N_MODES)])
+            kept = self.next[1] if self.twists.get("integrator_stays") else np.zeros(N_MODES)
+            self.next = np.stack([self.next[1], after if self.closed else kept])
 
     def _execute(self, command):
         self.commands.append(command)
@@ -297,6 +298,7 @@ class Pretend:
             return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
         self._start_over("s-measuring")
         matrix = self.twists.get("measured", 1.0) * RESPONSE[:, list(command.modes)]
+        matrix += self.twists.get("noise", 0.0) * self.rng.standard_normal(matrix.shape)
         self.due.append((self.now_s + 1.0, lambda: self._send(command, matrix.astype("<f4"))))
         return Reply(id=command.id, accepted=True, reason="", start_seq=self.seq)
 

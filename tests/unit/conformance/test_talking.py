@@ -172,7 +172,7 @@ def test_a_session_that_changes_because_the_router_was_away_is_named():
     ("twists", "words"),
     [
         ({"session_when_open": "s-1"}, "opening began no new session"),
-        ({"integrator_stays": True}, "nm, not 0"),
+        ({"integrator_stays": True}, "nm stands: the integrator is not 0"),
         ({"session_when_closed": "s-closed"}, "closing began session s-closed"),
         ({"no_command": (CommandKind.LOOP,)}, "it would not open: no answer"),
     ],
@@ -196,6 +196,12 @@ def test_a_measured_matrix_that_is_not_of_metres_is_named(twists, words):
 def test_an_rtc_that_measures_nothing_is_no_fault():
     check = asked(Pretend(no_command=("measure",)), "measure")["measure"]
     assert check.outcome is Outcome.SKIPPED
+
+
+def test_a_measurement_that_drowns_in_noise_is_no_fault():
+    check = asked(Pretend(noise=1e8), "measure")["measure"]
+    assert check.outcome is Outcome.SKIPPED
+    assert "too noisy" in check.found
 
 
 # --- safety

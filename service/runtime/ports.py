@@ -16,6 +16,7 @@ from service.worker import Done, OpticsWorker
 
 P = ParamSpec("P")
 R = TypeVar("R")
+Numbers = TypeVar("Numbers", contravariant=True)
 
 
 class RtcPort(Protocol):
@@ -49,17 +50,10 @@ class WorkerPort(Protocol):
         """Run a method of the workbench and return its result."""
 
 
-class MeasuredPort(Protocol):
-    """Where measured interaction matrices are kept."""
+class MeasuredPort(Protocol[Numbers]):
+    """Where measured interaction matrices of one kind are kept."""
 
-    def store(self, record: MeasurementRecord, matrix: NDArray[np.float32], name: str, /) -> None:
-        """Keep one ``(n_slopes, n_modes)`` of the instrument of that name."""
-
-
-class NoisyPort(Protocol):
-    """Where noisy interaction matrices are kept."""
-
-    def store(self, record: MeasurementRecord, numbers: NoisyNumbers, name: str, /) -> None:
+    def store(self, record: MeasurementRecord, numbers: Numbers, name: str, /) -> None:
         """Keep one of the instrument of that name."""
 
 
@@ -88,9 +82,9 @@ class StorePort(Protocol):
         """Reconstructors."""
 
     @property
-    def measured(self) -> MeasuredPort:
-        """Interaction matrices the RTC has measured."""
+    def measured(self) -> MeasuredPort[NDArray[np.float32]]:
+        """Those the RTC has measured, ``(n_slopes, n_modes)``."""
 
     @property
-    def noisy(self) -> NoisyPort:
-        """Noisy interaction matrices of random dithers."""
+    def noisy(self) -> MeasuredPort[NoisyNumbers]:
+        """Noisy ones, of random dithers."""

@@ -19,7 +19,7 @@ from pydantic import Field
 from service.archive import Archive, AuditEntry, Range
 from service.routes.problems import INVALID
 from service.routes.reading import FOREVER_NS, TimeParameters
-from service.routes.views import ServiceDep, answer, picture, shows, view
+from service.routes.views import ServiceDep, answer, clock_of, is_time, picture, shows, view
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -120,7 +120,8 @@ def _json_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
 def _csv_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
     """Yield a table; a cell that a spreadsheet would work out is kept from it by an apostrophe."""
     buffer = io.StringIO()
-    table = csv.DictWriter(buffer, ENTRY.paths)
+    names = (n for name in ENTRY.paths for n in (name, clock_of(name))[: 1 + is_time(name)])
+    table = csv.DictWriter(buffer, list(names))
     table.writeheader()
     while True:
         yield buffer.getvalue()

@@ -14,9 +14,10 @@ from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Discriminator
 
 from service.errors import StaleError, UntaggedError
+from service.routes.numbers import MatrixId
 from service.routes.orders import Said, about, body
 from service.routes.problems import COMMAND, DECISION, INVALID, UNKNOWN
-from service.routes.views import RECONSTRUCTORS, MatrixId, ServiceDep, known, tagged
+from service.routes.views import RECONSTRUCTORS, ServiceDep, known, tagged
 from service.runtime.recording import Caller, Whence
 from service.runtime.supervisor import Supervisor
 from service.tracking.commands import (

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator, Callable
 from http import HTTPStatus
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -18,9 +18,19 @@ from service.files.uploads import FitAsked, FitState
 from service.fit.matrix import FitOptions, Method
 from service.routes import views
 from service.routes.problems import INVALID, UNKNOWN, problem_response
-from service.routes.views import FitJobs, FitsDep, ServiceDep, answer, picture, shows
+from service.routes.views import FitJobs, ServiceDep, answer, picture, shows
+from service.runtime.uploads import FitQueue
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
+
+
+def _fits_of(request: Request) -> FitQueue:
+    fits: FitQueue = request.app.state.fits
+    return fits
+
+
+FitsDep = Annotated[FitQueue, Depends(_fits_of)]
+"""The desk a route works for."""
 
 FitId = Annotated[str, Path(alias="id", description="Id of a fit")]
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import UTC, datetime
-from enum import StrEnum
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
@@ -16,9 +15,9 @@ from fastapi.concurrency import run_in_threadpool
 
 from service.routes import views
 from service.routes.commands import AcceptedView, ClientDep
+from service.routes.numbers import MatrixParameters, describes_numbers, numbers_of
 from service.routes.orders import Said, about, body
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
-from service.routes.reading import Parameters, describes_numbers, numbers_of
 from service.routes.views import ServiceDep, answer, known, shows
 from service.snapshot import Snapshot
 from service.tracking.commands import (
@@ -49,34 +48,11 @@ class MatrixAcceptedView(AcceptedView):
     """Of the matrix to come."""
 
 
-class MeasuredFormat(StrEnum):
-    """How a measured matrix leaves."""
-
-    NPY = "npy"
-    """NumPy's own file format."""
-
-    RAW = "raw"
-    """C-ordered little-endian float32, the bytes ``sha256`` is of."""
-
-    HDF5 = "hdf5"
-    """The archived product, with how it was measured."""
-
-
-class MeasuredParameters(Parameters):
-    """How to return a measured matrix."""
-
-    format: MeasuredFormat = MeasuredFormat.NPY
-    """"npy", "raw" or "hdf5"."""
-
-
 _MEASURED_NUMBERS = describes_numbers(
     "The measured interaction matrix, slope per metre OPD",
-    "Rows (slopes) and columns (modes); not with hdf5",
+    "Rows (slopes) and columns (modes)",
     "1384,400",
 )
-_MEASURED_NUMBERS["content"]["application/x-hdf5"] = {
-    "schema": {"type": "string", "format": "binary"}
-}
 
 
 def _new_id(prefix: str, snapshot: Snapshot) -> str:
@@ -139,17 +115,16 @@ async def give_up(client: ClientDep, measurement_id: MeasurementId, said: Said) 
 async def measured_matrix(
     service: ServiceDep,
     measurement_id: MeasurementId,
-    parameters: Annotated[MeasuredParameters, Query()],
+    parameters: Annotated[MatrixParameters, Query()],
 ) -> Response:
     """Return a measured interaction matrix ``(n_slopes, n_modes)``, slope per metre OPD.
 
     ``?format=npy`` (the default) is a NumPy file, ``raw`` the bytes whose SHA-256 is the
-    measurement's ``sha256``, ``hdf5`` the archived product with how it was measured.
+    measurement's ``sha256``, ``hdf5`` the archived product with how it was measured, ``fits`` an
+    image.
     """
-    if parameters.format is MeasuredFormat.HDF5:
-        return await _file(service.archive.measured.file, measurement_id)
-    raw = parameters.format is MeasuredFormat.RAW
-    return await numbers_of(service.archive.measured.matrix, measurement_id, raw=raw)
+    kept = service.archive.measured
+    return await numbers_of(measurement_id, parameters.format, kept.matrix, kept.file)
 
 
 @noisy.post("/noisy-matrix", status_code=202, responses={**COMMAND})

@@ -2,43 +2,30 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from enum import StrEnum
 from http import HTTPStatus
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from numpy.typing import NDArray
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AwareDatetime, Field, model_validator
 
 from service.errors import CommandError
 from service.routes import views
+from service.routes.numbers import (
+    MatrixId,
+    MatrixParameters,
+    Parameters,
+    describes_numbers,
+    numbers_of,
+)
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
-from service.routes.views import GainTableShown, MatrixId, ServiceDep, answer, known, shows, tagged
+from service.routes.views import GainTableShown, ServiceDep, answer, known, shows, tagged
 from service.tracking.registration import HistoryEntry, ModeGain, table_of
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
-
-
-class MatrixFormat(StrEnum):
-    """How a reconstructor's numbers leave."""
-
-    NPY = "npy"
-    """NumPy's own file format."""
-
-    RAW = "raw"
-    """The bytes as they travel to the RTC: C-ordered little-endian float32."""
-
-
-class Parameters(BaseModel):
-    """Query parameters; an unknown one is refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class LimitParameters(Parameters):
@@ -105,50 +92,6 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 def _nanoseconds(time: datetime | None) -> int | None:
     return None if time is None else (time - _EPOCH) // timedelta(microseconds=1) * 1000
-
-
-class MatrixParameters(Parameters):
-    """How to return a reconstructor."""
-
-    format: MatrixFormat = MatrixFormat.NPY
-    """"npy" or "raw"."""
-
-
-async def numbers_of(
-    matrix_of: Callable[[str], NDArray[np.float32]], matrix_id: str, *, raw: bool
-) -> Response:
-    """Return the numbers of a matrix: a NumPy file, or the bytes its SHA-256 is of."""
-    numbers = np.ascontiguousarray(await run_in_threadpool(matrix_of, matrix_id), "<f4")
-    buffer = io.BytesIO()
-    np.save(buffer, numbers, allow_pickle=False)
-    extension = "f4" if raw else "npy"
-    return Response(
-        numbers.tobytes() if raw else buffer.getvalue(),
-        media_type="application/octet-stream",
-        headers={
-            "X-Shape": ",".join(str(n) for n in numbers.shape),
-            "X-Dtype": "<f4",
-            "Content-Disposition": f'attachment; filename="{matrix_id}.{extension}"',
-        },
-    )
-
-
-def describes_numbers(description: str, rows_and_columns: str, example: str) -> dict[str, Any]:
-    """Return the OpenAPI description of such an answer."""
-    return {
-        "description": description,
-        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
-        "headers": {
-            "X-Shape": {
-                "description": rows_and_columns,
-                "schema": {"type": "string", "example": example},
-            },
-            "X-Dtype": {
-                "description": "C-ordered little-endian float32",
-                "schema": {"type": "string", "example": "<f4"},
-            },
-        },
-    }
 
 
 @router.get("/state", responses={200: shows(views.STATE)})
@@ -257,11 +200,16 @@ async def reconstructor_matrix(
 ) -> Response:
     """Return a reconstructor's numbers, ``(n_modes, n_slopes)``, metres OPD per slope.
 
-    ``?format=npy`` (the default) is a NumPy file, ``?format=raw`` the bytes as they travel to
-    the RTC, whose SHA-256 is the reconstructor's ``sha256``.
+    ``?format=npy`` (the default) is a NumPy file, ``raw`` the bytes as they travel to the RTC,
+    whose SHA-256 is the reconstructor's ``sha256``, ``hdf5`` the archived product, ``fits`` an
+    image.
     """
-    raw = parameters.format is MatrixFormat.RAW
-    return await numbers_of(service.matrix, matrix_id, raw=raw)
+    return await numbers_of(
+        matrix_id,
+        parameters.format,
+        service.matrix,
+        lambda name: service.archive.reconstructors.file(name),
+    )
 
 
 @router.get("/events", responses={200: shows(views.EVENTS)})

@@ -41,7 +41,7 @@ RETRY_MS = 1000
 ABORT = "pyrcal.abort"
 """Extension of a request's scope: ends its connection at once, with all that was not taken."""
 
-_CLOCKS = {"now_ns", "uptime_s", "age_s", "window_age_s", "frame_age_s"}
+_CLOCKS = {"now_ns", "now_utc", "uptime_s", "age_s", "window_age_s", "frame_age_s"}
 """What changes in the state while nothing happens."""
 
 Log = tuple[LogEntry, ...]

@@ -15,6 +15,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from functools import cache
 from hashlib import blake2b
@@ -24,7 +25,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from fastapi import Depends, Path, Request
+from fastapi import Depends, Request
 from fastapi.responses import JSONResponse
 from numpy.typing import NDArray
 
@@ -35,7 +36,6 @@ from service.files.uploads import FitJob
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.runtime.supervisor import Supervisor
-from service.runtime.uploads import FitQueue
 from service.snapshot import Alpha, Pace, Rtc, Snapshot
 from service.tracking.commands import GainGroup
 from service.tracking.dither_request import Dither, Dithering, DitherPlan
@@ -55,6 +55,9 @@ Record = TypeVar("Record")
 
 Schema = dict[str, Any]
 """A JSON schema."""
+
+_LATEST_NS = 253_402_300_800 * 1_000_000_000
+"""RFC 3339 has years of four digits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -111,10 +114,31 @@ def view(name: str, record: type, fields_of: str = "", text: str = "", **below: 
 def picture(record: object, of: View | None = None) -> dict[str, Any]:
     """Return what JSON can hold of a record, as its usual view or another shows it."""
     of = of or _USUAL[type(record)]
-    return {
-        name: _plain(attrgetter(path)(record), of.below.get(name))
-        for name, path in of.paths.items()
-    }
+    shown = {}
+    for name, path in of.paths.items():
+        value = attrgetter(path)(record)
+        shown[name] = _plain(value, of.below.get(name))
+        if is_time(name):
+            shown[clock_of(name)] = rfc3339(value)
+    return shown
+
+
+def is_time(name: str) -> bool:
+    """Return whether a field is nanoseconds since the Unix epoch, by its name."""
+    return name.endswith("_ns_utc") or name == "now_ns"
+
+
+def clock_of(name: str) -> str:
+    """Return the name under which a time leaves as operators read it."""
+    return f"{name.removesuffix('_utc').removesuffix('_ns')}_utc"
+
+
+def rfc3339(t_ns: int | None) -> str | None:
+    """Return a time in UTC to the microsecond; None for one that is not known, or too late."""
+    if not t_ns or not 0 < t_ns < _LATEST_NS:
+        return None
+    seconds, rest_ns = divmod(t_ns, 1_000_000_000)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
 
 
 def answer(record: object, of: View | None = None) -> JSONResponse:
@@ -174,18 +198,8 @@ def _service_of(request: Request) -> Supervisor:
     return service
 
 
-def _fits_of(request: Request) -> FitQueue:
-    fits: FitQueue = request.app.state.fits
-    return fits
-
-
 ServiceDep = Annotated[Supervisor, Depends(_service_of)]
 """The service a route works for."""
-
-MatrixId = Annotated[str, Path(alias="id", description="Id of a reconstructor")]
-
-FitsDep = Annotated[FitQueue, Depends(_fits_of)]
-"""The desk a route works for."""
 
 
 # --- the OpenAPI document
@@ -208,6 +222,8 @@ def schemas() -> dict[str, Schema]:
             properties[name] = _schema(kind, of.below.get(name), found)
             if text:
                 properties[name] = {**properties[name], "description": _for_readers(text)}
+            if is_time(name):
+                properties[clock_of(name)] = {**_CLOCK, "description": f"``{name}`` by the clock."}
         found[of.name] = {
             "type": "object",
             "description": _for_readers(of.text),
@@ -219,6 +235,7 @@ def schemas() -> dict[str, Schema]:
 
 _SCHEMAS = "#/components/schemas/"
 _NUMBER: Schema = {"anyOf": [{"type": "number"}, {"type": "null"}]}
+_CLOCK: Schema = {"anyOf": [{"type": "string", "format": "date-time"}, {"type": "null"}]}
 _OF_KIND: dict[object, Schema] = {
     float: _NUMBER,
     int: {"type": "integer"},

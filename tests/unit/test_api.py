@@ -372,7 +372,14 @@ async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(cl
     assert body["restored_ns_utc"] == 60 * SECOND
     assert body["jumped_ns_utc"] == 61 * SECOND
     assert body["optical_gains"] == [
-        {"mode": 501, "gain": 0.6, "gain_sigma": 0.01, "gain_scatter": 0.03, "t_ns_utc": 1}
+        {
+            "mode": 501,
+            "gain": 0.6,
+            "gain_sigma": 0.01,
+            "gain_scatter": 0.03,
+            "t_ns_utc": 1,
+            "t_utc": "1970-01-01T00:00:00.000000Z",
+        }
     ]
     assert body["passive_bias"]["rotation_deg"] == pytest.approx(0.01)
     assert body["passive_bias_sigma"]["shift_x_subap"] == pytest.approx(SIGMA[0])
@@ -764,6 +771,7 @@ async def test_a_measurement_under_way_is_seen_in_the_state_and_the_metrics(clie
         "pattern": "hadamard",
         "modes": [0, 1],
         "asked_ns_utc": 70 * SECOND,
+        "asked_utc": "1970-01-01T00:01:10.000000Z",
         "opens_loop": True,
     }
     found = await metrics_of(client)

@@ -69,6 +69,7 @@ async def test_the_newest_come_without_a_word_oldest_first(client):
     (first, *_) = (await client.get("/v1/audit")).json()["entries"]
     assert first == {
         "t_ns_utc": 0,
+        "t_utc": None,
         "who": "service",
         "name": "entry-0",
         "text": "a, b",
@@ -131,8 +132,10 @@ async def test_an_export_has_all_of_it_whatever_a_page_holds(client, monkeypatch
     assert 'filename="audit.jsonl"' in lines.headers["content-disposition"]
     read = [json.loads(line) for line in lines.text.splitlines()]
     assert [entry["id"] for entry in read] == list(range(1, N_ENTRIES + 1))
+    assert read[3]["t_utc"] == "1970-01-01T00:00:03.000000Z"
     table = list(csv.DictReader(io.StringIO((await client.get("/v1/audit?format=csv")).text)))
     assert [row["name"] for row in table] == [entry["name"] for entry in read]
+    assert table[3]["t_utc"] == "1970-01-01T00:00:03.000000Z"
     assert table[0]["text"] == "a, b"
     assert table[3]["text"] == "'=1+1"
     assert len((await client.get("/v1/audit?format=csv&since_ns=11000000000")).text.split()) == 3

@@ -127,6 +127,7 @@ async def test_lines_of_the_log_come_one_by_one_as_events_shows_them(service):
         first, second = await listener.event("log"), await listener.event("log")
     assert json.loads(first["data"]) == {
         "t_ns_utc": 1001,
+        "t_utc": "1970-01-01T00:00:00.000001Z",
         "level": "info",
         "name": "mode",
         "text": "line 1",

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -108,9 +109,12 @@ def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> Dialect | s
                 f"the matrix in use is {list(matrix.shape)}, {instrument.name} has "
                 f"{len(response)} slopes and {response.shape[1]} modes"
             )
-        return of_reconstructor(matrix, instrument, basis, near=instrument.start, response=response)
+        dialect = of_reconstructor(
+            matrix, instrument, basis, near=instrument.start, response=response
+        )
     except ModelError as error:
         return f"the model of {instrument.name} cannot tell: {error}"
+    return replace(dialect, adopted=instrument.slopes.orientation is None)
 
 
 def _agreed(moved: tuple[str, ...], *, yes: bool) -> bool:

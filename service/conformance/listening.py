@@ -397,7 +397,9 @@ def _orientation(_: Watch, about: About) -> Checked:
         return wrong("orientation", dialect.wrong)
     if dialect.found is None:
         return skipped("orientation", "the matrix in use does not tell")
-    return fine("orientation", f"by the matrix in use {setting_written(dialect.found)}, as told")
+    told = "the instrument file leaves it open" if dialect.adopted else "as told"
+    found = f"by the matrix in use {setting_written(dialect.found)}: {told}"
+    return fine("orientation", found)
 
 
 def _late_join(watch: Watch, about: About) -> Checked:

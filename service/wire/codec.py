@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, fields, is_dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar
 
@@ -112,7 +112,7 @@ def _no_more(_record: object, _where: str) -> None:
     """Ask for no more than the types of the fields do."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Form(Generic[_R]):
     """How one kind of message travels, as far as the fields of its record do not say it."""
 
@@ -122,6 +122,7 @@ class Form(Generic[_R]):
     where: str
     """What a message is called in refusals."""
 
+    _: KW_ONLY
     extensions: tuple[str, ...] = ()
     """Keys that came after the contract: who does not know them need not send them."""
 

@@ -293,21 +293,15 @@ def _check_ramp(command: RampRequest, where: str) -> None:
 
 travels(
     Form(
-        kind=DitherRequest,
-        where="a dither command",
+        DitherRequest,
+        "a dither command",
         keys=lambda keys: {**keys, "action": _START},
         fields=_starts,
         check=_check_dither,
     )
 )
-travels(
-    Form(
-        kind=DitherStop,
-        where="a dither command",
-        keys=lambda keys: {**keys, "action": _STOP},
-    )
-)
-travels(Form(kind=LoopRequest, where="a loop command"))
-travels(Form(kind=MeasureRequest, where="a measure command", check=_check_measurement))
-travels(Form(kind=RampRequest, where="a ramp command", check=_check_ramp))
-travels(Form(kind=Reply, where="a reply", fields=reason_or_none))
+travels(Form(DitherStop, "a dither command", keys=lambda keys: {**keys, "action": _STOP}))
+travels(Form(LoopRequest, "a loop command"))
+travels(Form(MeasureRequest, "a measure command", check=_check_measurement))
+travels(Form(RampRequest, "a ramp command", check=_check_ramp))
+travels(Form(Reply, "a reply", fields=reason_or_none))

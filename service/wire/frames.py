@@ -147,8 +147,8 @@ def decode_frames(payload: bytes, attachment: bytes | None) -> FrameBatch:
 
 travels(
     Form(
-        kind=FrameHeader,
-        where="the attachment of a frame batch",
+        FrameHeader,
+        "the attachment of a frame batch",
         opened=lambda data, where: unpack(data, where, ATTACHMENT_LIMIT),
     )
 )

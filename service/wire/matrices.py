@@ -199,16 +199,16 @@ def _with_layout(values: Map, where: str, *, may_fail: bool = False) -> Map:
 
 travels(
     Form(
-        kind=Manifest,
-        where="the manifest of a reconstructor",
+        Manifest,
+        "the manifest of a reconstructor",
         keys=_with_keys_of_layout,
         fields=_manifest_fields,
     )
 )
 travels(
     Form(
-        kind=MeasuredManifest,
-        where="the manifest of a measured matrix",
+        MeasuredManifest,
+        "the manifest of a measured matrix",
         keys=_with_keys_of_layout,
         fields=_measured_fields,
         check=_check_measured,

@@ -314,8 +314,8 @@ def _state_fields(values: Map, where: str) -> Map:
 
 travels(
     Form(
-        kind=Status,
-        where=WHERE,
+        Status,
+        WHERE,
         extensions=("pointing",),
         opened=_opened,
         keys=_status_keys,
@@ -324,20 +324,11 @@ travels(
     )
 )
 travels(
-    Form(
-        kind=Acknowledgement,
-        where="an acknowledgement",
-        fields=reason_or_none,
-        check=_check_acknowledgement,
-    )
+    Form(Acknowledgement, "an acknowledgement", fields=reason_or_none, check=_check_acknowledgement)
 )
 travels(
     Form(
-        kind=StateMessage,
-        where="a state message",
-        extensions=("validity",),
-        fields=_state_fields,
-        held=False,
+        StateMessage, "a state message", extensions=("validity",), fields=_state_fields, held=False
     )
 )
-travels(Form(kind=AlarmMessage, where="an alarm message", held=False))
+travels(Form(AlarmMessage, "an alarm message", held=False))

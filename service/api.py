@@ -89,8 +89,8 @@ def create_app(
     It answers to ``hosts``, loopback alone where they are not given, and to no other name. Streams
     end when it is ``over``.
 
-    Swagger and ReDoc pages are left out: they load their scripts from the internet, which an
-    observatory's network need not reach. ``/openapi.json`` is there.
+    FastAPI's own pages are left out: they load their scripts from the internet. ``/docs`` is there
+    all the same, from the package.
     """
     app = _Application(
         title="pyrcal",

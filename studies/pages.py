@@ -1,4 +1,4 @@
-"""Writes what the pages of docs repeat of the code: states.md, house.md, the tables of rtc.md.
+"""Writes what docs repeat of the code: states.md, house.md, the tables of rtc.md, openapi.json.
 
 Run: ``python -m studies.pages``, then ``git diff``; a test compares.
 """
@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import textwrap
 from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
+from service.api import create_app
 from service.tracking.activity import ALLOWS
 from service.tracking.alarms import ALARMS, Act
 from service.tracking.commands import Command
@@ -77,7 +79,14 @@ def rtc() -> str:
     return with_tables((ROOT / "docs" / "rtc.md").read_text(encoding="utf-8"))
 
 
-PAGES = {"states.md": states, "house.md": house, "rtc.md": rtc}
+def openapi() -> str:
+    """Return what REST answers, with the desk for fits."""
+    nobody: Any = object()  # neither is asked anything
+    app = create_app(nobody, nobody)
+    return json.dumps(app.openapi(), indent=1, ensure_ascii=False) + "\n"
+
+
+PAGES = {"states.md": states, "house.md": house, "rtc.md": rtc, "openapi.json": openapi}
 
 
 def _refusals() -> list[tuple[str, ...]]:

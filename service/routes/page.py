@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -23,6 +24,9 @@ router = APIRouter(prefix="/v1", tags=["what the service knows"])
 
 FILES: Final = Path(__file__).parent.parent / "dashboard"
 
+MANUAL: Final = Path(__file__).parent.parent / "swagger"
+"""Swagger UI, which shows what REST answers and tries it out: no observatory needs the internet."""
+
 HEADERS: Final = {
     # its own files and its own service: nothing inline, no other host
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -35,21 +39,35 @@ HEADERS: Final = {
 }
 
 
+MANUAL_HEADERS: Final = {
+    **HEADERS,
+    # Swagger UI sets styles of elements, and has its icons in its style sheet
+    "Content-Security-Policy": HEADERS["Content-Security-Policy"]
+    .replace("style-src 'self'", "style-src 'self' 'unsafe-inline'")
+    .replace("img-src 'self'", "img-src 'self' data:"),
+}
+
+
 def install(app: FastAPI) -> None:
-    """Serve the page at ``/``, and what it is made of below ``/dashboard``."""
+    """Serve the page at ``/``, what REST answers at ``/docs``, and what both are made of."""
 
     @app.get("/", include_in_schema=False)
     async def page() -> Response:
         return FileResponse(FILES / "index.html", headers=HEADERS)
 
-    app.mount("/dashboard", _with_headers(StaticFiles(directory=FILES)))
+    @app.get("/docs", include_in_schema=False)
+    async def manual() -> Response:
+        return FileResponse(MANUAL / "index.html", headers=MANUAL_HEADERS)
+
+    app.mount("/dashboard", _with_headers(StaticFiles(directory=FILES), HEADERS))
+    app.mount("/docs/files", _with_headers(StaticFiles(directory=MANUAL), MANUAL_HEADERS))
 
 
-def _with_headers(app: ASGIApp) -> ASGIApp:
+def _with_headers(app: ASGIApp, headers: Mapping[str, str]) -> ASGIApp:
     async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
         async def sent(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
+                MutableHeaders(scope=message).update(headers)
             await send(message)
 
         await app(scope, receive, sent)

@@ -822,46 +822,6 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
         for path, methods in description["paths"].items()
         for method, operation in methods.items()
     }
-    assert set(operations) == {
-        "GET /v1/state",
-        "POST /v1/acquisition",
-        "POST /v1/stop",
-        "POST /v1/resume",
-        "POST /v1/loop",
-        "POST /v1/loop/ramp",
-        "DELETE /v1/measurements/{id}",
-        "GET /v1/audit",
-        "GET /v1/alpha",
-        "GET /v1/alpha/history",
-        "GET /v1/reconstructors",
-        "GET /v1/reconstructors/{id}",
-        "GET /v1/reconstructors/{id}/matrix",
-        "GET /v1/reconstructors/{id}/gains",
-        "GET /v1/gains",
-        "GET /v1/events",
-        "GET /v1/mirror",
-        "GET /v1/stream",
-        "POST /v1/noisy-matrix",
-        "GET /v1/noisy-matrix",
-        "GET /v1/noisy-matrix/{id}",
-        "DELETE /v1/noisy-matrix/{id}",
-        "GET /v1/noisy-matrix/{id}/file",
-        "GET /v1/measurements",
-        "GET /v1/measurements/{id}",
-        "GET /v1/measurements/{id}/matrix",
-        "POST /v1/measurements",
-        "POST /v1/refit",
-        "POST /v1/dither",
-        "POST /v1/reconstructors/{id}/approve",
-        "POST /v1/reconstructors/{id}/reject",
-        "POST /v1/reconstructors/{id}/publish",
-        "POST /v1/rollback",
-        "PUT /v1/mode",
-        "PUT /v1/pointing",
-        "GET /healthz",
-        "GET /readyz",
-        "GET /metrics",
-    }
     for name, operation in operations.items():
         assert operation["description"], name
         for status, answer in operation["responses"].items():

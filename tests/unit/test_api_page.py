@@ -206,3 +206,16 @@ async def test_of_a_night_every_extreme_is_kept_however_short(client, service):
 
 async def test_few_entries_are_not_thinned(client):
     assert times(await history(client, points=8)) == [0, 1, 2, 3, 4]
+
+
+async def test_what_rest_answers_is_shown_and_tried_without_the_internet(client):
+    page = await client.get("/docs")
+    assert page.status_code == 200
+    assert "script-src 'self';" in page.headers["content-security-policy"]
+    named = re.findall(r'(?:src|href)="([^"]+)"', page.text)
+    assert len(named) == 3
+    for name in (*named, "docs/files/LICENSE.txt", "openapi.json"):
+        assert not name.startswith(("http", "//"))
+        answer = await client.get(f"/{name}")
+        assert answer.status_code == 200, name
+    assert "openapi.json" in (await client.get("/docs/files/start.js")).text

@@ -20,6 +20,9 @@ export function showHeader(service, orders) {
   if (state && document.activeElement !== chosen) chosen.value = state.mode;
   chosen.disabled = Boolean(orders.whyNot("mode"));
   put($("#rtc"), rtcLine(state, fresh));
+  const stop = $("#stop");
+  stop.dataset.order = state?.stopped_because ? "resume" : "stop";
+  put(stop, state?.stopped_because ? "▶ Release" : "■ Stop everything");
   const n = state?.alarms.length ?? 0;
   const alarms = $("#alarm-count");
   put(alarms, !fresh ? `alarms ${DASH}` : n ? `■ ${n} alarm${n > 1 ? "s" : ""}` : "○ no alarm");
@@ -66,6 +69,17 @@ export function showWaiting(service, orders) {
   }
 }
 
+export function showWork(service, orders) {
+  const work = service.fresh ? orders.work : null;
+  $("#work").hidden = !work;
+  if (!work) return;
+  put($("#work-title"), `◐ ${work.title}`);
+  put($("#work-text"), `${work.text}; for ${span((service.now - milliseconds(work.since)) / 1000)}`);
+  const button = $("#work-end");
+  button.dataset.order = work.order;
+  put(button, work.button);
+}
+
 export function showLoop(service, mirror) {
   const { state, fresh } = service;
   const root = $("#loop");
@@ -101,10 +115,10 @@ export function showProvenance(service, orders) {
   $("#provenance").classList.toggle("old", !fresh);
   if (!state?.in_use) return put($("#provenance"), `in use: ${DASH} (nobody has told which matrix the RTC multiplies with)`);
   if (!record) return put($("#provenance"), `in use: ${state.in_use}, of which nothing is known`);
+  if (!record.alpha) return put($("#provenance"), `in use: ${record.id}, ${record.n_modes} modes; the RTC's own, for an unknown registration`);
   const frame = present(record.applied_frame_seq) ? `, applied at frame ${record.applied_frame_seq}` : "";
   const sent = record.published_ns_utc ? `, sent ${when(record.published_ns_utc, now)}` : "";
-  const made = record.alpha ? `; made ${when(record.created_ns_utc, now)}, for ${shortly(record.alpha, record.sigma)}` : "; the RTC's own, for an unknown registration";
-  return put($("#provenance"), `in use: ${record.id}, ${record.n_modes} modes${frame}${sent}${made}`);
+  return put($("#provenance"), `in use: ${record.id}, ${record.n_modes} modes${frame}${sent}, for ${shortly(record.alpha, record.sigma)}`);
 }
 
 function when(ns, now) {
@@ -122,7 +136,7 @@ export function showReconstructors(service, orders) {
     make("td", { text: r.id }),
     make("td", { className: "n", text: String(r.n_modes) }),
     make("td", { text: shortly(r.alpha, r.sigma), title: registrationOf(r.alpha, r.sigma) }),
-    make("td", { text: verdict(r.gate) }),
+    make("td", { text: `${r.gate && !r.gate.accepted ? "REFUSED, " : ""}${margin(r.gate)?.text ?? "not judged"}`, title: verdict(r.gate) }),
     make("td", { text: r.created_ns_utc > 0 ? ago(milliseconds(r.created_ns_utc), now) : DASH }),
     make("td", { text: r.reason || DASH }),
   ));

@@ -1,6 +1,6 @@
 // The operator's page: what is known, what wants a decision, and the keys.
 
-import { showButtons, showConnection, showHeader, showLoop, showProvenance, showReconstructors, showWaiting } from "./cards.js";
+import { showButtons, showConnection, showHeader, showLoop, showProvenance, showReconstructors, showWaiting, showWork } from "./cards.js";
 import { Events } from "./events.js";
 import { MirrorOnSensor } from "./mirror.js";
 import { Orders } from "./orders.js";
@@ -18,6 +18,7 @@ function show() {
   showConnection(service);
   showHeader(service, orders);
   showWaiting(service, orders);
+  showWork(service, orders);
   showProvenance(service, orders);
   showLoop(service, mirror.mirror);
   showButtons(orders);
@@ -34,7 +35,7 @@ service.addEventListener("reset", async () => {
   }
 });
 
-for (const button of document.querySelectorAll("[data-order]"))
+for (const button of document.querySelectorAll("[data-order], #work-end"))
   button.addEventListener("click", () => orders.open(button.dataset.order));
 document.querySelector("#mode").addEventListener("change", (event) => {
   const { value } = event.target;

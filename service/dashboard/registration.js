@@ -4,8 +4,9 @@
 import { PARAMETERS, DASH, ago, clock, day, make, milliseconds, present, put, rounded } from "./words.js";
 
 const RANGES = { 1: 600, 2: 3600, 3: 43_200 }; // seconds: ten minutes, an hour, a night
-const POINTS = 600;
-const MOST = 2000;
+const POINTS = { 1: 600, 2: 1200, 3: 2000 };
+const MOST = 4000; // then the range is read anew, thinned by the service
+const EVERY_MS = 5000; // between two looks at what has been measured since
 const LATE_MS = 5000; // telemetry takes less than this to be understood: more is another clock
 const GAP_S = 120; // longer than any pause between two sittings
 const AXIS = "#9aa4af";
@@ -29,6 +30,7 @@ export class Registration {
   #charts = [];
   #range = 1;
   #reading = false;
+  #asked = 0;
   #drawn = 0;
 
   constructor(service, root) {
@@ -87,10 +89,11 @@ export class Registration {
   async #read() {
     if (this.#reading) return;
     this.#reading = true;
+    this.#asked = performance.now();
     const range = this.#range;
     const since = Math.max(0, this.#service.now - RANGES[range] * 1000 - this.#behind);
     const last = this.#entries.at(-1)?.t_ns_utc;
-    const query = last ? `after=${last}&limit=${MOST}` : `since=${new Date(since).toISOString()}&points=${POINTS}`;
+    const query = last ? `after=${last}&limit=2000` : `since=${new Date(since).toISOString()}&points=${POINTS[range]}`;
     try {
       const { entries } = await this.#service.get(`v1/alpha/history?${query}`);
       if (range === this.#range) {
@@ -110,7 +113,6 @@ export class Registration {
   #forget(since) {
     const first = this.#entries.findIndex((e) => e.t_ns_utc / 1e6 >= since);
     this.#entries.splice(0, first < 0 ? 0 : first);
-    // of a night the older half is thinned by the service, not here: it is read anew
     if (this.#entries.length > MOST) this.#entries = [];
   }
 
@@ -131,7 +133,9 @@ export class Registration {
       put(sigma, known ? `± ${shown.sigma}` : "");
     }
     const newest = this.#entries.at(-1)?.t_ns_utc ?? 0;
-    if (known && known.t_ns_utc > newest + 1000) this.#read();
+    // the state itself is the last point of every line: what is behind it may come later
+    const due = performance.now() - this.#asked > EVERY_MS || !newest;
+    if (known && due && known.t_ns_utc > newest + 1000) this.#read();
   }
 
   #onTick() {
@@ -234,6 +238,7 @@ export class Registration {
     ctx.fillStyle = "#e6e9ed";
     ctx.textAlign = "center";
     ctx.font = `${11 * devicePixelRatio}px system-ui`;
+    let shapeX = -Infinity; // shapes that would lie on one another are drawn once
     for (const mark of this.#marks) {
       const x = u.valToPos(mark.t, "x", true);
       if (x < bbox.left || x > bbox.left + bbox.width) continue;
@@ -243,7 +248,9 @@ export class Registration {
       ctx.lineTo(x, bbox.top + bbox.height);
       ctx.stroke();
       ctx.globalAlpha = 1;
-      if (named) ctx.fillText(SHAPES[mark.kind], x, bbox.top + 10 * devicePixelRatio);
+      if (!named || x - shapeX < 12 * devicePixelRatio) continue;
+      shapeX = x;
+      ctx.fillText(SHAPES[mark.kind], x, bbox.top + 10 * devicePixelRatio);
     }
     ctx.restore();
   }
@@ -291,8 +298,10 @@ export class Registration {
   }
 }
 
+// As many as every multiple of the step needs.
 function decimals(step) {
-  return Math.min(6, Math.max(0, Math.ceil(-Math.log10(step) - 1e-9)));
+  for (let n = 0; n < 6; n++) if (Math.abs(step * 10 ** n - Math.round(step * 10 ** n)) < 1e-6) return n;
+  return 6;
 }
 
 // The range of an axis: never so narrow that noise fills it.

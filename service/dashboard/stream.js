@@ -55,17 +55,17 @@ export class Service extends EventTarget {
     return answer.json();
   }
 
-  // Give an order; what is answered is text, and whether it was refused.
-  async order(method, path, body) {
+  // Give an order; what is answered is text, and whether it was refused. One key is one order, however often it is sent.
+  async order(method, path, body, key) {
     let answer;
     try {
       answer = await fetch(path, {
         method,
-        headers: body === undefined ? {} : { "Content-Type": "application/json" },
-        body: body === undefined ? undefined : JSON.stringify(body),
+        headers: { "Content-Type": "application/json", "Idempotency-Key": key },
+        body: JSON.stringify(body),
       });
     } catch {
-      return { refused: true, text: "the service does not answer: nothing is known of what became of it" };
+      return { refused: true, lost: true, text: "the service does not answer: nothing is known of what became of it" };
     }
     const told = await answer.json().catch(() => ({}));
     return { refused: !answer.ok, text: told.detail ?? told.text ?? `${answer.status} ${answer.statusText}` };

@@ -65,6 +65,7 @@ export function milliseconds(ns) {
 export function operation(state) {
   const worth = state.registration?.validity;
   if (!state.ready) return { word: "NOT READY", tone: "bad", why: state.ready_reason };
+  if (state.stopped_because) return { word: "STOPPED", tone: "bad", why: state.stopped_because };
   if (state.acquisition.under_way)
     return { word: "ACQUIRING", tone: "busy", why: `${state.acquisition.stage}: ${state.acquisition.text}` };
   if (state.measuring) return { word: "MEASURING", tone: "busy", why: state.measuring.id };

@@ -24,6 +24,7 @@ from service.routes.numbers import (
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.routes.views import GainTableShown, ServiceDep, answer, known, shows, tagged
 from service.tracking.registration import HistoryEntry, ModeGain, table_of
+from service.tracking.state import TrackerState
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -129,9 +130,13 @@ async def alpha_history(
 
     The service remembers the last 5000, and none from before its start.
     """
-    tracker = service.snapshot().tracker
-    asked = replace(tracker, history=_asked_for(tracker.history, parameters))
-    return await run_in_threadpool(answer, asked, views.HISTORY)
+    # a night takes a quarter of a second, in which telemetry is taken in
+    return await run_in_threadpool(_history, service.snapshot().tracker, parameters)
+
+
+def _history(tracker: TrackerState, asked: RangeParameters) -> Response:
+    part = replace(tracker, history=_asked_for(tracker.history, asked))
+    return answer(part, views.HISTORY)
 
 
 History = tuple[HistoryEntry, ...]

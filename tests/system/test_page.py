@@ -163,8 +163,9 @@ def test_a_click_approves_and_the_answer_is_what_the_rtc_did(page):
     page.click("[data-order=approve]")
     page.says("#order", name)
     page.says("#order", "pole radius")
+    assert page.faults_of_access() == []
     page.click("#order [value=send]")
-    page.says("#answer", f"{name} applied at frame", 20.0)
+    page.says("#answer", "applied at frame", 20.0)
     assert page.night.state["in_use"] == name
     page.says("#provenance", f"in use: {name}")
 
@@ -177,12 +178,13 @@ def test_by_keys_alone_one_is_rejected_and_not_without_a_reason(page):
     page.driver.find_element("css selector", "#order [value=send]").send_keys("\n")
     assert page.js("document.querySelector('#order').open")
     assert page.night.client.get(f"/v1/reconstructors/{name}").json()["state"] == "proposed"
-    page.js("document.querySelector('#order textarea').focus()")
-    page.press("not tonight\t")
-    page.press("\t")
-    page.press("\n")
-    page.says("#answer", f"{name} discarded: not tonight")
+    page.js("document.querySelector('#reason').focus()")
+    page.press("not tonight\tnight operator\n")  # Enter in a field sends
+    page.says("#answer", f"{name} is discarded")
     assert page.night.client.get(f"/v1/reconstructors/{name}").json()["reason"] == "not tonight"
+    trail = page.night.client.get("/v1/audit").json()["entries"]
+    order = next(entry for entry in reversed(trail) if entry["name"] == "Reject")
+    assert (order["who"], order["whence"]) == ("night operator", "page")
 
 
 def test_by_keys_alone_the_service_goes_back_and_holds(page):
@@ -191,7 +193,7 @@ def test_by_keys_alone_the_service_goes_back_and_holds(page):
     page.until("document.querySelector('[data-order=rollback]').ariaDisabled === 'false'", 20.0)
     page.press("r")
     page.says("#order", "Mode becomes hold")
-    page.press("\n")
+    page.press("the image was better before\n")
     page.says("#answer", "applied at frame", 20.0)
     assert page.night.state["in_use"] != before
     page.says("#operation", "HOLD")
@@ -209,6 +211,23 @@ def test_a_change_is_seen_within_a_second(page):
         page.night.client.put("/v1/mode", json={"mode": mode}).raise_for_status()
         page.until(f"document.querySelector('#mode').value === '{mode}'", 1.0)
         assert time.monotonic() - began_s < patience(1.0)
+
+
+def test_everything_is_stopped_and_released_in_two_clicks_each(page):
+    page.open()
+    page.click("#stop")
+    page.says("#order", "Nothing is made or sent")
+    page.click("#order [value=send]")
+    page.says("#operation", "STOPPED")
+    page.says("#alarms", "stopped")
+    assert page.night.state["stopped_because"]
+    page.says("#answer", "everything was stopped")
+    page.press("r")
+    page.says("#answer", "Roll back cannot be ordered now: everything is stopped")
+    page.click("#stop")
+    page.click("#order [value=send]")
+    page.says("#answer", "released")
+    page.says("#operation", "TRACKING", 20.0)
 
 
 def test_an_rtc_that_is_gone_is_seen_with_what_to_do(page):

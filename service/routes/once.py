@@ -75,18 +75,17 @@ class Once:
             return await self._refuse(request, send, found)
         body = await request.body()
         print_ = hashlib.sha256(f"{request.method} {request.url}\n".encode() + body).digest()
-        before = self._given.get(key)
-        if before is not None and before.print != print_:
-            found = "found a key that was used with another request, expected a new one for each"
-            return await self._refuse(request, send, found)
-        if before is not None:
+        while (before := self._given.get(key)) is not None:
+            if before.print != print_:
+                found = "found a key that was used with another request, expected a new one"
+                return await self._refuse(request, send, found)
             await before.done.wait()
-        if before is None or not before.answer:
-            receive = again(body, request.receive)
-            return await self._carry_out(key, print_, receive, request.scope, send)
-        for message in before.answer:
-            await send(message)
-        return None
+            if before.answer:
+                for message in before.answer:
+                    await send(message)
+                return None
+        receive = again(body, request.receive)
+        return await self._carry_out(key, print_, receive, request.scope, send)
 
     async def _carry_out(
         self, key: str, print_: bytes, receive: Receive, scope: Scope, send: Send

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 import time
 from dataclasses import replace
@@ -40,6 +41,8 @@ def main(options: argparse.Namespace) -> int:
     PyrcalError
         If nothing could be checked: no RTC, no link, or options that make no sense.
     """
+    if options.own_process:  # told to end, it first stops its dither and closes the loop again
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     unknown = [name for name in options.only if name not in ARTICLES]
     if unknown:
         raise ConfigurationError(

@@ -133,7 +133,8 @@ class _Application(FastAPI):
     def openapi(self) -> dict[str, Any]:
         if self.openapi_schema is None:
             document = super().openapi()
-            document["components"]["schemas"] |= views.schemas() | self._tell_bodies(document)
+            schemas = {"Problem": problems.Problem.model_json_schema()} | views.schemas()
+            document["components"]["schemas"] |= schemas | self._tell_bodies(document)
         return super().openapi()
 
     def _tell_bodies(self, document: dict[str, Any]) -> dict[str, views.Schema]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
-from service.errors import ArchiveError, StorageError
+from service.errors import ArchiveError, StorageError, shown
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
 
 Product = ReconstructorRecord | MeasurementRecord
@@ -257,5 +257,4 @@ def _storable(value: str | int) -> str | int:
     """
     if isinstance(value, int):
         return value
-    seen = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in value)
-    return "".join(seen)
+    return shown(value)

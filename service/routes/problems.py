@@ -84,7 +84,7 @@ def problem_response(description: str) -> dict[str, Any]:
     """Return the OpenAPI description of an error response."""
     return {
         "description": description,
-        "content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}},
+        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
     }
 
 

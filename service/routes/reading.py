@@ -10,7 +10,7 @@ from typing import Annotated, Self
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import AwareDatetime, Field, model_validator
+from pydantic import AwareDatetime, BeforeValidator, Field, model_validator
 
 from service.errors import CommandError
 from service.routes import views
@@ -40,6 +40,15 @@ Points = Annotated[int, Field(ge=8, le=2000)]
 Nanoseconds = Annotated[int, Field(ge=0, le=(1 << 63) - 1)]
 
 
+def _said_as_a_clock_does(value: object) -> object:
+    if isinstance(value, str) and "T" not in value.upper():  # "2026" would be seconds since 1970
+        raise ValueError(f"found {value!r:.40}, expected a time such as 2026-03-01T21:14:03Z")
+    return value
+
+
+Clock = Annotated[AwareDatetime, BeforeValidator(_said_as_a_clock_does)]
+
+
 class TimeParameters(Parameters):
     """A time, from its beginning to its end."""
 
@@ -49,10 +58,10 @@ class TimeParameters(Parameters):
     until_ns: Nanoseconds | None = None
     """Up to this time, which belongs to it."""
 
-    since: AwareDatetime | None = None
+    since: Clock | None = None
     """``since_ns`` as RFC 3339 says it, such as 2026-03-01T21:14:03Z."""
 
-    until: AwareDatetime | None = None
+    until: Clock | None = None
     """``until_ns`` as RFC 3339 says it."""
 
     @model_validator(mode="after")

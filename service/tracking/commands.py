@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge, Gt, Le, Len, MaxLen
 from typing_extensions import override
 
+from service.errors import shown
 from service.tracking.products import ModeSet
 from service.tracking.state import Mode
 from service.wire import DitherKind, Pattern, Pointing
@@ -54,7 +55,7 @@ class Instruction:
             If it makes no sense in any state.
         """
         for name, text in (("reason", self.reason), ("by", self.by)):
-            unseen = next((char for char in text if not char.isprintable()), None)
+            unseen = next((char for char in text if shown(char) != char), None)
             if unseen is not None:
                 raise ValueError(f"found {unseen!r} in {name}, expected printable characters")
 

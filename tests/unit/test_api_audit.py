@@ -110,6 +110,8 @@ async def test_a_time_is_told_in_nanoseconds_or_as_a_clock_does(client, query):
     [
         ("since=yesterday", "query.since"),
         ("since=2026-03-01T21:14:03", "timezone"),
+        ("since=2026", "expected a time such as 2026-03-01T21:14:03Z"),
+        ("until=0.5", "expected a time such as"),
         ("since_ns=2&until_ns=1", "since <= until"),
         ("limit=0", "query.limit"),
         ("after=-1", "query.after"),

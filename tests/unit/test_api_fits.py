@@ -165,6 +165,7 @@ async def test_fits_are_listed_with_their_state(client):
                 "id": "fit-1",
                 "state": "waiting",
                 "asked_ns_utc": 7,
+                "asked_utc": "1970-01-01T00:00:00.000000Z",
                 "n_bytes": 4,
                 "sha256": "ab",
                 "reason": "",

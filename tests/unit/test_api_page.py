@@ -54,7 +54,8 @@ async def test_the_page_is_served_with_all_it_names_and_may_do_nothing_else(clie
     page = await client.get("/")
     assert page.status_code == 200
     assert page.headers["content-type"] == "text/html; charset=utf-8"
-    named = re.findall(r'(?:src|href)="([^"#]+)"', page.text)
+    named = re.findall(r'<(?:script|link)[^>]* (?:src|href)="([^"#]+)"', page.text)
+    assert (await client.get("/docs")).status_code == 200, "it is where the help leads"
     assert {"dashboard/page.js", "dashboard/page.css", "dashboard/uPlot.iife.min.js"} <= set(named)
     answers = {name: await client.get(f"/{name}") for name in named}
     for name, answer in {"/": page, **answers}.items():

@@ -156,3 +156,26 @@ def test_on_a_disk_that_refuses_nothing_is_ordered_and_afterwards_all_is_on_reco
     assert names == [*orders, "Approve", "Approve.refused"]
     process.send(signal.SIGTERM)
     assert process.ended(30.0) == 0, process.log
+
+
+def test_what_was_stopped_stays_so_though_the_service_is_killed_at_once(night):
+    order = {"by": "Ada", "reason": "someone is on the platform"}
+    answer = night.client.post("/v1/stop", json=order)
+    assert answer.status_code == httpx.codes.ACCEPTED, answer.text
+    night.processes.pop().kill()
+    assert answer.json()["text"].startswith("everything was stopped by Ada (someone is on the")
+    night.service("auto")
+    assert "Ada" in night.state["stopped_because"]
+    assert "stopped" in night.alarms
+    refused = night.client.post("/v1/refit")
+    assert refused.status_code == httpx.codes.CONFLICT
+    assert "stopped by Ada" in refused.json()["detail"]
+    released = night.client.post("/v1/resume", json={"by": "Bob"})
+    assert released.json()["text"] == "released: mode is auto"
+    assert night.state["stopped_because"] == ""
+    entries = night.client.get("/v1/audit").json()["entries"]
+    told = [(entry["name"], entry["who"]) for entry in entries if entry["whence"]]
+    stop, resume = "StopEverything", "Resume"
+    assert told[0] == (stop, "Ada")
+    assert told[-1] == (resume, "Bob") or told[-1] == (f"{resume}.answered", "Bob")
+    assert ("Refit.refused", "127.0.0.1") in told

@@ -83,8 +83,8 @@ export function showWork(service, orders) {
 export function showLoop(service, mirror) {
   const { state, fresh } = service;
   const root = $("#loop");
-  root.classList.toggle("old", !fresh);
   const rtc = state?.rtc;
+  root.classList.toggle("old", !fresh || !rtc);
   const expected = state?.assessment?.id === state?.in_use ? state?.assessment?.expected : null;
   const gains = (state?.registration?.optical_gains ?? []).map((g) => g.gain);
   put($("#loop-state"), rtc ? `${rtc.loop}, ${rtc.n_controlled} of ${rtc.n_modes} modes` : DASH);

@@ -237,6 +237,7 @@ def test_an_rtc_that_is_gone_is_seen_with_what_to_do(page):
     page.says("#alarm-count", "1 alarm")
     page.says("#rtc", "waiting for the RTC")
     page.says("#operation", "NO RTC")
+    assert page.js("document.querySelector('#loop').classList.contains('old')")
     page.says("#live", "rtc-vanished")
     assert "cannot be used now: no RTC is there" in page.js(
         "document.querySelector('[data-order=rollback]').title"

@@ -11,6 +11,7 @@ from service.tracking.commands import Command
 from service.tracking.dither_request import total_m
 from service.tracking.loop import CommandState
 from service.tracking.products import MatrixState, MeasureState, ReconstructorRecord
+from service.tracking.reconstructors import why_unsendable
 from service.tracking.state import TrackerState
 from service.tracking.turn import new_lines
 
@@ -116,6 +117,9 @@ class Given:
         for line in new_lines(self.then, now):
             if line.name == "reconstructor.not-sent" and line.text.startswith(name):
                 raise CommandError(line.text)
+        held = why_unsendable(now, record) if record.state is MatrixState.PROPOSED else None
+        if held is not None:
+            return Answer(f"{name} is proposed and not sent: {held}")
         words = _ON_ITS_WAY.get(record.state)
         if words is not None:
             return Answer(f"{name} {words}", final=False)

@@ -92,6 +92,17 @@ def test_a_rollback_tells_which_one_went_out_under_which_name_and_that_it_is_hol
     assert last == (words, True)
 
 
+def test_a_copy_that_may_not_be_sent_now_is_said_to_be_kept_and_why():
+    world = idle()
+    order = given(world, cmd.Rollback())
+    world.tell(ev.Trouble(name="matrix-mismatch", text="the RTC's matrix is of other slopes"))
+    world.pass_(2.0)
+    (text, final) = told(order, world)
+    new = world.state.reconstructors[-1].id
+    assert text.startswith(f"{new} is proposed and not sent: the RTC's matrix is of other slopes")
+    assert final
+
+
 def test_a_copy_that_cannot_be_made_is_refused_with_the_reason():
     world = idle()
     order = given(world, cmd.Rollback())

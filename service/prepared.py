@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from service.files.report import instrument_sha256
 from service.model import instrument as model_code
-from service.model.instrument import BasisKind, Instrument, Mirror
+from service.model.instrument import Instrument, Mirror
+from service.model.kinds import BasisKind
 from service.model.modes import Basis, ModalBasis, mirror_surface, modal_basis
 
 Arrays = Mapping[str, NDArray[Any]]

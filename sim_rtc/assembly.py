@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument, KarhunenLoeve, TabulatedModes
+from service.model.kinds import Normalisation, SlopeOrder
 from service.model.modes import ModalBasis, analytic_basis, mirror_surface
-from service.model.slopes import Normalisation, Orientation, SlopeOrder
+from service.model.slopes import Orientation
 from service.prepared import Prepared, usual_folder
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
 from sim_rtc.computer.gains import by_group

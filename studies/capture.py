@@ -23,10 +23,11 @@ from service.fit.methods import SAME, land
 from service.fit.models import FitModels
 from service.fit.reference import Reference, Target, oriented, target_of
 from service.model.instrument import Instrument
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pyramid import Mapper
-from service.model.slopes import Orientation, SlopeOrder
+from service.model.slopes import Orientation
 from sim_rtc.telescope.imperfections import SETS
 from studies.fit_coverage import FIRST_SEED, N_MODES, measured
 

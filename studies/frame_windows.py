@@ -19,18 +19,12 @@ from service.config.mirrors import grid
 from service.fit.matrix import fit_matrix
 from service.fit.reference import Reference
 from service.model.detector_windows import frame_windows, slopes_from_frames, slopes_per_unit
-from service.model.instrument import (
-    FrameWindows,
-    Instrument,
-    KarhunenLoeve,
-    Mirror,
-    Pyramid,
-    Stop,
-)
+from service.model.instrument import FrameWindows, Instrument, KarhunenLoeve, Mirror, Pyramid
 from service.model.interaction import rtc_valid_subapertures
+from service.model.kinds import Normalisation, Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import modal_basis
-from service.model.slopes import Normalisation, SlopeRecipe
+from service.model.slopes import SlopeRecipe
 from sim_rtc.telescope.diffractive import DiffractivePyramid, centred_pupil
 
 Array = NDArray[np.float64]

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import load_instrument
-from service.model.instrument import Influence, Instrument, Mirror, Stop
+from service.model.instrument import Instrument, Mirror
+from service.model.kinds import Influence, Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from studies.peers_pushpull import Bench

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.instrument import Influence, Stop
+from service.model.kinds import Influence, Stop
 from studies.peers_cases import N_MODES, Case, basis, bench
 from studies.peers_pushpull import Measured
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.instrument import Stop
+from service.model.kinds import Stop
 from service.model.misregistration import PARAMETERS
 from studies.peers_cases import SMALLEST, Case, in_degrees
 from studies.peers_files import (

@@ -21,8 +21,9 @@ from threadpoolctl import threadpool_limits
 from service.config.instrument import load_instrument
 from service.fit.matrix import Fit, fit_matrix
 from service.fit.reference import Reference
-from service.model.instrument import Instrument, Stop, TabulatedModes
+from service.model.instrument import Instrument, TabulatedModes
 from service.model.interaction import InteractionModel
+from service.model.kinds import Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
 from service.model.pyramid import Mapper

@@ -13,15 +13,9 @@ from scipy.signal import lfilter
 from service.config.instrument import load_instrument
 from service.config.mirrors import rings
 from service.control.reconstructor import invert
-from service.model.instrument import (
-    Influence,
-    Instrument,
-    KarhunenLoeve,
-    Mirror,
-    Pyramid,
-    Stop,
-)
+from service.model.instrument import Instrument, KarhunenLoeve, Mirror, Pyramid
 from service.model.interaction import InteractionModel, Linearisation
+from service.model.kinds import Influence, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.telemetry.frames import FrameBlock

@@ -9,8 +9,7 @@ from pydantic import BeforeValidator, Field
 
 from service.config.sources import Id, Named, Table, in_file, read_toml, validated
 from service.errors import ConfigurationError
-from service.model.instrument import BasisKind, Influence, Stop
-from service.model.slopes import Normalisation, SlopeOrder
+from service.model.kinds import BasisKind, Influence, Normalisation, SlopeOrder, Stop
 
 Positive = Annotated[float, Field(gt=0.0)]
 Count = Annotated[int, Field(ge=1)]

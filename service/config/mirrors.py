@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from service.config.instrument_schema import MirrorTable
 from service.config.sources import read_dataset, refuse
 from service.errors import ConfigurationError
-from service.model.instrument import BasisKind, Influence, Mirror, TabulatedModes
+from service.model.instrument import Mirror, TabulatedModes
+from service.model.kinds import BasisKind, Influence
 from service.model.tabulated import (
     ENOUGH_POINTS_PER_SUBAPERTURE,
     LEAST_POINTS_PER_SUBAPERTURE,

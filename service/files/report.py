@@ -20,13 +20,14 @@ from service.errors import MatrixError, shown
 from service.fit.matrix import Fit, Method
 from service.fit.methods import ScanStep
 from service.model.instrument import Instrument
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import (
     BOUNDARY_SCALE,
     COVARIANCE_SCALE,
     PARAMETERS,
     Misregistration,
 )
-from service.model.slopes import Orientation, SlopeOrder
+from service.model.slopes import Orientation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

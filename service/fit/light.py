@@ -23,7 +23,8 @@ import scipy
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import Instrument, Stop
+from service.model.instrument import Instrument
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination, instrument_pupil
 from service.model.pyramid import PyramidOptics, enough_modulation_points

@@ -28,11 +28,12 @@ from service.fit.uncertainty import pupil_regions, uncertainty
 from service.fit.verdict import SUSPICIOUS, Evidence, alternatives, judged, remarks
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import Basis, modal_basis
 from service.model.pupil import Illumination
 from service.model.pyramid import Mapper
-from service.model.slopes import Orientation, SlopeOrder
+from service.model.slopes import Orientation
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]

@@ -13,8 +13,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.instrument import Instrument, Stop
+from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import Basis
 from service.model.pupil import Illumination

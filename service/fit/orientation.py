@@ -24,10 +24,11 @@ from service.fit.reference import Reference, Target, oriented, target_of
 from service.fit.solver import vertex
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration, rotation, wrapped
 from service.model.modes import Basis
 from service.model.pyramid import Mapper
-from service.model.slopes import Orientation, SlopeOrder, turned_mask
+from service.model.slopes import Orientation, turned_mask
 
 Array = NDArray[np.float64]
 Setting = tuple[SlopeOrder, Orientation]

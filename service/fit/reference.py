@@ -12,8 +12,9 @@ from service.errors import MatrixError
 from service.fit.solver import Columns
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import unit_like
-from service.model.slopes import Orientation, SlopeOrder, to_conventions
+from service.model.slopes import Orientation, to_conventions
 
 Array = NDArray[Any]
 

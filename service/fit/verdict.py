@@ -20,8 +20,8 @@ from service.fit.reference import Target
 from service.fit.solver import Nuisances, Solution, refine
 from service.fit.uncertainty import Uncertainty
 from service.model.instrument import Instrument
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.model.slopes import SlopeOrder
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.interaction import differences_of, rtc_valid_subapertures
-from service.model.slopes import Normalisation
+from service.model.kinds import Normalisation
 
 Array = NDArray[np.float64]
 

@@ -3,41 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.model.kinds import BasisKind, Influence, Stop
 from service.model.misregistration import Misregistration
 from service.model.slopes import SlopeRecipe
-
-
-class Stop(StrEnum):
-    """The element that limits the beam."""
-
-    MIRROR = "mirror"
-    """The adaptive mirror is the stop: pupil edge and obscuration move with the shift (FLAO)."""
-
-    TELESCOPE = "telescope"
-    """The pupil is fixed; only the influence functions move (the ELT, most simulators)."""
-
-
-class Influence(StrEnum):
-    """Shape of an analytic influence function."""
-
-    THIN_PLATE = "thin-plate"
-    GAUSSIAN = "gaussian"
-
-
-class BasisKind(StrEnum):
-    """Modes of a mirror whose user brings none."""
-
-    KARHUNEN_LOEVE = "KL"
-    """Karhunen-Loeve modes of von Karman turbulence."""
-
-    ZONAL = "zonal"
-    """The actuators themselves, in their order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -17,12 +17,13 @@ import scipy
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.model.instrument import Instrument, Stop
+from service.model.instrument import Instrument
+from service.model.kinds import Normalisation, Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import Basis
 from service.model.pupil import Illumination, annular_pupil, instrument_pupil
 from service.model.pyramid import Mapper, Nodes, PyramidOptics, Response, enough_modulation_points
-from service.model.slopes import Normalisation, rtc_mask, to_rtc, turned_mask
+from service.model.slopes import rtc_mask, to_rtc, turned_mask
 from service.model.turbulence import Halo
 
 Array = NDArray[Any]

@@ -10,7 +10,8 @@ import scipy
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import BasisKind, Influence, Instrument, Mirror, TabulatedModes
+from service.model.instrument import Instrument, Mirror, TabulatedModes
+from service.model.kinds import BasisKind, Influence
 from service.model.pupil import PupilGrid, instrument_pupil
 from service.model.tabulated import TabulatedBasis, tabulated_basis
 from service.model.turbulence import (

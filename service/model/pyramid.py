@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Pyramid
+from service.model.kinds import Normalisation
 from service.model.pupil import PupilGrid
-from service.model.slopes import Normalisation
 from service.model.turbulence import Halo
 
 Array = NDArray[Any]

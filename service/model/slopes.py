@@ -8,38 +8,15 @@ slope vector with one sign per element, so nothing is interpolated and the inver
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.model.kinds import Normalisation, SlopeOrder
 
 Scalar = TypeVar("Scalar", bound=np.generic)
-
-
-class SlopeOrder(StrEnum):
-    """How the two components follow one another in the RTC's slope vector."""
-
-    XY = "xy"
-    """All Sx, then all Sy."""
-
-    YX = "yx"
-    """All Sy, then all Sx."""
-
-    INTERLEAVED = "interleaved"
-    """Sx and Sy of one subaperture, then of the next."""
-
-
-class Normalisation(StrEnum):
-    """What the differences of intensity are divided by."""
-
-    GLOBAL = "global"
-    """The mean flux per valid subaperture."""
-
-    LOCAL = "local"
-    """Each subaperture's own flux."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

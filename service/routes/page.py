@@ -16,7 +16,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.control.gate import LIMIT_M
-from service.model.instrument import Instrument, Mirror, Stop
+from service.model.instrument import Instrument, Mirror
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.routes.views import ServiceDep, answer, shows, view
 

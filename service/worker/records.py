@@ -20,8 +20,9 @@ from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.control.reconstructor import MAX_CONDITION, InversionMethod
 from service.errors import ModelError
-from service.model.instrument import Influence, Instrument, Mirror
+from service.model.instrument import Instrument, Mirror
 from service.model.interaction import RtcInteractionModel
+from service.model.kinds import Influence
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.telemetry.health import Actuators

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.linalg import svd
 
 from service.errors import WireError
-from service.model.instrument import BasisKind, Instrument
+from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
+from service.model.kinds import BasisKind
 from service.model.modes import ModalBasis
 from service.wire import (
     CHUNK_LIMIT,

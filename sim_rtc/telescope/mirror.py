@@ -17,7 +17,8 @@ from scipy.spatial import Delaunay
 from scipy.special import k0
 
 from service.errors import ConfigurationError
-from service.model.instrument import Influence, Mirror
+from service.model.instrument import Mirror
+from service.model.kinds import Influence
 from service.model.modes import mirror_surface
 
 Array = NDArray[np.float64]

@@ -12,8 +12,9 @@ from typing import Required, Self, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.instrument import Instrument, Mirror, Stop
+from service.model.instrument import Instrument, Mirror
 from service.model.interaction import valid_subapertures
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid

@@ -22,7 +22,8 @@ from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.fit.reference import oriented
 from service.model.interaction import rtc_valid_subapertures
-from service.model.slopes import Orientation, SlopeOrder, to_rtc
+from service.model.kinds import SlopeOrder
+from service.model.slopes import Orientation, to_rtc
 from service.tracking.state import Mode
 from service.wire import LoopRequest, Status
 from service.worker import Compute, OpticsWorker

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from service.model.interaction import InteractionModel
+from service.model.kinds import Normalisation
 from service.model.misregistration import Misregistration
-from service.model.slopes import Normalisation, SlopeRecipe
+from service.model.slopes import SlopeRecipe
 from tests.numerics import SOMEWHERE, small_basis, small_instrument
 from tests.physics.fft_pyramid import FftPyramid
 

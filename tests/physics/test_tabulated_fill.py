@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.instrument import Stop, TabulatedModes
+from service.model.instrument import TabulatedModes
 from service.model.interaction import InteractionModel
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from studies.tabulated_fill import FILLS, registered, sampled

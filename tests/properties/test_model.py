@@ -7,16 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from service.model.instrument import Stop
+from service.model.kinds import SlopeOrder, Stop
 from service.model.misregistration import Misregistration, rotation
-from service.model.slopes import (
-    Orientation,
-    SlopeOrder,
-    rtc_mask,
-    to_conventions,
-    to_rtc,
-    turned_mask,
-)
+from service.model.slopes import Orientation, rtc_mask, to_conventions, to_rtc, turned_mask
 from tests.numerics import small_linearisation, small_model
 
 registrations = st.builds(

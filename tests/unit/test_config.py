@@ -11,11 +11,12 @@ import pytest
 from service.config import Settings, load_instrument, load_settings
 from service.config.mirrors import coincident, grid, rings, typical_pitch
 from service.errors import ConfigurationError
-from service.model.instrument import Influence, LoopFacts, Stop
+from service.model.instrument import LoopFacts
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
+from service.model.kinds import Influence, Normalisation, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from service.model.slopes import Normalisation, Orientation, SlopeOrder
+from service.model.slopes import Orientation
 from service.tracking.state import Mode
 
 ABOUT = '[instrument]\nname = "bench"\ndiameter_m = 8.0\nstop = "telescope"\n'

@@ -12,9 +12,10 @@ from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError
 from service.files.report import document, fill_fit, instrument_sha256
 from service.model.interaction import InteractionModel
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from service.model.slopes import Orientation, SlopeOrder, rtc_mask, to_conventions
+from service.model.slopes import Orientation, rtc_mask, to_conventions
 from tests.unit.files.made import a_fit, a_report
 
 TINY = Path(__file__).parents[2] / "data" / "tiny" / "tiny.toml"

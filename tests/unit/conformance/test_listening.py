@@ -10,7 +10,8 @@ from service.conformance.ear import Heard, Topic
 from service.conformance.examine import Examination, examine
 from service.errors import LinkError, WireError
 from service.fit.dialect import Dialect
-from service.model.slopes import Orientation, SlopeOrder
+from service.model.kinds import SlopeOrder
+from service.model.slopes import Orientation
 from tests.unit.conformance.pretend import Pretend
 from tests.vectors import PAGE, anchors_of
 

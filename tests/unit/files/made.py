@@ -7,8 +7,9 @@ import numpy as np
 from service.files.report import FitReport
 from service.fit.matrix import Fit, Method
 from service.fit.methods import ScanStep
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
-from service.model.slopes import Orientation, SlopeOrder
+from service.model.slopes import Orientation
 
 ALPHA = Misregistration(
     shift_x_subap=-0.92, shift_y_subap=0.35, rotation_rad=np.deg2rad(65.08), magnification=0.98

@@ -7,8 +7,8 @@ import pytest
 
 from service.errors import MatrixError
 from service.files.report import document, fill_fit, instrument_sha256, read_fit
-from service.model.instrument import Stop
-from service.model.slopes import Orientation, SlopeOrder
+from service.model.kinds import SlopeOrder, Stop
+from service.model.slopes import Orientation
 from tests.numerics import small_instrument
 from tests.unit.files.made import ALPHA, GAINS, SCAN, a_fit, a_report
 

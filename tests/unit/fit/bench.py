@@ -11,8 +11,9 @@ from service.fit.matrix import Fit, FitOptions, fit_matrix
 from service.fit.reference import Reference
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
-from service.model.slopes import Orientation, SlopeOrder, SlopeRecipe, to_rtc
+from service.model.slopes import Orientation, SlopeRecipe, to_rtc
 from tests.numerics import small_basis, small_instrument
 
 PLAIN = Orientation()

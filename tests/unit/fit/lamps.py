@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 
 from service.config.instrument import load_instrument
-from service.model.instrument import Instrument, Stop
+from service.model.instrument import Instrument
+from service.model.kinds import Stop
 from service.model.pupil import Illumination, instrument_pupil
 from service.model.pyramid import PyramidOptics
 from tests.numerics import small_instrument

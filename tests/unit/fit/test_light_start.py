@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from service.fit.light import far_starts
-from service.model.instrument import SlopeRecipe, Stop
+from service.model.instrument import SlopeRecipe
+from service.model.kinds import Stop
 from service.model.slopes import Orientation
 from tests.unit.fit.lamps import counts_of, small
 

@@ -5,8 +5,9 @@ import pytest
 
 from service.fit.matrix import fit_matrix
 from service.fit.reference import Reference
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
-from service.model.slopes import Orientation, SlopeOrder
+from service.model.slopes import Orientation
 from tests.numerics import small_basis
 from tests.unit.fit.bench import ELSEWHERE, GRID, error, fit, instrument, listed, matrix
 

@@ -3,10 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.instrument import Stop
+from service.model.kinds import SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
-from service.model.slopes import SlopeOrder
 from tests.numerics import small_instrument
 from tests.unit.fit.bench import PLAIN, fit, instrument, listed, matrix
 

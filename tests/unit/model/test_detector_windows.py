@@ -16,7 +16,7 @@ from service.model.detector_windows import (
     slopes_per_unit,
 )
 from service.model.instrument import FrameWindows
-from service.model.slopes import Normalisation
+from service.model.kinds import Normalisation
 from tests.numerics import small_instrument
 
 RECTANGLE = np.array([[14.0, 15.0], [14.0, 45.0], [44.0, 15.0], [44.0, 45.0]])

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.instrument import Stop
 from service.model.interaction import InteractionModel, reference_slopes
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.model.pupil import instrument_pupil

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from service.model.interaction import InteractionModel, RtcInteractionModel
-from service.model.slopes import Orientation, SlopeOrder, SlopeRecipe, to_conventions
+from service.model.kinds import SlopeOrder
+from service.model.slopes import Orientation, SlopeRecipe, to_conventions
 from tests.numerics import SOMEWHERE, small_basis, small_instrument
 
 ORIENTATION = Orientation(swap_xy=True, flip_x=True, sign_y=-1)

@@ -9,7 +9,7 @@ from service.config.instrument import load_instrument
 from service.config.mirrors import grid, rings
 from service.errors import ModelError
 from service.model import modes
-from service.model.instrument import Influence
+from service.model.kinds import Influence
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.model.pupil import instrument_pupil
 from tests.numerics import N_MODES, flao_basis, small_basis, small_instrument

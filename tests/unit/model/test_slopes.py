@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
+from service.model.kinds import SlopeOrder
 from service.model.slopes import (
     Orientation,
-    SlopeOrder,
     SlopeRecipe,
     rtc_mask,
     to_conventions,

@@ -10,9 +10,10 @@ import pytest
 from service.errors import ModelError
 from service.model.instrument import FrameWindows
 from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from service.model.slopes import Normalisation, Orientation, SlopeOrder, SlopeRecipe, to_rtc
+from service.model.slopes import Orientation, SlopeRecipe, to_rtc
 from service.worker import OpticsWorker
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, loop_settings, small_instrument
 from tests.unit.runtime.test_workbench import dithered_window, open_loop

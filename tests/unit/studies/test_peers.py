@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
-from service.model.instrument import Stop
+from service.model.kinds import Stop
 from studies.peers_cases import LARGE, Case, bench, cases, digest, mirror_points
 from studies.peers_files import LISTINGS, turned, write_instrument, write_reference
 from studies.peers_fits import KEPT_ANSWERS, Answer, Question, error, kept_answers

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.instrument import KarhunenLoeve, Stop
+from service.model.instrument import KarhunenLoeve
 from service.model.interaction import (
     normalised_jacobian,
     reference_slopes,
     valid_subapertures,
 )
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.pyramid import PyramidOptics
 from sim_rtc.computer.feed import BATCH_FRAMES, PhaseFeed

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.model.instrument import Stop
 from service.model.interaction import InteractionModel
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import ThinPlate
 from service.model.pupil import instrument_pupil

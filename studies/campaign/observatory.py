@@ -142,6 +142,7 @@ class Observatory:
             ),
             clock_ns=lambda: self.dome.now_ns,
         )
+        self._n_restarts = 0
         self._agenda: list[_Due] = []
         self._numbers = itertools.count()
         self._with_poles = with_poles
@@ -199,6 +200,7 @@ class Observatory:
 
     def restart_rtc(self) -> None:
         """Let the RTC begin again with the matrix it started the night with."""
+        self._n_restarts += 1
         self.dome.restart()
         self._link.void()
         self._hear(ev.SessionStarted(session=self.dome.computer.session))
@@ -384,10 +386,13 @@ class Observatory:
         except PyrcalError as error:
             event = ev.JobFailed(effect=effect, text=str(error))
         while self._link.sent:
-            self._in(self.latencies.send_s, partial(self._deliver, *self._link.sent.pop()))
+            sent = partial(self._deliver, self._n_restarts, *self._link.sent.pop())
+            self._in(self.latencies.send_s, sent)
         return event
 
-    def _deliver(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+    def _deliver(self, n_restarts: int, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+        if n_restarts != self._n_restarts:
+            return  # on its way to a process that is gone, and its connection with it
         for answer in self._link.deliver(manifest, matrix):
             self._hear(answer)
 

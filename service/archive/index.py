@@ -130,7 +130,7 @@ class Index:
                     raise ArchiveError(
                         f"{self._path}: found version {version}, expected {_VERSION}"
                     )
-                older = _widened() if 0 < version < _VERSION else ""
+                older = _widened(connection) if 0 < version < _VERSION else ""
                 connection.executescript(f"BEGIN;{older}{_SCHEMA}")
                 return bool(version == 0)
         except sqlite3.OperationalError as error:
@@ -243,10 +243,13 @@ _N_COLUMNS = len(fields(AuditEntry)) - 1
 _COLUMNS = ", ".join(field.name for field in fields(AuditEntry)[:_N_COLUMNS])
 
 
-def _widened() -> str:
+def _widened(connection: sqlite3.Connection) -> str:
     """Return what gives an older trail the columns it lacks."""
+    there = {name for _, name, *_ in connection.execute("PRAGMA table_info(audit)")}
     return "".join(
-        f"ALTER TABLE audit ADD COLUMN {column} TEXT NOT NULL DEFAULT '';" for column in _OF_ORDERS
+        f"ALTER TABLE audit ADD COLUMN {column} TEXT NOT NULL DEFAULT '';"
+        for column in _OF_ORDERS
+        if column not in there
     )
 
 

@@ -29,7 +29,7 @@ test: $(STAMP) ## all that a change needs, what is known soonest first; ARGS go 
 	@$(PYTEST) -n 2 -m 'not long and not slow' $(ARGS)
 
 test-long: $(STAMP) ## the other tests: what takes minutes of real time
-	@$(PYTEST) -n 3 -m 'long and not slow' $(ARGS)  # they wait more than they work
+	@$(PYTEST) -n 4 -m 'long and not slow' $(ARGS)  # they wait more than they work
 
 check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff check .

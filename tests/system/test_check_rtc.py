@@ -38,6 +38,9 @@ LINES = {
 }
 """Each fault, and the lines that name it."""
 
+ALWAYS = {"lost@3:0.2,100", "clock@3", "restart@3", "refuse@0", "dither-lost@0:100"}
+"""One of each kind; a quarter of a minute each, so that the others are asked for with -m slow."""
+
 
 def checked(folder, *options, faults=()):
     """The simulated RTC's exit status, the outcome of each check, and all that is said."""
@@ -71,7 +74,10 @@ def test_a_healthy_rtc_keeps_the_contract_and_is_told_what_was_moved(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("fault", LINES)
+@pytest.mark.parametrize(
+    "fault",
+    [pytest.param(one, marks=[] if one in ALWAYS else pytest.mark.slow) for one in LINES],
+)
 def test_each_fault_is_named_by_its_line_and_by_no_other(tmp_path, fault):
     asking = LINES[fault] & {"commit", "dither"}
     options = ["--yes", "--seconds", "1", "--only", *asking] if asking else ["--passive"]

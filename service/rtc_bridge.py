@@ -44,7 +44,6 @@ from service.wire import (
     decode,
     encode,
     layout_of,
-    split,
 )
 
 if TYPE_CHECKING:
@@ -339,12 +338,7 @@ class Bridge:
                 f"id: manifest {manifest.id} is of system {manifest.system}, "
                 f"expected {self._endpoint.system}"
             )
-        offer = Offer(
-            manifest=manifest,
-            commit=encode(manifest),
-            parts=tuple(split(matrix, layout.chunk_bytes)),
-            offered_s=time.monotonic(),
-        )
+        offer = Offer.of(manifest, matrix)
         self._outbox.add(offer)
         return offer
 

@@ -27,8 +27,6 @@ from service.wire import (
     Reply,
     Role,
     decode,
-    encode,
-    split,
 )
 
 if TYPE_CHECKING:
@@ -200,10 +198,7 @@ class Ear:
         WireError
             If its id names another one.
         """
-        parts = tuple(split(matrix, manifest.layout.chunk_bytes))
-        commit = encode(manifest)
-        offered_s = time.monotonic()
-        self._outbox.add(Offer(manifest=manifest, commit=commit, parts=parts, offered_s=offered_s))
+        self._outbox.add(Offer.of(manifest, matrix))
 
     def put_chunk(self, matrix_id: str, index: int, data: bytes) -> None:
         """Send one part of a matrix."""

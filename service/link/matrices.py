@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from service.wire import (
     MeasuredManifest,
     chunk_index,
     decode,
+    encode,
+    split,
 )
 
 OFFERS: Final = 8
@@ -58,6 +61,14 @@ class Offer:
     parts: tuple[bytes, ...]
     offered_s: float
     """When, on a monotonic clock."""
+
+    @classmethod
+    def of(cls, manifest: Manifest, matrix: NDArray[np.float32]) -> Self:
+        """Return a matrix in the parts its manifest tells, offered from now on."""
+        parts = tuple(split(matrix, manifest.layout.chunk_bytes))
+        return cls(
+            manifest=manifest, commit=encode(manifest), parts=parts, offered_s=time.monotonic()
+        )
 
 
 class Outbox:

@@ -45,15 +45,15 @@ def _named(
     if matrix_id not in _ALIASES:
         return matrix_id
     state = service.snapshot().tracker
-    used, proposed = MatrixState.SUPERSEDED, MatrixState.PROPOSED
+    proposed = [r.id for r in state.reconstructors if r.state is MatrixState.PROPOSED]
     found = {
-        "in-use": [state.in_use] if state.in_use else [],
-        "previous": [r.id for r in state.reconstructors if r.state is used],
-        "candidate": [r.id for r in state.reconstructors if r.state is proposed],
+        "in-use": state.in_use,
+        "previous": state.previous,
+        "candidate": proposed[-1] if proposed else None,
     }[matrix_id]
     if not found:
         raise UnknownIdError(f"{matrix_id}: {_ALIASES[matrix_id]}")
-    return found[-1]
+    return found
 
 
 MatrixId = Annotated[str, Depends(_named)]

@@ -11,7 +11,7 @@ from http import HTTPStatus
 from fastapi import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.routes.admission import again
+from service.routes.admission import STREAMED, again
 from service.routes.problems import problem
 
 KEY = "idempotency-key"
@@ -22,9 +22,6 @@ MOST_KEPT = 1000
 
 LARGEST_KEPT = 100_000
 """Bytes: an order's answer is a few hundred."""
-
-STREAMED = "/v1/fits"
-"""Uploads go to the disk as they come: nobody has their bytes to compare."""
 
 _NOT_DONE = {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.INSUFFICIENT_STORAGE}
 """Answers that say that nothing was done: the next time may do it."""
@@ -68,7 +65,8 @@ class Once:
         return await self._answer(request, key, send)
 
     async def _answer(self, request: Request, key: str, send: Send) -> None:
-        if request.url.path == STREAMED:
+        if (request.method, request.url.path) == STREAMED:
+            # it goes to the disk as it comes: nobody has its bytes to compare
             return await self._refuse(request, send, "found a key, expected none with an upload")
         if not (0 < len(key) <= LONGEST_KEY and key.isprintable()):
             found = f"found {len(key)} characters, expected 1 to {LONGEST_KEY} printable ones"

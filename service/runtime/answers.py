@@ -94,8 +94,7 @@ class Given:
             case cmd.Publish(id=name):
                 return self._copied(now, name)
             case _:
-                used = [r for r in self.before.reconstructors if r.state is MatrixState.SUPERSEDED]
-                return self._copied(now, used[-1].id)
+                return self._copied(now, self.before.previous or "")
 
     def _copied(self, now: TrackerState, source: str) -> Answer:
         """Tell of a reconstructor that goes out again, under an id of its own."""

@@ -134,11 +134,10 @@ def roll_back(turn: Turn) -> None:
     CommandError
         If there was none, or no RTC is there.
     """
-    states = MatrixState.SUPERSEDED
-    earlier = [r.id for r in turn.state.reconstructors if r.state is states]
-    if not earlier:
+    earlier = turn.state.previous
+    if earlier is None:
         raise CommandError("rollback: no earlier reconstructor has been in use")
-    _copy(turn, earlier[-1], f"the operator goes back to {earlier[-1]}")
+    _copy(turn, earlier, f"the operator goes back to {earlier}")
 
 
 def refit(turn: Turn, n_modes: int | None) -> None:

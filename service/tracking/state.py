@@ -14,6 +14,7 @@ from service.tracking.dither_request import Dither, Dithering
 from service.tracking.loop import LoopCommand
 from service.tracking.products import (
     Assessment,
+    MatrixState,
     MeasurementRecord,
     ModeLimit,
     ReconstructorRecord,
@@ -390,6 +391,12 @@ class TrackerState:
     def reconstructor(self, matrix_id: str) -> ReconstructorRecord | None:
         """Return the record of this id, or None."""
         return next((r for r in reversed(self.reconstructors) if r.id == matrix_id), None)
+
+    @property
+    def previous(self) -> str | None:
+        """Id of the reconstructor that was in use before: what a rollback goes back to."""
+        used = (r.id for r in reversed(self.reconstructors) if r.state is MatrixState.SUPERSEDED)
+        return next(used, None)
 
     def measurement(self, measurement_id: str) -> MeasurementRecord | None:
         """Return the record of this measured matrix, or None."""

@@ -13,8 +13,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import svd
 
 from service.errors import WireError
 from service.model.instrument import Instrument
@@ -224,7 +224,7 @@ class Staging:
 
 def truncated_inverse(interaction: Array32) -> Array32:
     """Return the pseudo-inverse of D ``(n_slopes, n_modes)`` without its weakest directions."""
-    u, values, vh = svd(interaction.astype(np.float64), full_matrices=False)
+    u, values, vh = scipy.linalg.svd(interaction.astype(np.float64), full_matrices=False)
     kept = values > _SMALLEST_SINGULAR_RATIO * values[0]
     inverse = (vh[kept].T / values[kept]) @ u[:, kept].T
     return np.ascontiguousarray(inverse, dtype=np.float32)

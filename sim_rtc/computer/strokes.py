@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, eigh, hadamard
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -97,7 +97,7 @@ def hadamard_shapes(
 
     With all modes always at work the noise of each is that of ``n`` times as many pushes.
     """
-    signs = hadamard(hadamard_order(len(modes)))[:, : len(modes)]
+    signs = scipy.linalg.hadamard(hadamard_order(len(modes)))[:, : len(modes)]
     return np.asarray(signs @ modal(modes, amplitude_m, n_modes), dtype=np.float32)
 
 
@@ -110,7 +110,7 @@ def system_shapes(
     are orthogonal to one another, so none is mistaken for a mixture of the others.
     """
     rows = reconstructor[list(modes)].astype(np.float64)
-    _, vectors = eigh(rows @ rows.T)
+    _, vectors = scipy.linalg.eigh(rows @ rows.T)
     shapes = np.zeros((len(modes), n_modes), dtype=np.float32)
     shapes[:, list(modes)] = amplitude_m * vectors.T
     return shapes
@@ -121,8 +121,8 @@ def pokes(mode_to_actuator: Array, amplitude_m: float) -> Array32:
 
     Every shape has the same RMS OPD: the modes are orthonormal over the pupil.
     """
-    gram = cho_factor(mode_to_actuator.T @ mode_to_actuator)
-    shapes = cho_solve(gram, mode_to_actuator.T).T
+    gram = scipy.linalg.cho_factor(mode_to_actuator.T @ mode_to_actuator)
+    shapes = scipy.linalg.cho_solve(gram, mode_to_actuator.T).T
     shapes *= amplitude_m / np.linalg.norm(shapes, axis=1, keepdims=True)
     return np.asarray(shapes, dtype=np.float32)
 

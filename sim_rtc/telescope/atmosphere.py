@@ -13,11 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
-from scipy.linalg import cho_factor, cho_solve, cholesky
-from scipy.sparse import csr_array
 
 from service.errors import ModelError
 from service.model.instrument import KarhunenLoeve
@@ -122,8 +120,8 @@ def _conditional(
     seen = _covariance(stencil, stencil, pitch_m, turbulence)
     cross = _covariance(row, stencil, pitch_m, turbulence)
     own = _covariance(row, row, pitch_m, turbulence)
-    weights = cho_solve(cho_factor(seen), cross.T).T
-    return weights, cholesky(own - weights @ cross.T, lower=True)
+    weights = scipy.linalg.cho_solve(scipy.linalg.cho_factor(seen), cross.T).T
+    return weights, scipy.linalg.cholesky(own - weights @ cross.T, lower=True)
 
 
 def _covariance(
@@ -220,7 +218,7 @@ class FrozenLayer:
         self._n_rows = int(np.ceil(2 * radius)) + 2 * _MARGIN_ROWS + 1
         centre = (self._n_rows - 1) / 2
         self._reading = _reading(along + centre, across + centre, self._n_rows)
-        self._length = next_fast_len(int(_LENGTH * self._n_rows), real=True)
+        self._length = scipy.fft.next_fast_len(int(_LENGTH * self._n_rows), real=True)
         self._block_steps = self._length - self._n_rows + 1
         self._screen = ExtrudedScreen(
             n_columns=self._n_rows,
@@ -284,7 +282,7 @@ class FrozenLayer:
         cells = self._reading.T @ np.ascontiguousarray(matrix.T)
         cells -= matrix.sum(axis=1) / np.float32(len(cells))
         filters = cells.reshape(self._n_rows, self._n_rows, -1)
-        return np.asarray(rfft(filters, self._length, axis=0))
+        return np.asarray(scipy.fft.rfft(filters, self._length, axis=0))
 
     def _windows(self, step: NDArray[np.intp]) -> Array32:
         """Return what lies before the pupil at these steps, ``(n_steps, n_rows²)``, mean 0."""
@@ -305,8 +303,8 @@ class FrozenLayer:
         padded = np.zeros((n_padded, self._n_rows), dtype=np.float32)
         padded[: len(rows)] = rows
         blocks = sliding_window_view(padded, self._length, axis=0)[:: self._block_steps]
-        parts = np.ascontiguousarray(rfft(blocks, axis=2).transpose(2, 0, 1))
-        answers = irfft(parts @ spectra, self._length, axis=0)[self._n_rows - 1 :]
+        parts = np.ascontiguousarray(scipy.fft.rfft(blocks, axis=2).transpose(2, 0, 1))
+        answers = scipy.fft.irfft(parts @ spectra, self._length, axis=0)[self._n_rows - 1 :]
         return np.asarray(answers.transpose(1, 0, 2).reshape(-1, spectra.shape[2])[:n_steps])
 
     def _extruded(self, n_rows: int) -> list[Array32]:
@@ -364,7 +362,7 @@ def cubic_weights(fraction: Array) -> Array:
     )
 
 
-def _reading(row: Array, column: Array, n_rows: int) -> csr_array:
+def _reading(row: Array, column: Array, n_rows: int) -> scipy.sparse.csr_array:
     """Return the matrix ``(n_points, n_rows²)`` that reads points of a window, newest row first."""
     row0, column0 = np.floor(row), np.floor(column)
     rows = row0[:, None].astype(np.intp) + _TAPS
@@ -372,7 +370,7 @@ def _reading(row: Array, column: Array, n_rows: int) -> csr_array:
     cells = rows[:, :, None] * n_rows + columns[:, None, :]
     weights = cubic_weights(row - row0)[:, :, None] * cubic_weights(column - column0)[:, None, :]
     pointer = np.arange(0, cells.size + 1, _TAPS.size**2)
-    return csr_array(
+    return scipy.sparse.csr_array(
         (weights.astype(np.float32).reshape(-1), cells.reshape(-1), pointer),
         shape=(len(row), n_rows**2),
     )

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
@@ -117,7 +117,7 @@ class Detector:
 
 def _normal_values(n: int) -> Array32:
     """Return n equally probable values of a normal distribution, of variance 1."""
-    values = ndtri((np.arange(n) + 0.5) / n)
+    values = scipy.special.ndtri((np.arange(n) + 0.5) / n)
     return np.asarray(values / values.std(), dtype=np.float32)
 
 

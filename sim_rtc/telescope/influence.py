@@ -12,9 +12,8 @@ from typing import NoReturn
 
 import h5py
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import shift, spline_filter
-from scipy.sparse import csr_array
 
 from service.config.sources import read_dataset
 from service.errors import ConfigurationError
@@ -52,7 +51,12 @@ class InfluenceCube:
         steps = (moved_m - positions_m)[:, ::-1] / self.pitch_m
         maps = self.maps
         if steps.any():
-            maps = np.stack([shift(f, d, mode="nearest") for f, d in zip(maps, steps, strict=True)])
+            maps = np.stack(
+                [
+                    scipy.ndimage.shift(f, d, mode="nearest")
+                    for f, d in zip(maps, steps, strict=True)
+                ]
+            )
         return TabulatedSurface(
             maps=maps,
             pitch=self.pitch_m / subaperture_m,
@@ -86,9 +90,9 @@ class TabulatedSurface:
             bent = self._curvature(np.tensordot(strokes.T, self.maps, 1))
             strokes[list(free)] = -np.linalg.lstsq(curved, bent.T, rcond=None)[0]
         shapes = np.tensordot(strokes.T, self.maps, 1)
-        return np.stack([spline_filter(shape).ravel() for shape in shapes], axis=1)
+        return np.stack([scipy.ndimage.spline_filter(shape).ravel() for shape in shapes], axis=1)
 
-    def basis(self, points: Array) -> csr_array:
+    def basis(self, points: Array) -> scipy.sparse.csr_array:
         """Return ``(n_points, n_knots)`` weights of the knots at ``points`` ``(n_points, 2)``."""
         _, n_y, n_x = self.maps.shape
         columns, weights_x = _knots(points[:, 0] / self.pitch, n_x)
@@ -96,7 +100,7 @@ class TabulatedSurface:
         knots = rows[:, :, None] * n_x + columns[:, None, :]
         weights = weights_y[:, :, None] * weights_x[:, None, :]
         of_point = np.repeat(np.arange(len(points)), knots[0].size)
-        return csr_array(
+        return scipy.sparse.csr_array(
             (weights.ravel(), (of_point, knots.ravel())), shape=(len(points), n_y * n_x)
         )
 

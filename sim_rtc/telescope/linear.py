@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Unpack
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 from typing_extensions import override
 
 from service.model.instrument import Instrument, Mirror
@@ -125,7 +125,10 @@ class LinearPlant(Plant):
         """Return ``(n_modes, n_points)``: least-squares modal content of a phase, by area."""
         weighted = modes * self.weights[:, None].astype(np.float32)
         gram = (modes.T @ weighted).astype(np.float64)
-        return np.asarray(cho_solve(cho_factor(gram), weighted.T.astype(np.float64)), np.float32)
+        return np.asarray(
+            scipy.linalg.cho_solve(scipy.linalg.cho_factor(gram), weighted.T.astype(np.float64)),
+            np.float32,
+        )
 
 
 def _modulation_points(radius_lambda_over_d: float) -> int:

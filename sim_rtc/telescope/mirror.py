@@ -10,11 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import lu_factor, lu_solve
-from scipy.sparse import csr_array
-from scipy.spatial import Delaunay
-from scipy.special import k0
 
 from service.errors import ConfigurationError
 from service.model.instrument import Mirror
@@ -68,7 +65,7 @@ class PlantSurface(Protocol):
         ``strokes`` is ``(n_actuators, n_shapes)``; those of ``free`` actuators do not count.
         """
 
-    def basis(self, points: Array) -> Array | csr_array:
+    def basis(self, points: Array) -> Array | scipy.sparse.csr_array:
         """Return ``(n_points, n_basis)`` at ``points`` ``(n_points, 2)``, x and y."""
 
 
@@ -108,7 +105,7 @@ class TensionedPlate:
         system[-1, -1] = 0.0
         padded = np.vstack([strokes[held], np.zeros((1, strokes.shape[1]))])
         weights = np.zeros((n + 1, strokes.shape[1]))
-        weights[np.append(held, n)] = lu_solve(lu_factor(system), padded)
+        weights[np.append(held, n)] = scipy.linalg.lu_solve(scipy.linalg.lu_factor(system), padded)
         return weights
 
     def basis(self, points: Array) -> Array:
@@ -152,7 +149,7 @@ def _tension_kernel(scaled: Array) -> Array:
     """Return ``-(K0(x) + log x + γ - log 2)``, by its series where the terms would cancel."""
     x = np.maximum(scaled, 1e-12)
     near = x < 1e-3
-    exact = -(k0(x) + np.log(x / 2) + _EULER)
+    exact = -(scipy.special.k0(x) + np.log(x / 2) + _EULER)
     half = (x / 2) ** 2
     return np.asarray(np.where(near, half * (np.log(x / 2) + _EULER - 1.0), exact))
 
@@ -276,13 +273,13 @@ class MirrorDrive:
         command += distance * self._left_on_average
 
 
-def _neighbour_mean(positions_m: Array, pitch_m: float) -> csr_array:
+def _neighbour_mean(positions_m: Array, pitch_m: float) -> scipy.sparse.csr_array:
     """Return ``(n, n)`` averages over the neighbours of each actuator within two pitches."""
     n = len(positions_m)
     near = np.zeros((n, n), dtype=bool)
-    for corners in Delaunay(positions_m).simplices:
+    for corners in scipy.spatial.Delaunay(positions_m).simplices:
         near[np.ix_(corners, corners)] = True
     distance = np.hypot(*(positions_m[:, None] - positions_m).transpose(2, 0, 1))
     near &= (distance > 0.0) & (distance < 2 * pitch_m)
     share = near / np.maximum(near.sum(axis=1, keepdims=True), 1)
-    return csr_array(share.astype(np.float32))
+    return scipy.sparse.csr_array(share.astype(np.float32))

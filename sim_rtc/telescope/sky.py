@@ -7,8 +7,8 @@ from enum import StrEnum
 from itertools import pairwise
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from service.errors import ConfigurationError
 from sim_rtc.telescope.atmosphere import FrozenLayer, PhaseResponse, cubic_weights
@@ -286,10 +286,11 @@ class _Shaken:
         )
         self._state = np.array([-a1 * last - a2 * before, -a2 * last])
         self._rng = rng
+        self._filter = scipy.signal.lfilter  # its import takes a second: not between frames
 
     def next(self, n_frames: int) -> Array:
         noise = self._noise * self._rng.standard_normal(n_frames)
-        moved, self._state = lfilter([1.0], self._denominator, noise, zi=self._state)
+        moved, self._state = self._filter([1.0], self._denominator, noise, zi=self._state)
         return np.asarray(moved)
 
 

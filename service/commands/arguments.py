@@ -18,7 +18,7 @@ from typing_extensions import override
 
 from service import __version__
 from service.errors import ConfigurationError, shown
-from service.files import is_hdf5
+from service.files import kind_of
 from service.files.request import parse_alpha, parse_arms, parse_modes
 
 OTHER_PROGRAMS = {
@@ -291,7 +291,7 @@ def check_files(options: argparse.Namespace) -> None:
             raise ConfigurationError(f"{path}: found no folder {path.parent}, expected it to exist")
     measured = ("reference",) if options.command == "fit" else ()
     for path in _paths(options, "flux_map", "flux_reference", *measured):
-        is_hdf5(path)
+        kind_of(path)
     if options.command == "reconstruct" and not Path(options.alpha).is_file():
         try:
             parse_alpha(options.alpha)

@@ -1,4 +1,4 @@
-"""HDF5 and FITS files as one thing, and the measured interaction matrix in one.
+"""HDF5, FITS and NumPy files as one thing, and the measured interaction matrix in one.
 
 Their arrays have names and can be looked at before they are read.
 """
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import MatrixError
-from service.files import is_hdf5
+from service.files import FileKind, kind_of
 
 MOST_BYTES = 4 << 30
 """Largest array that is read: a cube of 400 full frames of 512 x 512 is a tenth of it."""
@@ -124,14 +124,15 @@ class _ImageHdu(Protocol):
 
 @contextmanager
 def opened(path: Path) -> Iterator[Container]:
-    """Open an HDF5 or FITS file, known by its content and not by its name.
+    """Open an HDF5, FITS or NumPy file, known by its content and not by its name.
 
     Raises
     ------
     MatrixError
-        If there is no such file, it is neither, or it is damaged.
+        If there is no such file, it is none of them, or it is damaged.
     """
-    with (_hdf5 if is_hdf5(path) else _fits)(path) as container:
+    readers = {FileKind.HDF5: _hdf5, FileKind.FITS: _fits, FileKind.NUMPY: _numpy}
+    with readers[kind_of(path)](path) as container:
         yield container
 
 
@@ -272,6 +273,24 @@ def _image(hdu: _ImageHdu, where: str, file_bytes: int) -> StoredArray:
     )
 
 
+@contextmanager
+def _numpy(path: Path) -> Iterator[Container]:
+    """Open the one array of a NumPy file; nothing that would have to be unpickled."""
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise MatrixError(f"{path}: damaged NumPy file: {error}") from error
+    stored = StoredArray(
+        where=str(path),
+        shape=array.shape,
+        dtype=array.dtype,
+        stored_bytes=array.nbytes,
+        load=lambda: array,
+    )
+    arrays = {DATASET: stored}
+    yield Container(path=path, arrays=arrays, find=arrays.get, facts={})
+
+
 # --- a measured interaction matrix, with what its file says of the measurement
 
 
@@ -310,7 +329,7 @@ class Recorded:
 
 
 def read_recorded(path: Path, dataset: str | None = None) -> Recorded:
-    """Read a measured matrix from an HDF5 or FITS file.
+    """Read a measured matrix from an HDF5, FITS or NumPy file.
 
     Beside the matrix, in the same HDF5 group or as further FITS extensions, ``modes``
     (``(n_modes,)``, basis indices), ``noise`` (``(n_modes,)``) and ``flux_frame`` are taken where
@@ -322,7 +341,7 @@ def read_recorded(path: Path, dataset: str | None = None) -> Recorded:
     path
         The file.
     dataset
-        Name of the array; None: ``interaction_matrix``, or the only image of a FITS file.
+        Name of the array; None: ``interaction_matrix``, or the only one of a FITS or NumPy file.
 
     Raises
     ------

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
+from service.files.drawn import as_maps, shown_modes, singular_values_of
 from service.files.report import FitReport, verdict_line
 from service.fit.matrix import Fit
 from service.fit.methods import ScanStep
@@ -94,14 +94,10 @@ SYNTHETIC = "tab:blue"
 
 def singular_values(axes: Axes, fit: Fit) -> None:
     """Draw the singular values of both matrices, each over its largest, and their conditions."""
-    for matrix, name, colour, style in (
-        (fit.synthetic * fit.gains, "synthetic", SYNTHETIC, "-"),
-        (fit.measured, "measured", MEASURED, "--"),
-    ):
-        values = scipy.linalg.svdvals(np.asarray(matrix, dtype=np.float64))
-        condition = values[0] / values[-1]
-        label = f"{name}, condition {condition:.2f}"
-        axes.semilogy(values / values[0], style, color=colour, label=label)
+    for name, values in singular_values_of(fit).items():
+        colour, style = {"synthetic": (SYNTHETIC, "-"), "measured": (MEASURED, "--")}[name]
+        label = f"{name}, condition {1.0 / values[-1]:.2f}"
+        axes.semilogy(values, style, color=colour, label=label)
     axes.set(title="singular values", xlabel="number", ylabel="over the largest")
     axes.legend(fontsize="small")
 
@@ -185,16 +181,7 @@ def _outline(instrument: Instrument) -> tuple[Array, str]:
     return mirror.positions_m / instrument.subaperture_m * parity, "+"
 
 
-PAPER_MODES = (1, 5, 10, 50, 100, 200, 300, 350, 400)
-"""Modes the paper shows, counted from 1 as it does."""
-
 _COLUMNS = ("synthetic", "measured", "difference")
-
-
-def shown_modes(fit: Fit) -> NDArray[np.intp]:
-    """Return which columns of the fit are shown: the paper's modes, as far as they were used."""
-    found = np.flatnonzero(np.isin(fit.modes + 1, PAPER_MODES))
-    return found if len(found) else np.arange(min(len(fit.modes), 4))
 
 
 def slope_maps(figure: SubFigure, fit: Fit) -> None:
@@ -227,13 +214,6 @@ def _mode(triple: NDArray[Any], fit: Fit, column: int) -> None:
     triple[0].set_ylabel(f"mode {fit.modes[column]}", fontsize="small")
     left = 100.0 * fit.residual_by_mode[column]
     triple[2].set_xlabel(f"{left:.1f} % left", fontsize="small")
-
-
-def as_maps(slopes: NDArray[np.floating], valid: NDArray[np.bool_]) -> Array:
-    """Return slopes ``(n_slopes,)`` as ``(n, 2 n)``: Sx beside Sy, NaN where none is valid."""
-    maps = np.full((2, *valid.shape), np.nan)
-    maps[:, valid] = slopes.reshape(2, -1)
-    return np.hstack(list(maps))
 
 
 def scans(figure: SubFigure, steps: tuple[ScanStep, ...]) -> None:

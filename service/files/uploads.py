@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import tomllib
@@ -14,6 +15,7 @@ from typing import Any
 
 from service.errors import ConfigurationError, MatrixError, PyrcalError
 from service.files.container import check_sealed
+from service.files.drawn import numbers
 from service.files.report import document
 from service.files.run import fit_file
 from service.fit.matrix import FitOptions
@@ -147,6 +149,12 @@ def _texts(value: object) -> Iterator[str]:
 UPLOAD = "upload"
 """Name of what was uploaded, in the folder of its fit."""
 
+STAGE, FIGURES = "stage", "figures.json"
+"""In the same folder: what the fit is at, in a word, and what its figures are drawn from."""
+
+STAGES = ("reading", "modes", "orientation", "fit", "verdict", "figures")
+"""What a fit does, in this order."""
+
 
 class FitState(StrEnum):
     """How far a fit is."""
@@ -163,6 +171,9 @@ class FitState(StrEnum):
 
     FAILED = "failed"
     """There is none; the reason says why."""
+
+    GIVEN_UP = "given-up"
+    """There is none: somebody has ended it."""
 
 
 UNFINISHED = frozenset({FitState.RECEIVING, FitState.WAITING, FitState.RUNNING})
@@ -198,6 +209,9 @@ class FitJob:
     asked_ns_utc: int
     """When it was asked for, the service's clock."""
 
+    name: str = ""
+    """Of the measured matrix, or the file, as whoever asked calls it."""
+
     n_bytes: int = 0
     """Of the upload so far."""
 
@@ -207,8 +221,14 @@ class FitJob:
     reason: str = ""
     """Why it failed."""
 
+    stage: str = ""
+    """What it is at while it runs: reading, modes, orientation, fit, verdict, figures."""
+
     document: Mapping[str, Any] | None = None
     """What was found, as ``service.files.report.document`` says it."""
+
+    figures: bytes | None = None
+    """What its figures are drawn from, JSON of ``service.files.drawn.numbers``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -240,6 +260,11 @@ class UploadFitter:
         """
         unpacked = folder / "unpacked"
         unpacked.mkdir()
+
+        def tell(stage: str) -> None:
+            (folder / STAGE).write_text(stage, encoding="utf-8")
+
+        tell(STAGES[0])
         try:
             parcel = opened_parcel(folder / UPLOAD, unpacked, asked.reference, self.most_bytes)
             if asked.instrument is not None:
@@ -254,8 +279,11 @@ class UploadFitter:
                 asked.options,
                 dataset=asked.dataset,
                 threads=self.threads,
+                progress=tell,
             )
         except PyrcalError as error:
             said = str(error).replace(f"{unpacked}/", "").replace(f"{folder}/", "")
             raise MatrixError(said) from error
+        tell(STAGES[-1])
+        (folder / FIGURES).write_text(json.dumps(numbers(report.fit)), encoding="utf-8")
         return document(report)

@@ -17,8 +17,8 @@ from service.files.request import parse_alpha, parse_modes
 from service.files.uploads import FitAsked, FitState
 from service.fit.matrix import FitOptions, Method
 from service.routes import views
-from service.routes.problems import INVALID, UNKNOWN, problem_response
-from service.routes.views import FitJobs, ServiceDep, answer, picture, shows
+from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem_response
+from service.routes.views import FitJobs, ServiceDep, answer, known, picture, shows
 from service.runtime.uploads import FitQueue
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
@@ -85,6 +85,9 @@ class FitParameters(BaseModel):
 
     reference: str | None = Field(default=None, min_length=1, max_length=_TEXT)
     """Name of the measured file in an uploaded zip."""
+
+    name: str = Field(default="", max_length=_TEXT)
+    """What to call it in the list of fits, such as the file's name."""
 
     measurement: str | None = Field(default=None, min_length=1, max_length=_TEXT)
     """Id of a matrix the RTC has measured for this service; there is no body then."""
@@ -169,7 +172,8 @@ class FitAcceptedView(BaseModel):
 _UPLOAD: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "An HDF5 or FITS file, or a zip of one, an instrument file and its data",
+        "description": "An HDF5, FITS or NumPy file, or a zip of one, an instrument file and its "
+        "data",
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }
@@ -204,7 +208,8 @@ async def fit(
             raise MatrixError("found a body beside ?measurement=, expected one of the two")
         content = await run_in_threadpool(service.archive.measured.file, parameters.measurement)
         body, content_length = _kept(content), len(content)
-    job = await fits.take(parameters.asked(), body, content_length)
+    name = parameters.name or parameters.measurement or ""
+    job = await fits.take(parameters.asked(), body, content_length, name)
     return FitAcceptedView(id=job.id, links={"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"})
 
 
@@ -227,9 +232,59 @@ async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
     job = fits.job(fit_id)
     if job.document is not None:
         return JSONResponse(dict(job.document))
-    if job.state is FitState.FAILED:
+    if job.state in {FitState.FAILED, FitState.GIVEN_UP}:
         raise MatrixError(job.reason)
     return JSONResponse(picture(job), status_code=HTTPStatus.ACCEPTED)
+
+
+class FitMap(BaseModel):
+    """The slopes of one mode: rows from the lowest y on, Sx beside Sy; null: not valid."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    mode: int
+    measured: list[list[int | None]]
+    """Percent of three times the RMS of what was measured, cut there."""
+
+    synthetic: list[list[int | None]]
+    """The model's, gain applied, in the same unit."""
+
+
+class FitFigures(BaseModel):
+    """What the figures of a fit are drawn from."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    modes: list[int]
+    """Basis indices of the modes used; ``gains`` of the fit are of these."""
+
+    residual_by_mode: list[float | None]
+    """RMS of what is left over RMS of the measurement, of each."""
+
+    singular_values: dict[str, list[float | None]]
+    """"measured" and "synthetic", each over its largest."""
+
+    residual_map: list[list[int | None]]
+    """What is left in each subaperture, percent of the measured RMS: rows from the lowest y on, Sx
+    beside Sy; null: not valid."""
+
+    maps: list[FitMap]
+    """Of a few modes, the paper's where they were used."""
+
+
+@router.get("/fits/{id}/figures", response_model=FitFigures, responses={**UNKNOWN})
+async def fit_figures(fits: FitsDep, fit_id: FitId) -> Response:
+    """Return what the figures of a finished fit are drawn from; 404 while there are none."""
+    job = fits.job(fit_id)
+    return Response(
+        known(job.figures, f"figures of {fit_id}, {job.state}"), media_type="application/json"
+    )
+
+
+@router.delete("/fits/{id}", responses={200: shows(views.FIT_JOB), **UNKNOWN, **COMMAND})
+async def give_up_fit(fits: FitsDep, fit_id: FitId) -> Response:
+    """End a fit that waits or runs; 409 where it is over."""
+    return answer(await fits.give_up(fit_id))
 
 
 async def _kept(content: bytes) -> AsyncIterator[bytes]:

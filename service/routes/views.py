@@ -465,7 +465,7 @@ GATHERING = view(
     "The noisy interaction matrix under way: ``/v1/noisy-matrix/{id}`` says more.",
 )
 
-FIT_JOB = view("FitJobView", FitJob, "id state asked_ns_utc n_bytes sha256 reason")
+FIT_JOB = view("FitJobView", FitJob, "id state stage name asked_ns_utc n_bytes sha256 reason")
 FIT_JOBS = view("FitJobsView", FitJobs)
 
 view("AlarmView", Alarm, "name since_ns_utc text")

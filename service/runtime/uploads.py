@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import itertools
 import shutil
@@ -20,6 +21,7 @@ import structlog
 from service.errors import (
     ArchiveError,
     BusyError,
+    CommandError,
     MatrixError,
     PyrcalError,
     StorageError,
@@ -27,7 +29,16 @@ from service.errors import (
     TooSlowError,
     UnknownIdError,
 )
-from service.files.uploads import UNFINISHED, UPLOAD, FitAsked, FitJob, FitState
+from service.files import NUMPY_BEGINS
+from service.files.uploads import (
+    FIGURES,
+    STAGE,
+    UNFINISHED,
+    UPLOAD,
+    FitAsked,
+    FitJob,
+    FitState,
+)
 from service.runtime.workers import run_in_process
 
 FITS_KEPT = 50
@@ -45,8 +56,8 @@ SLOWEST_BYTES_S = 200_000
 _BLOCK = 1 << 20
 """Bytes written to the disk at once."""
 
-_BEGINS = (b"\x89HDF\r\n\x1a\n", b"SIMPLE  =", b"\x1f\x8b", b"PK\x03\x04")
-"""First bytes of HDF5, FITS, anything gzipped, and zip."""
+_BEGINS = (b"\x89HDF\r\n\x1a\n", b"SIMPLE  =", b"\x1f\x8b", NUMPY_BEGINS, b"PK\x03\x04")
+"""First bytes of HDF5, FITS, anything gzipped, NumPy, and zip."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +102,7 @@ class FitQueue:
         self._numbers = itertools.count(1)
         self._jobs: OrderedDict[str, FitJob] = OrderedDict()
         self._turn = asyncio.Lock()
-        self._running: set[asyncio.Task[None]] = set()
+        self._running: dict[str, asyncio.Task[None]] = {}
         self._log = structlog.get_logger()
 
     def open(self) -> None:
@@ -110,14 +121,15 @@ class FitQueue:
 
     async def close(self) -> None:
         """End the fit that runs, drop those that wait, and remove their files."""
-        for task in self._running:
+        tasks = list(self._running.values())
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self._running, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def jobs(self) -> Sequence[FitJob]:
         """Return the fits that are remembered, oldest first."""
-        return tuple(self._jobs.values())
+        return tuple(self._staged(job) for job in self._jobs.values())
 
     def job(self, fit_id: str) -> FitJob:
         """Return one of them.
@@ -130,12 +142,41 @@ class FitQueue:
         found = self._jobs.get(fit_id)
         if found is None:
             raise UnknownIdError(f"fit {fit_id}: nobody has heard of it since the service started")
-        return found
+        return self._staged(found)
+
+    async def give_up(self, fit_id: str) -> FitJob:
+        """End a fit that waits or runs, and return what is left of it.
+
+        Raises
+        ------
+        UnknownIdError
+            If none has this id.
+        CommandError
+            If it is over, or its upload is still on its way.
+        """
+        job, task = self.job(fit_id), self._running.get(fit_id)
+        if task is None or job.state not in UNFINISHED:
+            raise CommandError(f"fit {fit_id} is {job.state}: there is nothing to give up")
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        if self._jobs[fit_id].state in UNFINISHED:  # else it was over at the last moment
+            self._put(replace(job, state=FitState.GIVEN_UP, reason="given up", stage=""))
+            # one that had not begun has not tidied up
+            await asyncio.to_thread(shutil.rmtree, self._folder / fit_id, ignore_errors=True)
+        return self.job(fit_id)
+
+    def _staged(self, job: FitJob) -> FitJob:
+        """Return a fit with what it is at, as its process has written it down."""
+        if job.state is not FitState.RUNNING:
+            return job
+        with contextlib.suppress(OSError):
+            return replace(job, stage=(self._folder / job.id / STAGE).read_text("utf-8"))
+        return job
 
     async def take(
-        self, asked: FitAsked, body: AsyncIterator[bytes], n_bytes: int | None
+        self, asked: FitAsked, body: AsyncIterator[bytes], n_bytes: int | None, name: str = ""
     ) -> FitJob:
-        """Keep an upload and put its fit in the queue.
+        """Keep an upload and put its fit in the queue, under a ``name`` for whoever looks there.
 
         Raises
         ------
@@ -149,7 +190,7 @@ class FitQueue:
             If it stops half-way, or is no file a matrix could be in.
         """
         self._check_room(n_bytes)
-        job = self._remember(asked)
+        job = self._remember(name)
         folder = self._folder / job.id
         try:
             await asyncio.to_thread(folder.mkdir)
@@ -162,7 +203,7 @@ class FitQueue:
             await self._forget(job.id)
             raise
         self._put(replace(self._jobs[job.id], state=FitState.WAITING))
-        self._start(self._carry_out(job.id, asked))
+        self._start(job.id, self._carry_out(job.id, asked))
         return self.job(job.id)
 
     def _check_room(self, n_bytes: int | None) -> None:
@@ -173,13 +214,14 @@ class FitQueue:
         if unfinished >= self._limits.waiting:
             raise BusyError(f"found {unfinished} fits unfinished, the most there may be: try later")
 
-    def _remember(self, asked: FitAsked) -> FitJob:
+    def _remember(self, name: str) -> FitJob:
         now_ns = self._clock_ns()
         stamp = datetime.fromtimestamp(now_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S")
         job = FitJob(
             id=f"fit-{stamp}-{next(self._numbers)}",
             state=FitState.RECEIVING,
             asked_ns_utc=now_ns,
+            name=name,
         )
         self._jobs[job.id] = job
         finished = [j.id for j in self._jobs.values() if j.state not in UNFINISHED]
@@ -208,7 +250,9 @@ class FitQueue:
                 await flush()
         await flush()
         if n_bytes == 0:
-            raise MatrixError("upload: found an empty body, expected an HDF5, FITS or zip file")
+            raise MatrixError(
+                "upload: found an empty body, expected an HDF5, FITS, NumPy or zip file"
+            )
         self._put(replace(self._jobs[fit_id], n_bytes=n_bytes, sha256=digest.hexdigest()))
 
     async def _carry_out(self, fit_id: str, asked: FitAsked) -> None:
@@ -221,7 +265,9 @@ class FitQueue:
                 found = await run_in_process(
                     work, nice=limits.nice, limit_s=limits.seconds, memory_mb=limits.memory_mb
                 )
-            self._put(replace(self._jobs[fit_id], state=FitState.DONE, document=found))
+            drawn = await asyncio.to_thread(_kept, folder / FIGURES)
+            done = replace(self._jobs[fit_id], state=FitState.DONE, document=found, figures=drawn)
+            self._put(done)
             self._log.info("fit.done", id=fit_id, verdict=found["verdict"])
         except PyrcalError as error:
             self._put(replace(self._jobs[fit_id], state=FitState.FAILED, reason=str(error)))
@@ -229,10 +275,10 @@ class FitQueue:
         finally:
             await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
 
-    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+    def _start(self, fit_id: str, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)
-        self._running.add(task)
-        task.add_done_callback(self._running.discard)
+        self._running[fit_id] = task
+        task.add_done_callback(lambda _: self._running.pop(fit_id))
 
     def _put(self, job: FitJob) -> None:
         self._jobs[job.id] = job
@@ -240,6 +286,10 @@ class FitQueue:
     async def _forget(self, fit_id: str) -> None:
         del self._jobs[fit_id]
         await asyncio.to_thread(shutil.rmtree, self._folder / fit_id, ignore_errors=True)
+
+
+def _kept(path: Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None
 
 
 async def _in_time(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
@@ -266,8 +316,8 @@ async def _in_time(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 def _check_kind(first: bytes) -> None:
     if not first.startswith(_BEGINS):
         raise MatrixError(
-            f"upload: found a body that begins with {first[:8]!r}, expected an HDF5, FITS or zip "
-            "file (curl -X POST -T FILE)"
+            f"upload: found a body that begins with {first[:8]!r}, expected an HDF5, FITS, NumPy "
+            "or zip file (curl -X POST -T FILE)"
         )
 
 

@@ -1,5 +1,6 @@
 """Fits over real HTTP messages, with a hand-written desk behind them."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,10 +10,11 @@ import pytest
 
 from service.api import create_app
 from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
+from service.files.drawn import numbers
 from service.files.report import document
 from service.files.uploads import FitJob, FitState
 from service.fit.matrix import Method
-from tests.unit.files.made import a_report
+from tests.unit.files.made import a_fit, a_report
 
 JOB = FitJob(id="fit-1", state=FitState.WAITING, asked_ns_utc=7, n_bytes=4, sha256="ab")
 
@@ -27,10 +29,10 @@ class FakeDesk:
         self.refusal = None
         self.known = {JOB.id: JOB}
 
-    async def take(self, asked, body, n_bytes):
+    async def take(self, asked, body, n_bytes, name):
         if self.refusal is not None:
             raise self.refusal
-        self.asked, self.length = asked, n_bytes
+        self.asked, self.length, self.name = asked, n_bytes, name
         self.body = b"".join([chunk async for chunk in body])
         return JOB
 
@@ -41,6 +43,11 @@ class FakeDesk:
         if fit_id not in self.known:
             raise UnknownIdError(f"fit {fit_id}: nobody has heard of it")
         return self.known[fit_id]
+
+    async def give_up(self, fit_id):
+        ended = replace(self.job(fit_id), state=FitState.GIVEN_UP, reason="given up")
+        self.known[fit_id] = ended
+        return ended
 
 
 @pytest.fixture
@@ -85,6 +92,7 @@ async def test_the_body_is_the_file_and_the_parameters_are_those_of_the_command(
         "anamorphosis": "true",
         "instrument": "flao-lbt",
         "reference": "im.h5",
+        "name": "last night",
     }
     response = await client.post("/v1/fits", params=parameters, content=b"file")
     assert response.status_code == 202, response.text
@@ -95,6 +103,7 @@ async def test_the_body_is_the_file_and_the_parameters_are_those_of_the_command(
     assert (desk.body, desk.length) == (b"file", 4)
     asked, options = desk.asked, desk.asked.options
     assert (asked.dataset, asked.instrument, asked.reference) == ("D", "flao-lbt", "im.h5")
+    assert desk.name == "last night"
     assert options.method is Method.PAPER
     assert options.modes.tolist() == [0, 1, 2, 3]
     assert options.start.vector == pytest.approx([0.1, 0.0, np.deg2rad(65.0), 0.98])
@@ -164,6 +173,8 @@ async def test_fits_are_listed_with_their_state(client):
             {
                 "id": "fit-1",
                 "state": "waiting",
+                "stage": "",
+                "name": "",
                 "asked_ns_utc": 7,
                 "asked_utc": "1970-01-01T00:00:00.000000Z",
                 "n_bytes": 4,
@@ -191,6 +202,24 @@ async def test_a_finished_fit_is_the_document_and_nothing_else(client, desk):
 async def test_a_fit_that_could_not_be_made_is_a_problem(client, desk):
     desk.known["fit-1"] = replace(JOB, state=FitState.FAILED, reason="it is transposed")
     assert_problem(await client.get("/v1/fits/fit-1"), 422, "unusable-matrix", "it is transposed")
+
+
+async def test_figures_are_there_when_the_fit_is(client, desk):
+    assert_problem(await client.get("/v1/fits/fit-1/figures"), 404, "unknown-id", "waiting")
+    drawn = json.dumps(numbers(a_fit())).encode()
+    desk.known["fit-1"] = replace(JOB, state=FitState.DONE, figures=drawn)
+    response = await client.get("/v1/fits/fit-1/figures")
+    assert response.content == drawn
+    described = (await client.get("/openapi.json")).json()["components"]["schemas"]
+    assert set(described["FitFigures"]["properties"]) == set(response.json())
+
+
+async def test_a_fit_is_given_up(client, desk):
+    response = await client.delete("/v1/fits/fit-1")
+    assert (response.status_code, response.json()["state"]) == (200, "given-up")
+    ended = await client.get("/v1/fits/fit-1")
+    assert_problem(ended, 422, "unusable-matrix", "given up")
+    assert_problem(await client.delete("/v1/fits/fit-9"), 404, "unknown-id", "fit-9")
 
 
 async def test_an_unknown_fit_is_404(client):

@@ -80,7 +80,6 @@ def test_a_missing_file_is_said(tmp_path):
     ("content", "kind"),
     [
         (b"", "an empty file"),
-        (b"\x93NUMPY\x01\x00v", "a NumPy file"),
         (b"MATLAB 5.0 MAT-file", "a MATLAB file"),
         (b"shift,rotation\n", "something else"),
     ],
@@ -90,7 +89,27 @@ def test_another_kind_of_file_is_named(tmp_path, content, kind):
     path.write_bytes(content)
     text = refused(path)
     assert kind in text
-    assert "expected an HDF5 or a FITS file" in text
+    assert "expected an HDF5, a FITS or a NumPy file" in text
+
+
+def test_the_one_array_of_a_numpy_file_is_the_matrix(tmp_path):
+    path = tmp_path / "matrix.npy"
+    np.save(path, VALUES.astype(">f4"))
+    assert np.array_equal(numbers(path, "interaction_matrix"), VALUES)
+
+
+@pytest.mark.parametrize("n_bytes", [9, 100, -4])
+def test_a_truncated_numpy_file_is_damaged(tmp_path, n_bytes):
+    path = tmp_path / "matrix.npy"
+    np.save(path, VALUES)
+    path.write_bytes(path.read_bytes()[:n_bytes])
+    assert "damaged NumPy file" in refused(path)
+
+
+def test_a_numpy_file_of_anything_pickled_is_not_opened(tmp_path):
+    path = tmp_path / "matrix.npy"
+    np.save(path, np.array([{"a": 1}], dtype=object))
+    assert "damaged NumPy file" in refused(path)
 
 
 def test_a_truncated_hdf5_file_is_damaged(hdf5, tmp_path):

@@ -10,7 +10,7 @@ from service.files import figures
 from service.files.figures import check_plots, write_sheet
 from service.model.misregistration import Misregistration
 from tests.numerics import small_instrument
-from tests.unit.files.made import ALPHA, GAINS, SCAN, SYNTHETIC, VALID, a_fit, a_report
+from tests.unit.files.made import ALPHA, GAINS, SCAN, SYNTHETIC, a_fit, a_report
 
 
 @pytest.fixture
@@ -52,20 +52,6 @@ def test_every_actuator_is_in_the_registration_picture(axes):
     low, high = axes.get_xlim()
     assert low < drawn.min()
     assert high > drawn.max()
-
-
-def test_slopes_become_maps_side_by_side():
-    found = figures.as_maps(np.arange(10.0), VALID)
-    assert found.shape == (3, 6)
-    assert found[0].tolist()[1] == 0.0
-    assert found[0].tolist()[4] == 5.0
-    assert np.isnan(found[0, 0])
-
-
-def test_the_papers_modes_are_shown_where_they_were_used():
-    fit = a_fit(modes=np.array([0, 3, 4]))
-    assert fit.modes[figures.shown_modes(fit)].tolist() == [0, 4], "1 and 5, as the paper counts"
-    assert figures.shown_modes(a_fit(modes=np.array([1, 2, 3]))).tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("n_scans", "n_places"), [(5, 5), (6, 10)])

@@ -9,6 +9,7 @@ import pytest
 
 from service.errors import (
     BusyError,
+    CommandError,
     MatrixError,
     StorageError,
     TooLargeError,
@@ -112,6 +113,38 @@ async def test_fits_run_one_after_the_other(opened):
     assert desk.job(first.id).state is FitState.RUNNING
     assert desk.job(second.id).state is FitState.WAITING
     assert [job.id for job in desk.jobs()] == [first.id, second.id]
+
+
+def at_a_stage(folder, asked):
+    (folder / "stage").write_text("orientation")
+    time.sleep(60.0)
+
+
+async def test_what_a_fit_is_at_is_told_and_it_ends_when_it_is_given_up(opened, tmp_path):
+    desk = opened(at_a_stage)
+    first, second = await taken(desk), await desk.take(ASKED, in_chunks(HDF5), None, "im.h5")
+    for _ in range(200):
+        if desk.job(first.id).stage:
+            break
+        await asyncio.sleep(0.05)
+    assert desk.job(first.id).stage == "orientation"
+    assert (await desk.give_up(second.id)).name == "im.h5"
+    ended = await desk.give_up(first.id)
+    assert (ended.state, ended.stage) == (FitState.GIVEN_UP, "")
+    assert [job.state for job in desk.jobs()] == [FitState.GIVEN_UP] * 2
+    assert not list((tmp_path / "uploads").iterdir())
+    with pytest.raises(CommandError, match="is given-up: there is nothing to give up"):
+        await desk.give_up(first.id)
+
+
+def drawing(folder, asked):
+    (folder / "figures.json").write_text("{}")
+    return telling(folder, asked)
+
+
+async def test_what_its_figures_are_drawn_from_is_kept(opened):
+    desk = opened(drawing)
+    assert (await finished(desk, await taken(desk))).figures == b"{}"
 
 
 async def test_too_many_unfinished_fits_are_refused_before_anything_is_read(opened):

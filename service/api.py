@@ -15,6 +15,7 @@ from fastapi.routing import APIRoute, iter_route_contexts
 from typing_extensions import override
 
 from service import __version__
+from service.keys import KeyFile
 from service.routes import (
     audit,
     commands,
@@ -25,10 +26,12 @@ from service.routes import (
     page,
     problems,
     reading,
+    session,
     stream,
     views,
 )
-from service.routes.admission import Admission, Hosts, server_config
+from service.routes.admission import OPEN, SCHEMES, Admission, Hosts, needs, scope_of
+from service.routes.connections import server_config
 from service.routes.once import Once
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
@@ -51,11 +54,12 @@ async def answer(
     desk: FitQueue,
     listener: socket.socket,
     names: tuple[str, ...],
+    keys: KeyFile,
     over: asyncio.Event,
 ) -> None:
     """Answer requests under these ``names`` until it is ``over``."""
     host, port = listener.getsockname()[:2]
-    app = create_app(service, desk, hosts=Hosts(bound=host, allowed=names), over=over)
+    app = create_app(service, desk, hosts=Hosts(bound=host, allowed=names), keys=keys, over=over)
     server = _Server(server_config(app, timeout_graceful_shutdown=REQUESTS_WITHIN_S))
     server.over = over
     structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
@@ -82,12 +86,13 @@ def create_app(
     desk: FitQueue | None = None,
     *,
     hosts: Hosts | None = None,
+    keys: KeyFile | None = None,
     over: asyncio.Event | None = None,
 ) -> FastAPI:
     """Return the REST application of a service, and of a desk for fits where there is one.
 
-    It answers to ``hosts``, loopback alone where they are not given, and to no other name. Streams
-    end when it is ``over``.
+    It answers to ``hosts``, loopback alone where they are not given, and to no other name; who asks
+    needs one of the ``keys``, if there are any. Streams end when it is ``over``.
 
     FastAPI's own pages are left out: they load their scripts from the internet. ``/docs`` is there
     all the same, from the package.
@@ -102,8 +107,11 @@ def create_app(
         responses=problems.EVERYWHERE,
     )
     app.add_middleware(Once)
-    app.add_middleware(Admission, hosts=hosts or Hosts())
+    app.add_middleware(
+        Admission, hosts=hosts or Hosts(), keys=keys, audit=lambda entry: service.audit(entry)
+    )
     app.state.service = service
+    app.state.keys = keys
     app.state.stream = stream.Stream(service, over or asyncio.Event())
     problems.install(app)
     page.install(app)
@@ -117,6 +125,7 @@ def create_app(
         matrices.router,
         matrices.noisy,
         health.router,
+        session.router,
     ]
     if desk is not None:
         app.state.fits = desk
@@ -135,6 +144,8 @@ class _Application(FastAPI):
             document = super().openapi()
             schemas = {"Problem": problems.Problem.model_json_schema()} | views.schemas()
             document["components"]["schemas"] |= schemas | self._tell_bodies(document)
+            document["components"]["securitySchemes"] = SCHEMES
+            self._tell_scopes(document)
         return super().openapi()
 
     def _tell_bodies(self, document: dict[str, Any]) -> dict[str, views.Schema]:
@@ -152,6 +163,14 @@ class _Application(FastAPI):
             method, _, path = operation.partition(" ")
             document["paths"][path][method]["requestBody"] = body
         return schemas
+
+    def _tell_scopes(self, document: dict[str, Any]) -> None:
+        """Say of each operation which key it needs."""
+        for route in iter_route_contexts(self.routes):
+            for method in route.methods or () if route.path_format in document["paths"] else ():
+                scope = scope_of(route, method)
+                security = OPEN if scope is None else needs(scope)
+                document["paths"][route.path_format][method.lower()] |= security
 
 
 def _operation_id(route: APIRoute) -> str:

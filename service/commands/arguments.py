@@ -38,6 +38,7 @@ def command_line() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
     _describe_run(commands.add_parser("run", help="the service"))
     _describe_status(commands.add_parser("status", help="what a running service is doing"))
+    _describe_key(commands.add_parser("key", help="who may ask: make, list, revoke API keys"))
     _describe_check(commands.add_parser("check-rtc", help="does an RTC keep the contract?"))
     _describe_fit(commands.add_parser("fit", help="the registration in a measured matrix"))
     _describe_reconstruct(
@@ -73,6 +74,29 @@ def _describe_status(status: argparse.ArgumentParser) -> None:
         help="of the service's REST API, default %(default)s",
     )
     status.add_argument("--json", action="store_true", help="print all that the service tells")
+
+
+def _describe_key(key: argparse.ArgumentParser) -> None:
+    key.description = (
+        "Make, list and revoke the keys of those who may ask a service, in its data_dir. A running "
+        "service goes by them at once. docs/operating.md says how a key is shown."
+    )
+    key.epilog = "Exit status: 0 done, 2 it cannot be done."
+    where = argparse.ArgumentParser(add_help=False)
+    where.add_argument("--config", type=Path, metavar="FILE", help="the service's settings, TOML")
+    where.add_argument("--data-dir", metavar="DIR", help="the service's data_dir, default var")
+    actions = key.add_subparsers(dest="action", required=True)
+    add = actions.add_parser("add", parents=[where], help="make a key, and show it this once")
+    revoke = actions.add_parser("revoke", parents=[where], help="make one worthless")
+    actions.add_parser("list", parents=[where], help="who has a key, and for what")
+    for action in (add, revoke):
+        action.add_argument("name", metavar="NAME", help="of the person, program or place")
+    add.add_argument(
+        "--scope",
+        choices=("read", "operate", "admin"),
+        required=True,
+        help="read: look; operate: give orders, too; admin: also see who has a key, and revoke one",
+    )
 
 
 _CHECK_EPILOG = """

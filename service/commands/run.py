@@ -6,8 +6,10 @@ import argparse
 import os
 from functools import partial
 
-from service.config import load_settings
+from service.config import Settings, load_settings
 from service.config.instrument_schema import read_instrument_file
+from service.errors import ConfigurationError
+from service.keys import KeyFile, KeyScope, is_loopback
 
 _OPTIONS = {
     "instrument": "service.instrument",
@@ -33,6 +35,7 @@ def main(options: argparse.Namespace) -> int:
             given[key] = [given[key]]
     settings = load_settings(options.config, os.environ, given)
     read_instrument_file(settings.service.instrument)
+    _check_keys(settings)
     # from here on each import takes its time: the worker's first, so that it imports beside them
     from service.processes import Worker
 
@@ -48,3 +51,21 @@ def main(options: argparse.Namespace) -> int:
 
     workers = WorkerPool(partial(start_worker, instrument, compute), early)
     return run(settings, instrument, workers)
+
+
+def _check_keys(settings: Settings) -> None:
+    """Refuse to be asked by other machines before somebody has a key to give orders with.
+
+    Raises
+    ------
+    ConfigurationError
+        If it would be, or the keys there are cannot be read.
+    """
+    host, keys = settings.api.host, KeyFile(settings.service.data_dir)
+    can_operate = any(key.scope.covers(KeyScope.OPERATE) for key in keys.all())
+    if not can_operate and not is_loopback(host):
+        raise ConfigurationError(
+            f"api.host: found {host}, which other machines can reach, and in {keys.path} no key "
+            f"of scope operate or admin; make one first: pyrcal key add NAME --scope operate "
+            f"--data-dir {settings.service.data_dir}"
+        )

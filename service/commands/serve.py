@@ -25,6 +25,7 @@ from service.config import Settings, load_instrument, packaged_instrument
 from service.config.policy import policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.uploads import UploadFitter
+from service.keys import KeyFile
 from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
@@ -62,14 +63,19 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
             desk = _desk(settings, instrument)
             names = (settings.api.host, *settings.api.allowed_hosts)
+            keys = KeyFile(settings.service.data_dir)
             try:
-                return await _until_stopped(supervisor, desk, listener, names)
+                return await _until_stopped(supervisor, desk, listener, names, keys)
             finally:
                 workers.close()
 
 
 async def _until_stopped(
-    supervisor: Supervisor, desk: FitQueue, listener: socket.socket, names: tuple[str, ...]
+    supervisor: Supervisor,
+    desk: FitQueue,
+    listener: socket.socket,
+    names: tuple[str, ...],
+    keys: KeyFile,
 ) -> int:
     desk.open()
     ending = _Ending()
@@ -79,7 +85,7 @@ async def _until_stopped(
         await asyncio.to_thread(import_module, "service.api")
         from service import api
 
-        await api.answer(supervisor, desk, listener, names, ending.asked)
+        await api.answer(supervisor, desk, listener, names, keys, ending.asked)
 
     work = asyncio.create_task(supervisor.run())
     web = asyncio.create_task(answer())

@@ -1,56 +1,88 @@
-"""Who may ask over HTTP, and how much of the service's time and memory one request may take.
+"""Who may ask over HTTP, and for what.
 
 A page in an operator's browser can send requests to this service: from another origin, or under a
-name of its own that it has had resolved to this address. Programs send no ``Origin``.
+name of its own that it has had resolved to this address. Programs send no ``Origin``. Whatever is
+asked needs a key of the scope its route has, once there are keys.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
+import math
 import re
 import time
-from dataclasses import dataclass
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from http import HTTPStatus
-from ipaddress import ip_address
-from typing import Any
+from ipaddress import ip_address, ip_network
 
 import structlog
-import uvicorn
 from fastapi import Request
+from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from typing_extensions import override
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from service.errors import PyrcalError, TooLargeError, TooSlowError
-from service.routes.problems import Problem, known_problem, problem
-from service.routes.stream import ABORT
+from service.archive import AuditEntry
+from service.errors import ConfigurationError
+from service.keys import Key, KeyFile, KeyScope, is_loopback
+from service.routes.connections import RETRY_S, bounded, to_its_end
+from service.routes.problems import problem
+from service.runtime.recording import Whence
 
-MOST_BODY_BYTES = 1_000_000
-"""Of a request; uploads to be fitted have a limit of their own."""
+COOKIE = "pyrcal_key"
+"""Under which a browser keeps the key."""
 
-BODY_S = 20.0
-"""Longest time the body of a request may take to come, seconds."""
+MOST_FAILURES, FAILURES_WITHIN_S = 10, 60.0
+"""Wrong keys that an address may show within so many seconds: the next are answered 429."""
 
-HALF_OPEN_S = 10.0
-"""Longest time a request's head may take, seconds; also for what still comes after the answer."""
+MOST_ADDRESSES = 1000
+"""Whose failures are remembered; the oldest go first."""
 
-MOST_CONNECTIONS = 100
-"""Beyond it the one that has waited longest, with no request at work, gives way."""
+MOST_TOLD, TOLD_WITHIN_S = 20, 60.0
+"""Refusals that are told one by one within so many seconds; the others are counted."""
 
-RETRY_S = 5
-"""When a client that finds no place should come again, seconds."""
-
-STREAMED = ("POST", "/v1/fits")
-"""The route that reads its body itself: it goes to the disk, with its own limits."""
-
-QUIET_S = 60.0
-"""Between two lines in the log on strangers, seconds."""
+_READS = {"GET", "HEAD", "OPTIONS"}
 
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:\d{1,5})?", re.IGNORECASE)
 
 _PORTS = {"http": ":80", "https": ":443"}
 """What need not be written in an origin."""
+
+Security = dict[str, list[dict[str, list[str]]]]
+
+OPEN: Security = {"security": []}
+"""``openapi_extra`` of a route that needs no key."""
+
+
+def needs(scope: KeyScope) -> Security:
+    """Return ``openapi_extra`` of a route that needs a key of this scope."""
+    return {"security": [{scheme: [scope.value]} for scheme in SCHEMES]}
+
+
+SCHEMES: dict[str, dict[str, str]] = {
+    "bearer": {"type": "http", "scheme": "bearer", "description": "An API key"},
+    "cookie": {
+        "type": "apiKey",
+        "in": "cookie",
+        "name": COOKIE,
+        "description": "The same, kept by a browser that logged in; orders need its Origin, too",
+    },
+}
+"""How a key is shown, as the OpenAPI has it. None is needed while there are none, on loopback."""
+
+
+def scope_of(route: RouteContext, method: str) -> KeyScope | None:
+    """Return the scope a route needs; None: no key.
+
+    A route that does not say lets read what only reads, and operators do the rest. What is no
+    route of REST is a file of the package.
+    """
+    if not isinstance(route.original_route, APIRoute):
+        return None
+    said = (route.openapi_extra or {}).get("security")
+    if said is None:
+        return KeyScope.READ if method in _READS else KeyScope.OPERATE
+    return KeyScope(said[0]["bearer"][0]) if said else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +95,11 @@ class Hosts:
 
     allowed: tuple[str, ...] = ()
     """Further names, without a port."""
+
+    @property
+    def local(self) -> bool:
+        """Whether nobody can ask but this machine."""
+        return is_loopback(self.bound)
 
     def know(self, host: str) -> bool:
         """Return whether the value of a ``Host`` header is one of them."""
@@ -78,8 +115,127 @@ class Hosts:
             return False
 
 
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a request may not be made."""
+
+    status: HTTPStatus
+    kind: str
+    """Of the problem that it is answered with."""
+
+    detail: str
+    headers: Mapping[str, str] = field(default_factory=dict)
+    who: str = ""
+    """Name of the key that was shown, where there is such a key."""
+
+
+class Failures:
+    """Wrong keys by the address that has shown them.
+
+    A right one is never refused for what others at its address do: what has 256 bits cannot be
+    guessed, and an operator must not be locked out by a forgotten program.
+    """
+
+    def __init__(self) -> None:
+        self._of: OrderedDict[str, tuple[float, int]] = OrderedDict()
+
+    def count(self, address: str) -> int:
+        """Count one more; return after how many seconds the address may try again, 0: at once."""
+        now_s, house = time.monotonic(), _house(address)
+        since_s, n_before = self._of.pop(house, (now_s, 0))
+        if now_s - since_s >= FAILURES_WITHIN_S:
+            since_s, n_before = now_s, 0
+        self._of[house] = (since_s, n_before + 1)
+        if len(self._of) > MOST_ADDRESSES:
+            self._of.popitem(last=False)
+        left_s = since_s + FAILURES_WITHIN_S - now_s
+        return 0 if n_before < MOST_FAILURES else math.ceil(left_s)
+
+
+def _house(address: str) -> str:
+    """Return what one client can have all addresses of."""
+    try:
+        six = ip_address(address).version == 6
+    except ValueError:
+        return address
+    return str(ip_network(f"{address}/64", strict=False)) if six else address
+
+
+class Refusals:
+    """Tells the audit trail of what was refused: one by one, of a flood how many a minute.
+
+    Parameters
+    ----------
+    audit
+        Takes an entry of the trail.
+    """
+
+    def __init__(self, audit: Callable[[AuditEntry], object]) -> None:
+        self._audit = audit
+        self._left = MOST_TOLD
+        self._untold: Counter[str] = Counter()
+        self._next: asyncio.TimerHandle | None = None
+
+    def tell(self, request: Request, refusal: Refusal) -> None:
+        """Take down a refusal."""
+        if self._next is None:
+            self._next = asyncio.get_running_loop().call_later(TOLD_WITHIN_S, self._look_again)
+        if self._left == 0:
+            self._untold[refusal.kind] += 1
+            return
+        self._left -= 1
+        address = address_of(request)
+        self._write(
+            AuditEntry(
+                t_ns_utc=time.time_ns(),
+                who=refusal.who or address or "somebody",
+                name=f"request.{refusal.kind}",
+                text=f"{request.method} {request.url.path:.200}",
+                address=address,
+                whence=whence_of(request),
+                answer=f"{refusal.status}: {refusal.detail}",
+            )
+        )
+
+    def _look_again(self) -> None:
+        """Tell how many were not told; while they keep coming, nothing but that."""
+        self._next = None
+        self._left = 0 if self._untold else MOST_TOLD
+        if self._untold:
+            kinds = ", ".join(f"{n} {kind}" for kind, n in self._untold.most_common())
+            text = f"{self._untold.total()} more within {TOLD_WITHIN_S:g} s: {kinds}"
+            self._untold.clear()
+            self._next = asyncio.get_running_loop().call_later(TOLD_WITHIN_S, self._look_again)
+            self._write(
+                AuditEntry(t_ns_utc=time.time_ns(), who="service", name="request.flood", text=text)
+            )
+
+    def _write(self, entry: AuditEntry) -> None:
+        structlog.get_logger().warning(
+            "api.refused", kind=entry.name, who=entry.who, asked=entry.text, answer=entry.answer
+        )
+        self._audit(entry)
+
+
+def address_of(request: Request) -> str:
+    """Return the address of whoever asks; empty: it is not known."""
+    return "" if request.client is None else request.client.host
+
+
+def whence_of(request: Request) -> Whence:
+    """Return what a request came through."""
+    sent = request.headers
+    if "origin" in sent or "sec-fetch-site" in sent:  # only browsers say so
+        return Whence.PAGE
+    return Whence.CLI if sent.get("user-agent", "").startswith("pyrcal") else Whence.REST
+
+
 class Admission:
     """Lets requests through to the application that may be made, each with its whole body.
+
+    ``request.user`` is then the key it was made with; None: there are no keys, or none is needed.
+    As soon as there is a key, one is needed from everywhere: what comes from loopback may be a
+    proxy's, or anybody's who has an account here.
 
     Parameters
     ----------
@@ -87,37 +243,45 @@ class Admission:
         The application.
     hosts
         Under which it is asked for.
+    keys
+        Those there are; None: nobody needs one.
+    audit
+        Takes an entry of the audit trail.
     """
 
-    def __init__(self, app: ASGIApp, hosts: Hosts) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        hosts: Hosts,
+        keys: KeyFile | None,
+        audit: Callable[[AuditEntry], object],
+    ) -> None:
         self._app = app
         self._hosts = hosts
-        self._quiet_until_s = 0.0
+        self._keys = keys
+        self._failures = Failures()
+        self._refusals = Refusals(audit)
+        self._routes: tuple[RouteContext, ...] = ()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request that may not be made; hand on every other."""
         if scope["type"] != "http":
             return await self._app(scope, receive, send)
-        return await _to_its_end(self._admit, scope, receive, send)
+        return await to_its_end(self._admit, scope, receive, send)
 
     async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
         request = Request(scope)
-        stranger = self._stranger(request)
-        if stranger is not None:
-            status, kind, detail = stranger
-            self._tell(request, kind, detail)
-            return await problem(request, status, kind, detail)(scope, receive, send)
-        if (request.method, request.url.path) != STREAMED:
-            try:
-                body = await _whole(request, receive)
-            except PyrcalError as error:
-                return await known_problem(request, error)(scope, receive, send)
-            if body is None:
-                return None
-            receive = again(body, receive)
-        return await self._app(scope, receive, send)
+        refusal = self._stranger(request)
+        if refusal is None:
+            key, refusal = self._known(request)
+            scope["user"] = key
+        if refusal is not None:
+            self._refusals.tell(request, refusal)
+            told = (refusal.status, refusal.kind, refusal.detail, refusal.headers)
+            return await problem(request, *told)(scope, receive, send)
+        return await bounded(self._app, scope, receive, self._while_valid(scope["user"], send))
 
-    def _stranger(self, request: Request) -> tuple[HTTPStatus, str, str] | None:
+    def _stranger(self, request: Request) -> Refusal | None:
         """Return why a request is not for this service, or not of its own page; None: it is."""
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
         if not self._hosts.know(host):
@@ -125,203 +289,104 @@ class Admission:
                 f"found Host {host!r:.100}, expected localhost or the address this service listens "
                 "on; name others in the settings, api.allowed_hosts"
             )
-            return HTTPStatus.MISDIRECTED_REQUEST, "foreign-host", detail
+            return Refusal(HTTPStatus.MISDIRECTED_REQUEST, "foreign-host", detail)
         if origin is not None and not _same(origin.lower(), host.lower()):
             detail = (
                 f"found Origin {origin!r:.100}, expected none or http://{host}: a page from "
                 "elsewhere cannot use this service"
             )
-            return HTTPStatus.FORBIDDEN, "foreign-origin", detail
+            return Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail)
         return None
 
-    def _tell(self, request: Request, kind: str, detail: str) -> None:
-        now_s = time.monotonic()
-        if now_s >= self._quiet_until_s:
-            self._quiet_until_s = now_s + QUIET_S
-            client = None if request.client is None else request.client.host
-            structlog.get_logger().warning(
-                "api.stranger", kind=kind, client=client, path=request.url.path, text=detail
-            )
+    def _known(self, request: Request) -> tuple[Key | None, Refusal | None]:
+        """Return the key a request is made with, and why it may not be made."""
+        needed = self._scope_of(request)
+        if needed is None or self._keys is None:
+            return None, None
+        secret, by_cookie = shown_key(request)
+        try:
+            if self._hosts.local and not self._keys.all():
+                return None, None
+            key = None if secret is None else self._keys.key_of(secret)
+        except ConfigurationError as error:
+            structlog.get_logger().error("api.keys", text=str(error))
+            detail = "the file of the API keys cannot be read; the service's log says more"
+            later = {"Retry-After": str(RETRY_S)}
+            return None, Refusal(HTTPStatus.SERVICE_UNAVAILABLE, "keys", detail, later)
+        if key is None:
+            return None, self._unknown(request, needed, shown=secret is not None)
+        if not key.scope.covers(needed):
+            detail = f"key {key.name} is of scope {key.scope}, this needs one of scope {needed}"
+            told = _challenge(f', error="insufficient_scope", scope="{needed}"')
+            return key, Refusal(HTTPStatus.FORBIDDEN, "scope", detail, told, key.name)
+        if by_cookie and request.method not in _READS and "origin" not in request.headers:
+            detail = "found a browser's cookie and no Origin, expected both: is it this page's?"
+            return key, Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail, who=key.name)
+        return key, None
+
+    def _unknown(self, request: Request, needed: KeyScope, *, shown: bool) -> Refusal:
+        """Return the refusal of a request without a key, or with one that is none."""
+        expected = f"expected a key of scope {needed}"
+        if not shown:
+            detail = f"found no key, {expected}: Authorization: Bearer KEY, or log in at the page"
+            return Refusal(HTTPStatus.UNAUTHORIZED, "no-key", detail, _challenge())
+        wait_s = self._failures.count(address_of(request))
+        if wait_s:
+            detail = f"found more than {MOST_FAILURES} wrong keys from here, {expected}"
+            later = {"Retry-After": str(wait_s)}
+            return Refusal(HTTPStatus.TOO_MANY_REQUESTS, "too-many", detail, later)
+        detail = f"found a key that is none, or no longer, {expected}"
+        told = _challenge(', error="invalid_token"')
+        return Refusal(HTTPStatus.UNAUTHORIZED, "wrong-key", detail, told)
+
+    def _scope_of(self, request: Request) -> KeyScope | None:
+        """Return the scope a request needs; None: no key."""
+        self._routes = self._routes or tuple(iter_route_contexts(request.app.routes))
+        for route in self._routes:
+            if route.path_regex.match(request.scope["path"]) and (
+                route.methods is None or request.method in route.methods
+            ):
+                return scope_of(route, request.method)
+        return KeyScope.READ if request.method in _READS else KeyScope.OPERATE
+
+    def _while_valid(self, key: Key | None, send: Send) -> Send:
+        """Return what ends an answer that comes bit by bit when its key is revoked."""
+        if key is None:
+            return send
+        ended = False
+
+        async def sent(message: Message) -> None:
+            nonlocal ended
+            if ended:
+                return
+            if message.get("more_body", False) and not self._holds(key):
+                ended = True
+                message = {"type": "http.response.body", "body": b"", "more_body": False}
+            await send(message)
+
+        return sent
+
+    def _holds(self, key: Key) -> bool:
+        try:
+            return self._keys is None or key in self._keys.all()
+        except ConfigurationError:
+            return False
 
 
-async def _to_its_end(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Run a request; one that is still at work when the service ends is told so, if it can be."""
-    begun = False
+def shown_key(request: Request) -> tuple[str | None, bool]:
+    """Return the key that a request shows, and whether it is a browser's cookie."""
+    scheme, _, secret = request.headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return secret.strip(), False
+    return request.cookies.get(COOKIE), True
 
-    async def noted(message: Message) -> None:
-        nonlocal begun
-        begun = True
-        await send(message)
 
-    try:
-        await app(scope, receive, noted)
-    except asyncio.CancelledError:
-        if not begun:
-            detail = "the service ends: ask the next one again"
-            status = HTTPStatus.SERVICE_UNAVAILABLE
-            headers = {"Retry-After": str(RETRY_S)}
-            await problem(Request(scope), status, "ending", detail, headers)(scope, receive, send)
+def _challenge(more: str = "") -> dict[str, str]:
+    """Return the header that says how to show a key (RFC 6750)."""
+    return {"WWW-Authenticate": f'Bearer realm="pyrcal"{more}'}
 
 
 def _same(origin: str, host: str) -> bool:
     scheme, _, authority = origin.partition("://")
     port = _PORTS.get(scheme)
     return port is not None and authority.removesuffix(port) == host.removesuffix(port)
-
-
-async def _whole(request: Request, receive: Receive) -> bytes | None:
-    """Return the body of a request; None: the client went away before it was whole.
-
-    Raises
-    ------
-    TooLargeError, TooSlowError
-        If it is beyond the limit, or has not come in time.
-    """
-    told = request.headers.get("content-length", "")
-    if told.isdecimal() and int(told) > MOST_BODY_BYTES:
-        raise _too_large(f"{int(told) / 1e6:.1f} MB")
-    body = bytearray()
-    try:
-        async with asyncio.timeout(BODY_S):
-            while True:
-                message = await receive()
-                if message["type"] == "http.disconnect":
-                    return None
-                body += message.get("body", b"")
-                if len(body) > MOST_BODY_BYTES:
-                    raise _too_large("more")
-                if not message.get("more_body", False):
-                    return bytes(body)
-    except TimeoutError as error:
-        raise TooSlowError(f"body: {len(body)} bytes came within {BODY_S:g} s, not all") from error
-
-
-def _too_large(found: str) -> TooLargeError:
-    return TooLargeError(f"body: found {found}, expected at most {MOST_BODY_BYTES / 1e6:.1f} MB")
-
-
-def again(body: bytes, receive: Receive) -> Receive:
-    """Return a ``receive`` that begins with this body."""
-    first = True
-
-    async def replayed() -> Message:
-        nonlocal first
-        if not first:
-            return await receive()
-        first = False
-        return {"type": "http.request", "body": body, "more_body": False}
-
-    return replayed
-
-
-def server_config(app: ASGIApp, **options: Any) -> uvicorn.Config:  # noqa: ANN401 - uvicorn's own
-    """Return how the application is served: with limits, and nothing logged for each request."""
-    return uvicorn.Config(
-        app, http=_Connection, ws="none", log_config=None, access_log=False, **options
-    )
-
-
-async def _busy(scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer instead of the application."""
-    detail = f"{MOST_CONNECTIONS} requests are at work, the most there may be: try later"
-    headers = {"Retry-After": str(RETRY_S), "Connection": "close"}
-    status = HTTPStatus.SERVICE_UNAVAILABLE
-    answer = problem(Request(scope), status, "busy", detail, headers)
-    await answer(scope, receive, send)
-
-
-def _abortable(app: Any, transport: asyncio.Transport) -> Any:  # noqa: ANN401 - uvicorn's own
-    """Let the application end the connection itself, where nobody takes what it sends."""
-
-    async def abortable(scope: Scope, receive: Receive, send: Send) -> None:
-        scope["extensions"] = {ABORT: transport.abort}
-        await app(scope, receive, send)
-
-    return abortable
-
-
-class _Connection(H11Protocol):
-    """A connection that does not wait for ever, and gives way to others while it does.
-
-    uvicorn limits the time between two requests, not that of a request's head.
-    """
-
-    _since_s = 0.0
-    _ending: asyncio.TimerHandle | None = None
-
-    @override
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self._since_s = self.loop.time()
-        others = [c for c in self.connections if isinstance(c, _Connection) and c.stands]
-        if len(others) > MOST_CONNECTIONS:
-            resting = [c for c in others if c.rests and c is not self]
-            if resting:
-                min(resting, key=lambda c: c._since_s).transport.abort()  # noqa: SLF001 - its own
-            else:
-                self.app = _busy
-        self.app = _abortable(self.app, transport)
-        self._watch()
-
-    @override
-    def data_received(self, data: bytes) -> None:
-        super().data_received(data)
-        self._watch()
-
-    @override
-    def on_response_complete(self) -> None:
-        super().on_response_complete()
-        self._since_s = self.loop.time()
-        self._watch()
-
-    @override
-    def connection_lost(self, exc: Exception | None) -> None:
-        super().connection_lost(exc)
-        self._unwatch()
-
-    @override
-    def send_400_response(self, msg: str) -> None:
-        self._answer(HTTPStatus.BAD_REQUEST, "http", msg)
-
-    @property
-    def stands(self) -> bool:
-        """Whether it has not been ended yet; one that has is gone a moment later."""
-        return not self.transport.is_closing()
-
-    @property
-    def rests(self) -> bool:
-        """Whether no request is at work."""
-        begun = self.cycle is not None  # though its type says that it always is
-        return not begun or self.cycle.response_complete
-
-    def _watch(self) -> None:
-        """Start the clock when something is awaited that no request needs, else stop it."""
-        if not self.rests or self.transport.is_closing():
-            self._unwatch()
-        elif self._ending is None:
-            self._ending = self.loop.call_later(HALF_OPEN_S, self._end)
-
-    def _unwatch(self) -> None:
-        if self._ending is not None:
-            self._ending.cancel()
-            self._ending = None
-
-    def _end(self) -> None:
-        head_came_half = self.conn.trailing_data[0] and self.cycle is None
-        if head_came_half:
-            detail = f"the head of the request did not come within {HALF_OPEN_S:g} s"
-            self._answer(HTTPStatus.REQUEST_TIMEOUT, "too-slow", detail)
-        else:
-            self.transport.abort()
-
-    def _answer(self, status: HTTPStatus, kind: str, detail: str) -> None:
-        """Answer without the application, which has not heard of a request, and close."""
-        if self.rests:
-            told = Problem.of(status, kind, detail, instance="")
-            body = json.dumps(told.model_dump()).encode()
-            head = (
-                f"HTTP/1.1 {status} {status.phrase}\r\nContent-Type: application/problem+json\r\n"
-                f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
-            )
-            self.transport.write(head.encode() + body)
-        self.transport.close()

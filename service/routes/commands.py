@@ -14,11 +14,12 @@ from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict, Discriminator
 
 from service.errors import StaleError, UntaggedError
+from service.routes.admission import address_of, whence_of
 from service.routes.numbers import MatrixId
 from service.routes.orders import Said, about, body
 from service.routes.problems import COMMAND, DECISION, INVALID, UNKNOWN
 from service.routes.views import RECONSTRUCTORS, ServiceDep, known, tagged
-from service.runtime.recording import Caller, Whence
+from service.runtime.recording import Caller
 from service.runtime.supervisor import Supervisor
 from service.tracking.commands import (
     AbortAcquisition,
@@ -104,21 +105,20 @@ class Client:
     async def _orders(
         self, command: Command, caller: Caller, links: dict[str, str]
     ) -> AcceptedView:
+        if caller.key:
+            by = f"{command.by} ({caller.key})" if command.by else caller.key
+            command = replace(command, by=by)
         text = await self.service.submit(command, caller)
         links = {"state": "/v1/state", "events": "/v1/events", **links}
         return AcceptedView(text=text, links=links)
 
 
 def _client_of(request: Request, service: ServiceDep) -> Client:
-    sent = request.headers
-    if "origin" in sent or "sec-fetch-site" in sent:  # only browsers say so
-        whence = Whence.PAGE
-    else:
-        from_us = sent.get("user-agent", "").startswith("pyrcal")
-        whence = Whence.CLI if from_us else Whence.REST
-    address = "" if request.client is None else request.client.host
+    sent, key = request.headers, request.user
     strict = "handling=strict" in sent.get("prefer", "").replace(" ", "").lower()
-    caller = Caller(address=address, whence=whence)
+    caller = Caller(
+        address=address_of(request), key="" if key is None else key.name, whence=whence_of(request)
+    )
     return Client(service, caller, sent.get("if-match"), strict)
 
 

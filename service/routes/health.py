@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from service import __version__
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.routes.admission import OPEN
 from service.routes.problems import problem, problem_response
 from service.routes.views import ServiceDep
 from service.snapshot import Pace, Snapshot
@@ -45,7 +46,7 @@ class ReadyView(BaseModel):
     reason: str
 
 
-@router.get("/healthz")
+@router.get("/healthz", openapi_extra=OPEN)
 async def healthz(service: ServiceDep) -> HealthView:
     """Answer as long as the process lives."""
     snapshot = service.snapshot()
@@ -54,6 +55,7 @@ async def healthz(service: ServiceDep) -> HealthView:
 
 @router.get(
     "/readyz",
+    openapi_extra=OPEN,
     response_model=ReadyView,
     responses={503: problem_response("The service cannot do its work yet; the detail says why")},
 )

@@ -11,7 +11,7 @@ from http import HTTPStatus
 from fastapi import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.routes.admission import STREAMED, again
+from service.routes.connections import STREAMED, again
 from service.routes.problems import problem
 
 KEY = "idempotency-key"
@@ -25,6 +25,10 @@ LARGEST_KEPT = 100_000
 
 _NOT_DONE = {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.INSUFFICIENT_STORAGE}
 """Answers that say that nothing was done: the next time may do it."""
+
+
+_Name = tuple[object, str]
+"""Who may act, and the key of that one."""
 
 
 @dataclass(eq=False, slots=True)
@@ -52,7 +56,7 @@ class Once:
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._given: OrderedDict[str, _Given] = OrderedDict()
+        self._given: OrderedDict[_Name, _Given] = OrderedDict()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or hand it on."""
@@ -71,9 +75,10 @@ class Once:
         if not (0 < len(key) <= LONGEST_KEY and key.isprintable()):
             found = f"found {len(key)} characters, expected 1 to {LONGEST_KEY} printable ones"
             return await self._refuse(request, send, found)
+        name = (request.user and request.user.name, key)
         body = await request.body()
         print_ = hashlib.sha256(f"{request.method} {request.url}\n".encode() + body).digest()
-        while (before := self._given.get(key)) is not None:
+        while (before := self._given.get(name)) is not None:
             if before.print != print_:
                 found = "found a key that was used with another request, expected a new one"
                 return await self._refuse(request, send, found)
@@ -83,14 +88,14 @@ class Once:
                     await send(message)
                 return None
         receive = again(body, request.receive)
-        return await self._carry_out(key, print_, receive, request.scope, send)
+        return await self._carry_out(name, print_, receive, request.scope, send)
 
     async def _carry_out(
-        self, key: str, print_: bytes, receive: Receive, scope: Scope, send: Send
+        self, name: _Name, print_: bytes, receive: Receive, scope: Scope, send: Send
     ) -> None:
         """Hand a request on, and remember what it is answered."""
         given = _Given(print_)
-        self._given[key] = given
+        self._given[name] = given
         heard: list[Message] = []
 
         async def noted(message: Message) -> None:
@@ -102,8 +107,8 @@ class Once:
             if _lasts(heard):
                 given.answer = heard
         finally:
-            if not given.answer and self._given.get(key) is given:
-                del self._given[key]
+            if not given.answer and self._given.get(name) is given:
+                del self._given[name]
             given.done.set()
             while len(self._given) > MOST_KEPT:
                 self._given.popitem(last=False)

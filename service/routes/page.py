@@ -19,6 +19,7 @@ from service.control.gate import LIMIT_M
 from service.model.instrument import Instrument, Mirror
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
+from service.routes.admission import OPEN
 from service.routes.views import ServiceDep, answer, shows, view
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"])
@@ -52,11 +53,11 @@ MANUAL_HEADERS: Final = {
 def install(app: FastAPI) -> None:
     """Serve the page at ``/``, what REST answers at ``/docs``, and what both are made of."""
 
-    @app.get("/", include_in_schema=False)
+    @app.get("/", include_in_schema=False, openapi_extra=OPEN)
     async def page() -> Response:
         return FileResponse(FILES / "index.html", headers=HEADERS)
 
-    @app.get("/docs", include_in_schema=False)
+    @app.get("/docs", include_in_schema=False, openapi_extra=OPEN)
     async def manual() -> Response:
         return FileResponse(MANUAL / "index.html", headers=MANUAL_HEADERS)
 

@@ -9,6 +9,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi.routing import iter_route_contexts
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 
@@ -93,10 +94,12 @@ Responses = dict[int | str, dict[str, Any]]
 
 INVALID: Responses = {422: problem_response("A parameter or a field of the body cannot be used")}
 EVERYWHERE: Responses = {
-    403: problem_response("Sent by a page from elsewhere: its Origin is not the Host it asks"),
+    401: problem_response("There are keys, and none was shown, or one that is none"),
+    403: problem_response("The key's scope is another, or a page from elsewhere has sent it"),
     408: problem_response("The request did not come in time"),
     413: problem_response("The body is larger than this service takes"),
     421: problem_response("Asked for under a name this service does not know"),
+    429: problem_response("Too many wrong keys from there"),
 }
 UNKNOWN: Responses = {404: problem_response("No such thing")}
 DECISION: Responses = {
@@ -170,7 +173,17 @@ async def _http(request: Request, error: HTTPException) -> JSONResponse:
         HTTPStatus.NOT_FOUND: f"there is nothing at {request.url.path}",
         HTTPStatus.METHOD_NOT_ALLOWED: f"{request.method} is not possible at {request.url.path}",
     }.get(status, error.detail)
-    return problem(request, status, "http", detail, error.headers)
+    headers = dict(error.headers or {})
+    if status is HTTPStatus.METHOD_NOT_ALLOWED:  # Starlette names those of one route
+        headers["Allow"] = ", ".join(sorted(_methods(request)))
+    return problem(request, status, "http", detail, headers)
+
+
+def _methods(request: Request) -> set[str]:
+    """Return the methods there are at the path of a request."""
+    routes = iter_route_contexts(request.app.routes)
+    path = request.scope["path"]
+    return {m for r in routes if r.path_regex.match(path) for m in r.methods or ()}
 
 
 async def _fault(request: Request, _error: Exception) -> JSONResponse:

@@ -55,6 +55,9 @@ class Caller:
     """Whoever gives an order, besides the name in it."""
 
     address: str = ""
+    key: str = ""
+    """Name of the API key it was given with; empty: none is needed."""
+
     whence: Whence = Whence.REST
     check: Callable[[], None] = lambda: None
     """Raises where what the order was decided on has changed."""
@@ -111,7 +114,7 @@ class Recorder:
             if new:
                 self._news.set()
         for entry in news:
-            self._add(
+            self.add(
                 AuditEntry(t_ns_utc=entry.t_ns_utc, who="service", name=entry.name, text=entry.text)
             )
 
@@ -135,12 +138,12 @@ class Recorder:
         self._order(command, caller, ".refused", str(error))
 
     def _order(self, command: Command, caller: Caller, end: str = "", answer: str = "") -> None:
-        self._add(
+        self.add(
             AuditEntry(
                 t_ns_utc=time.time_ns(),
-                who=command.by or caller.address or "operator",
+                who=caller.key or command.by or caller.address or "operator",
                 name=f"{type(command).__name__}{end}",
-                text=asked_for(command),
+                text=asked_for(command, caller),
                 address=caller.address,
                 whence=caller.whence,
                 why=command.reason,
@@ -235,7 +238,8 @@ class Recorder:
             except ArchiveError as error:
                 self._log.error("archive.failed", text=str(error))
 
-    def _add(self, entry: AuditEntry) -> None:
+    def add(self, entry: AuditEntry) -> None:
+        """Take a line of the audit trail, to be written soon."""
         with self._guard:
             if len(self._entries) < MOST_WAITING:
                 self._entries.append(entry)
@@ -265,12 +269,16 @@ class Recorder:
                         del self._records[name]
 
 
-def asked_for(command: Command) -> str:
-    """Return the fields of a command that say more than nothing, as JSON."""
+def asked_for(command: Command, caller: Caller) -> str:
+    """Return the fields of a command that say more than who and why, as JSON.
+
+    Beside a key the name in the command is what somebody has called themselves.
+    """
+    told = {"reason"} | ({"by"} if command.by == caller.key or not caller.key else set())
     said = {
         field.name: getattr(command, field.name)
         for field in fields(command)
-        if field.name not in {"reason", "by"} and getattr(command, field.name) != field.default
+        if field.name not in told and getattr(command, field.name) != field.default
     }
     return msgspec.json.encode(said).decode()
 

@@ -13,7 +13,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from service.archive import Archive
+from service.archive import Archive, AuditEntry
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
@@ -126,6 +126,10 @@ class Supervisor:
             worker_trouble=self._workers.trouble,
         )
         return waiting_for(facts)
+
+    def audit(self, entry: AuditEntry) -> None:
+        """Take a line of the audit trail that is of no command."""
+        self._recorder.add(entry)
 
     async def submit(self, command: Command, caller: Caller = OPERATOR) -> str:
         """Carry out an operator's command; return one sentence on what came of it.

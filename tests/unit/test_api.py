@@ -214,6 +214,8 @@ class FakeService:
 
     now: Snapshot
     commands: list = field(default_factory=list)
+    callers: list = field(default_factory=list)
+    audited: list = field(default_factory=list)
     refusal: Exception | None = None
     thread: int | None = None
 
@@ -224,7 +226,11 @@ class FakeService:
         if self.refusal is not None:
             raise self.refusal
         self.commands.append(command)
+        self.callers.append(caller)
         return f"{type(command).__name__} is on its way"
+
+    def audit(self, entry):
+        self.audited.append(entry)
 
     def matrix(self, matrix_id):
         self.thread = threading.get_ident()
@@ -829,7 +835,8 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
             assert answer["description"], name
             assert expected is None or list(answer["content"]) == [expected], (name, status)
         if not name.startswith("GET"):
-            assert "202" in operation["responses"], name
+            at_once = operation["tags"] == ["who may ask"]
+            assert at_once or "202" in operation["responses"], name
     assert "HTTPValidationError" not in description["components"]["schemas"]
     assert len({o["operationId"] for o in operations.values()}) == len(operations)
 

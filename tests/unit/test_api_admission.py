@@ -11,8 +11,9 @@ import pytest
 import uvicorn
 
 from service.api import create_app
-from service.routes import admission
-from service.routes.admission import Hosts, server_config
+from service.routes import connections
+from service.routes.admission import Hosts
+from service.routes.connections import server_config
 from tests.system.pace import in_time
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
 
@@ -141,9 +142,9 @@ async def test_a_body_within_the_limit_reaches_the_service(service):
 
 
 @contextlib.asynccontextmanager
-async def serving(service):
+async def serving(service, keys=None):
     listener = socket.create_server(("127.0.0.1", 0))
-    server = uvicorn.Server(server_config(create_app(service)))
+    server = uvicorn.Server(server_config(create_app(service, keys=keys)))
     server.capture_signals = contextlib.nullcontext
     task = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started:  # noqa: ASYNC110 - uvicorn has no event for it
@@ -174,7 +175,7 @@ async def state_of(port):
 
 async def test_a_request_whose_head_does_not_come_is_ended(service, monkeypatch):
     """Also one that sends a byte now and then."""
-    monkeypatch.setattr(admission, "HALF_OPEN_S", 0.5)
+    monkeypatch.setattr(connections, "HALF_OPEN_S", 0.5)
     async with serving(service) as port:
         silent, never = await connected(port)
         slow, dripping = await connected(port, b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\n")
@@ -198,7 +199,7 @@ async def test_a_request_whose_head_does_not_come_is_ended(service, monkeypatch)
 
 
 async def test_a_connection_may_rest_between_requests_as_before(service, monkeypatch):
-    monkeypatch.setattr(admission, "HALF_OPEN_S", 0.3)
+    monkeypatch.setattr(connections, "HALF_OPEN_S", 0.3)
     async with serving(service) as port:
         request = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
         reader, writer = await connected(port, request)
@@ -211,8 +212,8 @@ async def test_a_connection_may_rest_between_requests_as_before(service, monkeyp
 
 
 async def test_a_body_that_does_not_come_is_ended_with_408(service, monkeypatch):
-    monkeypatch.setattr(admission, "BODY_S", 0.5)
-    monkeypatch.setattr(admission, "HALF_OPEN_S", 0.5)
+    monkeypatch.setattr(connections, "BODY_S", 0.5)
+    monkeypatch.setattr(connections, "HALF_OPEN_S", 0.5)
     async with serving(service) as port:
         head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
         reader, writer = await connected(port, head)
@@ -224,7 +225,7 @@ async def test_a_body_that_does_not_come_is_ended_with_408(service, monkeypatch)
 
 
 async def test_a_client_that_goes_on_sending_after_its_refusal_is_let_go(service, monkeypatch):
-    monkeypatch.setattr(admission, "HALF_OPEN_S", 0.5)
+    monkeypatch.setattr(connections, "HALF_OPEN_S", 0.5)
     async with serving(service) as port:
         head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99999999\r\n\r\n"
         reader, writer = await connected(port, head)
@@ -251,7 +252,7 @@ def has_ended(line):
 
 
 async def test_half_open_connections_give_way_to_the_operator(service, monkeypatch):
-    monkeypatch.setattr(admission, "MOST_CONNECTIONS", 20)
+    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 20)
     async with serving(service) as port:
         held = [socket.create_connection(("127.0.0.1", port)) for _ in range(60)]  # all at once
         for line in held:
@@ -268,7 +269,7 @@ async def test_half_open_connections_give_way_to_the_operator(service, monkeypat
 async def test_too_many_requests_at_work_are_answered_503_with_when_to_come_again(
     service, monkeypatch
 ):
-    monkeypatch.setattr(admission, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 3)
     head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
     async with serving(service) as port:
         held = [await connected(port, head) for _ in range(3)]

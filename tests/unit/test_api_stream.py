@@ -12,7 +12,7 @@ import uvicorn
 
 from service.api import create_app
 from service.routes import stream
-from service.routes.admission import server_config
+from service.routes.connections import server_config
 from service.tracking.state import Level, LogEntry
 from service.tracking.turn import LOG_LENGTH
 from tests.system.pace import patience

@@ -1,0 +1,204 @@
+"""API keys: who may ask the service, and for what; a file that the keys cannot be read from.
+
+A key is 256 random bits. What is kept of it is its SHA-256: there is no dictionary to try such keys
+from, so that a slow hash would protect nothing and cost the service its time with each request.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hmac
+import os
+import re
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import StrEnum
+from hashlib import sha256
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from service.errors import ConfigurationError, UnknownIdError
+
+PREFIX = "pyrcal_"
+"""Of every key: whoever finds one lying about can tell what it is."""
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+_TAKEN = {"service", "operator"}
+"""Who else the audit trail speaks of."""
+
+
+class KeyScope(StrEnum):
+    """What a key is good for; each one for what those before it are, too."""
+
+    READ = "read"
+    """Look at everything, and order nothing."""
+
+    OPERATE = "operate"
+    """Give orders, and upload what is to be fitted."""
+
+    ADMIN = "admin"
+    """See who has a key, and revoke one."""
+
+    def covers(self, other: KeyScope) -> bool:
+        """Return whether it is good for what needs the other."""
+        ranks = list(KeyScope)
+        return ranks.index(self) >= ranks.index(other)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Key:
+    """What is kept of a key."""
+
+    name: str
+    """Of the person, program or place that has it."""
+
+    scope: KeyScope
+    created_ns_utc: int
+    """When it was made, nanoseconds since the Unix epoch."""
+
+    sha256: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+    """Of the whole key as text."""
+
+
+class KeyFile:
+    """The keys of a service, as they are on the disk at this moment.
+
+    Several processes may change the file, one after the other; readers find it whole at any time.
+
+    Parameters
+    ----------
+    directory
+        The service's ``data_dir``; made by :meth:`add` where it does not exist.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / "keys.json"
+        self._seen: tuple[tuple[int, ...], tuple[Key, ...]] = ((), ())
+
+    def all(self) -> tuple[Key, ...]:
+        """Return the keys there are now; the file is read again only when it has changed.
+
+        Raises
+        ------
+        ConfigurationError
+            If the file cannot be read, or is none of keys.
+        """
+        try:
+            found = self.path.stat()
+            stamp = (found.st_ino, found.st_mtime_ns, found.st_size)
+            before, keys = self._seen
+            if stamp != before:
+                keys = msgspec.json.decode(self.path.read_bytes(), type=tuple[Key, ...])
+                self._seen = (stamp, keys)
+        except FileNotFoundError:
+            return ()
+        except (OSError, msgspec.MsgspecError) as error:
+            raise ConfigurationError(
+                f"{self.path}: cannot be read: {error}; it must belong to whom the service runs "
+                "as. Made anew by pyrcal key add when it has been moved away"
+            ) from error
+        return keys
+
+    def key_of(self, secret: str) -> Key | None:
+        """Return what is kept of a key; None: it is none, or no longer.
+
+        It takes as long whichever it is.
+
+        Raises
+        ------
+        ConfigurationError
+            As :meth:`all` does.
+        """
+        digest, found = _digest(secret), None
+        for key in self.all():
+            if hmac.compare_digest(key.sha256, digest):
+                found = key
+        return found
+
+    def add(self, name: str, scope: KeyScope) -> str:
+        """Make a key, and return it: it is not to be had again.
+
+        Raises
+        ------
+        ConfigurationError
+            If the name cannot be used, or the file.
+        """
+        if not _NAME.fullmatch(name) or name in _TAKEN:
+            raise ConfigurationError(
+                f"key: found name {name!r:.80}, expected up to 64 letters, digits and ._@-, and "
+                f"none of {', '.join(sorted(_TAKEN))}"
+            )
+        secret = PREFIX + secrets.token_urlsafe(32)
+        key = Key(name=name, scope=scope, created_ns_utc=time.time_ns(), sha256=_digest(secret))
+        with self._alone():
+            keys = self.all()
+            if any(one.name == name for one in keys):
+                raise ConfigurationError(
+                    f"{self.path}: found a key {name} already; revoke it first, or choose another "
+                    "name"
+                )
+            self._write((*keys, key))
+        return secret
+
+    def revoke(self, name: str) -> None:
+        """Make a key worthless, from this moment on.
+
+        Raises
+        ------
+        UnknownIdError
+            If there is none of this name.
+        ConfigurationError
+            If the file cannot be read or written.
+        """
+        with self._alone():
+            keys = self.all()
+            rest = tuple(key for key in keys if key.name != name)
+            if rest == keys:
+                names = ", ".join(key.name for key in keys) or "none at all"
+                raise UnknownIdError(f"key {name!r:.80}: no such key; there are {names}")
+            self._write(rest)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Keep others from changing the file."""
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            folder = os.open(self.path.parent, os.O_RDONLY)
+        except OSError as error:
+            raise ConfigurationError(f"{self.path.parent}: cannot be used: {error}") from error
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX)
+            yield
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+    def _write(self, keys: tuple[Key, ...]) -> None:
+        part = self.path.with_suffix(".part")
+        try:
+            part.unlink(missing_ok=True)  # with whatever rights somebody left it
+            with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                file.write(msgspec.json.format(msgspec.json.encode(keys)) + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(self.path)
+        except OSError as error:
+            raise ConfigurationError(f"{self.path}: cannot be written: {error}") from error
+
+
+def _digest(secret: str) -> str:
+    return sha256(secret.encode(errors="surrogateescape")).hexdigest()
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether what listens there can be asked by this machine alone."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False

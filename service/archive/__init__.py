@@ -7,11 +7,12 @@
       interaction_matrices/<id>.h5  one measured interaction matrix each, likewise
       noisy_matrices/<id>.h5        one noisy interaction matrix each, likewise
       tracking.json                 the registration, for the service after this one
-      index.sqlite                  where each is on its way, and who did what, when
+      index.sqlite                  where each is on its way, who did what, when, and α over time
       lock                          held while a service uses the directory
 """
 
 from service.archive.archive import Archive
 from service.archive.index import AuditEntry, Range
+from service.archive.nights import Mark, Night
 
-__all__ = ["Archive", "AuditEntry", "Range"]
+__all__ = ["Archive", "AuditEntry", "Mark", "Night", "Range"]

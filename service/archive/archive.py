@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import IO, Self
 
 from service.archive.index import AuditEntry, Index, Range, begun_ns_utc
+from service.archive.nights import Nights
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
 from service.archive.records import TrackingFile
 from service.errors import ArchiveError, StorageError
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
+from service.tracking.registration import HistoryEntry
 
 
 class Archive:
@@ -27,9 +29,11 @@ class Archive:
     ----------
     directory
         Made by :meth:`open` where it does not exist.
+    noon_utc_h
+        UTC hour of local noon, where one night ends and the next begins.
     """
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, noon_utc_h: int = 12) -> None:
         self._directory = directory
         self._index = Index(directory / "index.sqlite")
         self.reconstructors = ReconstructorArchive(directory / "reconstructors", self._index)
@@ -40,6 +44,8 @@ class Archive:
         """Noisy interaction matrices of random dithers."""
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
+        self.nights = Nights(self._index.reading, noon_utc_h)
+        """Every estimate of α, and what happened beside it."""
         self._lock: IO[str] | None = None
         self.wrong: tuple[str, ...] = ()
         """What :meth:`open` has found wrong, a line for each."""
@@ -99,8 +105,13 @@ class Archive:
             self._lock.close()
             self._lock = None
 
-    def record(self, records: Sequence[ReconstructorRecord], entries: Sequence[AuditEntry]) -> None:
-        """Remember where reconstructors are now and add to the audit trail: all or nothing.
+    def record(
+        self,
+        records: Sequence[ReconstructorRecord],
+        entries: Sequence[AuditEntry],
+        estimates: Sequence[HistoryEntry] = (),
+    ) -> None:
+        """Remember where reconstructors are, add to audit trail and history: all or nothing.
 
         Raises
         ------
@@ -109,7 +120,7 @@ class Archive:
         """
         for record in records:
             self.reconstructors.write_fate(record)
-        self._index.record(records, entries)
+        self._index.record(records, entries, estimates)
 
     def measurements(self) -> tuple[MeasurementRecord, ...]:
         """Return what is known of each measured interaction matrix, oldest first."""

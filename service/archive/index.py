@@ -5,19 +5,21 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import TypeVar
 
+from service.archive import nights
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, shown
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
+from service.tracking.registration import HistoryEntry
 
 Product = ReconstructorRecord | MeasurementRecord
 Indexed = TypeVar("Indexed", bound=Product)
 
-_VERSION = 3
+_VERSION = 4
 
 _PRODUCTS = """
 CREATE TABLE IF NOT EXISTS {} (
@@ -42,6 +44,7 @@ CREATE TABLE IF NOT EXISTS audit (
     {", ".join(f"{column} TEXT NOT NULL DEFAULT ''" for column in _OF_ORDERS)}
 );
 CREATE INDEX IF NOT EXISTS audit_by_time ON audit (t_ns_utc);
+{nights.SCHEMA}
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_entries BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_words BEFORE UPDATE ON audit
@@ -123,13 +126,14 @@ class Index:
                 self._path, isolation_level=None, check_same_thread=False
             )
             with self._use() as connection:
-                connection.execute("PRAGMA journal_mode = WAL")
-                connection.execute("PRAGMA synchronous = FULL")
                 version = connection.execute("PRAGMA user_version").fetchone()[0]
                 if version > _VERSION:
                     raise ArchiveError(
-                        f"{self._path}: found version {version}, expected {_VERSION}"
+                        f"{self._path}: found version {version}, which a later pyrcal has written, "
+                        f"expected at most {_VERSION}: run that pyrcal, nothing has been changed"
                     )
+                connection.execute("PRAGMA journal_mode = WAL")
+                connection.execute("PRAGMA synchronous = FULL")
                 older = _widened(connection) if 0 < version < _VERSION else ""
                 connection.executescript(f"BEGIN;{older}{_SCHEMA}")
                 return bool(version == 0)
@@ -158,8 +162,13 @@ class Index:
             )
         return done.rowcount > 0
 
-    def record(self, records: Sequence[ReconstructorRecord], entries: Sequence[AuditEntry]) -> None:
-        """Replace what is known of reconstructors and add to the audit trail: all or nothing.
+    def record(
+        self,
+        records: Sequence[ReconstructorRecord],
+        entries: Sequence[AuditEntry],
+        estimates: Sequence[HistoryEntry] = (),
+    ) -> None:
+        """Replace what is known of reconstructors, add to trail and history: all or nothing.
 
         A reconstructor that has no product here is entered.
         """
@@ -174,7 +183,15 @@ class Index:
                 f"INSERT INTO audit ({_COLUMNS}) VALUES ({', '.join('?' * _N_COLUMNS)})",
                 [tuple(map(_storable, astuple(entry)[:_N_COLUMNS])) for entry in entries],
             )
+            connection.executemany(nights.INSERT, nights.rows_of(estimates))
             connection.execute("COMMIT")
+
+    @contextmanager
+    def reading(self) -> Iterator[sqlite3.Connection]:
+        """Open a connection that only reads: a long question holds up nobody who writes."""
+        name = f"{self._path.absolute().as_uri()}?mode=ro"
+        with self._explained(), closing(sqlite3.connect(name, uri=True)) as connection:
+            yield connection
 
     def checksums(self, table: str) -> dict[str, str]:
         """Return the checksum of every product of a kind that is stored, by id."""
@@ -219,18 +236,24 @@ class Index:
             if self._connection is None:
                 raise ArchiveError(f"{self._path}: not open")
             try:
-                yield self._connection
-            except sqlite3.OperationalError as error:
-                text = f"{self._path}: cannot be used: {error} ({error.sqlite_errorname})"
-                raise StorageError(text) from error
-            except sqlite3.DatabaseError as error:
-                raise ArchiveError(
-                    f"{self._path}: damaged ({error}): move it away; the next start makes a new "
-                    "one from the products, the audit trail stays in the old one"
-                ) from error
+                with self._explained():
+                    yield self._connection
             finally:
                 if self._connection.in_transaction:
                     self._connection.rollback()
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.OperationalError as error:
+            text = f"{self._path}: cannot be used: {error} ({error.sqlite_errorname})"
+            raise StorageError(text) from error
+        except sqlite3.DatabaseError as error:
+            raise ArchiveError(
+                f"{self._path}: damaged ({error}): move it away; the next start makes a new "
+                "one from the products, audit trail and history stay in the old one"
+            ) from error
 
 
 def begun_ns_utc(record: Product) -> int:

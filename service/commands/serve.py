@@ -55,7 +55,7 @@ def run(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
 async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
     """Open everything, run until asked to stop or the service fails, close everything."""
     system = settings.service.system or instrument.name
-    archive = Archive(settings.service.data_dir)
+    archive = Archive(settings.service.data_dir, settings.archive.noon_utc_h)
     with _listener(settings.api.host, settings.api.port) as listener:
         archive.open()
         with archive, Bridge(_endpoint(settings, system)) as bridge:

@@ -265,6 +265,13 @@ class FitsTable(Table):
     """A fit whose process needs more is stopped, megabytes."""
 
 
+class ArchiveTable(Table):
+    """``[archive]``: what is kept, and how it is told."""
+
+    noon_utc_h: int = Field(default=12, ge=0, le=23)
+    """UTC hour of local noon, where one night ends and the next begins."""
+
+
 class Settings(Table):
     """Everything the user may decide about the service."""
 
@@ -277,6 +284,7 @@ class Settings(Table):
     control: ControlTable = ControlTable()
     compute: ComputeTable = ComputeTable()
     fits: FitsTable = FitsTable()
+    archive: ArchiveTable = ArchiveTable()
 
 
 _Key = tuple[str, ...]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from http import HTTPStatus
 from typing import Annotated, Self
@@ -12,6 +12,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from pydantic import AwareDatetime, BeforeValidator, Field, model_validator
 
+from service.archive import Archive, Mark, Night
 from service.errors import CommandError
 from service.routes import views
 from service.routes.numbers import (
@@ -22,9 +23,9 @@ from service.routes.numbers import (
     numbers_of,
 )
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
-from service.routes.views import GainTableShown, ServiceDep, answer, known, shows, tagged
+from service.routes.views import GainTableShown, ServiceDep, answer, known, shows, tagged, view
+from service.runtime.supervisor import Supervisor
 from service.tracking.registration import HistoryEntry, ModeGain, table_of
-from service.tracking.state import TrackerState
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -82,8 +83,11 @@ class TimeParameters(Parameters):
         return first or 0, FOREVER_NS if last is None else last
 
 
-class RangeParameters(TimeParameters, LimitParameters):
+class RangeParameters(TimeParameters):
     """Which part of a history to return."""
+
+    limit: int = Field(default=200, ge=1, le=5000)
+    """At most so many entries, the newest ones."""
 
     after: Nanoseconds | None = None
     """``t_ns_utc`` of the last entry of the page before: the ``limit`` entries that follow it,
@@ -135,27 +139,43 @@ async def alpha(request: Request, service: ServiceDep) -> Response:
 async def alpha_history(
     service: ServiceDep, parameters: Annotated[RangeParameters, Query()]
 ) -> Response:
-    """Return the estimates of the last windows, or of those of a time, oldest first.
+    """Return the last estimates, or those of a time, oldest first.
 
-    The service remembers the last 5000, and none from before its start.
+    Those of the last hours are in memory; what is older, or of the run before, is in the archive.
     """
     # a night takes a quarter of a second, in which telemetry is taken in
-    return await run_in_threadpool(_history, service.snapshot().tracker, parameters)
+    return await run_in_threadpool(_history, service, parameters)
 
 
-def _history(tracker: TrackerState, asked: RangeParameters) -> Response:
-    part = replace(tracker, history=_asked_for(tracker.history, asked))
-    return answer(part, views.HISTORY)
+def _history(service: Supervisor, asked: RangeParameters) -> Response:
+    tracker = service.snapshot().tracker
+    first_ns, last_ns = asked.between
+    first_ns = first_ns if asked.after is None else max(first_ns, asked.after + 1)
+    found = tuple(entry for entry in tracker.history if first_ns <= entry.t_ns_utc <= last_ns)
+    if asked.points or asked.after is not None or len(found) < asked.limit:
+        last_ns = min([last_ns, *(entry.t_ns_utc - 1 for entry in tracker.history)])
+        found = (*_older(service.archive, first_ns, last_ns, asked), *found)
+    return answer(replace(tracker, history=_cut(found, asked)), views.HISTORY)
 
 
 History = tuple[HistoryEntry, ...]
 
+OF_ONE_TIME = 10
+"""Estimates of one time in which a page may end."""
 
-def _asked_for(history: History, asked: RangeParameters) -> History:
-    first_ns, last_ns = asked.between
-    found = tuple(entry for entry in history if first_ns <= entry.t_ns_utc <= last_ns)
-    if asked.after is not None:
-        found = tuple(entry for entry in found if entry.t_ns_utc > asked.after)
+
+def _older(archive: Archive, first_ns: int, last_ns: int, asked: RangeParameters) -> History:
+    """Return what the archive has of a time before all that is in memory."""
+    if first_ns > last_ns:
+        return ()
+    if asked.points is not None:
+        return archive.nights.thinned(first_ns, last_ns, asked.points)
+    n_most = asked.limit + OF_ONE_TIME
+    return archive.nights.estimates(first_ns, last_ns, n_most, newest=asked.after is None)
+
+
+def _cut(found: History, asked: RangeParameters) -> History:
+    """Return as much of what was found as was asked for."""
     if asked.points is not None:
         return thinned(found, asked.points)
     if asked.after is None:
@@ -182,6 +202,51 @@ def thinned(history: History, n_points: int) -> History:
             kept.update(members[values[members].argmin(axis=0)].tolist())
             kept.update(members[values[members].argmax(axis=0)].tolist())
     return tuple(history[k] for k in sorted(kept))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NightList:
+    """The nights of which something is in the archive."""
+
+    nights: tuple[Night, ...]
+    """Oldest first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarkList:
+    """What belongs into a chart of α besides α."""
+
+    marks: tuple[Mark, ...]
+    """Oldest first."""
+
+
+class MarkParameters(TimeParameters):
+    """Which marks to return."""
+
+    limit: int = Field(default=500, ge=1, le=2000)
+    """At most so many, the newest ones."""
+
+
+view("NightView", Night)
+view("MarkView", Mark)
+NIGHTS = view("NightsView", NightList)
+MARKS = view("MarksView", MarkList)
+
+
+@router.get("/nights", responses={200: shows(NIGHTS)})
+async def nights(service: ServiceDep, parameters: Annotated[TimeParameters, Query()]) -> Response:
+    """Return the nights of a time, from noon to noon, and what there is of each."""
+    found = await run_in_threadpool(service.archive.nights.between, *parameters.between)
+    return answer(NightList(nights=found))
+
+
+@router.get("/marks", responses={200: shows(MARKS)})
+async def marks(service: ServiceDep, parameters: Annotated[MarkParameters, Query()]) -> Response:
+    """Return swaps, jumps, alarms and starts of a time, for a chart of it."""
+    found = await run_in_threadpool(
+        service.archive.nights.marks, *parameters.between, parameters.limit
+    )
+    return answer(MarkList(marks=found))
 
 
 @router.get("/reconstructors", responses={200: shows(views.RECONSTRUCTORS)})

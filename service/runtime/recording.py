@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from functools import partial
+from itertools import takewhile
 
 import msgspec
 import structlog
@@ -22,6 +23,7 @@ from service.tracking.events import Effect
 from service.tracking.operator import orders_of
 from service.tracking.policy import Policy
 from service.tracking.products import ReconstructorRecord
+from service.tracking.registration import HistoryEntry
 from service.tracking.resume import resumed, saved_of, with_orders
 from service.tracking.state import Level, LogEntry, TrackerState
 from service.tracking.turn import logged
@@ -31,7 +33,8 @@ RETRY_S = 2.0
 """Between two attempts while the disk refuses."""
 
 MOST_WAITING = 10_000
-"""Lines of the audit trail that wait for a disk; newer ones are counted and dropped."""
+"""Lines of the audit trail, and estimates, that wait for a disk; newer ones are counted and
+dropped."""
 
 BEGINNINGS = (DitherRequest, MeasureRequest, RampRequest)
 """What is not done unless why it is done is on the disk. What ends something never waits."""
@@ -90,6 +93,7 @@ class Recorder:
         self._post = post
         self._records: dict[str, ReconstructorRecord] = {}
         self._entries: list[AuditEntry] = []
+        self._estimates: list[HistoryEntry] = []
         self._lost = 0
         self._guard = threading.Lock()
         self._writing = threading.Lock()
@@ -113,6 +117,14 @@ class Recorder:
                 self._records |= new
             if new:
                 self._news.set()
+        if after.history is not before.history:
+            last = before.history[-1:]
+            new_ones = takewhile(lambda entry: entry not in last, reversed(after.history))
+            with self._guard:
+                room = MOST_WAITING - len(self._estimates)
+                found = list(new_ones)[::-1]
+                self._estimates += found[:room]
+                self._lost += len(found[room:])
         for entry in news:
             self.add(
                 AuditEntry(t_ns_utc=entry.t_ns_utc, who="service", name=entry.name, text=entry.text)
@@ -217,6 +229,7 @@ class Recorder:
             try:
                 await asyncio.to_thread(leave, self._archive, state, time.time_ns())
                 saved = state
+                self._news.set()  # estimates are written as seldom as what the next service needs
             except StorageError as error:
                 self.failed(error)
                 await asyncio.sleep(RETRY_S)
@@ -252,17 +265,19 @@ class Recorder:
         with self._writing:
             with self._guard:
                 records, entries = dict(self._records), tuple(self._entries)
+                estimates = tuple(self._estimates)
                 lost = self._lost
             told = _told(lost) if lost else ()
             try:
-                if records or entries:
-                    self._archive.record(tuple(records.values()), (*entries, *told))
+                if records or entries or estimates:
+                    self._archive.record(tuple(records.values()), (*entries, *told), estimates)
             except StorageError:
                 raise
             except ArchiveError as error:  # a damaged index is a disk that refuses, too
                 raise StorageError(str(error)) from error
             with self._guard:
                 del self._entries[: len(entries)]
+                del self._estimates[: len(estimates)]
                 self._lost -= lost
                 for name, record in records.items():
                     if self._records[name] is record:

@@ -215,6 +215,7 @@ def bias_of(
 
 def remember(turn: Turn, entry: HistoryEntry) -> None:
     """Keep one more line of history."""
+    entry = replace(entry, in_use=turn.state.in_use)
     history = (*turn.state.history, entry)[-HISTORY_LENGTH:]
     turn.state = replace(turn.state, history=history)
 

@@ -267,6 +267,9 @@ class HistoryEntry:
     entered: bool = True
     """False: it was too far out to be believed, and did not enter the estimate."""
 
+    in_use: str | None = None
+    """Id of the matrix in use when it was looked at; None: unknown."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Watchdog:

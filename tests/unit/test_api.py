@@ -17,6 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service import __version__
 from service.api import create_app
+from service.archive import Archive
 from service.control.gate import GateVerdict
 from service.errors import (
     ArchiveError,
@@ -218,6 +219,7 @@ class FakeService:
     audited: list = field(default_factory=list)
     refusal: Exception | None = None
     thread: int | None = None
+    archive: Archive | None = None
 
     def snapshot(self):
         return self.now
@@ -245,9 +247,18 @@ class FakeService:
 
 
 @pytest.fixture
-def service():
+def archive(tmp_path):
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        yield archive
+
+
+@pytest.fixture
+def service(archive):
     return FakeService(
-        Snapshot(
+        archive=archive,
+        now=Snapshot(
             tracker=STATE,
             link=LINK,
             now_ns=100 * SECOND,
@@ -256,7 +267,7 @@ def service():
             ready_reason="telemetry flows",
             archive_failures=3,
             archive_waiting=2,
-        )
+        ),
     )
 
 

@@ -19,6 +19,7 @@ from tests.unit.test_api import (
     STATE,
     FakeService,
     Snapshot,
+    archive,  # noqa: F401  a fixture
     assert_problem,
     body_of,
     entry,
@@ -29,11 +30,12 @@ LIMIT_BYTES = 300_000
 
 
 @pytest.fixture
-def service():
+def service(archive):  # noqa: F811
     service = FakeService(
-        Snapshot(
+        archive=archive,
+        now=Snapshot(
             tracker=STATE, link=LINK, now_ns=100, started_ns=40, ready=True, ready_reason="ready"
-        )
+        ),
     )
     service.instrument = packaged_instrument("flao-lbt")
     service.policy = POLICY

@@ -267,12 +267,17 @@ def test_a_damaged_index_is_refused_with_what_to_do(tmp_path):
         Archive(tmp_path).open()
 
 
-def test_an_index_of_a_later_version_is_refused(tmp_path):
-    connection = sqlite3.connect(tmp_path / "index.sqlite")
-    connection.execute("PRAGMA user_version = 99")
+def test_an_index_of_a_later_version_is_refused_by_name_and_left_as_it_is(tmp_path):
+    path = tmp_path / "index.sqlite"
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA user_version = 99")
+        connection.execute("CREATE TABLE audit (t_ns_utc INTEGER)")
     connection.close()
-    with pytest.raises(ArchiveError, match="found version 99, expected 3"):
+    before = path.read_bytes()
+    with pytest.raises(ArchiveError, match=r"found version 99, .*nothing has been changed"):
         Archive(tmp_path).open()
+    assert path.read_bytes() == before
+    assert not list(tmp_path.glob("index.sqlite-*"))
 
 
 def test_a_directory_that_cannot_be_made_is_named(tmp_path):

@@ -1,0 +1,300 @@
+"""What was measured over the nights: every estimate of α, and what happened beside it."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections import Counter
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import TooLargeError
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.tracking.alarms import ALARMS
+from service.tracking.registration import HistoryEntry, Source
+
+_FOURS = ("measured", "measured_sigma", "filtered", "filtered_sigma")
+_FILTERED = tuple(f"filtered_{parameter}" for parameter in PARAMETERS)
+_NUMBERS = ("innovation", "misfit", *(f"{four}_{name}" for four in _FOURS for name in PARAMETERS))
+_COLUMNS = ", ".join(("t_ns_utc", "source", "entered", "in_use", *_NUMBERS))
+
+SCHEMA = f"""
+CREATE TABLE IF NOT EXISTS estimate (
+    t_ns_utc INTEGER NOT NULL, source TEXT NOT NULL, entered INTEGER NOT NULL, in_use TEXT,
+    {", ".join(f"{name} REAL" for name in _NUMBERS)}
+);
+CREATE INDEX IF NOT EXISTS estimate_by_time ON estimate (t_ns_utc);
+CREATE INDEX IF NOT EXISTS audit_by_name ON audit (name, t_ns_utc);
+"""
+"""Columns are the fields of a line of history, in the units of their names."""
+
+INSERT = f"INSERT INTO estimate ({_COLUMNS}) VALUES ({', '.join('?' * (4 + len(_NUMBERS)))})"
+
+HOUR_NS = 3_600_000_000_000
+DAY_NS = 24 * HOUR_NS
+
+MOST_THINNED = 300_000
+"""Estimates that are looked through at once: a week of telemetry."""
+
+
+class MarkKind(StrEnum):
+    """What a mark in a chart of α stands for."""
+
+    SWAP = "swap"
+    """The RTC uses another reconstructor."""
+
+    JUMP = "jump"
+    """The mirror has jumped."""
+
+    ALARM = "alarm"
+    """An alarm was raised."""
+
+    OVER = "over"
+    """An alarm was over."""
+
+    START = "start"
+    """The service started: alarms of the run before ended with it, untold."""
+
+
+_KINDS = {
+    "reconstructor.applied": MarkKind.SWAP,
+    "reconstructor.adopted": MarkKind.SWAP,
+    "registration.jump": MarkKind.JUMP,
+    "registration.passive-jump": MarkKind.JUMP,
+    "service.ready": MarkKind.START,
+    **dict.fromkeys(ALARMS, MarkKind.ALARM),
+}
+_OF_KINDS = f"who = 'service' AND name IN ({', '.join(map(repr, _KINDS))})"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mark:
+    """Something that belongs into a chart of α."""
+
+    t_ns_utc: int
+    kind: MarkKind
+    name: str
+    """As in the audit trail: of an alarm its name."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Night:
+    """What there is of one night."""
+
+    date: str
+    """UTC, of the noon at which it begins, such as 2026-03-01."""
+
+    since_ns_utc: int
+    """That noon."""
+
+    until_ns_utc: int
+    """The last nanosecond before the next one."""
+
+    duration_s: float = 0.0
+    """From the first estimate to the last."""
+
+    n_estimates: int = 0
+    n_swaps: int = 0
+    n_jumps: int = 0
+    n_alarms: int = 0
+
+
+class Nights:
+    """Reads what the nights have left; never waits for a writer, nor has one wait.
+
+    Parameters
+    ----------
+    reading
+        Opens a connection that only reads.
+    noon_utc_h
+        UTC hour of local noon, where one night ends and the next begins.
+    """
+
+    def __init__(
+        self,
+        reading: Callable[[], AbstractContextManager[sqlite3.Connection]],
+        noon_utc_h: int = 12,
+    ) -> None:
+        self._reading = reading
+        self._noon_ns = noon_utc_h * HOUR_NS
+
+    def estimates(
+        self, first_ns: int, last_ns: int, n_most: int, *, newest: bool = True
+    ) -> tuple[HistoryEntry, ...]:
+        """Return the newest or the oldest estimates of a time, which has both ends; oldest first.
+
+        Raises
+        ------
+        StorageError
+            If they cannot be read.
+        """
+        with self._reading() as connection:
+            rows = connection.execute(
+                f"SELECT {_COLUMNS} FROM estimate WHERE t_ns_utc BETWEEN ? AND ?"
+                f" ORDER BY t_ns_utc {'DESC' if newest else 'ASC'} LIMIT ?",
+                (first_ns, last_ns, n_most),
+            ).fetchall()
+        return tuple(map(_entry, reversed(rows) if newest else rows))
+
+    def thinned(self, first_ns: int, last_ns: int, n_points: int) -> tuple[HistoryEntry, ...]:
+        """Return at most so many estimates of a time, oldest first.
+
+        They are the lowest and the highest of each parameter in equal parts of the time.
+
+        Raises
+        ------
+        TooLargeError
+            If there are more than ``MOST_THINNED``.
+        StorageError
+            If they cannot be read.
+        """
+        within = "WHERE t_ns_utc BETWEEN :first AND :last"
+        with self._reading() as connection:
+            begin_ns, end_ns, n_there = connection.execute(
+                f"SELECT min(t_ns_utc), max(t_ns_utc), count(*) FROM estimate {within}",
+                {"first": first_ns, "last": last_ns},
+            ).fetchone()
+            if n_there > MOST_THINNED:
+                raise TooLargeError(
+                    f"found {n_there} estimates in this time, expected at most {MOST_THINNED}: "
+                    "ask for less of it"
+                )
+            if n_there <= n_points:
+                return self.estimates(first_ns, last_ns, n_points)
+            n_parts = n_points // (2 * len(PARAMETERS))
+            # of the row that has it, where there is one min or max: https://sqlite.org/lang_select.html
+            extremes = " UNION ".join(
+                f"SELECT id FROM (SELECT rowid AS id, {end}({name}) FROM estimate {within}"
+                " GROUP BY (t_ns_utc - :begin) / :width)"
+                for name in _FILTERED
+                for end in ("min", "max")
+            )
+            rows = connection.execute(
+                f"SELECT {_COLUMNS} FROM estimate WHERE rowid IN ({extremes}) ORDER BY t_ns_utc",
+                {
+                    "first": first_ns,
+                    "last": last_ns,
+                    "begin": begin_ns,
+                    "width": (end_ns - begin_ns) // n_parts + 1,
+                },
+            ).fetchall()
+        return tuple(map(_entry, rows))
+
+    def marks(self, first_ns: int, last_ns: int, n_most: int) -> tuple[Mark, ...]:
+        """Return the newest marks of a time, which has both ends; oldest first.
+
+        Raises
+        ------
+        StorageError
+            If they cannot be read.
+        """
+        with self._reading() as connection:
+            rows = connection.execute(
+                f"SELECT t_ns_utc, name, text FROM audit WHERE {_OF_KINDS}"
+                " AND t_ns_utc BETWEEN ? AND ? ORDER BY t_ns_utc DESC LIMIT ?",
+                (first_ns, last_ns, n_most),
+            ).fetchall()
+        return tuple(
+            Mark(t_ns_utc=t_ns, kind=_kind(name, text), name=name, text=text)
+            for t_ns, name, text in reversed(rows)
+        )
+
+    def between(self, first_ns: int, last_ns: int) -> tuple[Night, ...]:
+        """Return the nights of which something is there, as far as they lie in a time.
+
+        Raises
+        ------
+        StorageError
+            If they cannot be read.
+        """
+        night = f"(t_ns_utc - {self._noon_ns}) / {DAY_NS}"
+        time = (first_ns, last_ns)
+        with self._reading() as connection:
+            measured = connection.execute(
+                f"SELECT {night}, count(*), max(t_ns_utc) - min(t_ns_utc) FROM estimate"
+                " WHERE t_ns_utc BETWEEN ? AND ? GROUP BY 1",
+                time,
+            ).fetchall()
+            marks = connection.execute(
+                f"SELECT {night}, name, text LIKE '%: over', count(*) FROM audit"
+                f" WHERE {_OF_KINDS} AND t_ns_utc BETWEEN ? AND ? GROUP BY 1, 2, 3",
+                time,
+            ).fetchall()
+        counts: Counter[tuple[int, MarkKind]] = Counter()
+        for day, name, over, n_times in marks:
+            counts[day, MarkKind.OVER if over else _KINDS[name]] += n_times
+        spans = {day: (n_there, span_ns / 1e9) for day, n_there, span_ns in measured}
+        return tuple(
+            self._night(day, *spans.get(day, (0, 0.0)), counts)
+            for day in sorted({*spans, *(day for day, _ in counts)})
+        )
+
+    def _night(
+        self, day: int, n_estimates: int, duration_s: float, counts: Counter[tuple[int, MarkKind]]
+    ) -> Night:
+        since_ns = day * DAY_NS + self._noon_ns
+        return Night(
+            date=f"{datetime.fromtimestamp(since_ns // 1_000_000_000, UTC):%Y-%m-%d}",
+            since_ns_utc=since_ns,
+            until_ns_utc=since_ns + DAY_NS - 1,
+            duration_s=duration_s,
+            n_estimates=n_estimates,
+            n_swaps=counts[day, MarkKind.SWAP],
+            n_jumps=counts[day, MarkKind.JUMP],
+            n_alarms=counts[day, MarkKind.ALARM],
+        )
+
+
+def rows_of(entries: Iterable[HistoryEntry]) -> list[tuple[object, ...]]:
+    """Return the rows that :data:`INSERT` takes."""
+    return [
+        (
+            entry.t_ns_utc,
+            str(entry.source),
+            entry.entered,
+            entry.in_use,
+            entry.innovation,
+            entry.misfit,
+            *_shown(entry.measured.vector),
+            *_shown(entry.measured_sigma),
+            *_shown(entry.filtered.vector),
+            *_shown(entry.filtered_sigma),
+        )
+        for entry in entries
+    ]
+
+
+def _shown(four: NDArray[np.float64]) -> list[float]:
+    found: list[float] = (four * BOUNDARY_SCALE).tolist()
+    return found
+
+
+def _entry(row: tuple[Any, ...]) -> HistoryEntry:
+    t_ns, source, entered, in_use, innovation, misfit, *numbers = row
+    # SQLite has no NaN, it keeps NULL instead
+    fours = np.array(numbers, dtype=np.float64).reshape(4, 4) / BOUNDARY_SCALE
+    return HistoryEntry(
+        t_ns_utc=t_ns,
+        source=Source(source),
+        entered=bool(entered),
+        in_use=in_use,
+        innovation=math.nan if innovation is None else innovation,
+        misfit=math.nan if misfit is None else misfit,
+        measured=Misregistration.from_vector(fours[0]),
+        measured_sigma=fours[1],
+        filtered=Misregistration.from_vector(fours[2]),
+        filtered_sigma=fours[3],
+    )
+
+
+def _kind(name: str, text: str) -> MarkKind:
+    return MarkKind.OVER if text == f"{name}: over" else _KINDS[name]

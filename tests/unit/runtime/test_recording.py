@@ -1,0 +1,69 @@
+"""Estimates on their way to the disk: batched, in their order, none twice."""
+
+from dataclasses import replace
+
+import pytest
+
+from service.errors import StorageError
+from service.runtime import recording
+from service.runtime.recording import Recorder
+from service.tracking.state import TrackerState
+from tests.unit.test_archive_nights import NOON, entry
+
+EMPTY = TrackerState(system="small")
+
+
+@pytest.fixture
+def recorder(archive):
+    return Recorder(archive, lambda: EMPTY, lambda event: None)
+
+
+def measured(recorder, first, last):
+    """Have the tracker take in estimates one by one."""
+    every = tuple(entry(NOON + k) for k in range(last))
+    for n_known in range(first, last):
+        before, after = (replace(EMPTY, history=every[:n]) for n in (n_known, n_known + 1))
+        recorder.changed(before, after, ())
+
+
+def kept(archive):
+    return [one.t_ns_utc - NOON for one in archive.nights.estimates(0, 2 * NOON, 100)]
+
+
+async def test_estimates_wait_for_one_write_and_are_written_once(recorder, archive):
+    measured(recorder, 0, 4)
+    assert kept(archive) == []
+    await recorder.flush()
+    measured(recorder, 4, 6)
+    await recorder.flush()
+    await recorder.flush()
+    assert kept(archive) == [0, 1, 2, 3, 4, 5]
+
+
+async def test_two_estimates_of_one_event_keep_their_order_when_the_oldest_are_forgotten(
+    recorder, archive
+):
+    every = tuple(entry(NOON + k) for k in range(5))
+    before, after = replace(EMPTY, history=every[:3]), replace(EMPTY, history=every[2:])
+    recorder.changed(before, after, ())
+    recorder.close()
+    assert kept(archive) == [3, 4]
+
+
+async def test_a_disk_that_refuses_for_long_loses_the_newest_and_says_how_many(
+    recorder, archive, monkeypatch
+):
+    def refuse(*_):
+        raise StorageError("full")
+
+    monkeypatch.setattr(recording, "MOST_WAITING", 3)
+    with monkeypatch.context() as patch:
+        patch.setattr(archive, "record", refuse)
+        measured(recorder, 0, 5)
+        with pytest.raises(StorageError):
+            await recorder.flush()
+        assert recorder.waiting == 2
+    await recorder.flush()
+    assert kept(archive) == [0, 1, 2]
+    assert recorder.waiting == 0
+    assert archive.audit_trail()[-1].text.startswith("2 lines came while the disk refused")

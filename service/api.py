@@ -33,6 +33,7 @@ from service.routes import (
 from service.routes.admission import OPEN, SCHEMES, Admission, Hosts, needs, scope_of
 from service.routes.connections import server_config
 from service.routes.once import Once
+from service.routes.tracing import Traced
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 
@@ -45,7 +46,8 @@ Calibration service of an adaptive telescope with a pyramid wavefront sensor.
 
 Shifts are in subapertures, angles in degrees, magnification is a ratio; every number has its unit
 in its name. Times are nanoseconds since the Unix epoch, UTC. A number that is not known or not
-finite is `null`. Errors are `application/problem+json` (RFC 9457).
+finite is `null`. Errors are `application/problem+json` (RFC 9457). `X-Request-ID` of an answer, the
+one that was sent or a new one, is in every line of the log that the request has led to.
 """
 
 
@@ -110,6 +112,7 @@ def create_app(
     app.add_middleware(
         Admission, hosts=hosts or Hosts(), keys=keys, audit=lambda entry: service.audit(entry)
     )
+    app.add_middleware(Traced)
     app.state.service = service
     app.state.keys = keys
     app.state.stream = stream.Stream(service, over or asyncio.Event())

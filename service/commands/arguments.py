@@ -62,6 +62,11 @@ def _describe_run(run: argparse.ArgumentParser) -> None:
     run.add_argument("--connect", metavar="ENDPOINT", help="an observatory's own zenoh router")
     run.add_argument("--host", help="of the REST API, default 127.0.0.1")
     run.add_argument("--port", type=int, help="of the REST API, default 8080")
+    run.add_argument(
+        "--log-format",
+        choices=["auto", "text", "json"],
+        help="default: text on a terminal, else a JSON object a line",
+    )
 
 
 def _describe_status(status: argparse.ArgumentParser) -> None:

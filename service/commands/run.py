@@ -19,6 +19,7 @@ _OPTIONS = {
     "connect": "zenoh.connect",
     "host": "api.host",
     "port": "api.port",
+    "log_format": "service.log_format",
 }
 """Command-line options that stand for a settings key."""
 

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from importlib import import_module
-from typing import TextIO, cast
+from typing import Literal, TextIO, cast
 
 import structlog
 from structlog.typing import EventDict
@@ -46,7 +46,7 @@ def run(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
     """Run the service until it is asked to stop or fails; return the exit status."""
     # the event loop's own products are small; a second BLAS thread would only fight the RTC link
     threadpool_limits(1)
-    log_to_the_terminal()
+    log_to_the_terminal(settings.service.log_format)
     for remark in instrument.remarks:
         structlog.get_logger().warning("instrument.remark", text=remark)
     return asyncio.run(_serve(settings, instrument, workers))
@@ -231,15 +231,19 @@ def _endpoint(settings: Settings, system: str) -> Endpoint:
     )
 
 
-def log_to_the_terminal() -> None:
+def log_to_the_terminal(log_format: Literal["auto", "text", "json"] = "auto") -> None:
     """Have everything that is logged, by libraries too, written to standard error."""
+    is_json = log_format == "json" or (log_format == "auto" and not sys.stderr.isatty())
     structlog.configure(
         processors=[
+            structlog.contextvars.merge_contextvars,  # of the request that has led to it
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
             structlog.processors.format_exc_info,
             _harmless,
-            structlog.dev.ConsoleRenderer(
+            structlog.processors.JSONRenderer(ensure_ascii=False)
+            if is_json
+            else structlog.dev.ConsoleRenderer(
                 colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
             ),
         ],

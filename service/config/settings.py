@@ -41,6 +41,9 @@ class ServiceTable(Table):
     """Where what takes long to compute and is always the same is kept; it may be deleted at any
     time. None: ``pyrcal`` in the user's cache folder."""
 
+    log_format: Literal["auto", "text", "json"] = "auto"
+    """How a line of the log is written; "auto": as text on a terminal, else as a JSON object."""
+
 
 class ZenohTable(Table):
     """``[zenoh]``: the way to the RTC."""

@@ -9,7 +9,7 @@ from enum import StrEnum
 from http import HTTPStatus
 
 from fastapi import APIRouter, Request, Response
-from prometheus_client import CollectorRegistry
+from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
@@ -17,18 +17,21 @@ from pydantic import BaseModel
 
 from service import __version__
 from service.link.statistics import LinkStatistics
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.routes.admission import OPEN
 from service.routes.problems import problem, problem_response
 from service.routes.views import ServiceDep
 from service.snapshot import Pace, Snapshot
+from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND
 from service.tracking.dither_request import DitherPhase
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Mode, Party, TrackerState
 from service.wire import Pattern
 
 router = APIRouter(tags=["how it is doing"])
+
+FRESH_S = 3.0
+"""Telemetry whose last frame is older has stopped, seconds."""
 
 
 class HealthView(BaseModel):
@@ -40,7 +43,7 @@ class HealthView(BaseModel):
 
 
 class ReadyView(BaseModel):
-    """The service can do its work."""
+    """The service does its work: telemetry is fresh, the archive writable, the worker keeps up."""
 
     ready: bool
     reason: str
@@ -57,15 +60,37 @@ async def healthz(service: ServiceDep) -> HealthView:
     "/readyz",
     openapi_extra=OPEN,
     response_model=ReadyView,
-    responses={503: problem_response("The service cannot do its work yet; the detail says why")},
+    responses={503: problem_response("Telemetry, archive or worker: the detail says which, why")},
 )
 async def readyz(request: Request, service: ServiceDep) -> ReadyView | Response:
-    """Say whether the service can do its work, and what it waits for."""
+    """Say whether telemetry is fresh, the archive writable and the worker keeps up; which is not.
+
+    It asks for more than ``ready`` of the state, which a service without an RTC is, too.
+    """
     snapshot = service.snapshot()
-    if not snapshot.ready:
-        detail = snapshot.ready_reason
+    detail = "; ".join(f"{part}: {text}" for part, text in troubles(snapshot).items() if text)
+    if detail:
         return problem(request, HTTPStatus.SERVICE_UNAVAILABLE, "not-ready", detail)
     return ReadyView(ready=True, reason=snapshot.ready_reason)
+
+
+def troubles(snapshot: Snapshot) -> dict[str, str]:
+    """Return what is the matter with telemetry, archive and worker; empty: nothing."""
+    alarms = {alarm.name: alarm.text for alarm in snapshot.tracker.alarms}
+    hindering = [wait for wait in snapshot.waiting_for if wait.hinders]
+    age_s = snapshot.link.frame_age_s
+    stopped = []
+    if age_s is None:
+        stopped = ["no frame has come from an RTC yet"]
+    elif age_s > FRESH_S:
+        stopped = [f"the last frame came {age_s:.0f} s ago, expected one within {FRESH_S:g} s"]
+    unusable = [wait.text for wait in hindering if wait.party is not Party.WORKER]
+    lost = [wait.text for wait in hindering if wait.party is Party.WORKER]
+    return {
+        "telemetry": "; ".join([*stopped, *unusable]),
+        "archive": alarms.get(ARCHIVE_FAILED, ""),
+        "worker": "; ".join([*lost, *([alarms[WORKER_BEHIND]] if WORKER_BEHIND in alarms else [])]),
+    }
 
 
 @router.get(
@@ -83,10 +108,19 @@ async def metrics(request: Request, service: ServiceDep) -> Response:
     encode, content_type = choose_encoder(request.headers.get("accept", ""))
     registry = CollectorRegistry(auto_describe=False)
     registry.register(SnapshotCollector(service.snapshot))
+    ProcessCollector(registry=registry)
     return Response(encode(registry), headers={"Content-Type": content_type})
 
 
 # --- the snapshot as Prometheus metrics
+
+_ALPHA = (
+    "shift_x_subapertures",
+    "shift_y_subapertures",
+    "rotation_radians",
+    "magnification_ratio",
+)
+"""The four parameters in base units; the sensor's own for shifts."""
 
 _LINK_COUNTERS = {
     "batches_received": "Telemetry batches taken in",
@@ -122,7 +156,8 @@ class SnapshotCollector(Collector):
         snapshot = self._snapshot()
         tracker = snapshot.tracker
         yield _gauge("build_info", "Version", {__version__: 1}, "version")
-        yield _gauge("ready", "1 when the service can do its work", snapshot.ready)
+        parts = {part: not text for part, text in troubles(snapshot).items()}
+        yield _gauge("ready", "1 for each part that does its work; all: /readyz", parts, "part")
         yield _gauge("uptime_seconds", "Since the service started", snapshot.uptime_s)
         refused = "Attempts to write that the disk has refused"
         yield _counter("archive_failures", refused, snapshot.archive_failures)
@@ -191,8 +226,8 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
         ("alpha", "Registration", registration.alpha.vector),
         ("alpha_sigma", "1 sigma, floor included", registration.sigma),
     ):
-        for parameter, value in zip(PARAMETERS, four * BOUNDARY_SCALE, strict=True):
-            yield _gauge(f"{name}_{parameter}", f"{text}: {parameter}", float(value))
+        for parameter, value in zip(_ALPHA, four.tolist(), strict=True):
+            yield _gauge(f"{name}_{parameter}", text, value)
     yield _gauge("alpha_age_seconds", "Age of the estimate", alpha.age_s)
     worth = registration.standing.validity
     text = "1 for what the estimate is worth"
@@ -205,9 +240,9 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
 
 def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:
     dithering = tracker.dithering
-    mean = "Quadratic mean of the dither over ten minutes, metres OPD"
-    yield _gauge("dither_mean_metres", mean, dithering.mean_cost_m)
-    yield _gauge("dither_budget_metres", "Largest RMS of all modes together", dithering.budget_m)
+    mean = "Quadratic mean of the dither over ten minutes, OPD"
+    yield _gauge("dither_mean_meters", mean, dithering.mean_cost_m)
+    yield _gauge("dither_budget_meters", "Largest RMS of all modes together", dithering.budget_m)
     phases = _one_of(DitherPhase, dithering.phase)
     yield _gauge("dither_phase", "1 for how the service dithers", phases, "phase")
 

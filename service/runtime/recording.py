@@ -40,6 +40,10 @@ BEGINNINGS = (DitherRequest, MeasureRequest, RampRequest)
 """What is not done unless why it is done is on the disk. What ends something never waits."""
 
 
+_LOGGED = ("who", "text", "address", "whence", "why", "answer")
+"""What the log tells of an order."""
+
+
 class Whence(StrEnum):
     """What an order came through."""
 
@@ -150,18 +154,19 @@ class Recorder:
         self._order(command, caller, ".refused", str(error))
 
     def _order(self, command: Command, caller: Caller, end: str = "", answer: str = "") -> None:
-        self.add(
-            AuditEntry(
-                t_ns_utc=time.time_ns(),
-                who=caller.key or command.by or caller.address or "operator",
-                name=f"{type(command).__name__}{end}",
-                text=asked_for(command, caller),
-                address=caller.address,
-                whence=caller.whence,
-                why=command.reason,
-                answer=answer,
-            )
+        entry = AuditEntry(
+            t_ns_utc=time.time_ns(),
+            who=caller.key or command.by or caller.address or "operator",
+            name=f"{type(command).__name__}{end}",
+            text=asked_for(command, caller),
+            address=caller.address,
+            whence=caller.whence,
+            why=command.reason,
+            answer=answer,
         )
+        self.add(entry)
+        said = {key: getattr(entry, key) for key in _LOGGED if getattr(entry, key)}
+        self._log.info(entry.name, **said, **ids_of(f"{entry.text} {answer}", self._state()))
 
     async def before(self, effect: Effect) -> None:
         """Wait until what has led to an effect is on the disk.
@@ -282,6 +287,17 @@ class Recorder:
                 for name, record in records.items():
                     if self._records[name] is record:
                         del self._records[name]
+
+
+def ids_of(text: str, state: TrackerState) -> dict[str, object]:
+    """Return what a line of the log is to be found by: frame, matrix in use, matrices it names."""
+    known = [r.id for r in state.reconstructors] + [m.id for m in state.measurements]
+    ids = {
+        "frame": None if state.rtc is None else state.rtc.seq,
+        "in_use": state.in_use,
+        "matrices": [name for name in known if name in text],
+    }
+    return {name: found for name, found in ids.items() if found}
 
 
 def asked_for(command: Command, caller: Caller) -> str:

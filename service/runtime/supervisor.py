@@ -22,7 +22,7 @@ from service.runtime.actions import Actions
 from service.runtime.answers import Given
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
-from service.runtime.recording import Caller, Recorder
+from service.runtime.recording import Caller, Recorder, ids_of
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
 from service.snapshot import Snapshot
@@ -419,5 +419,6 @@ class Supervisor:
         """Log what is new in the state's log, at its level, and have it recorded."""
         entries = new_lines(before, self._engine.state)
         for entry in entries:
-            getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text)
+            ids = ids_of(entry.text, self._engine.state)
+            getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text, **ids)
         self._recorder.changed(before, self._engine.state, entries)

@@ -178,7 +178,8 @@ def test_an_rtc_that_pauses_is_waited_for(night, rtc):
 
 def test_an_rtc_that_is_not_there_is_waited_for(night):
     named(night, waits, "rtc", "no RTC is there", 5.0)
-    wait_for(lambda: night.client.get("/readyz").status_code == 200, 5.0, "it is ready")
+    wait_for(lambda: night.state["ready"], 5.0, "it is ready for one")
+    wait_for(lambda: "telemetry: " in night.client.get("/readyz").text, 5.0, "and says it is not")
 
 
 @pytest.mark.long

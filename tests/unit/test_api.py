@@ -438,7 +438,7 @@ async def test_a_suspected_jump_and_a_dither_that_is_due_are_seen(client, servic
     assert 'pyrcal_alpha_validity{validity="fresh"} 1.0' in metrics
     assert 'pyrcal_windows_total{verdict="outlying"} 3.0' in metrics
     assert "pyrcal_dither_due 1.0" in metrics
-    assert "pyrcal_dither_mean_metres 3e-09" in metrics
+    assert "pyrcal_dither_mean_meters 3e-09" in metrics
     assert 'pyrcal_dither_phase{phase="sparse"} 1.0' in metrics
 
 
@@ -717,13 +717,6 @@ async def test_healthz_answers_while_the_process_lives(client):
     }
 
 
-async def test_readyz_says_what_the_service_waits_for(client, service):
-    assert await body_of(client, "/readyz") == {"ready": True, "reason": "telemetry flows"}
-    service.now = replace(service.now, ready=False, ready_reason="no RTC has been heard")
-    response = await client.get("/readyz")
-    assert_problem(response, 503, "not-ready", "no RTC has been heard")
-
-
 async def metrics_of(client):
     response = await client.get("/metrics")
     assert response.status_code == 200
@@ -751,8 +744,11 @@ async def test_metrics_count_everything_on_the_link(client):
 
 async def test_metrics_show_what_the_service_knows(client):
     found = await metrics_of(client)
-    assert found["alpha_rotation_deg",] == pytest.approx(0.3)
-    assert found["alpha_sigma_rotation_deg",] == pytest.approx(np.hypot(0.03, 0.005))
+    assert found["alpha_rotation_radians",] == pytest.approx(np.deg2rad(0.3))
+    assert found["alpha_sigma_rotation_radians",] == pytest.approx(
+        np.deg2rad(np.hypot(0.03, 0.005))
+    )
+    assert found["alpha_shift_x_subapertures",] == 0.2
     assert found["alpha_age_seconds",] == 10.0
     assert found["optical_gain_ratio",] == 0.6
     assert (found["windows_total", "accepted"], found["windows_total", "refused"]) == (4, 1)
@@ -762,7 +758,7 @@ async def test_metrics_show_what_the_service_knows(client):
     assert found["reconstructors", "rejected"] == 0
     assert (found["alarms",], found["alarm", "rtc.silent"]) == (1, 1)
     assert (found["mode", "propose"], found["mode", "auto"]) == (1, 0)
-    assert (found["ready",], found["uptime_seconds",]) == (1, 60.0)
+    assert (found["ready", "worker"], found["uptime_seconds",]) == (1, 60.0)
     assert (found["archive_failures_total",], found["archive_waiting",]) == (3, 2)
 
 
@@ -828,7 +824,7 @@ async def test_metrics_of_a_service_that_knows_nothing_are_readable(client, serv
         service.now, tracker=TrackerState(system="bench"), link=replace(LINK, frame_age_s=None)
     )
     found = await metrics_of(client)
-    assert ("alpha_rotation_deg",) not in found
+    assert ("alpha_rotation_radians",) not in found
     assert found["windows_total", "accepted"] == 0
 
 

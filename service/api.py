@@ -17,6 +17,7 @@ from typing_extensions import override
 from service import __version__
 from service.keys import KeyFile
 from service.routes import (
+    archive,
     audit,
     commands,
     fits,
@@ -121,6 +122,7 @@ def create_app(
     routers = [
         reading.router,
         audit.router,
+        archive.router,
         stream.router,
         page.router,
         commands.router,

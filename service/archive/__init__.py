@@ -12,7 +12,7 @@
 """
 
 from service.archive.archive import Archive
-from service.archive.index import AuditEntry, Range
+from service.archive.index import AuditEntry, Pin, Range
 from service.archive.nights import Mark, Night
 
-__all__ = ["Archive", "AuditEntry", "Mark", "Night", "Range"]
+__all__ = ["Archive", "AuditEntry", "Mark", "Night", "Pin", "Range"]

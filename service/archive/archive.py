@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Self
 
-from service.archive.index import AuditEntry, Index, Range, begun_ns_utc
+from service.archive.index import AuditEntry, Index, Pin, Range, begun_ns_utc
 from service.archive.nights import Nights
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
 from service.archive.records import TrackingFile
-from service.errors import ArchiveError, StorageError
+from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.tracking.registration import HistoryEntry
 
@@ -34,7 +34,7 @@ class Archive:
     """
 
     def __init__(self, directory: Path, noon_utc_h: int = 12) -> None:
-        self._directory = directory
+        self.directory = directory
         self._index = Index(directory / "index.sqlite")
         self.reconstructors = ReconstructorArchive(directory / "reconstructors", self._index)
         """Those that were made here or read back from the RTC, and what became of each."""
@@ -42,6 +42,7 @@ class Archive:
         """Interaction matrices the RTC has measured."""
         self.noisy = NoisyArchive(directory / "noisy_matrices", self._index)
         """Noisy interaction matrices of random dithers."""
+        self.stores = (self.reconstructors, self.measured, self.noisy)
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
         self.nights = Nights(self._index.reading, noon_utc_h)
@@ -77,26 +78,74 @@ class Archive:
             damaged.
         """
         try:
-            self._directory.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(self._directory / "lock")
-            folders = (self.reconstructors, self.measured, self.noisy)
-            told = [line for folder in folders for line in folder.prepare()]
+            self.directory.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(self.directory / "lock")
+            told = [line for folder in self.stores for line in folder.prepare()]
         except OSError as error:
             self.close()
-            raise ArchiveError(f"{self._directory}: cannot be used: {error}") from error
+            raise ArchiveError(f"{self.directory}: cannot be used: {error}") from error
         try:
             anew = self._index.open()
-            for folder in folders:
+            for folder in self.stores:
                 told += folder.adopt(anew=anew)
         except ArchiveError:
             self.close()
             raise
         if anew and (n_products := len(self.reconstructors.records())):
-            lost = self._directory / "index.sqlite"
+            lost = self.directory / "index.sqlite"
             text = f"was not there: made anew of {n_products} products; the audit trail begins here"
             told.append(f"{lost}: {text}")
         self.wrong = tuple(told)
         return self.wrong
+
+    def look(self) -> None:
+        """Open it to read, beside a service that may be using it; nothing is brought up to date.
+
+        Raises
+        ------
+        ArchiveError
+            If there is none, or it cannot be read.
+        """
+        if not (self.directory / "index.sqlite").is_file():
+            raise ArchiveError(
+                f"{self.directory}: found no index.sqlite, expected the data_dir of a service"
+            )
+        self._index.look()
+
+    def index_fault(self) -> str:
+        """Return what SQLite finds wrong with the index; empty: nothing."""
+        return self._index.fault()
+
+    def pin(self, pin: Pin) -> None:
+        """Keep a product for ever.
+
+        Raises
+        ------
+        UnknownIdError
+            If its numbers are not here.
+        StorageError
+            If the disk refuses.
+        """
+        if not any(pin.id in store.stored() for store in self.stores):
+            raise UnknownIdError(f"{pin.id}: no such product in the archive")
+        self._index.pin(pin)
+
+    def unpin(self, product_id: str) -> None:
+        """Let a product go when its time has come.
+
+        Raises
+        ------
+        UnknownIdError
+            If it was not pinned.
+        StorageError
+            If the disk refuses.
+        """
+        if not self._index.unpin(product_id):
+            raise UnknownIdError(f"{product_id}: it is not pinned")
+
+    def pins(self) -> tuple[Pin, ...]:
+        """Return what is kept for ever by order."""
+        return self._index.pins()
 
     def close(self) -> None:
         """Close the index and let another service use the directory."""

@@ -31,11 +31,18 @@ CREATE TABLE IF NOT EXISTS {} (
 """
 """A table for each kind."""
 
+_TABLES = f"""
+{"".join(map(_PRODUCTS.format, ("reconstructor", "measurement", "noisy_matrix")))}
+CREATE TABLE IF NOT EXISTS pin (
+    id TEXT PRIMARY KEY, who TEXT NOT NULL, why TEXT NOT NULL
+);
+"""
+
 _OF_ORDERS = ("address", "whence", "why", "answer")
 """Columns of the audit trail that are there since version 3."""
 
 _SCHEMA = f"""
-{"".join(map(_PRODUCTS.format, ("reconstructor", "measurement", "noisy_matrix")))}
+{_TABLES}
 CREATE TABLE IF NOT EXISTS audit (
     t_ns_utc INTEGER NOT NULL,
     who TEXT NOT NULL,
@@ -88,6 +95,15 @@ class AuditEntry:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Pin:
+    """A product that is kept for ever."""
+
+    id: str
+    who: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Range:
     """A part of the audit trail."""
 
@@ -126,12 +142,7 @@ class Index:
                 self._path, isolation_level=None, check_same_thread=False
             )
             with self._use() as connection:
-                version = connection.execute("PRAGMA user_version").fetchone()[0]
-                if version > _VERSION:
-                    raise ArchiveError(
-                        f"{self._path}: found version {version}, which a later pyrcal has written, "
-                        f"expected at most {_VERSION}: run that pyrcal, nothing has been changed"
-                    )
+                version = self._version(connection)
                 connection.execute("PRAGMA journal_mode = WAL")
                 connection.execute("PRAGMA synchronous = FULL")
                 older = _widened(connection) if 0 < version < _VERSION else ""
@@ -139,6 +150,33 @@ class Index:
                 return bool(version == 0)
         except sqlite3.OperationalError as error:
             raise ArchiveError(f"{self._path}: cannot be opened: {error}") from error
+
+    def look(self) -> None:
+        """Open the file to read it, as it is, beside a service that may be using it.
+
+        Raises
+        ------
+        ArchiveError
+            If it is not there, damaged, or of a later version.
+        """
+        name = f"{self._path.absolute().as_uri()}?mode=ro"
+        with self._explained():
+            self._connection = sqlite3.connect(name, uri=True, isolation_level=None)
+            self._version(self._connection)
+            there = self._connection.execute("SELECT name FROM sqlite_master").fetchall()
+            # what an earlier version did not have is empty here, and nowhere on the disk
+            for statement in _TABLES.split(";"):
+                if statement.strip() and not any(f" {name} (" in statement for (name,) in there):
+                    self._connection.execute(statement.replace("CREATE", "CREATE TEMP"))
+
+    def _version(self, connection: sqlite3.Connection) -> int:
+        version: int = connection.execute("PRAGMA user_version").fetchone()[0]
+        if version > _VERSION:
+            raise ArchiveError(
+                f"{self._path}: found version {version}, which a later pyrcal has written, "
+                f"expected at most {_VERSION}: run that pyrcal, nothing has been changed"
+            )
+        return version
 
     def close(self) -> None:
         """Close the file."""
@@ -192,6 +230,36 @@ class Index:
         name = f"{self._path.absolute().as_uri()}?mode=ro"
         with self._explained(), closing(sqlite3.connect(name, uri=True)) as connection:
             yield connection
+
+    def forget_numbers(self, table: str, product_id: str) -> None:
+        """Keep what is known of a product, and no longer that its numbers are there."""
+        with self._use() as connection:
+            connection.execute(
+                f"UPDATE {table} SET product_sha256 = NULL WHERE id = ?", (product_id,)
+            )
+
+    def pin(self, pin: Pin) -> None:
+        """Keep a product for ever; who has pinned it last counts."""
+        values = tuple(map(_storable, astuple(pin)))
+        with self._use() as connection:
+            connection.execute("INSERT OR REPLACE INTO pin VALUES (?, ?, ?)", values)
+
+    def unpin(self, product_id: str) -> bool:
+        """Let a product go when it is old; return whether it was pinned."""
+        with self._use() as connection:
+            return connection.execute("DELETE FROM pin WHERE id = ?", (product_id,)).rowcount > 0
+
+    def fault(self) -> str:
+        """Return what SQLite finds wrong with the file; empty: nothing."""
+        with self._use() as connection:
+            (found,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+        return "" if found == "ok" else str(found)
+
+    def pins(self) -> tuple[Pin, ...]:
+        """Return all of them."""
+        with self._use() as connection:
+            rows = connection.execute("SELECT id, who, why FROM pin").fetchall()
+        return tuple(Pin(id=one, who=who, why=why) for one, who, why in rows)
 
     def checksums(self, table: str) -> dict[str, str]:
         """Return the checksum of every product of a kind that is stored, by id."""

@@ -61,12 +61,34 @@ class Store(Generic[Record]):
         self.directory = directory
         self._index = index
         self._kind = kind
-        self._noun = noun
+        self.noun = noun
+        """What one of them is called."""
         self._table = noun.replace(" ", "_")
         self._description = description
         self._dataset = dataset
         self._unsound: dict[str, str] = {}
         self._stand_ins: dict[str, Record] = {}
+
+    def stored(self) -> frozenset[str]:
+        """Return the ids of those whose numbers lie here."""
+        return frozenset(self._index.checksums(self._table))
+
+    def remove(self, product_id: str) -> None:
+        """Remove the numbers of one; what is known of it stays in the index.
+
+        The index forgets them first: one that is killed in between takes the file in again.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses.
+        """
+        self._index.forget_numbers(self._table, product_id)
+        try:
+            for path in (self.path_of(product_id).with_suffix(".json"), self.path_of(product_id)):
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be removed: {error}") from error
 
     def path_of(self, product_id: str) -> Path:
         """Return where the file of a product is, or would be."""
@@ -135,7 +157,7 @@ class Store(Generic[Record]):
         """
         sha256 = self._index.checksums(self._table).get(product_id)
         if sha256 is None:
-            raise UnknownIdError(f"{self._noun} {product_id}: no such matrix in the archive")
+            raise UnknownIdError(f"{self.noun} {product_id}: no such matrix in the archive")
         return self._matrix(product_id, sha256)
 
     def file(self, product_id: str) -> bytes:
@@ -172,15 +194,15 @@ class Store(Generic[Record]):
         WireError
             If the id is not one.
         """
-        checked_id(record.id, f"a {self._noun} to be stored")
+        checked_id(record.id, f"a {self.noun} to be stored")
         path, found = self.path_of(record.id), checksum(matrix)
         self._check_numbers(record, "a matrix", matrix, shape)
         if found != (sha256 or found):
             raise ArchiveError(
-                f"{self._noun} {record.id}: found a matrix of checksum {found}, "
+                f"{self.noun} {record.id}: found a matrix of checksum {found}, "
                 f"expected {sha256} of its record"
             )
-        taken = ArchiveError(f"{self._noun} {record.id}: already stored, ids are never reused")
+        taken = ArchiveError(f"{self.noun} {record.id}: already stored, ids are never reused")
         if path.exists():
             raise taken
 
@@ -202,7 +224,7 @@ class Store(Generic[Record]):
     ) -> None:
         if values.shape != shape or not np.isfinite(values).all():
             raise ArchiveError(
-                f"{self._noun} {record.id}: found {name} of shape {values.shape}, expected a "
+                f"{self.noun} {record.id}: found {name} of shape {values.shape}, expected a "
                 f"finite one of {shape}"
             )
 
@@ -212,7 +234,7 @@ class Store(Generic[Record]):
         with _opened(path) as file:
             record = from_json(file.attrs["record"], self._kind)
         if record.id != product_id:
-            text = f"found {self._noun} {record.id} in it, expected {product_id}"
+            text = f"found {self.noun} {record.id} in it, expected {product_id}"
             raise ArchiveError(f"{path}: {text}")
         return record
 

@@ -39,6 +39,7 @@ def command_line() -> argparse.ArgumentParser:
     _describe_run(commands.add_parser("run", help="the service"))
     _describe_status(commands.add_parser("status", help="what a running service is doing"))
     _describe_key(commands.add_parser("key", help="who may ask: make, list, revoke API keys"))
+    _describe_archive(commands.add_parser("archive", help="what is kept, and is it sound?"))
     _describe_check(commands.add_parser("check-rtc", help="does an RTC keep the contract?"))
     _describe_fit(commands.add_parser("fit", help="the registration in a measured matrix"))
     _describe_reconstruct(
@@ -102,6 +103,26 @@ def _describe_key(key: argparse.ArgumentParser) -> None:
         required=True,
         help="read: look; operate: give orders, too; admin: also see who has a key, and revoke one",
     )
+
+
+def _describe_archive(archive: argparse.ArgumentParser) -> None:
+    archive.set_defaults(module="archive")
+    archive.description = (
+        "Look through the matrices in a service's data_dir, check them, remove what is old. Reads "
+        "beside a running service; prune refuses, for the service does it by itself."
+    )
+    archive.epilog = "Exit status: 0 done, 1 something is damaged, 2 it cannot be done."
+    where = argparse.ArgumentParser(add_help=False)
+    where.add_argument("--config", type=Path, metavar="FILE", help="the service's settings, TOML")
+    where.add_argument("--data-dir", metavar="DIR", help="the service's data_dir, default var")
+    where.add_argument("--json", action="store_true", help="print JSON")
+    actions = archive.add_subparsers(dest="action", required=True)
+    actions.add_parser("list", parents=[where], help="all, oldest first, and why one stays")
+    show = actions.add_parser("show", parents=[where], help="what is known of one")
+    show.add_argument("id", metavar="ID")
+    actions.add_parser("verify", parents=[where], help="read all of them and compare checksums")
+    prune = actions.add_parser("prune", parents=[where], help="remove what [archive] lets go")
+    prune.add_argument("--dry-run", action="store_true", help="only say what would go")
 
 
 _CHECK_EPILOG = """

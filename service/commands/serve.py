@@ -22,7 +22,7 @@ from typing_extensions import override
 
 from service.archive import Archive
 from service.config import Settings, load_instrument, packaged_instrument
-from service.config.policy import policy_of
+from service.config.policy import keeping_of, policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.uploads import UploadFitter
 from service.keys import KeyFile
@@ -196,6 +196,7 @@ def _supervisor(
         workers=workers,
         archive=archive,
         actions=actions,
+        keeping=keeping_of(settings),
     )
 
 

@@ -1,4 +1,4 @@
-"""The tracker's policy, how far the model itself leads astray, and what the worker may use."""
+"""The tracker's policy, how far the model leads astray, what the worker may use, what is kept."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
+from service.archive.retention import Keeping
 from service.config.settings import Settings
 from service.control.reconstructor import InversionMethod
 from service.model.misregistration import BOUNDARY_SCALE
@@ -87,6 +88,12 @@ def policy_of(settings: Settings) -> Policy:
 def _four(shift_subap: float, rotation_deg: float, magnification: float) -> NDArray[np.float64]:
     """Return ``(4,)`` in numeric units: the same for both shifts."""
     return np.array([shift_subap, shift_subap, np.deg2rad(rotation_deg), magnification])
+
+
+def keeping_of(settings: Settings) -> Keeping:
+    """Return what of the archive is kept."""
+    table = settings.archive
+    return Keeping(keep_days=table.keep_days, keep_gb=table.keep_gb, reserve_gb=table.reserve_gb)
 
 
 def compute_of(settings: Settings) -> Compute:

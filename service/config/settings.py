@@ -271,6 +271,16 @@ class FitsTable(Table):
 class ArchiveTable(Table):
     """``[archive]``: what is kept, and how it is told."""
 
+    keep_days: float = Field(default=0.0, ge=0.0)
+    """Matrices older than this are removed, but for those in use, referenced or pinned, and the
+    newest; what is known of them stays, as do α over time and the audit trail. 0: for ever."""
+
+    keep_gb: float = Field(default=100.0, ge=0.0)
+    """So much of them is kept, the oldest go first, gigabytes; 0: no limit."""
+
+    reserve_gb: float = Field(default=2.0, ge=0.0)
+    """Less free space than this raises an alarm, gigabytes."""
+
     noon_utc_h: int = Field(default=12, ge=0, le=23)
     """UTC hour of local noon, where one night ends and the next begins."""
 

@@ -14,6 +14,7 @@ import structlog
 from numpy.typing import NDArray
 
 from service.archive import Archive, AuditEntry
+from service.archive.retention import EVERYTHING, Keeping
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
@@ -22,6 +23,7 @@ from service.runtime.actions import Actions
 from service.runtime.answers import Given
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
+from service.runtime.housekeeping import keep_house
 from service.runtime.recording import Caller, Recorder, ids_of
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
@@ -73,6 +75,7 @@ class Supervisor:
         workers: WorkerPool,
         archive: Archive,
         actions: Actions,
+        keeping: Keeping = EVERYTHING,
     ) -> None:
         self._engine = Engine(state, policy, self)
         self._bridge = bridge
@@ -82,6 +85,7 @@ class Supervisor:
 
         self._recorder = Recorder(archive, lambda: self._engine.state, self._post)
         self._actions = actions
+        self._keeping = keeping
         self._backlog = Backlog()
         self._meter = PaceMeter(workers)
         self._running: set[asyncio.Task[None]] = set()
@@ -198,6 +202,15 @@ class Supervisor:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._recorder.run())
             group.create_task(self._recorder.save())
+            group.create_task(
+                keep_house(
+                    self.archive,
+                    self._keeping,
+                    lambda: self._engine.state,
+                    self._post,
+                    self._recorder.add,
+                )
+            )
             description = await self._described()
             self._engine.prepared(description)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"

@@ -293,7 +293,7 @@ def test_an_index_that_cannot_be_opened_is_named(tmp_path):
 
 
 def test_two_services_cannot_share_a_directory(archive):
-    second = Archive(archive._directory)
+    second = Archive(archive.directory)
     with pytest.raises(ArchiveError, match="in use by another service"):
         second.open()
     archive.close()
@@ -359,7 +359,7 @@ def test_a_record_nobody_understands_and_without_a_product_is_left_out_and_told(
 @pytest.mark.parametrize("folder", ["reconstructors", "interaction_matrices", "noisy_matrices"])
 @pytest.mark.parametrize("name", ["old.h5.part", "old.h5"])
 def test_a_folder_where_a_file_should_be_is_told_and_left_alone(archive, folder, name):
-    made = archive._directory / folder / name
+    made = archive.directory / folder / name
     made.mkdir()
     (told,) = begun_anew(archive)
     assert str(made) in told
@@ -379,7 +379,7 @@ def test_a_lost_index_is_made_anew_with_what_became_of_every_matrix(archive):
             (record_of(name, state=state, reason=f"it was {state}", published_ns_utc=7),), ()
         )
     archive.close()
-    for leftover in archive._directory.glob("index.sqlite*"):
+    for leftover in archive.directory.glob("index.sqlite*"):
         leftover.unlink()
     (told,) = archive.open()
     assert "index.sqlite: was not there: made anew of 4 products" in told
@@ -394,7 +394,7 @@ def test_of_a_matrix_whose_fate_is_lost_with_the_index_it_is_said(archive):
     archive.reconstructors.store(record_of(), MATRIX, None, {})
     archive.record((record_of(state=MatrixState.APPLIED),), ())
     archive.close()
-    for leftover in archive._directory.glob("index.sqlite*"):
+    for leftover in archive.directory.glob("index.sqlite*"):
         leftover.unlink()
     for fate in product(archive).parent.glob("*.json"):
         fate.write_text("{")

@@ -183,7 +183,7 @@ async def test_a_damaged_file_costs_alpha_and_not_the_start(archive, tmp_path):
 
 
 async def test_what_is_wrong_in_the_archive_is_on_record_from_the_start(archive):
-    (archive._directory / "reconstructors" / "old.h5").mkdir()
+    (archive.directory / "reconstructors" / "old.h5").mkdir()
     archive.close()
     archive.open()
     state = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
@@ -462,7 +462,7 @@ async def test_alpha_that_could_not_be_saved_is_an_alarm_and_saved_later(
     supervisor, archive, monkeypatch, impatient
 ):
     monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 0.01)
-    part = archive._directory / "tracking.part"
+    part = archive.directory / "tracking.part"
     async with running(supervisor):
         part.mkdir()
         known = told(Story(Mode.HOLD).meet(), n_windows=1)

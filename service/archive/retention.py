@@ -1,0 +1,210 @@
+"""What lies in the archive, what of it is kept for ever, and what may go, oldest first."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from service.archive.archive import Archive
+from service.archive.index import AuditEntry, Product
+from service.archive.nights import DAY_NS
+from service.errors import ArchiveError
+from service.tracking.products import MatrixState, ReconstructorRecord
+
+NEWEST_KEPT = 10
+"""Of each kind, whatever their age: those to go back to."""
+
+GIGABYTE = 1_000_000_000
+
+_ALIVE = {
+    MatrixState.PROPOSED: "waits for an operator",
+    MatrixState.PUBLISHED: "on its way to the RTC",
+    MatrixState.STAGED: "held by the RTC",
+    MatrixState.APPLIED: "in use",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Keeping:
+    """What the user has decided to keep; 0 stands for no limit."""
+
+    keep_days: float = 0.0
+    keep_gb: float = 0.0
+    """Of all products together, in units of 1e9 bytes."""
+
+    reserve_gb: float = 0.0
+    """Free space below which somebody is told."""
+
+
+EVERYTHING = Keeping()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Item:
+    """A product whose numbers lie in the archive."""
+
+    id: str
+    kind: str
+    """"reconstructor", "measurement" or "noisy matrix"."""
+
+    state: str
+    """What has become of it."""
+
+    stored_ns_utc: int
+    """When its file was written, by the service's clock; 0: it is not there."""
+
+    n_bytes: int
+    kept_because: str = ""
+    """Why it is kept for ever; empty: it goes when it is old, or there is too much."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Damage:
+    """A product that is not what was stored."""
+
+    id: str
+    kind: str
+    path: str
+    found: str
+    means: str
+    do: str
+
+
+def items(archive: Archive, in_use: Collection[str] = ()) -> tuple[Item, ...]:
+    """Return all products, oldest first.
+
+    Parameters
+    ----------
+    archive
+        Open.
+    in_use
+        Ids that somebody needs whatever their state says.
+
+    Raises
+    ------
+    ArchiveError
+        If the index cannot be read.
+    """
+    found, pins = [], archive.pins()
+    for store in archive.stores:
+        records = {record.id: record for record in store.records()}
+        there = [_item(store.noun, store.path_of(one), one, records) for one in store.stored()]
+        there.sort(key=lambda item: item.stored_ns_utc)
+        kept = {item.id: f"one of the newest {NEWEST_KEPT}" for item in there[-NEWEST_KEPT:]}
+        for item in there:
+            record = records.get(item.id)
+            alive = _ALIVE.get(record.state) if isinstance(record, ReconstructorRecord) else None
+            if alive and isinstance(record, ReconstructorRecord) and record.parent:
+                kept.setdefault(record.parent, f"{item.id} was made from it")
+            if alive or item.id in in_use:
+                kept[item.id] = alive or "in use"
+        kept |= {pin.id: f"pinned by {pin.who}: {pin.why}" for pin in pins}
+        found += [
+            replace(item, kept_because=item.kept_because or kept.get(item.id, "")) for item in there
+        ]
+    return tuple(sorted(found, key=lambda item: item.stored_ns_utc))
+
+
+def _item(kind: str, path: Path, product_id: str, records: Mapping[str, Product]) -> Item:
+    """Return a product; one that somebody has to look at is kept until then."""
+    record = records.get(product_id)
+    try:
+        status, fault = path.stat(), "" if record else "its record is not understood"
+    except OSError as error:
+        status, fault = None, f"its file cannot be found: {error.strerror}"
+    return Item(
+        id=product_id,
+        kind=kind,
+        state="" if record is None else record.state,
+        stored_ns_utc=0 if status is None else status.st_mtime_ns,
+        n_bytes=0 if status is None else status.st_size,
+        kept_because=fault,
+    )
+
+
+def due(every: Collection[Item], keeping: Keeping, now_ns: int) -> Iterator[tuple[Item, str]]:
+    """Yield what is to go, and why: what is too old, then as much as is too much, oldest first."""
+    n_bytes = sum(item.n_bytes for item in every)
+    for item in sorted(every, key=lambda item: item.stored_ns_utc):
+        age_days = (now_ns - item.stored_ns_utc) / DAY_NS
+        if item.kept_because:
+            continue
+        if 0 < keeping.keep_days < age_days:
+            why = f"{age_days:.0f} days old, keep_days is {keeping.keep_days:g}"
+        elif 0 < keeping.keep_gb * GIGABYTE < n_bytes:
+            there = n_bytes / GIGABYTE
+            why = f"{there:.3g} GB are there, keep_gb is {keeping.keep_gb:g}"
+        else:
+            continue
+        n_bytes -= item.n_bytes
+        yield item, why
+
+
+def remove(archive: Archive, item: Item, why: str) -> AuditEntry | None:
+    """Remove the numbers of a product, unless it has been pinned meanwhile; return what to tell.
+
+    Raises
+    ------
+    ArchiveError
+        If the disk refuses.
+    """
+    if any(pin.id == item.id for pin in archive.pins()):
+        return None
+    next(store for store in archive.stores if store.noun == item.kind).remove(item.id)
+    return AuditEntry(
+        t_ns_utc=time.time_ns(),
+        who="service",
+        name="archive.removed",
+        text=f"{item.kind} {item.id}: numbers removed, {why}",
+    )
+
+
+def verify(archive: Archive, which: Collection[Item]) -> Iterator[Damage | None]:
+    """Read every product and yield what is wrong with it, or None where it is as it was stored."""
+    of_kind = {store.noun: store for store in archive.stores}
+    for item in which:
+        try:
+            of_kind[item.kind].matrix(item.id)
+        except ArchiveError as error:
+            yield _damage(item, of_kind[item.kind].path_of(item.id), str(error))
+        else:
+            yield None
+
+
+def _damage(item: Item, path: Path, found: str) -> Damage:
+    if item.state == MatrixState.APPLIED:
+        means = "the RTC has it, and goes on; it could not be sent again to one that restarts"
+    elif item.kind == "reconstructor":
+        means = "it cannot be sent, nor gone back to; what is known of it is in the index"
+    else:
+        means = "it cannot be fitted or compared any more; what is known of it is in the index"
+    return Damage(
+        id=item.id,
+        kind=item.kind,
+        path=str(path),
+        found=found.removeprefix(f"{path}: "),
+        means=means,
+        do="put it back from a backup; else move it aside, and have another made or measured",
+    )
+
+
+def low_on_space(directory: Path, keeping: Keeping, *, low: bool) -> str | None:
+    """Return what to tell of a disk with little room, None where there is enough.
+
+    Where it was told of (``low``) a tenth more has to be free before it is over.
+
+    Raises
+    ------
+    OSError
+        If the disk does not say.
+    """
+    free_gb = shutil.disk_usage(directory).free / GIGABYTE
+    if free_gb >= keeping.reserve_gb * (1.1 if low else 1.0):
+        return None
+    return (
+        f"{free_gb:.1f} GB are free in {directory}, reserve_gb is {keeping.reserve_gb:g}: free "
+        "space there, or lower [archive] keep_days or keep_gb; once it is full no order is taken"
+    )

@@ -144,12 +144,13 @@ class PyramidOptics:
         roof_y = self._roof(shift[1], nodes_y or Nodes.area(self.n_nodes))
         roof_x = self._roof(shift[0], nodes_x or Nodes.area(self.n_nodes))
         fields = self._fields(roof_y, roof_x)
-        modulated_x = self._modulated_x(roof_x)
+        along_y, along_x = self._tilts()
+        modulated_x = self._modulated_x(roof_x, along_x)
         rows = np.flatnonzero(valid.any(axis=1))
         blocks = list(
             mapper(
                 lambda row: self._row_gradient(
-                    row, np.flatnonzero(valid[row]), fields, roof_y, modulated_x
+                    row, np.flatnonzero(valid[row]), fields, roof_y, along_y, modulated_x
                 ),
                 (int(row) for row in rows),
             )
@@ -237,21 +238,25 @@ class PyramidOptics:
         # what the halo loses beyond the grid still falls on the detector, only without signal
         return np.asarray(images / (2.0 * self._source()[2].sum()))
 
-    def _modulated_x(self, roof_x: _Roof) -> Array:
+    def _modulated_x(self, roof_x: _Roof, along_x: Array) -> Array:
         """Return the weighted x factors ``(M/2, 2, n, 2 of the pair * n_nodes, N)``."""
-        _, along_x = self._tilts()
         weighted = roof_x.kernel * roof_x.weights[:, None].astype(self.dtype)
         product = weighted[None, :, :, None] * along_x[:, None, None, :, None]
         return np.asarray(product.reshape(*product.shape[:3], -1, product.shape[-1]))
 
     def _row_gradient(
-        self, row: int, columns: Array, fields: Array, roof_y: _Roof, modulated_x: Array
+        self,
+        row: int,
+        columns: Array,
+        fields: Array,
+        roof_y: _Roof,
+        along_y: Array,
+        modulated_x: Array,
     ) -> tuple[Array, Array, Array]:
         """Return gradients of the x and y differences of one row, and of its flux.
 
         With local normalisation the flux is that of every subaperture; else one line, their sum.
         """
-        along_y, _ = self._tilts()
         factor_y = (
             along_y[:, None, None]
             * roof_y.kernel[:, row]

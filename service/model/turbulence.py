@@ -101,7 +101,12 @@ POINTS = tuple(range(12, 42, 2))
 """On each of 15 rings, inner ones first: 390 with an error of 0.01 % in magnification. As many on
 every ring, all at the same angles, would need 600: the outer ones are the longer."""
 
-_N_SAMPLES = 4000
+_N_SAMPLES = 1000
+"""Of frequencies and of tilts."""
+
+_N_DISTANCES = 600
+"""Nodes of a Gauss-Legendre rule over the pupil: enough for 100 subapertures. On FLAO the light of
+a ring is right to 1e-5, for which equal steps would have to be 20,000."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -142,17 +147,20 @@ def working_point(
             f"working point: found {n_controlled} controlled modes, r0 {r0} m; expected >= 1, > 0"
         )
     frequency, power = _residual_spectrum(instrument, n_controlled, r0)
-    distance = np.linspace(0.0, instrument.wfs.pupil_diameter, _N_SAMPLES)
+    nodes, node_weights = scipy.special.roots_legendre(_N_DISTANCES)
+    radius = instrument.wfs.pupil_diameter / 2.0
+    distance = radius * (1.0 + nodes)
     step = np.gradient(frequency)
+    variance = float(power * frequency @ step) / (2 * np.pi)
     covariance = (
         scipy.special.j0(np.outer(distance, frequency)) @ (power * frequency * step) / (2 * np.pi)
     )
-    coherence = np.exp(covariance - covariance[0])
-    far = float(np.exp(-covariance[0]))
+    coherence = np.exp(covariance - variance)
+    far = float(np.exp(-variance))
     circle = 2 * np.pi * instrument.wfs.modulation_lambda_over_d / instrument.wfs.pupil_diameter
     shape = (coherence - far) * scipy.special.j0(circle * distance) * distance
     tilt = np.linspace(0.0, np.pi * sampling, _N_SAMPLES)
-    halo = scipy.special.j0(np.outer(tilt, distance)) @ (shape * np.gradient(distance))
+    halo = scipy.special.j0(np.outer(tilt, distance)) @ (shape * radius * node_weights)
     return _rings(tilt, np.maximum(halo * tilt, 0.0), far)
 
 

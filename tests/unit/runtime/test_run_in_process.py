@@ -1,40 +1,24 @@
 import asyncio
 import multiprocessing
 import os
-import signal
-import time
 from functools import partial
 
-import numpy as np
 import pytest
 
 from service.errors import MatrixError, WorkerError
 from service.runtime.workers import run_in_process
+from tests.unit.runtime.jobs import (
+    asleep_at,
+    failing,
+    hungry,
+    killed,
+    modest,
+    niceness,
+    process_id,
+    refusing,
+)
 
 pytestmark = pytest.mark.timeout(60)
-
-
-def process_id(folder=None):
-    if folder is not None:
-        (folder / "pid").write_text(str(os.getpid()))
-        time.sleep(60.0)
-    return os.getpid()
-
-
-def niceness():
-    return os.nice(0)
-
-
-def refusing():
-    raise MatrixError("transposed")
-
-
-def failing():
-    raise ValueError("a bug in a job")
-
-
-def killed():
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 async def gone(folder):
@@ -71,13 +55,13 @@ async def test_a_killed_process_is_a_lost_job():
 async def test_a_job_that_takes_too_long_is_stopped(tmp_path):
     before = set(multiprocessing.active_children())  # a worker that other tests share
     with pytest.raises(WorkerError, match="longer than 3 s"):
-        await run_in_process(partial(process_id, tmp_path), nice=0, limit_s=3.0)
+        await run_in_process(partial(asleep_at, tmp_path), nice=0, limit_s=3.0)
     assert set(multiprocessing.active_children()) <= before
 
 
 async def test_a_job_nobody_waits_for_is_stopped(tmp_path):
     waiting = asyncio.create_task(
-        run_in_process(partial(process_id, tmp_path), nice=0, limit_s=60.0)
+        run_in_process(partial(asleep_at, tmp_path), nice=0, limit_s=60.0)
     )
     for _ in range(500):
         await asyncio.sleep(0.05)
@@ -87,14 +71,6 @@ async def test_a_job_nobody_waits_for_is_stopped(tmp_path):
     with pytest.raises(asyncio.CancelledError):
         await waiting
     await gone(tmp_path)
-
-
-def hungry():
-    return len(np.ones(400_000_000))
-
-
-def modest():
-    return float(np.ones(1_000_000).sum())
 
 
 async def test_a_job_that_needs_more_memory_than_it_may_have_is_told_how_much_that_is():

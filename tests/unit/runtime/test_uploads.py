@@ -21,26 +21,13 @@ from service.fit.matrix import FitOptions
 from service.runtime import uploads
 from service.runtime.uploads import FitLimits, FitQueue
 from tests.system.pace import in_time
+from tests.unit.runtime.jobs import refusing, sleeping, telling
 
 pytestmark = pytest.mark.timeout(60)
 
 LIMITS = FitLimits(most_bytes=10_000_000, waiting=2, seconds=30.0, nice=0, memory_mb=4000)
 ASKED = FitAsked(options=FitOptions())
 HDF5 = b"\x89HDF\r\n\x1a\n" + b"\x00" * 5_000_000
-
-
-def telling(folder, asked):
-    """Say what lies in the folder, instead of fitting it."""
-    content = (folder / "upload").read_bytes()
-    return {"verdict": f"accepted: {len(content)} bytes of {asked.dataset}"}
-
-
-def refusing(folder, asked):
-    raise MatrixError("transposed")
-
-
-def sleeping(folder, asked):
-    time.sleep(60.0)
 
 
 async def in_chunks(content, size=300_000):

@@ -13,50 +13,22 @@ from service.runtime import workers as crew_module
 from service.runtime.workers import WorkerPool
 from service.worker import OpticsWorker, run_job, start_worker
 from tests.system.pace import in_time
+from tests.unit.runtime.jobs import (
+    asleep,
+    endless,
+    failing,
+    interrupted,
+    killed,
+    napping,
+    niceness,
+    process_id,
+    remembered,
+    remembering,
+    spinning,
+)
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 pytestmark = pytest.mark.timeout(60)
-
-
-def process_id(_bench: OpticsWorker) -> int:
-    return os.getpid()
-
-
-def niceness(_bench: OpticsWorker) -> int:
-    return os.nice(0)
-
-
-def interrupted(_bench: OpticsWorker) -> str:
-    """Survive what Ctrl-C sends to the whole process group."""
-    os.kill(os.getpid(), signal.SIGINT)
-    return "still here"
-
-
-def asleep(_bench: OpticsWorker) -> None:
-    time.sleep(60.0)
-
-
-def napping(_bench: OpticsWorker) -> None:
-    time.sleep(1.2)
-
-
-def endless(_bench: OpticsWorker) -> None:
-    while True:
-        pass
-
-
-def killed(_bench: OpticsWorker) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def spinning(_bench: OpticsWorker) -> None:
-    end_s = time.process_time() + 0.2
-    while time.process_time() < end_s:
-        pass
-
-
-def failing(_bench: OpticsWorker) -> None:
-    raise ValueError("a bug in a job")
 
 
 @pytest.fixture
@@ -77,16 +49,24 @@ def workers(hired):
     workers.close()
 
 
+@pytest.fixture(scope="module")
+def shared():
+    """Of tests that leave its worker as they found it."""
+    workers = WorkerPool(lambda: start_worker(small_instrument(), COMPUTE))
+    yield workers
+    workers.close()
+
+
 async def test_nobody_is_hired_before_there_is_work(workers, hired):
     assert not hired
     assert await workers.call(process_id) != os.getpid()
     assert len(hired) == 1
 
 
-async def test_jobs_share_one_worker_and_its_workbench(workers):
-    first, second = await asyncio.gather(workers.call(process_id), workers.call(process_id))
+async def test_jobs_share_one_worker_and_its_workbench(shared):
+    first, second = await asyncio.gather(shared.call(process_id), shared.call(process_id))
     assert first == second
-    assert (await workers.call(OpticsWorker.describe)).n_modes == 90
+    assert (await shared.call(OpticsWorker.describe)).n_modes == 90
 
 
 async def test_a_killed_worker_costs_one_job_and_the_next_one_works(workers, hired):
@@ -109,12 +89,12 @@ async def test_jobs_that_waited_for_a_killed_worker_are_done_by_the_next(workers
     assert (workers.n_lost, len(hired)) == (1, 2)
 
 
-async def test_a_job_that_raises_keeps_its_worker(workers, hired):
-    before = await workers.call(process_id)
+async def test_a_job_that_raises_keeps_its_worker(shared):
+    before = await shared.call(process_id)
     with pytest.raises(WorkerError, match=r"failing failed unforeseen.*a bug in a job"):
-        await workers.call(failing)
-    assert await workers.call(process_id) == before
-    assert workers.n_lost == 0
+        await shared.call(failing)
+    assert await shared.call(process_id) == before
+    assert shared.n_lost == 0
 
 
 async def test_the_worker_tells_the_processor_time_of_every_kind_of_job(workers):
@@ -125,8 +105,8 @@ async def test_the_worker_tells_the_processor_time_of_every_kind_of_job(workers)
     assert 0.4 <= workers.cpu_s["spinning"] < 2.0
 
 
-async def test_an_interrupt_from_the_keyboard_is_the_services_business(workers):
-    assert await workers.call(interrupted) == "still here"
+async def test_an_interrupt_from_the_keyboard_is_the_services_business(shared):
+    assert await shared.call(interrupted) == "still here"
 
 
 async def test_a_worker_that_began_early_is_the_first_one_and_as_polite():
@@ -178,14 +158,6 @@ async def test_what_nobody_waits_for_any_more_is_not_finished(workers, hired):
     assert await workers.call(process_id) == hired[1].pid
 
 
-def remembering(bench: OpticsWorker) -> None:
-    bench.told = "first"
-
-
-def remembered(bench: OpticsWorker) -> str | None:
-    return getattr(bench, "told", None)
-
-
 def test_what_every_worker_must_be_told_is_told_to_one_that_takes_a_dead_ones_place(workers):
     async def jobs():
         await workers.call(process_id)
@@ -221,20 +193,20 @@ async def test_what_is_urgent_goes_first_and_what_waits_long_has_its_turn(worker
     assert order.index("watch") < 5
 
 
-async def test_within_a_turn_calls_are_done_at_once(workers):
-    async with workers.turn("fit"):
-        assert await workers.call(process_id)
+async def test_within_a_turn_calls_are_done_at_once(shared):
+    async with shared.turn("fit"):
+        assert await shared.call(process_id)
     async with asyncio.timeout(5.0):
-        assert await workers.call(process_id)
+        assert await shared.call(process_id)
 
 
-async def test_a_turn_nobody_takes_any_more_is_passed_on(workers):
-    async with workers.turn("fit"):
-        waiting = asyncio.create_task(workers.call(process_id))
+async def test_a_turn_nobody_takes_any_more_is_passed_on(shared):
+    async with shared.turn("fit"):
+        waiting = asyncio.create_task(shared.call(process_id))
         await asyncio.sleep(0)
         waiting.cancel()
     async with asyncio.timeout(20.0):
-        assert await workers.call(process_id)
+        assert await shared.call(process_id)
 
 
 async def test_a_worker_that_stands_still_is_named_then_killed_and_replaced(
@@ -276,8 +248,8 @@ async def test_a_job_that_rightly_takes_long_is_let_finish_in_the_end(workers, m
         pytest.fail("it never was")
 
 
-async def test_a_job_that_waits_for_the_disk_a_moment_is_not_a_hung_one(workers, monkeypatch):
+async def test_a_job_that_waits_for_the_disk_a_moment_is_not_a_hung_one(shared, monkeypatch):
     monkeypatch.setattr("service.runtime.workers.STILL_S", 0.6)
-    await workers.call(napping)
-    assert workers.trouble == ""
-    assert workers.n_lost == 0
+    await shared.call(napping)
+    assert shared.trouble == ""
+    assert shared.n_lost == 0

@@ -231,6 +231,7 @@ def _check(known: Registration) -> None:
     if bias is not None:
         arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, 4))]
         arrays += [(bias.excess, (4,)), (np.array(bias.loop), (len(bias.loop),))]
+        arrays += [(np.array(bias.scatter), ())]
     for values, shape in arrays:
         if values.shape != shape or not np.isfinite(values).all():
             raise ValueError(f"found numbers of shape {values.shape}, expected {shape} finite ones")

@@ -27,6 +27,9 @@ JUMP_THRESHOLD = 23.5
 JUMP_INFLATION = 10.0
 """After a jump each parameter may have moved by this many σ of the innovation."""
 
+SCATTER_LEARNING = 0.05
+"""Weight of the newest look in how much looks scatter: twenty are remembered."""
+
 _DITHERED = np.hstack([np.eye(4), np.zeros((4, 4))])
 _PASSIVE = np.hstack([np.eye(4), np.eye(4)])
 
@@ -44,6 +47,9 @@ class Joint:
     excess: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` variance of the bias beyond ``BIAS_FLOOR`` that looks have told of, and that is in
     the covariance or has been learnt away since."""
+
+    scatter: float = 1.0
+    """How much more looks scatter than their covariances say, in variance; never less than 1."""
 
     @property
     def alpha(self) -> Array:
@@ -89,7 +95,7 @@ def forgotten(joint: Joint, excess: Array | None = None) -> Joint:
     covariance[4:] = covariance[:, 4:] = 0.0
     covariance[4:, 4:] = np.diag(BIAS_FLOOR**2 + excess)
     mean = np.concatenate([joint.alpha, np.zeros(4)])
-    return Joint(mean=mean, covariance=covariance, excess=excess)
+    return replace(joint, mean=mean, covariance=covariance, excess=excess)
 
 
 def allowing(joint: Joint, excess: Array) -> Joint:
@@ -141,6 +147,16 @@ def with_dithered(prior: Joint, measured: Array, noise: Array) -> Joint:
 def with_passive(prior: Joint, measured: Array, noise: Array) -> Joint:
     """Fold in a passive estimate ``(4,)`` with the covariance of its scatter ``(4, 4)``."""
     return _corrected(prior, measured, noise, _PASSIVE)
+
+
+def scattered(joint: Joint, innovation: float) -> Joint:
+    """Return the estimate after a look that lay so far, 4 expected, with ``scatter`` allowed for.
+
+    In fast wind the bias swings from look to look, and looks scatter by more than they say.
+    """
+    seen = min(innovation, JUMP_THRESHOLD) / 4.0
+    learnt = joint.scatter * (1.0 + SCATTER_LEARNING * (seen - 1.0))
+    return replace(joint, scatter=max(learnt, 1.0))
 
 
 def widened(prior: Joint, noise: Array) -> Joint:

@@ -71,6 +71,11 @@ BIAS_OVER_SCATTER = np.array([10.0, 10.0, 0.0, 0.0])
 """Where the loop's own noise hardly shows (a bright star in 25 m/s) the scatter grows, and the bias
 with it: a quarter of a subaperture was seen at a scatter of 0.014."""
 
+SHRUNK = 0.2
+"""Share of the correlations between parameters that is not believed. They are estimated from the
+few errors of columns that are independent of one another, and what seems known best of all is what
+chance has made small: one look in 60 lay five of its own σ away in such a direction."""
+
 MIN_FRAMES_PER_MODE = 5
 """Fewer effective frames leave the command covariance too noisy to invert."""
 
@@ -351,7 +356,8 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
 
     By :mod:`service.fit.solver`, each mode weighted by its noise. The errors of the columns are not
     independent (Q), nor are those of the slopes (S): fast turbulence looks like modes. With both,
-    ``Cov = A^-1 (J w) (S x Q) (J w)^T A^-1``; the residual tells S.
+    ``Cov = A^-1 (J w) (S x Q) (J w)^T A^-1``; the residual tells S. ``SHRUNK`` of its correlations
+    is taken away.
     """
     found = passive_matrix(state)
     if found is None:
@@ -372,9 +378,10 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     variance = float(np.sum(left**2, axis=0) @ weights / freedom)
     scores = _patterns(left, noise).T @ (seen.jacobian * weights)
     spread = (scores @ found.shape).reshape(4, -1) @ scores.reshape(4, -1).T
+    covariance = variance * normal @ spread @ normal
     return PassiveEstimate(
         alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
-        covariance=variance * normal @ spread @ normal,
+        covariance=(1.0 - SHRUNK) * covariance + SHRUNK * np.diag(np.diag(covariance)),
         optical_gain=seen.gains,
         misfit=variance / _slope_variance(state, found.matrix),
         step=step,

@@ -192,7 +192,7 @@ def joint_of(known: Registration) -> Joint:
     covariance[4:, 4:] = bias.covariance
     covariance[4:, :4], covariance[:4, 4:] = bias.shared, bias.shared.T
     mean = np.concatenate([known.alpha.vector, bias.offset])
-    return Joint(mean=mean, covariance=covariance, excess=bias.excess)
+    return Joint(mean=mean, covariance=covariance, excess=bias.excess, scatter=bias.scatter)
 
 
 def bias_of(
@@ -210,6 +210,7 @@ def bias_of(
         shared=joint.covariance[4:, :4],
         looked_ns_utc=looked_ns_utc,
         excess=joint.excess,
+        scatter=joint.scatter,
     )
 
 

@@ -22,6 +22,7 @@ from service.telemetry.kalman import (
     dithered_innovation,
     forgotten,
     passive_innovation,
+    scattered,
     widened,
     with_dithered,
     with_passive,
@@ -288,7 +289,7 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
     measured = estimate.alpha.vector
     reading = Reading(
         value=measured,
-        noise=estimate.covariance,
+        noise=prior.scatter * estimate.covariance,
         t_ns_utc=event.t_ns_utc,
         pointing=pointing_at(turn.state, event.t_ns_utc),
     )
@@ -296,7 +297,7 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
     if far > JUMP_THRESHOLD:
         _doubt_by_look(turn, known, event, prior, far)
         return
-    joint = with_passive(prior, measured, estimate.covariance)
+    joint = scattered(with_passive(prior, measured, estimate.covariance), far)
     registration = _after_look(turn, known, joint, event)
     hold(turn, registration)
     age(turn)

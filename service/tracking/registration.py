@@ -122,6 +122,9 @@ class PassiveBias:
     excess: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` variance beyond the least that the scatter of passive estimates has told of."""
 
+    scatter: float = 1.0
+    """How much more passive estimates scatter than they say, in variance, one beside the other."""
+
     loop: tuple[float, ...] = ()
     """``tracking.loop.loop_numbers`` of the loop it is the bias of; empty: not known."""
 

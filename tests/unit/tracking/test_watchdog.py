@@ -145,6 +145,23 @@ def test_the_bias_is_learnt_between_windows_and_shown(story):
     assert known.alpha.shift_x_subap == pytest.approx(ALPHA.shift_x_subap, abs=0.003)
 
 
+def test_looks_that_scatter_more_than_they_say_are_no_jumps(story):
+    """By 40 % in σ: χ² of four alone would be too large once in 60 looks."""
+    said = 10 * SCATTER
+    rng = np.random.default_rng(3)
+    doubts = 0
+    for k in range(200):
+        if k % 5 == 0 or "watchdog" in story.alarms:
+            story.see(every_s=5.0)
+        drawn = ALPHA.vector + 1.4 * said * rng.standard_normal(4)
+        watch(story, Misregistration.from_vector(drawn), after_s=5.0, scatter=said)
+        doubts += "watchdog" in story.alarms
+    assert doubts <= 1
+    assert story.state.registration.bias.scatter == pytest.approx(1.96, rel=0.4)
+    watch(story, moved(shift_x_subap=0.3), after_s=5.0, scatter=said)
+    assert "watchdog" in story.alarms
+
+
 def test_once_learnt_it_follows_a_drift_without_any_window(story):
     """2 % of a subaperture in 40 s, four looks: followed to a quarter of it, and σ says so."""
     learnt(story)

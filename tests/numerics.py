@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -18,6 +19,7 @@ from service.model.interaction import InteractionModel, Linearisation
 from service.model.kinds import Influence, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
+from service.prepared import Prepared, usual_folder
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockInPlan
 from service.telemetry.windows import ClosedLoop
@@ -96,7 +98,10 @@ def small_linearisation() -> Linearisation:
 
 @cache
 def flao_basis() -> ModalBasis:
-    return karhunen_loeve_basis(load_instrument("flao-lbt"))
+    """Seconds of work, kept on disk for whatever process asks next."""
+    basis = Prepared(usual_folder(os.environ)).basis(load_instrument("flao-lbt"))
+    assert isinstance(basis, ModalBasis)
+    return basis
 
 
 @cache

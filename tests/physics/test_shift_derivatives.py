@@ -15,6 +15,7 @@ from tests.numerics import SOMEWHERE, flao_basis
 STEP = 1e-4
 
 
+@pytest.mark.long
 def test_derivatives_of_the_full_telescope_agree_with_central_differences():
     """At 3 nodes 0.4 % of a shift's (0.15 % seen; 4 % required): edges against nodes inside."""
     basis = flao_basis()

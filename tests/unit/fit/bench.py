@@ -13,6 +13,7 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, rtc_valid_subapertures
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
+from service.model.modes import Basis
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
 from tests.numerics import small_basis, small_instrument
 
@@ -41,16 +42,15 @@ def matrix(
     **model,
 ) -> np.ndarray:
     """D on a finer grid than the fit's own; ``noise`` is a share of each column's RMS."""
-    sampled = InteractionModel(
-        about or instrument(),
-        basis or small_basis(),
-        pupil_sampling=4,
-        detector_nodes=4,
-        **model,
-    )
-    exact = sampled.interaction_matrix(alpha).astype(np.float64)
+    exact = _exact(alpha, about or instrument(), basis or small_basis(), **model)
     scatter = np.random.default_rng(seed).normal(size=exact.shape) * exact.std(axis=0)
     return exact + noise * scatter
+
+
+@cache
+def _exact(alpha: Misregistration, about: Instrument, basis: Basis, **model) -> np.ndarray:
+    sampled = InteractionModel(about, basis, pupil_sampling=4, detector_nodes=4, **model)
+    return sampled.interaction_matrix(alpha).astype(np.float64)
 
 
 def listed(values: np.ndarray, order: SlopeOrder, orientation: Orientation) -> np.ndarray:

@@ -102,7 +102,7 @@ class TestOffByTheOperator:
         dither = story.state.dither
         accept(story, dither)
         story.tell(cmd.StopDither())
-        playing(story, dither, 3600)
+        playing(story, dither, 2700)  # four and a half of its memories
         expected = pytest.approx(total_m(dither.request), rel=0.01)
         assert story.state.dithering.mean_cost_m == expected
 

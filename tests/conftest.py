@@ -27,6 +27,13 @@ ORDER = ("tests/unit/", "tests/properties/", "tests/physics/", "tests/system/")
 REAL_TIME = ("tests/system/test_demo.py", "tests/system/test_sim_rtc.py")
 """The full instrument at 1 kHz: one after the other, on one worker."""
 
+LASTING = (
+    "tests/system/test_faults.py",
+    "tests/system/test_replay.py",
+    "tests/system/test_worker.py",
+)
+"""Of the long tests those that take longest: begun late they would have three workers wait."""
+
 SHARED = (
     "tests/system/test_broken_messages.py",
     "tests/system/test_page.py",
@@ -42,9 +49,17 @@ def log_of_its_own():
     structlog.reset_defaults()
 
 
+def pytest_ignore_collect(collection_path, config):
+    """Import no file without a long test where only those are asked for, four times over."""
+    if _only_long(config) and collection_path.match("test_*.py"):
+        return "mark.long" not in collection_path.read_text(encoding="utf-8") or None
+    return None
+
+
 def pytest_collection_modifyitems(config, items):
     """Put them in order, and give them the time that they need on this machine."""
-    items.sort(key=lambda item: _place(item.nodeid))
+    place = _place_among_long if _only_long(config) else _place
+    items.sort(key=lambda item: place(item.nodeid))
     for item in items:
         marked = item.get_closest_marker("timeout")
         limit_s = marked.args[0] if marked else float(config.getini("timeout"))
@@ -63,6 +78,16 @@ def pytest_terminal_summary(terminalreporter):
     for report in terminalreporter.getreports("rerun"):
         terminalreporter.write_sep("_", f"first try of {report.nodeid}")
         terminalreporter.line(report.longreprtext)
+
+
+def _only_long(config):
+    return config.option.markexpr.startswith("long")
+
+
+def _place_among_long(nodeid):
+    """What waits first; what computes fills the gaps in the end."""
+    folder, is_other = _place(nodeid)
+    return not nodeid.startswith(REAL_TIME + LASTING), -folder, is_other
 
 
 def _place(nodeid):

@@ -64,6 +64,7 @@ def checked_beside(folder, rtc_words, *options):
     return status, {one["check"]: one for one in told["checks"]}, check.log
 
 
+@pytest.mark.long
 def test_a_healthy_rtc_keeps_the_contract_and_is_told_what_was_moved(tmp_path):
     status, checks, text = checked(tmp_path, "--yes", "--open-loop", "--seconds", "4")
     assert status == 0, text

@@ -35,6 +35,7 @@ def test_they_are_as_short_as_the_page_says():
         }
 
 
+@pytest.mark.long
 def test_the_rtc_is_registered_and_swaps_a_matrix_that_a_subscriber_gets_too(tmp_path, plant):
     with a_night(tmp_path) as night:
         night.service("auto")

@@ -4,7 +4,7 @@ and goes on."""
 import httpx
 import pytest
 
-from tests.system.night import ALPHA, N_START, N_TARGET, a_night, wait_for
+from tests.system.night import N_START, N_TARGET, a_night, wait_for
 from tests.system.pace import slowness
 from tests.system.test_service import check_registration
 
@@ -69,7 +69,7 @@ def accepts_windows_again(night):
 
 def test_damaged_telemetry_costs_windows_and_nothing_else(night, late):
     service = night.service("auto")
-    first = float(late(18.0))
+    first = float(late(14.0))
     rtc = night.rtc(*faults(*(f"{kind}@{first + s:.1f}{rest}" for kind, s, rest in TELEMETRY)))
     night.wait_for_modes(N_TARGET)
     wait_for_fault(rtc, "lost")  # α is as good as it gets, and its matrix in use
@@ -116,10 +116,9 @@ def test_a_dither_that_never_reaches_the_mirror_is_named_and_asked_for_again(nig
     assert "Traceback" not in service.log
 
 
-def test_a_refusal_a_second_rtc_and_a_restart_are_named_and_survived(night, late):
+def test_a_refusal_is_told_with_its_reason_and_the_next_matrix_is_taken(night):
     service = night.service("auto")
-    words = ("refuse@0:1", "dither-late@0:1,10", f"second@{late(28)}:2", f"restart@{late(50)}:1")
-    rtc = night.rtc(*faults(*words))
+    night.rtc(*faults("refuse@0:1", "dither-late@0:1,10"))
     wait_for(lambda: night.ids("rejected"), 40.0, "a rejected reconstructor")
     (rejected,) = [r for r in night.shelf if r["state"] == "rejected"]
     assert rejected["reason"] == "range: refused as a fault asked for"
@@ -127,24 +126,22 @@ def test_a_refusal_a_second_rtc_and_a_restart_are_named_and_survived(night, late
     assert night.n_modes_in_use() == 0
     night.post("/v1/refit", {"n_modes": N_START})
     wait_for(lambda: night.n_modes_in_use() > 0, 20.0, "the next reconstructor")
-    in_use = night.state["in_use"]
+    assert rejected["id"] in {r["id"] for r in night.shelf}
+    assert "Traceback" not in service.log
 
+
+def test_a_second_rtc_is_named_and_survived(night, late):
+    service = night.service("auto")
+    rtc = night.rtc(*faults(f"second@{late(12)}:2"))
+    wait_for(lambda: night.n_modes_in_use() > 0, 40.0, "a reconstructor of its own")
+    in_use = night.state["in_use"]
     wait_for_fault(rtc, "second")
     named(service, "second-rtc", 10.0)
-    alpha = night.state["registration"]["alpha"]
-    assert alpha["shift_x_subap"] == pytest.approx(ALPHA["shift_x_subap"], abs=0.02)
     is_over(night, "second-rtc", 30.0)
-    accepts_windows_again(night)
-    assert in_use in {r["id"] for r in night.shelf}
-
-    session = night.state["rtc"]["session"]
-    wait_for_fault(rtc, "restart")
-    named(service, "rtc-vanished", 10.0)
-    wait_for(lambda: night.rtc_says("session") not in {None, session}, 15.0, "a new session")
-    assert night.state["registration"] is not None
     night.wait_for_modes(N_TARGET)
+    accepts_windows_again(night)
     check_registration(night.state["registration"])
-    assert {rejected["id"], in_use} <= {r["id"] for r in night.shelf}
+    assert in_use in {r["id"] for r in night.shelf}
     assert "Traceback" not in service.log
 
 
@@ -175,7 +172,7 @@ def saturated(night):
 
 def test_an_open_loop_little_stroke_and_a_stall_pass(night, late):
     service = night.service("hold")
-    words = (f"open@{late(9)}:4", f"saturation@{late(15)}:30,2.5", f"stall@{late(21)}:1.5")
+    words = (f"open@{late(8)}:4", f"saturation@{late(14)}:30,2.5", f"stall@{late(19)}:1.5")
     rtc = night.rtc(*faults(*words))
     wait_for(lambda: night.state["windows_accepted"] >= 2, 30.0, "two windows")
     alpha = night.state["registration"]["alpha"]

@@ -7,6 +7,7 @@ import resource
 import signal
 import socket
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
 
 import h5py
 import httpx
@@ -99,10 +100,14 @@ def endless():
 def test_endless_bodies_and_half_open_requests_cost_next_to_nothing(night):
     (process,) = night.processes
     before_mb = resident_mb(process.popen.pid)
-    for _ in range(5):
+
+    def send_without_end(_):
         with contextlib.suppress(httpx.TransportError):  # it may be cut before the answer is read
             answer = night.client.post("/v1/refit", content=endless())
             assert answer.status_code == httpx.codes.REQUEST_ENTITY_TOO_LARGE
+
+    with ThreadPoolExecutor(5) as clients:  # each is listened to for ten seconds
+        list(clients.map(send_without_end, range(5)))
     held = []
     for _ in range(500):
         held.append(socket.create_connection(("127.0.0.1", night.port), timeout=patience(10.0)))

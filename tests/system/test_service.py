@@ -139,6 +139,7 @@ def test_an_rtc_that_is_killed_and_restarted_is_calibrated_again(night):
     check_registration(state["registration"])
 
 
+@pytest.mark.long
 def test_a_service_that_is_killed_and_restarted_picks_up_where_it_was(night):
     service = night.service("auto")
     night.rtc()
@@ -167,6 +168,7 @@ def test_an_rtc_that_was_there_first_is_served(night):
     night.wait_for_modes(N_START)
 
 
+@pytest.mark.long
 def test_a_killed_worker_costs_a_job_but_not_the_service(night):
     service = night.service("auto")
     night.rtc()
@@ -257,6 +259,7 @@ def test_telemetry_that_makes_no_sense_is_counted_and_the_service_goes_on(night)
     assert any(event["name"] == "message.malformed" for event in events)
 
 
+@pytest.mark.long
 def test_a_stranger_on_the_network_cannot_stop_the_telemetry(night):
     night.service("hold")
     night.wait_for_rtc(night.rtc())

@@ -6,7 +6,7 @@ import pytest
 from tests.system.night import ALPHA, a_night, wait_for
 from tests.system.stranger import Stranger, small_telescope
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 
 
 @pytest.fixture

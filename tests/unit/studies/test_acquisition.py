@@ -2,12 +2,15 @@
 
 from pathlib import Path
 
+import pytest
+
 from studies.campaign.acquisition import Start, play
 from studies.campaign.acquisition_table import wrong
 
 SMALL = Path(__file__).parents[2] / "system" / "small.toml"
 
 
+@pytest.mark.long
 def test_a_loop_that_diverges_a_subaperture_off_ends_tracking_where_the_mirror_is():
     start = Start(instrument=str(SMALL), n_controlled=60, seed=0, within_s=40.0)
     assert (abs(start.alpha - [0.0, 0.0, 0.0, 1.0]) > [0.4, 1.0, 4.0, 0.04]).all()

@@ -40,6 +40,7 @@ def test_a_dither_too_strong_is_stopped_within_three_seconds_and_nothing_is_meas
     assert not night.swaps
 
 
+@pytest.mark.long
 def test_gains_that_follow_the_seeing_cost_no_window():
     plain, following = (played(m, 12.0).state for m in (None, Mischief.SEEING_GAINS))
     assert following.windows_accepted == plain.windows_accepted

@@ -248,7 +248,9 @@ def windy_night(seed: int, scatters: tuple[np.ndarray, np.ndarray]) -> np.ndarra
     return np.array(found)
 
 
-@pytest.mark.parametrize("scatters", [(CALM, STRONG), (STRONG, CALM)])
+@pytest.mark.parametrize(
+    "scatters", [(CALM, STRONG), pytest.param((STRONG, CALM), marks=pytest.mark.long)]
+)
 def test_sigma_covers_before_and_after_a_dither_and_when_the_wind_changes(scatters):
     """200 nights at four moments, each one draw: shifts within 1.96 σ in 95 %, chi2/4 of 1.
 

@@ -118,8 +118,10 @@ def in_sigma_of_the_mean(error: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(
     scope="module",
-    params=[(BRIGHT, bright_windows), (FAINT, faint_windows)],
-    ids=["bright", "faint"],
+    params=[
+        pytest.param((BRIGHT, bright_windows), id="bright", marks=pytest.mark.long),
+        pytest.param((FAINT, faint_windows), id="faint"),
+    ],
 )
 def found(request):
     """A case and the estimates of its 48 windows."""

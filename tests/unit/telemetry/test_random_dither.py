@@ -121,7 +121,7 @@ def many(monkeypatch):
 
 
 @pytest.mark.usefixtures("many")
-@pytest.mark.parametrize("modes", [FREE, EVERY])
+@pytest.mark.parametrize("modes", [pytest.param(FREE, marks=pytest.mark.long), EVERY])
 def test_sigma_is_the_scatter_of_closed_loop_windows(modes):
     """24 windows, 4 parameters: chi2/4 within 1 ± 0.35 at 95 %.
 

@@ -90,7 +90,8 @@ def test_interaction_matrix_agrees_with_the_fft_pyramid(basis):
 @pytest.mark.long
 @pytest.mark.parametrize("alpha", list(REGISTRATIONS.values())[:-1], ids=list(REGISTRATIONS)[:-1])
 def test_it_agrees_at_simpler_registrations_too(basis, alpha):
-    assert disagreement(*optics(basis, 2, 2), alpha) <= AGREEMENT
+    """By the other ten."""
+    assert disagreement(*optics(basis, 2, 2), alpha, MODES[::2]) <= AGREEMENT
 
 
 @pytest.mark.slow

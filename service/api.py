@@ -21,6 +21,7 @@ from service.routes import (
     audit,
     commands,
     fits,
+    glance,
     health,
     matrices,
     orders,
@@ -121,6 +122,7 @@ def create_app(
     page.install(app)
     routers = [
         reading.router,
+        glance.router,
         audit.router,
         archive.router,
         stream.router,

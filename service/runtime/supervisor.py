@@ -28,6 +28,7 @@ from service.runtime.recording import Caller, Recorder, ids_of
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
 from service.snapshot import Snapshot
+from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
 from service.tracking import commands as cmd
@@ -82,6 +83,9 @@ class Supervisor:
         self._workers = workers
         self.archive = archive
         """Products and their history; a call waits for the disk."""
+
+        self.newest_frames: FrameBlock | None = None
+        """The last telemetry that came; None: none has."""
 
         self._recorder = Recorder(archive, lambda: self._engine.state, self._post)
         self._actions = actions
@@ -251,6 +255,7 @@ class Supervisor:
         if self._engine.streams is None:
             return
         blocks = tuple(self._bridge.drain())
+        self.newest_frames = blocks[-1] if blocks else self.newest_frames
         for block in blocks:
             self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
         with self._surviving("telemetry"):

@@ -1,0 +1,102 @@
+"""Numbers behind the small figures of the page: singular values, and slopes as maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from fastapi import APIRouter, Response
+from fastapi.concurrency import run_in_threadpool
+from numpy.typing import NDArray
+
+from service.errors import UnknownIdError
+from service.files.drawn import as_maps
+from service.model.instrument import Instrument
+from service.model.interaction import rtc_valid_subapertures
+from service.model.slopes import to_conventions, turned_mask
+from service.routes.numbers import MatrixId
+from service.routes.problems import INVALID, UNKNOWN, problem_response
+from service.routes.views import ServiceDep, answer, shows, view
+from service.telemetry.frames import FrameBlock
+
+router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SingularValues:
+    """How strongly a reconstructor's modes are seen: the weak ones amplify noise."""
+
+    id: str
+    """Of the reconstructor."""
+
+    values: list[float]
+    """One over each singular value of the reconstructor, largest first, slope per metre OPD: those
+    of the interaction matrix it inverts, where none were left out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlopeMaps:
+    """The last slopes that came, over the subapertures.
+
+    Rows from the lowest y on, Sx beside Sy, in conventions' axes; null where none is valid.
+    """
+
+    t_ns_utc: int
+    """Of the first of these frames, the RTC's clock."""
+
+    n_frames: int
+    """About a tenth of a second of them."""
+
+    cm_id: str | None
+    """The reconstructor that multiplied them; null: nobody has told."""
+
+    rms: list[list[float]]
+    """Over these frames, about zero, in the slopes' own unit."""
+
+
+SINGULAR = view("SingularValuesView", SingularValues)
+SLOPES = view("SlopeMapsView", SlopeMaps)
+
+
+@router.get("/reconstructors/{id}/singular-values", responses={200: shows(SINGULAR), **UNKNOWN})
+async def singular_values(service: ServiceDep, matrix_id: MatrixId) -> Response:
+    """Return the singular values that a reconstructor stands for."""
+    matrix = await run_in_threadpool(service.matrix, matrix_id)
+    values = await run_in_threadpool(_inverted, matrix)
+    found = answer(SingularValues(id=matrix_id, values=[float(f"{v:.4g}") for v in values]))
+    found.headers["Cache-Control"] = "private, max-age=86400"  # an id is never reused
+    return found
+
+
+def _inverted(matrix: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return one over each singular value that is not lost in rounding."""
+    numbers = matrix.astype(np.float64)
+    power = np.linalg.eigvalsh(numbers @ numbers.T)
+    return np.asarray(power[power > power[-1] * 1e-13] ** -0.5)
+
+
+@router.get(
+    "/slopes",
+    responses={200: shows(SLOPES), 404: problem_response("No telemetry has come yet")},
+)
+async def slopes(service: ServiceDep) -> Response:
+    """Return the RMS of the last residual slopes as maps."""
+    block = service.newest_frames
+    if block is None:
+        raise UnknownIdError("slopes: no telemetry has come yet")
+    return answer(await run_in_threadpool(_maps, block, service.instrument))
+
+
+def _maps(block: FrameBlock, instrument: Instrument) -> SlopeMaps:
+    valid = rtc_valid_subapertures(instrument)
+    orientation = instrument.slopes.assumed_orientation
+    rms = np.sqrt(np.mean(np.square(block.slopes, dtype=np.float64), axis=0))
+    # a sign has no part in an RMS
+    ours = np.abs(to_conventions(rms, instrument.slopes.order, orientation, valid))
+    maps = np.round(as_maps(ours, turned_mask(valid, orientation)), 4)
+    return SlopeMaps(
+        t_ns_utc=block.t0_ns_utc,
+        n_frames=block.n_frames,
+        cm_id=block.cm_id,
+        rms=maps.tolist(),
+    )

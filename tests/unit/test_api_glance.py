@@ -1,0 +1,67 @@
+"""Singular values and slopes over real HTTP messages, with a hand-written service behind them."""
+
+import httpx
+import numpy as np
+import pytest
+
+from service.api import create_app
+from service.config import packaged_instrument
+from service.control.reconstructor import invert
+from service.errors import UnknownIdError
+from service.model.interaction import rtc_valid_subapertures
+from service.telemetry.frames import FrameBlock
+from tests.unit.test_api_fits import assert_problem
+
+
+class FakeService:
+    """One reconstructor, and the last frames."""
+
+    def __init__(self):
+        self.instrument = packaged_instrument("flao-lbt")
+        self.newest_frames = None
+        self.interaction = np.random.default_rng(3).normal(size=(12, 4)) * [1e7, 5e6, 2e6, 4e5]
+
+    def matrix(self, matrix_id):
+        if matrix_id != "cm-1":
+            raise UnknownIdError(f"reconstructor {matrix_id}: nobody has heard of it")
+        return invert(self.interaction, 4).matrix
+
+
+@pytest.fixture
+def service():
+    return FakeService()
+
+
+@pytest.fixture
+async def client(service):
+    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+        yield client
+
+
+async def test_singular_values_are_those_of_the_matrix_it_inverts(client, service):
+    response = await client.get("/v1/reconstructors/cm-1/singular-values")
+    expected = np.linalg.svd(service.interaction, compute_uv=False)
+    assert response.json()["values"] == pytest.approx(expected, rel=1e-3)
+    assert "max-age" in response.headers["cache-control"], "it never changes"
+    unknown = await client.get("/v1/reconstructors/cm-2/singular-values")
+    assert_problem(unknown, 404, "unknown-id", "cm-2")
+
+
+async def test_slopes_lie_where_their_subapertures_are(client, service):
+    assert_problem(await client.get("/v1/slopes"), 404, "unknown-id", "no telemetry has come yet")
+    valid = rtc_valid_subapertures(service.instrument)
+    half = int(valid.sum())
+    slopes = np.zeros((2, 2 * half), np.float32)
+    slopes[:, 0] = 0.3, -0.4  # the first x slope; its RMS about zero is sqrt((0.09 + 0.16) / 2)
+    service.newest_frames = FrameBlock(
+        session="s", first_seq=1, t0_ns_utc=5, dt_ns=1_000_000, slopes=slopes,
+        commands_m=np.zeros((2, 1), np.float32), dither_m=None, cm_id="cm-1",
+    )  # fmt: skip
+    body = (await client.get("/v1/slopes")).json()
+    maps = np.array(body["rms"], dtype=float)
+    assert (body["n_frames"], body["cm_id"], maps.shape) == (2, "cm-1", (30, 60))
+    assert np.isnan(maps).sum() == 2 * (valid.size - half)
+    row, column = np.argwhere(valid)[0]
+    assert maps[row, column] == pytest.approx(0.3536)
+    assert np.nansum(maps) == pytest.approx(0.3536)

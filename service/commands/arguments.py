@@ -188,7 +188,7 @@ measured.
 def _describe_fit(fit: argparse.ArgumentParser) -> None:
     fit.description, fit.epilog = _FIT, _FIT_EPILOG
     fit.add_argument("instrument", metavar="INSTRUMENT", help="TOML file, or a packaged name")
-    fit.add_argument("reference", metavar="REFERENCE", type=Path, help="HDF5 or FITS file")
+    fit.add_argument("reference", metavar="REFERENCE", type=Path, help="HDF5, FITS or NumPy file")
     fit.add_argument("--dataset", metavar="NAME", help="of the matrix, default interaction_matrix")
     fit.add_argument(
         "--method",

@@ -4,6 +4,7 @@ import { margin, described, usable } from "./orders.js";
 import {
   DASH, TONES, ago, clock, make, milliseconds, nanometres, number, operation, present, put, registrationOf, shortly, span, verdict,
 } from "./words.js";
+import { bar, soFar } from "./work.js";
 
 const $ = (selector) => document.querySelector(selector);
 
@@ -27,6 +28,9 @@ export function showHeader(service, orders) {
   const alarms = $("#alarm-count");
   put(alarms, !fresh ? `alarms ${DASH}` : n ? `■ ${n} alarm${n > 1 ? "s" : ""}` : "○ no alarm");
   alarms.dataset.tone = fresh && n ? "bad" : "";
+  // on the other pages the alarms themselves are out of sight
+  const lines = fresh ? (state?.alarms ?? []).slice(-3).map((a) => `■ ${a.name}: ${a.text}`) : [];
+  listed($("#alarm-lines"), lines);
   document.title = `${fresh && n ? `(${n}) ` : ""}${word} ${state?.system ?? "pyrcal"}`;
 }
 
@@ -62,11 +66,13 @@ export function showWaiting(service, orders) {
   $("#proposal-buttons").hidden = !proposal;
   const lines = others.slice(0, 3).map((w) => `${w.party}: ${w.text}`);
   if (others.length > 3) lines.push(`and ${others.length - 3} more`);
-  const list = $("#waits");
-  if (list.dataset.lines !== lines.join("\n")) {
-    list.dataset.lines = lines.join("\n");
-    list.replaceChildren(...lines.map((text) => make("li", { text })));
-  }
+  listed($("#waits"), lines);
+}
+
+function listed(list, lines) {
+  if ((list.dataset.lines ?? "") === lines.join("\n")) return;
+  list.dataset.lines = lines.join("\n");
+  list.replaceChildren(...lines.map((text) => make("li", { text })));
 }
 
 export function showWork(service, orders) {
@@ -74,7 +80,8 @@ export function showWork(service, orders) {
   $("#work").hidden = !work;
   if (!work) return;
   put($("#work-title"), `◐ ${work.title}`);
-  put($("#work-text"), `${work.text}; for ${span((service.now - milliseconds(work.since)) / 1000)}`);
+  put($("#work-text"), soFar(work, service.now));
+  bar($("#work progress"), work.share, work.title);
   const button = $("#work-end");
   button.dataset.order = work.order;
   put(button, work.button);

@@ -1,10 +1,7 @@
 // The mirror on the sensor: where its actuators should be, and where they are, exaggerated.
 
+import { colour } from "./scheme.js";
 import { PARAMETERS, DASH, put, present } from "./words.js";
-
-const COLOURS = {
-  grid: "#2c333c", rim: "#9aa4af", nominal: "#56606b", now: "#6cb6ff", marked: "#f0c674",
-};
 
 export class MirrorOnSensor {
   #service;
@@ -24,6 +21,7 @@ export class MirrorOnSensor {
     this.canvas.addEventListener("pointerleave", () => this.#mark(-1));
     service.addEventListener("state", () => this.#onState());
     service.addEventListener("lost", () => this.#onState());
+    document.addEventListener("scheme", () => this.#draw());
     new ResizeObserver(() => this.#draw()).observe(this.canvas);
   }
 
@@ -92,7 +90,7 @@ export class MirrorOnSensor {
   }
 
   #cells(ctx, { n_subapertures: n, pupil_diameter_subap: across, obscuration_ratio: hole }) {
-    ctx.strokeStyle = COLOURS.grid;
+    ctx.strokeStyle = colour("line");
     ctx.lineWidth = 0.06;
     ctx.beginPath();
     for (let row = 0; row < n; row++)
@@ -108,9 +106,9 @@ export class MirrorOnSensor {
     const alpha = this.#service.fresh ? this.#service.state?.registration?.alpha : null;
     const moves = stop === "mirror" && alpha;
     const now = moves ? [alpha.shift_x_subap * this.#factor, alpha.shift_y_subap * this.#factor] : [0, 0];
-    for (const [[x, y], colour, width] of [[[0, 0], COLOURS.nominal, 0.06], [now, COLOURS.rim, 0.12]])
+    for (const [[x, y], stroke, width] of [[[0, 0], colour("nominal"), 0.06], [now, colour("quiet"), 0.12]])
       for (const radius of [across / 2, (hole * across) / 2]) {
-        ctx.strokeStyle = colour;
+        ctx.strokeStyle = stroke;
         ctx.lineWidth = width;
         ctx.beginPath();
         ctx.arc(x, y, radius, 0, 2 * Math.PI);
@@ -125,11 +123,11 @@ export class MirrorOnSensor {
   #actuators(ctx) {
     const dot = this.#places.length > 300 ? 0.16 : 0.14 * Math.sqrt(300 / Math.max(this.#places.length, 30));
     this.#places.forEach((place, k) => {
-      ctx.fillStyle = COLOURS.nominal;
+      ctx.fillStyle = colour("nominal");
       disc(ctx, place.from, dot * 0.7);
       if (!place.to) return;
       const now = this.#shown(place);
-      ctx.strokeStyle = ctx.fillStyle = k === this.#marked ? COLOURS.marked : COLOURS.now;
+      ctx.strokeStyle = ctx.fillStyle = k === this.#marked ? colour("warn") : colour("accent");
       ctx.lineWidth = k === this.#marked ? 0.14 : 0.06;
       ctx.beginPath();
       ctx.moveTo(...place.from);

@@ -1,5 +1,6 @@
 // What an operator orders: one click, one dialog that says in numbers what will happen, one answer.
 
+import { busy } from "./work.js";
 import { DASH, MODES, clock, make, milliseconds, nanometres, number, present, put, registrationOf, verdict } from "./words.js";
 
 const NAME = "pyrcal.name"; // who sits here, kept by this browser
@@ -9,6 +10,7 @@ export class Orders {
   #dialog = document.querySelector("#order");
   #order = null;
   #key = ""; // of what one dialog orders, however often it is sent
+  #opening = false;
 
   constructor(service) {
     this.#service = service;
@@ -30,16 +32,12 @@ export class Orders {
 
   // What a rollback goes back to.
   get before() {
-    return this.#service.reconstructors.filter((r) => r.state === "superseded").at(-1) ?? null;
+    return beforeOf(this.#service.reconstructors);
   }
 
-  // What takes long and can be given up, with how far it is; null: nothing of the kind runs.
+  // What takes long and can be ended, with how far it is; null: nothing of the kind runs.
   get work() {
-    const { acquisition, measuring, gathering } = this.state;
-    if (acquisition.under_way)
-      return { title: `Acquisition, ${acquisition.stage}`, text: acquisition.text, since: acquisition.started_ns_utc, order: "abort", button: "Abort" };
-    const one = measuring ?? gathering;
-    return one && { title: `Measuring ${one.id}`, text: one.state, since: one.asked_ns_utc, order: "give-up", button: "Give up" };
+    return busy(this.state, this.#service.now);
   }
 
   // What a proposal wins, by the linear model; null: nobody knows.
@@ -59,18 +57,23 @@ export class Orders {
     return work ? `${work.title.toLowerCase()} is under way: wait for it, or end it` : "";
   }
 
-  open(name, value) {
+  async open(name, value) {
+    if (this.#dialog.open || this.#opening) return;
     const why = this.whyNot(name);
     if (why) {
       this.say(`${TITLES[name] ?? name} cannot be ordered now: ${why}`);
       return;
     }
-    if (this.#dialog.open) return;
-    this.#order = ORDERS[name](this, value);
-    this.#key = newKey();
-    const { title, facts, button, asked } = this.#order;
-    put(this.#dialog.querySelector("h2"), title);
-    this.#dialog.querySelector("ul").replaceChildren(...facts.filter(Boolean).map((text) => make("li", { text })));
+    this.#opening = true;
+    try {
+      await this.#look(name, value);
+    } catch (error) {
+      this.say(`${TITLES[name] ?? name} cannot be ordered now: ${error.message}`);
+      return;
+    } finally {
+      this.#opening = false;
+    }
+    const { button, asked } = this.#order;
     const [reason, by, send] = ["#reason", "#by", "[value=send]"].map((s) => this.#dialog.querySelector(s));
     reason.value = "";
     reason.required = Boolean(asked);
@@ -82,6 +85,32 @@ export class Orders {
     (asked ? reason : send).focus();
   }
 
+  // Say what will happen, from what is there now; what is decided on is read for it, with its tag.
+  async #look(name, value) {
+    const about = DECIDED_ON[name]?.(this);
+    const seen = about && (await this.#service.seen(about));
+    this.#order = { ...ORDERS[name](this, value, seen?.body), name, value, tag: seen?.tag };
+    this.#key = newKey();
+    put(this.#dialog.querySelector("h2"), this.#order.title);
+    const fields = (this.#order.fields ?? []).map(fieldOf);
+    const choices = this.#dialog.querySelector(".choices");
+    choices.replaceChildren(...fields);
+    choices.oninput = () => this.#tell();
+    this.#tell();
+  }
+
+  // What was chosen in this dialog, by name; what was left empty is left out.
+  get #chosen() {
+    const fields = [...this.#dialog.querySelectorAll(".choices :is(input, select)")].filter((f) => f.value !== "");
+    return Object.fromEntries(fields.map((f) => [f.name, f.type === "number" ? Number(f.value) : f.value]));
+  }
+
+  #tell() {
+    const { facts } = this.#order;
+    const lines = typeof facts === "function" ? facts(this.#chosen) : facts;
+    this.#dialog.querySelector("ul").replaceChildren(...lines.filter(Boolean).map((text) => make("li", { text })));
+  }
+
   say(text) {
     put(document.querySelector("#answer"), `${clock(this.#service.now)} UTC, ${text}`);
   }
@@ -90,17 +119,15 @@ export class Orders {
     event.preventDefault();
     const send = this.#dialog.querySelector("[value=send]");
     if (!this.#order || send.disabled) return; // a second click does nothing twice
-    const { title, method, path, body, still } = this.#order;
-    if (still && !still()) {
-      put(this.#dialog.querySelector(".refused"), "Not sent: what is said above is no longer so. Cancel, and look again.");
-      return;
-    }
+    const { title, method, path, body, tag } = this.#order;
+    const chosen = typeof body === "function" ? body(this.#chosen) : { ...body, ...this.#chosen };
     const reason = this.#dialog.querySelector("#reason").value.trim();
     const by = this.#dialog.querySelector("#by").value.trim();
     localStorage.setItem(NAME, by);
     this.#waits(true);
-    const answer = await this.#service.order(method, path, { ...body, reason, by }, this.#key);
+    const answer = await this.#service.order(method, path, { ...chosen, reason, by }, this.#key, tag);
     this.#waits(false);
+    if (answer.stale) return this.#again();
     if (answer.refused) {
       if (!answer.lost) this.#key = newKey(); // it may be sent again, as another order
       put(this.#dialog.querySelector(".refused"), `Refused: ${answer.text}`);
@@ -111,14 +138,42 @@ export class Orders {
     this.say(`${title}: ${answer.text}`);
   }
 
+  // Nothing was done: somebody, or the service, was faster. The dialog says how it is now.
+  async #again() {
+    const { name, value, title } = this.#order;
+    let why = this.whyNot(name);
+    if (!why) await this.#look(name, value).catch((error) => (why = error.message));
+    const text = why ? `nothing to decide any more: ${why}. Cancel.` : "above is how it is now: look again, then send or cancel.";
+    put(this.#dialog.querySelector(".refused"), `The state has changed since you looked, and nothing was done; ${text}`);
+    this.#dialog.querySelector("[value=send]").disabled = Boolean(why);
+    this.say(`${title}: nothing was done, the state had changed`);
+  }
+
   #waits(waits) {
     this.#dialog.querySelector("[value=send]").disabled = waits;
     put(this.#dialog.querySelector(".asked"), waits ? "◐ ordered, waiting for what comes of it" : "");
   }
 }
 
+// One field of a dialog: a choice of some, or a number.
+function fieldOf({ name, label, options, value = "", ...rest }) {
+  const input = options
+    ? make("select", { name }, ...Object.entries(options).map(([key, text]) => make("option", { value: key, text })))
+    : make("input", { name, type: "number", autocomplete: "off", ...rest });
+  input.value = value;
+  return make("label", { text: label }, input);
+}
+
 function newKey() {
   return `${Date.now()}-${Math.random().toString(36).slice(2)}`;
+}
+
+function needs(so, otherwise) {
+  if (!so) throw new Error(otherwise);
+}
+
+function beforeOf(reconstructors) {
+  return reconstructors.filter((r) => r.state === "superseded").at(-1) ?? null;
 }
 
 export function described(record, wins = null) {
@@ -127,7 +182,14 @@ export function described(record, wins = null) {
 }
 
 // What needs the mirror or the loop, and an RTC.
-const BUSY = new Set(["approve", "rollback", "dither-start", "acquire"]);
+const BUSY = new Set(["approve", "rollback", "dither-start", "acquire", "measure", "noisy"]);
+
+// What of REST an order decides about: it is sent with the tag of what was seen of that.
+const DECIDED_ON = {
+  approve: (orders) => `v1/reconstructors/${encodeURIComponent(orders.proposal.id)}`,
+  reject: (orders) => `v1/reconstructors/${encodeURIComponent(orders.proposal.id)}`,
+  rollback: () => "v1/reconstructors",
+};
 
 // What else an order needs: why it cannot be given.
 const NEEDS = {
@@ -144,6 +206,8 @@ const NEEDS = {
   hold: (orders, state) => (state.mode === "hold" ? "mode is hold already" : ""),
   abort: (orders, state) => (state.acquisition.under_way ? "" : "no acquisition is under way"),
   "give-up": (orders, state) => (state.measuring ?? state.gathering ? "" : "nothing is being measured"),
+  "open-loop": (orders) => (orders.work?.order === "open-loop" ? "" : "no gain ramp is under way"),
+  measure: (orders, state) => (state.dither ? `${state.dither.id} is running: stop the dither first` : ""),
   stop: (orders, state) => (state.stopped_because ? `everything is stopped already: ${state.stopped_because}` : ""),
   resume: (orders, state) => (state.stopped_because ? "" : "nothing is stopped"),
   "dither-start": (orders, state) => (state.dither ? `${state.dither.id} is running: stop it first` : ""),
@@ -152,7 +216,7 @@ const NEEDS = {
 const TITLES = {
   approve: "Approve", reject: "Reject", rollback: "Roll back", hold: "Hold", mode: "Mode", acquire: "Acquire",
   abort: "Abort the acquisition", "give-up": "Give up", "dither-start": "Start the dither", "dither-stop": "Stop the dither",
-  stop: "Stop everything", resume: "Release",
+  stop: "Stop everything", resume: "Release", measure: "Measure", noisy: "Noisy matrix", "open-loop": "End the gain ramp",
 };
 
 const ORDERS = {
@@ -183,8 +247,9 @@ const ORDERS = {
       path: "v1/resume",
     };
   },
-  approve(orders) {
-    const [record, inUse] = [orders.proposal, orders.inUse];
+  approve(orders, _, record) {
+    const { inUse } = orders;
+    needs(record.state === "proposed", `${record.id} is ${record.state}`);
     return {
       title: `Approve ${record.id}`,
       facts: [
@@ -200,8 +265,8 @@ const ORDERS = {
       path: `v1/reconstructors/${encodeURIComponent(record.id)}/approve`,
     };
   },
-  reject(orders) {
-    const record = orders.proposal;
+  reject(orders, _, record) {
+    needs(record.state === "proposed", `${record.id} is ${record.state}`);
     return {
       title: `Reject ${record.id}`,
       facts: [
@@ -214,8 +279,10 @@ const ORDERS = {
       path: `v1/reconstructors/${encodeURIComponent(record.id)}/reject`,
     };
   },
-  rollback(orders) {
-    const { before, inUse, state } = orders;
+  rollback(orders, _, { reconstructors, in_use: used }) {
+    const [before, inUse] = [beforeOf(reconstructors), reconstructors.find((r) => r.id === used)];
+    const { state } = orders;
+    needs(before, "no earlier reconstructor has been in use");
     return {
       title: `Roll back to ${before.id}`,
       facts: [
@@ -226,7 +293,6 @@ const ORDERS = {
       ],
       button: "Roll back",
       asked: true,
-      still: () => orders.before?.id === before.id && orders.state.in_use === inUse?.id,
       method: "POST",
       path: "v1/rollback",
     };
@@ -321,6 +387,70 @@ const ORDERS = {
       path: `v1/${measuring ? "measurements" : "noisy-matrix"}/${encodeURIComponent(one.id)}`,
     };
   },
+  "open-loop"(orders) {
+    return {
+      title: "End the gain ramp",
+      facts: [
+        `${orders.work.text}: the RTC ends it only when its loop is opened.`,
+        "The loop is opened: the image is lost until it is closed again. Gains stay as the ramp has left them.",
+      ],
+      button: "Open the loop",
+      asked: true,
+      method: "POST",
+      path: "v1/loop",
+      body: { loop: "open" },
+    };
+  },
+  measure(orders) {
+    const { rtc } = orders.state;
+    return {
+      title: "Measure an interaction matrix",
+      fields: [
+        { name: "pattern", label: "How", options: PATTERNS, value: "push-pull-modal" },
+        { name: "modes", label: "Modes, the first", min: 1, max: rtc.n_modes, placeholder: `the ${rtc.n_controlled} controlled` },
+        { name: "n_average", label: "Repetitions", min: 1, max: 10_000, placeholder: "the service chooses" },
+      ],
+      facts: ({ pattern, modes }) => [
+        pattern === "sine"
+          ? "The loop stays as it is; each mode moves at its own frequency, all at once, for about 10 s."
+          : `The loop, now ${rtc.loop}, is opened: the image is lost until the RTC has measured, seconds to minutes, and closes it again.`,
+        `What moves: ${modes ?? (pattern === "sine" ? "up to 40" : rtc.n_controlled)} modes, by some nanometres RMS each.`,
+        "No dither and no new reconstructor meanwhile. What is in use stays; nothing measured is ever sent to the RTC.",
+      ],
+      button: "Measure",
+      asked: true,
+      method: "POST",
+      path: "v1/measurements",
+      body: ({ modes, n_average: n, pattern }) => ({
+        pattern,
+        ...(modes && { modes: [...Array(modes).keys()] }),
+        ...(n && pattern !== "sine" && { n_average: n }),
+      }),
+    };
+  },
+  noisy(orders) {
+    const { rtc, dithering } = orders.state;
+    return {
+      title: "Measure a noisy interaction matrix",
+      fields: [{ name: "duration_s", label: "Seconds", min: 1, max: 3600, step: "any", value: 30 }],
+      facts: ({ duration_s: seconds }) => [
+        `The loop stays closed: random signs on its ${rtc.n_controlled} modes at once for ${number(seconds, 0)} s of telemetry.`,
+        `What moves: at most ${nanometres(Math.min(5e-9, dithering.budget_m))} RMS of all modes together; the service's own dither makes way.`,
+        "Its windows are fitted like any other; it can never become a reconstructor.",
+      ],
+      button: "Begin",
+      method: "POST",
+      path: "v1/noisy-matrix",
+    };
+  },
+};
+
+const PATTERNS = {
+  "push-pull-modal": "push-pull, mode by mode (loop open)",
+  "push-pull-zonal": "push-pull, actuator by actuator (loop open)",
+  hadamard: "Hadamard, all modes at once (loop open)",
+  "system-modes": "push-pull of the loop's own modes (loop open)",
+  sine: "sines, all modes at once (loop as it is)",
 };
 
 // A button that can be used, or says why not.

@@ -5,6 +5,7 @@ import { Events } from "./events.js";
 import { MirrorOnSensor } from "./mirror.js";
 import { Orders } from "./orders.js";
 import { Registration } from "./registration.js";
+import { choose, scheme } from "./scheme.js";
 import { Service } from "./stream.js";
 
 const service = new Service();
@@ -13,6 +14,47 @@ const registration = new Registration(service, document.querySelector("#registra
 const mirror = new MirrorOnSensor(service, document.querySelector("#mirror"));
 new Events(service, document.querySelector("#events"));
 const help = document.querySelector("#help");
+const $ = (selector) => document.querySelector(selector);
+
+// The other pages are fetched when they are looked at first.
+const PAGES = {
+  measurements: async (root) => new (await import("./measurements.js")).Measurements(service, root),
+  history: async (root) => new (await import("./history.js")).History(service, root),
+};
+const pages = {};
+
+async function fetched(name) {
+  const answer = await fetch(`dashboard/${name}.html`);
+  if (!answer.ok) throw new Error(`${name}: ${answer.status}`);
+  const { body } = new DOMParser().parseFromString(await answer.text(), "text/html");
+  const root = $(`#${name}`);
+  root.replaceChildren(...body.children);
+  return PAGES[name](root);
+}
+
+async function turnTo() {
+  const name = location.hash.slice(1) in PAGES ? location.hash.slice(1) : "operate";
+  for (const main of document.querySelectorAll("main")) main.hidden = main.id !== name;
+  for (const link of document.querySelectorAll("nav a")) {
+    if (link.hash === `#${name}`) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  document.body.dataset.page = name;
+  if (!PAGES[name]) return;
+  try {
+    pages[name] ??= fetched(name);
+    await (await pages[name]).look();
+  } catch {
+    delete pages[name];
+    orders.say(`the page ${name} cannot be fetched: the service does not answer; try again`);
+  }
+}
+
+function showScheme() {
+  const day = scheme() === "day";
+  $("#scheme").textContent = day ? "☾" : "☀";
+  $("#scheme").title = day ? "night: light on dark" : "day: dark on light";
+}
 
 function show() {
   showConnection(service);
@@ -35,8 +77,13 @@ service.addEventListener("reset", async () => {
   }
 });
 
-for (const button of document.querySelectorAll("[data-order], #work-end"))
-  button.addEventListener("click", () => orders.open(button.dataset.order));
+document.addEventListener("click", ({ target }) => {
+  const button = target.closest("[data-order], [data-help]");
+  if (button?.dataset.order) orders.open(button.dataset.order);
+  if (!button?.dataset.help) return;
+  help.showModal(); // where it speaks of what the button stands by
+  document.getElementById(button.dataset.help)?.scrollIntoView();
+});
 document.querySelector("#mode").addEventListener("change", (event) => {
   const { value } = event.target;
   event.target.value = service.state?.mode ?? value;
@@ -44,21 +91,23 @@ document.querySelector("#mode").addEventListener("change", (event) => {
   orders.open("mode", value);
 });
 
-// What a card shows: its "?" opens the help where it speaks of it.
-for (const button of document.querySelectorAll("[data-help]"))
-  button.addEventListener("click", () => {
-    help.showModal();
-    document.getElementById(button.dataset.help)?.scrollIntoView();
-  });
 help.querySelector("button").addEventListener("click", () => help.close());
+
+function chooseRange(range) {
+  location.hash = "operate";
+  registration.choose(range);
+}
 
 const KEYS = {
   a: () => orders.open("approve"),
   r: () => orders.open("rollback"),
   h: () => orders.open("hold"),
-  1: () => registration.choose(1),
-  2: () => registration.choose(2),
-  3: () => registration.choose(3),
+  1: () => chooseRange(1),
+  2: () => chooseRange(2),
+  3: () => chooseRange(3),
+  m: () => (location.hash = "measurements"),
+  o: () => (location.hash = "operate"),
+  y: () => (location.hash = "history"),
   "?": () => help.showModal(),
 };
 
@@ -71,5 +120,18 @@ document.addEventListener("keydown", (event) => {
   act();
 });
 
+// What is only glanced at comes after what is looked for.
+service.addEventListener("reconstructors", async () => new (await import("./glance.js")).Glance(service, orders, $("#glance")), { once: true });
+
+window.addEventListener("hashchange", () => {
+  turnTo();
+  const place = document.getElementById(location.hash.slice(1));
+  if (place?.tagName === "MAIN") place.focus(); // who cannot see is where the page begins
+});
+$("#scheme").addEventListener("click", () => choose(scheme() === "day" ? "night" : "day"));
+document.addEventListener("scheme", showScheme);
+
+choose();
+turnTo();
 service.start();
 show();

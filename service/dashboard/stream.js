@@ -49,26 +49,36 @@ export class Service extends EventTarget {
     };
   }
 
-  async get(path) {
-    const answer = await fetch(path, { cache: "no-store" });
+  async get(path, cache = "no-store") {
+    return (await this.seen(path, cache)).body;
+  }
+
+  // What is there, with the ETag of just this: an order decided on it is refused once it has changed.
+  async seen(path, cache = "no-store") {
+    const answer = await fetch(path, { cache });
     if (!answer.ok) throw new Error(`${path}: ${answer.status}`);
-    return answer.json();
+    return { body: await answer.json(), tag: answer.headers.get("ETag") };
   }
 
   // Give an order; what is answered is text, and whether it was refused. One key is one order, however often it is sent.
-  async order(method, path, body, key) {
+  // With the tag of what it was decided on it is carried out only while that is so.
+  async order(method, path, body, key, tag = null) {
     let answer;
     try {
       answer = await fetch(path, {
         method,
-        headers: { "Content-Type": "application/json", "Idempotency-Key": key },
-        body: JSON.stringify(body),
+        headers: {
+          "Content-Type": "application/json",
+          "Idempotency-Key": key,
+          ...(tag && { "If-Match": tag, Prefer: "handling=strict" }),
+        },
+        body: body && JSON.stringify(body),
       });
     } catch {
       return { refused: true, lost: true, text: "the service does not answer: nothing is known of what became of it" };
     }
     const told = await answer.json().catch(() => ({}));
-    return { refused: !answer.ok, text: told.detail ?? told.text ?? `${answer.status} ${answer.statusText}` };
+    return { refused: !answer.ok, stale: answer.status === 412, told, text: told.detail ?? told.text ?? `${answer.status} ${answer.statusText}` };
   }
 
   get #patience() {

@@ -285,5 +285,6 @@ class UploadFitter:
             said = str(error).replace(f"{unpacked}/", "").replace(f"{folder}/", "")
             raise MatrixError(said) from error
         tell(STAGES[-1])
-        (folder / FIGURES).write_text(json.dumps(numbers(report.fit)), encoding="utf-8")
+        drawn = {"own_instrument": instrument is self.own, **numbers(report.fit)}
+        (folder / FIGURES).write_text(json.dumps(drawn), encoding="utf-8")
         return document(report)

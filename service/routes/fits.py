@@ -255,6 +255,9 @@ class FitFigures(BaseModel):
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
+    own_instrument: bool
+    """Whether it is a fit of the service's own instrument, whose α it may be held against."""
+
     modes: list[int]
     """Basis indices of the modes used; ``gains`` of the fit are of these."""
 

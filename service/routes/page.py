@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from fastapi import APIRouter, FastAPI, Response
 from fastapi.responses import FileResponse
 from numpy.typing import NDArray
 from starlette.datastructures import MutableHeaders
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -61,8 +63,36 @@ def install(app: FastAPI) -> None:
     async def manual() -> Response:
         return FileResponse(MANUAL / "index.html", headers=MANUAL_HEADERS)
 
+    app.add_middleware(Packed)
     app.mount("/dashboard", _with_headers(StaticFiles(directory=FILES), HEADERS))
     app.mount("/docs/files", _with_headers(StaticFiles(directory=MANUAL), MANUAL_HEADERS))
+
+
+class Packed:
+    """Compresses what the page is made of, and the long lists it reads.
+
+    Not what is compressed already or cannot be, as noise in a matrix, nor a stream.
+
+    Parameters
+    ----------
+    app
+        The application.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self._packing = GZipMiddleware(app, minimum_size=1000, compresslevel=4)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        packs = scope["type"] == "http" and _PACKED.fullmatch(scope["path"])
+        await (self._packing if packs else self._app)(scope, receive, send)
+
+
+_PACKED: Final = re.compile(
+    r"/|/dashboard/.*|/v1/(alpha/history|marks|gains|slopes|mirror|events|reconstructors)"
+    r"|/v1/fits/[^/]*/figures"
+)
 
 
 def _with_headers(app: ASGIApp, headers: Mapping[str, str]) -> ASGIApp:

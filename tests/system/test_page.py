@@ -14,7 +14,8 @@ webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not in
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DRIVER = shutil.which("chromedriver")
-AXE = Path(__file__).parents[1] / "data" / "axe" / "axe.min.js"
+DATA = Path(__file__).parents[1] / "data"
+AXE, TINY = DATA / "axe" / "axe.min.js", DATA / "tiny"
 WIDE, NARROW = (1440, 900), (390, 844)
 FIRST_LOAD_BYTES = 300_000
 
@@ -202,6 +203,50 @@ def test_by_keys_alone_the_service_goes_back_and_holds(page):
     for key in "21":
         page.press(key)
         assert page.js(f"document.querySelector('[data-range=\"{key}\"]').ariaPressed") == "true"
+
+
+def test_what_was_decided_on_a_state_that_has_changed_is_not_done(page):
+    page.open()
+    page.until("document.querySelector('[data-order=rollback]').ariaDisabled === 'false'", 20.0)
+    page.press("r")
+    page.says("#order", "goes out again")
+    body = {"reason": "somebody was faster", "by": "another operator"}
+    page.night.client.post("/v1/rollback", json=body).raise_for_status()
+    theirs = page.night.state["in_use"]
+    page.press("too late\n")
+    page.says("#order .refused", "The state has changed since you looked, and nothing was done")
+    page.says("#order", f"in place of {theirs}")
+    assert page.night.state["in_use"] == theirs
+    page.click("#order [value=cancel]")
+
+
+def test_a_file_is_fitted_and_what_was_found_is_drawn(page):
+    page.open()
+    page.press("m")
+    page.until("document.querySelector('#fit form')")
+    for name in ("matrix", "instrument"):
+        path = TINY / {"matrix": "tiny.h5", "instrument": "tiny.toml"}[name]
+        page.driver.find_element("css selector", f"[name={name}]").send_keys(str(path))
+    page.click("#fit [type=submit]")
+    page.says("#found .verdict", "accepted", 60.0)
+    page.says("#found", "rotation")
+    page.until("document.querySelectorAll('#found .maps canvas').length >= 3")
+    assert page.js("document.querySelector('.left canvas').width") == 24
+    assert page.faults_of_access() == []
+    page.resize(NARROW)
+    assert page.js("document.documentElement.scrollWidth") <= NARROW[0]
+
+
+def test_this_night_is_seen_with_what_was_in_use_and_who_ordered_what(page):
+    page.open()
+    page.press("y")
+    page.until("document.querySelector('#nights')")
+    page.says("#nights .read", "swaps", 20.0)
+    page.says("#lives", page.night.state["in_use"])
+    page.says("#trail", "the image was better before")
+    page.says("#trail", "another operator")
+    assert page.js("document.querySelectorAll('#past .plot canvas').length") == 4
+    assert page.faults_of_access() == []
 
 
 def test_a_change_is_seen_within_a_second(page):

@@ -206,7 +206,7 @@ async def test_a_fit_that_could_not_be_made_is_a_problem(client, desk):
 
 async def test_figures_are_there_when_the_fit_is(client, desk):
     assert_problem(await client.get("/v1/fits/fit-1/figures"), 404, "unknown-id", "waiting")
-    drawn = json.dumps(numbers(a_fit())).encode()
+    drawn = json.dumps({"own_instrument": True, **numbers(a_fit())}).encode()
     desk.known["fit-1"] = replace(JOB, state=FitState.DONE, figures=drawn)
     response = await client.get("/v1/fits/fit-1/figures")
     assert response.content == drawn

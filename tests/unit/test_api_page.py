@@ -85,6 +85,17 @@ async def test_a_file_says_what_it_is_and_is_sent_once(client, name, kind):
     assert (await client.get(f"/dashboard/{name}", headers=headers)).status_code == 304
 
 
+async def test_what_a_page_reads_is_packed_and_what_streams_or_is_noise_is_not(client):
+    for path in ("/", "/dashboard/page.js", "/v1/mirror"):
+        answer = await client.get(path)
+        assert answer.headers["content-encoding"] == "gzip", path
+        assert answer.headers["vary"] == "Accept-Encoding"
+        plain = await client.get(path, headers={"Accept-Encoding": "identity"})
+        assert "content-encoding" not in plain.headers
+        assert plain.content == answer.content
+    assert "content-encoding" not in (await client.get("/v1/state")).headers
+
+
 @pytest.mark.parametrize("name", ["nothing.js", "../api.py", "%2e%2e/api.py", ""])
 async def test_nothing_but_its_files_is_served(client, name):
     assert_problem(await client.get(f"/dashboard/{name}"), 404, "http")
@@ -93,14 +104,22 @@ async def test_nothing_but_its_files_is_served(client, name):
 async def test_every_module_that_is_imported_is_there_and_nobody_names_another_host():
     for path in FILES.glob("*.js"):
         text = path.read_text(encoding="utf-8")
-        for name in re.findall(r'from "\./([^"]+)"', text):
+        for name in re.findall(r'(?:from |import\()"\./([^"]+)"', text):
             assert (FILES / name).exists(), (path.name, name)
         if path.name != "uPlot.iife.min.js":
             assert not re.search(r"https?://|innerHTML|eval\(", text), path.name
 
 
-def test_all_of_it_together_is_small():
-    assert sum(path.stat().st_size for path in FILES.iterdir()) < LIMIT_BYTES / 2
+def test_what_is_loaded_first_is_small_and_of_the_other_pages_there_is_nothing():
+    page = (FILES / "index.html").read_text(encoding="utf-8")
+    found = set(re.findall(r'"dashboard/([^"]+)"', page)) | {"index.html"}
+    for _ in FILES.iterdir():
+        for name in [name for name in found if name.endswith(".js")]:
+            text = (FILES / name).read_text(encoding="utf-8")
+            found |= set(re.findall(r'from "\./([^"]+)"', text))
+    assert "stream.js" in found
+    assert not {"measurements.js", "history.js"} & found
+    assert sum((FILES / name).stat().st_size for name in found) < LIMIT_BYTES / 2
 
 
 # --- the mirror

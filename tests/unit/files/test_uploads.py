@@ -1,4 +1,5 @@
 import io
+import json
 import pickle
 import zipfile
 from dataclasses import replace
@@ -9,7 +10,15 @@ import pytest
 
 from service.config import load_instrument, packaged_instrument
 from service.errors import ConfigurationError, MatrixError
-from service.files.uploads import MOST_FILES, UPLOAD, FitAsked, UploadFitter, opened_parcel
+from service.files.uploads import (
+    FIGURES,
+    MOST_FILES,
+    STAGE,
+    UPLOAD,
+    FitAsked,
+    UploadFitter,
+    opened_parcel,
+)
 from service.fit.matrix import FitOptions
 from tests.data.tiny.make import ALPHA, HERE
 from tests.numerics import small_instrument
@@ -179,12 +188,17 @@ def test_a_matrix_alone_belongs_to_the_services_own_instrument(tmp_path):
     found = fitter(own)(uploaded(tmp_path, HERE / "tiny.h5"), ASKED)
     assert found["n_modes_used"] == 15
     assert abs(found["rotation_deg"] - ALPHA["rotation_deg"]) < 0.2
+    drawn = json.loads((tmp_path / FIGURES).read_text())
+    assert drawn["own_instrument"]
+    assert drawn["modes"] == list(range(15))
+    assert (tmp_path / STAGE).read_text() == "figures"
 
 
 def test_an_instrument_may_come_with_the_matrix(tmp_path):
     folder = uploaded(tmp_path, HERE / "tiny.toml", HERE / "tiny.h5")
     found = fitter(small_instrument())(folder, ASKED)
     assert abs(found["rotation_deg"] - ALPHA["rotation_deg"]) < 0.2
+    assert not json.loads((folder / FIGURES).read_text())["own_instrument"]
 
 
 def test_a_packaged_instrument_may_be_named(tmp_path):

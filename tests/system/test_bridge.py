@@ -174,7 +174,6 @@ def test_frames_arrive_in_order_with_their_own_values_and_times(bridge, rtc):
     assert statistics.frame_age_s < 5.0
 
 
-@pytest.mark.long
 def test_a_flao_loop_at_1_khz_loses_nothing_and_is_read_within_a_millisecond(endpoint, capsys):
     with (
         Bridge(endpoint) as bridge,

@@ -17,6 +17,12 @@ DONE = 0
 DATA_DIR = "var"
 """The settings' own default; reading all of them would take three times as long."""
 
+_WITHOUT = {
+    False: "on loopback none is needed: pyrcal key add NAME makes one",
+    True: "nobody may ask: pyrcal key add makes one, without the file loopback needs none",
+}
+"""What that means, by whether there is a file."""
+
 
 def main(options: argparse.Namespace) -> int:
     """Do what is asked with the file of keys; return the exit status.
@@ -40,7 +46,7 @@ def main(options: argparse.Namespace) -> int:
             made = datetime.fromtimestamp(key.created_ns_utc / 1e9, UTC)
             print(f"{key.name:24} {key.scope:8} made {made:%Y-%m-%dT%H:%M:%SZ}")
         if not keys:
-            say(f"{file.path}: no keys: on loopback none is needed; pyrcal key add NAME makes one")
+            say(f"{file.path}: no keys; {_WITHOUT[file.path.exists()]}")
     return DONE
 
 

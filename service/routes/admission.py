@@ -234,8 +234,8 @@ class Admission:
     """Lets requests through to the application that may be made, each with its whole body.
 
     ``request.user`` is then the key it was made with; None: there are no keys, or none is needed.
-    As soon as there is a key, one is needed from everywhere: what comes from loopback may be a
-    proxy's, or anybody's who has an account here.
+    As soon as there has been a key, one is needed from everywhere: what comes from loopback may be
+    a proxy's, or anybody's who has an account here; and to revoke the last one opens no door.
 
     Parameters
     ----------
@@ -262,6 +262,7 @@ class Admission:
         self._failures = Failures()
         self._refusals = Refusals(audit)
         self._routes: tuple[RouteContext, ...] = ()
+        self._trouble = ""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request that may not be made; hand on every other."""
@@ -270,16 +271,16 @@ class Admission:
         return await to_its_end(self._admit, scope, receive, send)
 
     async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
-        request = Request(scope)
+        request, scope["user"] = Request(scope), None
         refusal = self._stranger(request)
-        if refusal is None:
-            key, refusal = self._known(request)
-            scope["user"] = key
+        if refusal is None and (needed := self._scope_of(request)) is not None:
+            scope["user"], refusal = self._known(request, needed)
+            send = self._while_valid(scope["user"], send)
         if refusal is not None:
             self._refusals.tell(request, refusal)
             told = (refusal.status, refusal.kind, refusal.detail, refusal.headers)
             return await problem(request, *told)(scope, receive, send)
-        return await bounded(self._app, scope, receive, self._while_valid(scope["user"], send))
+        return await bounded(self._app, scope, receive, send)
 
     def _stranger(self, request: Request) -> Refusal | None:
         """Return why a request is not for this service, or not of its own page; None: it is."""
@@ -298,18 +299,17 @@ class Admission:
             return Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail)
         return None
 
-    def _known(self, request: Request) -> tuple[Key | None, Refusal | None]:
+    def _known(self, request: Request, needed: KeyScope) -> tuple[Key | None, Refusal | None]:
         """Return the key a request is made with, and why it may not be made."""
-        needed = self._scope_of(request)
-        if needed is None or self._keys is None:
-            return None, None
         secret, by_cookie = shown_key(request)
         try:
-            if self._hosts.local and not self._keys.all():
+            if self._keys is None or self._holds(None):
                 return None, None
             key = None if secret is None else self._keys.key_of(secret)
         except ConfigurationError as error:
-            structlog.get_logger().error("api.keys", text=str(error))
+            if self._trouble != str(error):  # once, not with each request
+                self._trouble = str(error)
+                structlog.get_logger().error("api.keys", text=self._trouble)
             detail = "the file of the API keys cannot be read; the service's log says more"
             later = {"Retry-After": str(RETRY_S)}
             return None, Refusal(HTTPStatus.SERVICE_UNAVAILABLE, "keys", detail, later)
@@ -350,27 +350,36 @@ class Admission:
         return KeyScope.READ if request.method in _READS else KeyScope.OPERATE
 
     def _while_valid(self, key: Key | None, send: Send) -> Send:
-        """Return what ends an answer that comes bit by bit when its key is revoked."""
-        if key is None:
-            return send
+        """Return what ends an answer that comes bit by bit when its key is good no longer."""
         ended = False
 
         async def sent(message: Message) -> None:
             nonlocal ended
             if ended:
                 return
-            if message.get("more_body", False) and not self._holds(key):
-                ended = True
-                message = {"type": "http.response.body", "body": b"", "more_body": False}
+            if message.get("more_body", False):
+                try:
+                    ended = not self._holds(key)
+                except ConfigurationError:
+                    ended = True
+                if ended:
+                    message = {"type": "http.response.body", "body": b"", "more_body": False}
             await send(message)
 
         return sent
 
-    def _holds(self, key: Key) -> bool:
-        try:
-            return self._keys is None or key in self._keys.all()
-        except ConfigurationError:
-            return False
+    def _holds(self, key: Key | None) -> bool:
+        """Return whether a key is good at this moment; None: whether none is needed.
+
+        Raises
+        ------
+        ConfigurationError
+            If nobody can tell.
+        """
+        keys = () if self._keys is None else self._keys.all()
+        if key is None:
+            return self._keys is None or (self._hosts.local and not self._keys.path.exists())
+        return key in keys
 
 
 def shown_key(request: Request) -> tuple[str | None, bool]:

@@ -158,6 +158,8 @@ def bodies(by_operation: Mapping[str, Body]) -> tuple[dict[str, Schema], dict[st
     schemas: dict[str, Schema] = document.get("$defs", {})
     for name, schema in schemas.items():
         texts = explained(vars(commands)[name]) if "properties" in schema else {}
+        if "action" in schema.get("properties", ()):  # what tells alternatives apart
+            schema["required"] = [*schema.get("required", ()), "action"]
         for field, text in texts.items():
             if field in schema["properties"]:
                 schema["properties"][field]["description"] = text

@@ -155,6 +155,8 @@ def _line(error: Mapping[str, Any]) -> str:
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
         return f"{where}: unknown"
+    if error["type"] == "union_tag_not_found":
+        return f"{where}.{error['ctx']['discriminator'].strip(chr(39))}: missing"
     if error["type"] == "missing":
         return f"{where}: missing"
     if error["type"] == "json_invalid":

@@ -610,7 +610,7 @@ async def test_a_command_is_handed_on_and_answered_202(
         ("POST", "/v1/refit", {"n_modes": 5.5}, ["body.n_modes: found 5.5"]),
         ("POST", "/v1/refit", [1], ["body: found [1]"]),
         ("POST", "/v1/dither", None, ["body: missing"]),
-        ("POST", "/v1/dither", {}, ["body: found {}", "action"]),
+        ("POST", "/v1/dither", {}, ["body.action: missing"]),
         ("POST", "/v1/dither", {"action": "pause"}, ["'start', 'stop'"]),
         ("POST", "/v1/dither", {"action": "stop", "modes": [1]}, ["modes: unknown"]),
         ("POST", "/v1/dither", {"action": "start", "modes": [-1]}, ["modes.0: found -1"]),

@@ -373,6 +373,15 @@ async def test_who_has_a_key_is_for_admins_to_see_and_one_can_be_revoked_at_once
     assert_problem(again, 404, "unknown-id", "no such key")
 
 
+async def test_to_revoke_the_last_key_opens_no_door(client, service, keys, secrets):
+    """What schemathesis has found: it revoked its own key, and was let in from then on."""
+    for key in keys.all():
+        keys.revoke(key.name)
+    assert_problem(await client.post("/v1/rollback"), 401, "no-key")
+    keys.path.unlink()
+    assert (await client.post("/v1/rollback")).status_code == 202
+
+
 async def test_a_stream_ends_when_its_key_is_revoked(service, keys, secrets, monkeypatch):
     monkeypatch.setattr(stream, "HEARTBEAT_S", 0.5)
     async with serving(service, keys) as port:
@@ -385,6 +394,17 @@ async def test_a_stream_ends_when_its_key_is_revoked(service, keys, secrets, mon
         keys.revoke("reader")
         rest = await asyncio.wait_for(reader.readuntil(b"\r\n0\r\n\r\n"), 5.0)
         assert rest.count(b"event: state") <= 2
+        writer.close()
+
+
+async def test_a_stream_that_needed_no_key_ends_when_there_is_one(service, keys, monkeypatch):
+    monkeypatch.setattr(stream, "HEARTBEAT_S", 0.5)
+    async with serving(service, keys) as port:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        await asyncio.wait_for(reader.readuntil(b"event: state"), 5.0)
+        keys.add("ada", KeyScope.READ)
+        await asyncio.wait_for(reader.readuntil(b"\r\n0\r\n\r\n"), 5.0)
         writer.close()
 
 

@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
+from service.tracking.alarms import ALARMS, Kind, Note, Severity
+from service.tracking.attention import muted, note_of, stale, worst
 from service.tracking.commands import GainGroup
-from service.tracking.registration import Registration
+from service.tracking.operation import Operating, operating
+from service.tracking.registration import ModeGain, Registration
 from service.tracking.state import TrackerState, Waiting
 from service.wire import Status
 
@@ -80,6 +83,33 @@ class Snapshot:
         return (self.now_ns - self.started_ns) / 1e9
 
     @property
+    def operating(self) -> Operating:
+        """What the service is in, as a control room has it."""
+        hindered = "; ".join(wait.text for wait in self.waiting_for if wait.hinders)
+        return operating(self.tracker, hindered, self.now_ns)
+
+    @property
+    def alarms(self) -> tuple[AlarmShown, ...]:
+        """Those that last, in the order in which they were raised."""
+        raised = self.tracker.alarms
+        return tuple(AlarmShown(note=note_of(self.tracker, a), kind=a.kind) for a in raised)
+
+    @property
+    def stale_alarms(self) -> tuple[AlarmShown, ...]:
+        """Those that have gone and nobody has acknowledged."""
+        return tuple(AlarmShown(note=note) for note in stale(self.tracker))
+
+    @property
+    def muted_alarms(self) -> tuple[Note, ...]:
+        """Those that are muted, whether they last or not."""
+        return muted(self.tracker)
+
+    @property
+    def worst_severity(self) -> Severity | None:
+        """Of all that last, or went unseen; null: there is nothing."""
+        return worst(self.tracker)
+
+    @property
     def alpha(self) -> Alpha | None:
         """Null until the first accepted window."""
         known = self.tracker.registration
@@ -90,6 +120,34 @@ class Snapshot:
         """Null: no RTC has been heard, or it has vanished."""
         known = self.tracker.rtc
         return None if known is None else Rtc(known=known)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmShown:
+    """An alarm that lasts, or went unseen: how much it matters, what to do, who knows of it."""
+
+    note: Note
+    kind: Kind | None = None
+    """None: it does not last."""
+
+    @property
+    def severity(self) -> Severity | None:
+        """Null: it does not last."""
+        return None if self.kind is None else self.kind.severity
+
+    @property
+    def cause(self) -> str:
+        """What an alarm of this name means."""
+        return self._known.means if self._known else ""
+
+    @property
+    def do(self) -> str:
+        """What an operator does about it."""
+        return self._known.do if self._known else ""
+
+    @property
+    def _known(self) -> Kind | None:
+        return self.kind or ALARMS.get(self.note.name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -156,3 +214,23 @@ class Rtc:
             groups.append(GainGroup(first=first, last=last, gain=gain))
             first = last + 1
         return tuple(groups)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GainTableShown:
+    """Optical gains, and the factors of the loop gains that undo them, mode by mode."""
+
+    reconstructor: str | None
+    """The one it goes with; None: the present gains, with whichever is in use."""
+
+    measured: tuple[ModeGain, ...]
+    """Empty: the table is only what is expected at 1 arcsec of seeing."""
+
+    optical_gain: list[float]
+    """Of each mode: how much of the model's response the sensor shows."""
+
+    relative_sigma: list[float]
+    """1 σ of each as a share of it; it grows away from the measured modes."""
+
+    factor: list[float]
+    """By which to multiply one loop gain for all modes: mean 1, 0.5 to 2."""

@@ -6,8 +6,8 @@ night therefore replays exactly, and every reaction of the service can be tested
 
 from __future__ import annotations
 
-from service.tracking import commands as cmd
 from service.tracking import (
+    attention,
     dither,
     evidence,
     measuring,
@@ -16,6 +16,7 @@ from service.tracking import (
     rtc,
     stopping,
 )
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition import abort_on_command, acquire, acquire_on_command
 from service.tracking.activity import refuse_if_occupied
@@ -61,6 +62,7 @@ def step(
     _react(turn)
     note_declined(turn)
     _go_on(turn)
+    attention.follow(turn)
     return turn.state, tuple(turn.effects)
 
 
@@ -203,6 +205,12 @@ def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
             measuring.give_up(turn, name)
         case cmd.MeasureNoisy() as command:
             measuring.measure_noisy(turn, command)
+        case cmd.AcknowledgeAlarm() as command:
+            attention.acknowledge(turn, command)
+        case cmd.MuteAlarm() as command:
+            attention.mute(turn, command)
+        case cmd.UnmuteAlarm() as command:
+            attention.unmute(turn, command)
         case _:
             _obey_about_matrices(turn)
 

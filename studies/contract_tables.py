@@ -75,6 +75,7 @@ MAY_BE_ABSENT: Final = {
     ("im-commit", "reason"),
     ("state", "validity"),
     ("state", "waiting_for"),
+    ("state", "operation"),
 }
 
 _VERSION: Final = ("`v`", "int", "", "1", "no", "Version of the contract.")

@@ -16,8 +16,9 @@ from typing import Any, get_args
 
 from service.api import create_app
 from service.tracking.activity import ALLOWS
-from service.tracking.alarms import ALARMS, Act
+from service.tracking.alarms import ALARMS, Act, Attention, Severity
 from service.tracking.commands import Command
+from service.tracking.operation import OCCUPIES, Occupation, Operation
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.registration import Validity
 from service.tracking.state import AcquisitionStage, Mode
@@ -26,11 +27,15 @@ from studies.contract_tables import table, with_tables
 ROOT = Path(__file__).parents[1]
 
 _STATES: dict[str, type[StrEnum]] = {
+    "What the service is in": Operation,
+    "What it does": Occupation,
     "Modes": Mode,
     "What α is worth": Validity,
     "An acquisition's way": AcquisitionStage,
     "A reconstructor's way": MatrixState,
     "A measured matrix's way": MeasureState,
+    "How much an alarm matters": Severity,
+    "What operators have done about an alarm": Attention,
 }
 
 
@@ -42,16 +47,20 @@ def states() -> str:
         "change those.",
         "## What runs, and which commands that refuses",
         "Two may run at a time: what refuses a command says so, and how to end it.",
-        table(("while", "refused"), _refusals()),
+        table(("while", "refused", "the service is"), _refusals()),
     ]
     for title, kind in _STATES.items():
         rows = [(f"`{state}`", text) for state, text in _described(kind).items()]
         parts += [f"## {title}", table(("state", "meaning"), rows)]
     parts += [
         "## Alarms",
-        "An alarm lasts as long as what it tells of. What one forbids: "
+        "An alarm lasts as long as what it tells of. It is acknowledged, not dismissed; one that "
+        "goes unseen stays as stale until somebody acknowledges it; one that becomes worse has to "
+        "be acknowledged again; one that an operator's order ends has been seen. A muted one "
+        "is not shown for a time, of twelve hours at most, and forbids what it "
+        "forbids. Operators' acknowledgements and mutes outlive a restart. What one forbids: "
         + "; ".join(f"*{_plain(act)}*: {_lower(text)}" for act, text in _described(Act).items()),
-        table(("alarm", "it means", "do", "forbids"), _alarms()),
+        table(("alarm", "is", "it means", "do", "forbids"), _alarms()),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -102,6 +111,7 @@ def _refusals() -> list[tuple[str, ...]]:
         (
             activity.value,
             ", ".join(f"`{each.__name__}`" for each in every if each not in allowed),
+            OCCUPIES.get(activity, ""),
         )
         for activity, allowed in ALLOWS.items()
     ]
@@ -111,6 +121,7 @@ def _alarms() -> list[tuple[str, ...]]:
     return [
         (
             f"`{name}`",
+            kind.severity.value,
             kind.means,
             kind.do,
             ", ".join(_plain(act) for act in Act if act in kind.forbids),

@@ -60,6 +60,11 @@ class GateVerdict:
     edge_motion_m: float | None = None
     """Largest RMS motion of an outer actuator for slope noise of 1, metres; None: not known."""
 
+    @property
+    def unstable(self) -> bool:
+        """Whether a loop grows somewhere: 1 is the edge of stability."""
+        return self.worst_pole_radius >= 1.0
+
 
 def judge(
     reconstructor: NDArray[np.float32],

@@ -24,12 +24,14 @@ export function showHeader(service, orders) {
   const stop = $("#stop");
   stop.dataset.order = state?.stopped_because ? "resume" : "stop";
   put(stop, state?.stopped_because ? "▶ Release" : "■ Stop everything");
-  const n = state?.alarms.length ?? 0;
+  const n = state?.alarms.filter((alarm) => !alarm.muted).length ?? 0;
+  const others = [[state?.stale_alarms, "unseen"], [state?.muted_alarms, "muted"]].filter(([list]) => list?.length);
   const alarms = $("#alarm-count");
-  put(alarms, !fresh ? `alarms ${DASH}` : n ? `■ ${n} alarm${n > 1 ? "s" : ""}` : "○ no alarm");
-  alarms.dataset.tone = fresh && n ? "bad" : "";
+  const lasting = n ? `■ ${n} alarm${n > 1 ? "s" : ""}` : "○ no alarm";
+  put(alarms, fresh ? [lasting, ...others.map(([list, word]) => `${list.length} ${word}`)].join(", ") : `alarms ${DASH}`);
+  alarms.dataset.tone = !fresh ? "" : n ? "bad" : state.stale_alarms.length ? "warn" : "";
   // on the other pages the alarms themselves are out of sight
-  const lines = fresh ? (state?.alarms ?? []).slice(-3).map((a) => `■ ${a.name}: ${a.text}`) : [];
+  const lines = fresh ? (state?.alarms ?? []).filter((a) => !a.muted).slice(-3).map((a) => `■ ${a.name}: ${a.text}`) : [];
   listed($("#alarm-lines"), lines);
   document.title = `${fresh && n ? `(${n}) ` : ""}${word} ${state?.system ?? "pyrcal"}`;
 }

@@ -3,7 +3,43 @@
 import { ago, clock, day, make, milliseconds, put } from "./words.js";
 
 const MOST = 500;
-const SHAPES = { alarm: "■", warning: "▲", info: "·" };
+const SHAPES = { alarm: "■", critical: "■", serious: "◆", warning: "▲", info: "·" };
+
+const GRADES = ["warning", "serious", "critical"];
+
+// What nobody has acknowledged comes first, then what is worse, then what is newer.
+function worstFirst(a, b) {
+  const rank = (alarm) => [alarm.attention === "acknowledged" ? 0 : 1, GRADES.indexOf(alarm.worst_severity), alarm.since_ns_utc];
+  const [one, other] = [rank(a), rank(b)];
+  const k = one.findIndex((value, i) => value !== other[i]);
+  return k < 0 ? 0 : other[k] - one[k];
+}
+
+function about(order, name, text) {
+  return make("button", { type: "button", data_about: order, data_name: name, aria_label: `${text} ${name}`, text });
+}
+
+function lineOf(alarm) {
+  const { name, acknowledged: seen, worst_severity: worst, over_ns_utc: over } = alarm;
+  const word = alarm.severity ?? `over, was ${worst}`;
+  const been = alarm.severity && alarm.severity !== worst ? `, has been ${worst}` : "";
+  const known = seen && `● ${seen.by} knows since ${clock(milliseconds(seen.t_ns_utc))} UTC${seen.reason ? `: ${seen.reason}` : ""}`;
+  return make("li", { className: alarm.attention, title: alarm.do },
+    make("strong", { text: `${over ? "◇" : SHAPES[worst]} ${name}` }),
+    make("span", { text: `${word}${been}` }),
+    make("span", { className: "since", data_since: String(milliseconds(alarm.since_ns_utc)) }),
+    make("span", { className: "buttons" }, ...(seen ? [] : [about("acknowledge", name, "Acknowledge")]), about("mute", name, "Mute")),
+    make("span", { className: "says", text: alarm.text }),
+    ...(known ? [make("span", { className: "says", text: known })] : []));
+}
+
+function mutedLine({ name, muted }) {
+  const why = muted.reason ? `: ${muted.reason}` : "";
+  return make("li", { className: "muted" },
+    make("strong", { text: `○ ${name}` }),
+    make("span", { text: `muted by ${muted.by} until ${clock(milliseconds(muted.until_ns_utc))} UTC${why}` }),
+    make("span", { className: "buttons" }, about("unmute", name, "Unmute")));
+}
 
 export class Events {
   #service;
@@ -11,8 +47,12 @@ export class Events {
   #alarms = "";
   #told = new Set();
 
-  constructor(service, root) {
+  constructor(service, orders, root) {
     this.#service = service;
+    root.querySelector("#alarms").addEventListener("click", ({ target }) => {
+      const { about, name } = target.dataset;
+      if (about) orders.open(about, name);
+    });
     this.root = root;
     this.filter = root.querySelector("input");
     this.level = root.querySelector("select");
@@ -51,23 +91,23 @@ export class Events {
   }
 
   #showAlarms() {
-    const { alarms } = this.#service.state;
-    const told = JSON.stringify(alarms);
+    const { alarms, stale_alarms: stale, muted_alarms: muted } = this.#service.state;
+    const told = JSON.stringify([alarms, stale, muted]);
     if (told === this.#alarms) return;
     this.#alarms = told;
-    const newest = [...alarms].sort((a, b) => b.since_ns_utc - a.since_ns_utc);
-    this.root.querySelector("#alarms").replaceChildren(...newest.map((alarm) => make("li", {},
-      make("strong", { text: `■ ${alarm.name}` }),
-      make("span", { className: "since", data_since: String(milliseconds(alarm.since_ns_utc)) }),
-      make("span", { text: alarm.text }))));
+    const shown = [...alarms, ...stale].filter((alarm) => !alarm.muted).sort(worstFirst);
+    const list = this.root.querySelector("#alarms");
+    const focus = document.activeElement?.closest?.("#alarms button")?.dataset; // a rebuilt list keeps it
+    list.replaceChildren(...shown.map(lineOf), ...muted.map(mutedLine));
+    if (focus) list.querySelector(`[data-about="${focus.about}"][data-name="${focus.name}"]`)?.focus();
     this.#age();
-    this.#announce(alarms);
+    this.#announce(alarms.filter((alarm) => !alarm.muted));
   }
 
   // Screen readers hear of each alarm once, and of its end.
   #announce(alarms) {
     const now = new Set(alarms.map((alarm) => alarm.name));
-    const begun = alarms.filter((alarm) => !this.#told.has(alarm.name)).map((alarm) => `Alarm ${alarm.name}: ${alarm.text}`);
+    const begun = alarms.filter((alarm) => !this.#told.has(alarm.name)).map((alarm) => `Alarm ${alarm.name}, ${alarm.severity}: ${alarm.text}`);
     const over = [...this.#told].filter((name) => !now.has(name)).map((name) => `Alarm ${name} is over`);
     this.#told = now;
     if (begun.length || over.length) put(document.querySelector("#live"), [...begun, ...over].join(". "));

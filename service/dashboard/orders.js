@@ -18,6 +18,10 @@ export class Orders {
     this.#dialog.querySelector("[value=cancel]").addEventListener("click", () => this.#dialog.close());
   }
 
+  get service() {
+    return this.#service;
+  }
+
   get state() {
     return this.#service.state;
   }
@@ -47,11 +51,11 @@ export class Orders {
   }
 
   // Why something cannot be ordered now; empty: it can. The service has the last word.
-  whyNot(name) {
+  whyNot(name, value) {
     if (!this.#service.fresh) return "the connection to the service is lost";
     const { state, work } = this;
     if (BUSY.has(name) && state.stopped_because) return `everything is stopped: ${state.stopped_because}; release it first`;
-    const needs = NEEDS[name]?.(this, state) ?? "";
+    const needs = NEEDS[name]?.(this, state, value) ?? "";
     if (needs || !BUSY.has(name)) return needs;
     if (state.rtc === null) return "no RTC is there";
     return work ? `${work.title.toLowerCase()} is under way: wait for it, or end it` : "";
@@ -59,7 +63,7 @@ export class Orders {
 
   async open(name, value) {
     if (this.#dialog.open || this.#opening) return;
-    const why = this.whyNot(name);
+    const why = this.whyNot(name, value);
     if (why) {
       this.say(`${TITLES[name] ?? name} cannot be ordered now: ${why}`);
       return;
@@ -210,14 +214,26 @@ const NEEDS = {
   measure: (orders, state) => (state.dither ? `${state.dither.id} is running: stop the dither first` : ""),
   stop: (orders, state) => (state.stopped_because ? `everything is stopped already: ${state.stopped_because}` : ""),
   resume: (orders, state) => (state.stopped_because ? "" : "nothing is stopped"),
+  acknowledge: (_, state, name) => (alarmOf(state, name)?.attention ? "" : `${name} is over`),
+  mute: (_, state, name) => (alarmOf(state, name) ? "" : `${name} is over`),
+  unmute: (_, state, name) => (alarmOf(state, name)?.muted ? "" : `${name} is not muted`),
   "dither-start": (orders, state) => (state.dither ? `${state.dither.id} is running: stop it first` : ""),
 };
+
+// The alarm of this name, whether it lasts, went unseen, or is only muted.
+function alarmOf(state, name) {
+  const known = [...state.alarms, ...state.stale_alarms].find((alarm) => alarm.name === name);
+  return known ?? state.muted_alarms.find((alarm) => alarm.name === name);
+}
 
 const TITLES = {
   approve: "Approve", reject: "Reject", rollback: "Roll back", hold: "Hold", mode: "Mode", acquire: "Acquire",
   abort: "Abort the acquisition", "give-up": "Give up", "dither-start": "Start the dither", "dither-stop": "Stop the dither",
   stop: "Stop everything", resume: "Release", measure: "Measure", noisy: "Noisy matrix", "open-loop": "End the gain ramp",
+  acknowledge: "Acknowledge", mute: "Mute", unmute: "Unmute",
 };
+
+const MUTE_S = 3600;
 
 const ORDERS = {
   stop(orders) {
@@ -233,6 +249,49 @@ const ORDERS = {
       button: "Stop everything",
       method: "POST",
       path: "v1/stop",
+    };
+  },
+  acknowledge(orders, name) {
+    const alarm = alarmOf(orders.state, name);
+    const lasts = Boolean(alarm.severity);
+    return {
+      title: `Acknowledge ${name}`,
+      facts: [
+        alarm.text,
+        alarm.do && `What to do: ${alarm.do}.`,
+        lasts ? "It stays on this page, with who knows of it, until it is over." : "It is over; nobody had acknowledged it. It leaves this page.",
+        lasts && "If it becomes worse, it has to be acknowledged again.",
+      ],
+      button: "Acknowledge",
+      method: "POST",
+      path: `v1/alarms/${encodeURIComponent(name)}/acknowledge`,
+      body: { severity: alarm.worst_severity },
+    };
+  },
+  mute(orders, name) {
+    const alarm = alarmOf(orders.state, name);
+    return {
+      title: `Mute ${name} for an hour`,
+      facts: [
+        alarm.text,
+        `It is not listed here until ${clock(orders.service.now + MUTE_S * 1000)} UTC, however often it comes; muted alarms are counted.`,
+        "What it forbids, it goes on to forbid.",
+      ],
+      button: "Mute for an hour",
+      asked: true,
+      method: "POST",
+      path: `v1/alarms/${encodeURIComponent(name)}/mute`,
+      body: { for_s: MUTE_S },
+    };
+  },
+  unmute(orders, name) {
+    const { muted } = alarmOf(orders.state, name);
+    return {
+      title: `Unmute ${name}`,
+      facts: [`${muted.by} muted it${muted.reason ? `: ${muted.reason}` : ""}. It is listed again from now on.`],
+      button: "Unmute",
+      method: "POST",
+      path: `v1/alarms/${encodeURIComponent(name)}/unmute`,
     };
   },
   resume(orders) {

@@ -12,7 +12,7 @@ const service = new Service();
 const orders = new Orders(service);
 const registration = new Registration(service, document.querySelector("#registration"));
 const mirror = new MirrorOnSensor(service, document.querySelector("#mirror"));
-new Events(service, document.querySelector("#events"));
+new Events(service, orders, document.querySelector("#events"));
 const help = document.querySelector("#help");
 const $ = (selector) => document.querySelector(selector);
 

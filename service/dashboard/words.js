@@ -61,22 +61,14 @@ export function milliseconds(ns) {
   return present(ns) ? ns / 1e6 : null;
 }
 
-// What the service does, in a word; tone is shown as a shape, too.
+// What the service is in and does; tone is shown as a shape, too.
 export function operation(state) {
-  const worth = state.registration?.validity;
-  if (!state.ready) return { word: "NOT READY", tone: "bad", why: state.ready_reason };
-  if (state.stopped_because) return { word: "STOPPED", tone: "bad", why: state.stopped_because };
-  if (state.acquisition.under_way)
-    return { word: "ACQUIRING", tone: "busy", why: `${state.acquisition.stage}: ${state.acquisition.text}` };
-  if (state.measuring) return { word: "MEASURING", tone: "busy", why: state.measuring.id };
-  if (state.rtc === null) return { word: "NO RTC", tone: "warn", why: "no RTC is heard" };
-  if (state.rtc.loop !== "closed") return { word: "LOOP OPEN", tone: "warn", why: "the RTC's loop is open" };
-  if (!state.registration) return { word: "SEARCHING", tone: "busy", why: "no window has been accepted yet" };
-  if (worth === "invalid" || worth === "stale")
-    return { word: "DEGRADED", tone: "warn", why: `α is ${worth}: ${state.registration.validity_reason}` };
-  if (state.mode === "hold") return { word: "HOLD", tone: "warn", why: "nothing is made or sent unless asked for" };
-  return { word: "TRACKING", tone: "good", why: "α is known and the loop is closed" };
+  const { operation: word, occupation, because } = state.operating;
+  const idle = word === "Ready" || word === "NotReady";
+  return { word: (idle ? word.replace("tR", "t r") : `${word} · ${occupation}`).toUpperCase(), tone: TONE_OF[word], why: because };
 }
+
+const TONE_OF = { Operational: "good", Ready: "busy", Degraded: "warn", NotReady: "bad", Error: "bad" };
 
 export const TONES = { good: "●", busy: "◐", warn: "▲", bad: "■" };
 

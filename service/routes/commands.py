@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Depends, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Discriminator
 
 from service.errors import StaleError, UntaggedError
@@ -23,21 +23,26 @@ from service.runtime.recording import Caller
 from service.runtime.supervisor import Supervisor
 from service.tracking.commands import (
     AbortAcquisition,
+    AcknowledgeAlarm,
     Acquire,
     Approve,
     Command,
+    MuteAlarm,
+    MuteTime,
     Publish,
     Ramp,
     Refit,
     Reject,
     Resume,
     Rollback,
+    SeenAlarm,
     SetLoop,
     SetMode,
     SetPointing,
     StartDither,
     StopDither,
     StopEverything,
+    UnmuteAlarm,
 )
 from service.tracking.state import TrackerState
 
@@ -132,6 +137,8 @@ def _link(matrix_id: str) -> str:
 
 _ALL = "/v1/reconstructors"
 
+AlarmName = Annotated[str, Path(max_length=64)]
+
 
 @router.post("/refit", status_code=202)
 async def refit(client: ClientDep, command: Annotated[Refit, body(Refit)]) -> AcceptedView:
@@ -209,6 +216,28 @@ async def stop(
 async def resume(client: ClientDep, command: Annotated[Resume, body(Resume)]) -> AcceptedView:
     """Release what was stopped: mode and dither are as they were ordered before."""
     return await client.orders(command)
+
+
+@router.post("/alarms/{name}/acknowledge", status_code=202, responses={**UNKNOWN})
+async def acknowledge(
+    client: ClientDep, name: AlarmName, said: Annotated[SeenAlarm, body(SeenAlarm)]
+) -> AcceptedView:
+    """Say that an alarm is known of: it stays while it lasts; one that is over goes."""
+    return await client.orders(about(AcknowledgeAlarm, said, name=name), alarms="/v1/alarms")
+
+
+@router.post("/alarms/{name}/mute", status_code=202, responses={**UNKNOWN})
+async def mute(
+    client: ClientDep, name: AlarmName, said: Annotated[MuteTime, body(MuteTime)]
+) -> AcceptedView:
+    """Show an alarm no more for a time; what it forbids, it goes on to forbid."""
+    return await client.orders(about(MuteAlarm, said, name=name), alarms="/v1/alarms")
+
+
+@router.post("/alarms/{name}/unmute", status_code=202, responses={**UNKNOWN})
+async def unmute(client: ClientDep, name: AlarmName, said: Said) -> AcceptedView:
+    """Show an alarm again."""
+    return await client.orders(about(UnmuteAlarm, said, name=name), alarms="/v1/alarms")
 
 
 @router.put("/mode", status_code=202)

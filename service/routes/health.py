@@ -21,11 +21,12 @@ from service.routes.admission import OPEN
 from service.routes.problems import problem, problem_response
 from service.routes.views import ServiceDep
 from service.snapshot import Pace, Snapshot
-from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND
+from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND, Attention, Party, Severity
 from service.tracking.dither_request import DitherPhase
+from service.tracking.operation import Occupation, Operation
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
-from service.tracking.state import Mode, Party, TrackerState
+from service.tracking.state import Mode, TrackerState
 from service.wire import Pattern
 
 router = APIRouter(tags=["how it is doing"])
@@ -169,12 +170,29 @@ class SnapshotCollector(Collector):
         yield from _of_the_dither(tracker)
         yield from _of_reconstructors(tracker)
         yield from _of_measurement(snapshot)
-        yield _gauge("alarms", "Alarms that last", len(tracker.alarms))
+        yield from _of_alarms(snapshot)
         waits = {wait.name: wait.hinders + 1 for wait in snapshot.waiting_for}
         expected = "1 for what is waited for, 2 where nothing can be done meanwhile"
         yield _gauge("waiting_for", expected, waits, "name")
-        alarms = {alarm.name: 1 for alarm in tracker.alarms}
-        yield _gauge("alarm", "1 for each alarm that lasts", alarms, "name")
+
+
+def _of_alarms(snapshot: Snapshot) -> Iterator[Metric]:
+    lasting, operating = snapshot.alarms, snapshot.operating
+    yield _gauge("alarms", "Alarms that last", len(lasting))
+    names = {alarm.note.name: 1 for alarm in lasting}
+    yield _gauge("alarm", "1 for each alarm that lasts", names, "name")
+    by_severity = Counter(str(alarm.severity) for alarm in lasting if alarm.note.muted is None)
+    shown = {str(severity): by_severity[severity] for severity in Severity}
+    yield _gauge("alarms_shown", "Alarms that last and are not muted", shown, "severity")
+    active = sum(alarm.note.attention is Attention.ACTIVE for alarm in lasting)
+    yield _gauge("alarms_unacknowledged", "Alarms that last and nobody has acknowledged", active)
+    stale = "Alarms that have gone and nobody has acknowledged"
+    yield _gauge("alarms_stale", stale, len(snapshot.stale_alarms))
+    yield _gauge("alarms_muted", "Alarms that are muted", len(snapshot.muted_alarms))
+    states = _one_of(Operation, operating.operation)
+    yield _gauge("operation", "1 for the state of the service", states, "state")
+    doing = _one_of(Occupation, operating.occupation)
+    yield _gauge("occupation", "1 for what the service does", doing, "occupation")
 
 
 def _of_pace(pace: Pace) -> Iterator[Metric]:

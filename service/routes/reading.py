@@ -23,8 +23,9 @@ from service.routes.numbers import (
     numbers_of,
 )
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
-from service.routes.views import GainTableShown, ServiceDep, answer, known, shows, tagged, view
+from service.routes.views import ServiceDep, answer, known, shows, tagged, view
 from service.runtime.supervisor import Supervisor
+from service.snapshot import GainTableShown
 from service.tracking.registration import HistoryEntry, ModeGain, table_of
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
@@ -289,6 +290,12 @@ async def reconstructor_matrix(
         service.matrix,
         lambda name: service.archive.reconstructors.file(name),
     )
+
+
+@router.get("/alarms", responses={200: shows(views.ALARMS)})
+async def alarms(service: ServiceDep) -> Response:
+    """Return the alarms: those that last, those that went unseen, those that are muted."""
+    return answer(service.snapshot(), views.ALARMS)
 
 
 @router.get("/events", responses={200: shows(views.EVENTS)})

@@ -36,10 +36,12 @@ from service.files.uploads import FitJob
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.runtime.supervisor import Supervisor
-from service.snapshot import Alpha, Pace, Rtc, Snapshot
+from service.snapshot import AlarmShown, Alpha, GainTableShown, Pace, Rtc, Snapshot
+from service.tracking.alarms import Alarm, Note, Remark
 from service.tracking.commands import GainGroup
 from service.tracking.dither_request import Dither, Dithering, DitherPlan
 from service.tracking.loop import LoopCommand
+from service.tracking.operation import Operating
 from service.tracking.products import (
     Assessment,
     MeasurementRecord,
@@ -48,7 +50,7 @@ from service.tracking.products import (
     ReconstructorRecord,
 )
 from service.tracking.registration import HistoryEntry, ModeGain, Watchdog
-from service.tracking.state import Acquisition, Alarm, LogEntry, TrackerState, Waiting
+from service.tracking.state import Acquisition, LogEntry, TrackerState, Waiting
 from service.wire import Pointing
 
 Record = TypeVar("Record")
@@ -336,26 +338,6 @@ def _for_readers(text: str) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GainTableShown:
-    """Optical gains, and the factors of the loop gains that undo them, mode by mode."""
-
-    reconstructor: str | None
-    """The one it goes with; None: the present gains, with whichever is in use."""
-
-    measured: tuple[ModeGain, ...]
-    """Empty: the table is only what is expected at 1 arcsec of seeing."""
-
-    optical_gain: list[float]
-    """Of each mode: how much of the model's response the sensor shows."""
-
-    relative_sigma: list[float]
-    """1 σ of each as a share of it; it grows away from the measured modes."""
-
-    factor: list[float]
-    """By which to multiply one loop gain for all modes: mean 1, 0.5 to 2."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FitJobs:
     """The fits the service remembers until it ends."""
 
@@ -468,7 +450,16 @@ GATHERING = view(
 FIT_JOB = view("FitJobView", FitJob, "id state stage name asked_ns_utc n_bytes sha256 reason")
 FIT_JOBS = view("FitJobsView", FitJobs)
 
-view("AlarmView", Alarm, "name since_ns_utc text")
+view("RemarkView", Remark)
+view(
+    "AlarmView",
+    AlarmShown,
+    "note.name severity worst_severity=note.worst note.attention note.since_ns_utc note.text cause "
+    "do note.over_ns_utc note.acknowledged note.muted",
+)
+view("RaisedView", Alarm, "name since_ns_utc text")
+view("MutedView", Note, "name muted")
+view("OperatingView", Operating)
 view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times")
 EVENTS = view("EventsView", TrackerState, "alarms log", "What happened, and what is wrong now.")
 view("WaitingView", Waiting)
@@ -488,9 +479,16 @@ STATE = view(
     "tracker.pointing tracker.basis_id tracker.config_id tracker.dither tracker.dithering "
     "tracker.vibrations_hz tracker.measuring tracker.gathering tracker.acquisition "
     "tracker.loop_command tracker.dither_due_since_ns_utc tracker.dither_due_reason "
-    "tracker.watchdog tracker.unwatched waiting_for tracker.alarms tracker.windows_accepted "
+    "tracker.watchdog tracker.unwatched waiting_for operating alarms stale_alarms muted_alarms "
+    "worst_severity tracker.windows_accepted "
     "tracker.windows_refused tracker.windows_outlying pace link",
     "What the service knows, at one glance.",
     measuring=MEASURING,
     gathering=GATHERING,
+)
+ALARMS = view(
+    "AlarmsView",
+    Snapshot,
+    "alarms stale_alarms muted_alarms worst_severity",
+    "The alarms that last, that went unseen, and that are muted.",
 )

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from service.errors import CommandError, LinkError
 from service.tracking import commands as cmd
-from service.tracking.alarms import NO_DITHER
+from service.tracking.alarms import NO_DITHER, Note
+from service.tracking.attention import muted
 from service.tracking.commands import Command
 from service.tracking.dither_request import total_m
 from service.tracking.loop import CommandState
@@ -60,7 +61,7 @@ class Given:
             case cmd.StopEverything():
                 return _stopped(now)
             case cmd.Resume():
-                off = "; no dither is started until POST /v1/dither with start"
+                off = "; no dither is started until one is asked for"
                 return Answer(f"released: mode is {now.mode}{off if now.dither_stopped else ''}")
             case cmd.SetPointing():
                 return _pointing(now)
@@ -80,6 +81,10 @@ class Given:
                 record = now.measurement(name)
                 why = "" if record is None else record.reason.removeprefix("given up ")
                 return Answer(f"{name} is given up {why}")
+            case cmd.AcknowledgeAlarm(name=name) | cmd.MuteAlarm(name=name):
+                return _alarm(now, name)
+            case cmd.UnmuteAlarm(name=name):
+                return Answer(f"{name} is not muted any more")
             case _:
                 return self._of_matrices(now)
 
@@ -168,7 +173,7 @@ def _pointing(now: TrackerState) -> Answer:
 
 def _stopped(now: TrackerState) -> Answer:
     playing = None if now.rtc is None else now.rtc.dither_id
-    text = f"{now.stopped_because}; nothing is dithered, made or sent until POST /v1/resume"
+    text = f"{now.stopped_because}; nothing is dithered, made or sent until it is released"
     if playing is None:
         return Answer(text)
     return Answer(f"{text}; the RTC's status still shows {playing}, it was told to stop it", False)
@@ -176,10 +181,24 @@ def _stopped(now: TrackerState) -> Answer:
 
 def _no_dither(now: TrackerState) -> Answer:
     playing = None if now.rtc is None else now.rtc.dither_id
-    off = "no dither is started until POST /v1/dither with start"
+    off = "no dither is started until one is asked for"
     if playing is None:
         return Answer(f"no dither plays; {off}")
     return Answer(f"the RTC was told to stop {playing}, its status still shows it; {off}", False)
+
+
+def _alarm(now: TrackerState, name: str) -> Answer:
+    """Tell what is kept of an alarm that was acknowledged or muted."""
+    note = next((note for note in now.notes if note.name == name), Note(name=name))
+    said = []
+    if note.acknowledged is not None:
+        said.append("acknowledged; it stays until it is over")
+    elif note.worst is None:
+        said.append("over and done with")
+    if note.muted is not None:
+        left_s = ((note.muted.until_ns_utc or 0) - note.muted.t_ns_utc) / 1e9
+        said.append(f"muted for {left_s:.0f} s, with {len(muted(now))} muted in all")
+    return Answer(f"{name} is {', '.join(said)}")
 
 
 def _measurement(now: TrackerState, name: str) -> Answer:

@@ -12,11 +12,12 @@ from service.link.statistics import MALFORMED, RECENT_S, USED, Fate, LinkStatist
 from service.model.misregistration import at_boundary
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.alarms import Act, forbids
+from service.tracking.alarms import Act, Alarm, Party, forbids
+from service.tracking.operation import operating
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
 from service.tracking.reconstructors import why_unread
-from service.tracking.state import AcquisitionStage, Alarm, Mode, Party, TrackerState, Waiting
+from service.tracking.state import AcquisitionStage, Mode, TrackerState, Waiting
 from service.wire import TEXT_LIMIT, StateMessage
 
 SILENT_S: Final = 3.0
@@ -251,8 +252,7 @@ def _for_alarms(facts: Facts) -> Iterator[Waiting]:
     """Yield the alarms that keep the service from its job: their texts say what to do."""
     for alarm in facts.state.alarms:
         acts = [act for act in (Act.ASK, Act.DECIDE, Act.MEASURE) if forbids(alarm, act)]
-        kind = alarms.ALARMS.get(alarm.name)
-        party = None if kind is None else kind.party
+        party = alarm.kind.party
         if acts or party is not None:
             party = party or Party.OPERATOR
             hinders = Act.ASK in acts
@@ -262,10 +262,10 @@ def _for_alarms(facts: Facts) -> Iterator[Waiting]:
 def _for_the_operator(facts: Facts) -> Iterator[Waiting]:
     state, rtc = facts.state, facts.state.rtc
     orders = {
-        "mode": (state.mode is Mode.HOLD, "mode is hold, nothing is made: PUT /v1/mode"),
+        "mode": (state.mode is Mode.HOLD, "mode is hold, nothing is made: set another when it may"),
         "dither-stopped": (
             state.dither_stopped,
-            "the dither was stopped by an operator: POST /v1/dither with start",
+            "the dither was stopped by an operator: start it when it may",
         ),
         "interrupted": (
             state.acquisition.stage is AcquisitionStage.INTERRUPTED,
@@ -365,6 +365,7 @@ def state_message(
 ) -> StateMessage:
     """Return the short account of the state for whoever listens on the network."""
     known = state.registration
+    hindered = "; ".join(wait.text for wait in waiting if wait.hinders)
     return StateMessage(
         system=state.system,
         t_ns=now_ns,
@@ -374,4 +375,5 @@ def state_message(
         in_use=state.in_use,
         validity=None if known is None else known.standing.validity.value,
         waiting_for=tuple(f"{w.party}: {w.text}"[:TEXT_LIMIT] for w in waiting),
+        operation=operating(state, hindered, now_ns).words,
     )

@@ -45,7 +45,9 @@ class Activity(StrEnum):
 
 _ALL = frozenset[type](get_args(Command))
 
-_ALWAYS = frozenset[type](
+_SEEN = frozenset[type]({cmd.AcknowledgeAlarm, cmd.MuteAlarm, cmd.UnmuteAlarm})
+
+_ALWAYS = _SEEN | frozenset[type](
     {
         cmd.AbortAcquisition,
         cmd.GiveUp,
@@ -69,9 +71,8 @@ ALLOWS: dict[Activity, frozenset[type]] = {
     # it makes way for what needs the loop, and an RTC measures under no dither
     Activity.OWN_DITHER: _ALL - {cmd.Measure, cmd.StartDither},
     Activity.OTHER_DITHER: _ALL - {cmd.Measure, cmd.StartDither, cmd.MeasureNoisy},
-    Activity.STANDING_BY: frozenset[type](
-        {cmd.Reject, cmd.SetMode, cmd.SetPointing, cmd.StopEverything, cmd.Resume}
-    ),
+    Activity.STANDING_BY: _SEEN
+    | frozenset[type]({cmd.Reject, cmd.SetMode, cmd.SetPointing, cmd.StopEverything, cmd.Resume}),
     Activity.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish, cmd.Rollback},
     Activity.SENDING: _ALL - {cmd.Measure},
 }
@@ -128,7 +129,7 @@ def _exclusive(state: TrackerState, now_ns: int) -> tuple[Running, ...]:
         if alarm.name == STANDING_BY
     ]
     if state.stopped_because:
-        text = f"{state.stopped_because}; POST /v1/resume releases it"
+        text = f"{state.stopped_because}; release the stop first"
         found.append(Running(Activity.STOPPED, text))
     if state.measuring is not None:
         text = (

@@ -1,6 +1,7 @@
-"""The alarms by name, and what each forbids for as long as it lasts.
+"""The alarms by name: how much each matters, what it forbids, and what operators did about it.
 
-The one table of them is alarms.toml; docs/states.md shows it.
+The one table of them is alarms.toml; docs/states.md shows it. What operators do about them is as
+LSST's ts_watcher has it (doc/displaying_alarms.rst there).
 """
 
 from __future__ import annotations
@@ -9,11 +10,9 @@ import tomllib
 from dataclasses import dataclass
 from enum import StrEnum, auto
 from importlib.resources import files
-from typing import Final
+from typing import Final, Protocol
 
 import msgspec
-
-from service.tracking.state import Alarm, Party, TrackerState
 
 STOPPED = "stopped"
 ACQUISITION = "acquisition"
@@ -74,10 +73,41 @@ class Act(StrEnum):
     """Ask anything of the RTC, or follow its telemetry: nobody knows whose it is."""
 
 
+class Severity(StrEnum):
+    """How much an alarm matters, least first."""
+
+    WARNING = auto()
+    """Somebody should know; the service does its work."""
+
+    SERIOUS = auto()
+    """The service does less than it should until it is over."""
+
+    CRITICAL = auto()
+    """The loop is in danger, or what is heard of it cannot be relied on."""
+
+    def above(self, other: Severity | None) -> bool:
+        """Return whether it matters more than another; None: than nothing."""
+        order = list(Severity)
+        return other is None or order.index(self) > order.index(other)
+
+
+class Party(StrEnum):
+    """Whom the service waits for."""
+
+    RTC = "rtc"
+    OPERATOR = "operator"
+    WORKER = "worker"
+    """The service's own, which computes."""
+
+    SERVICE = "service"
+    """Another one, of the same system."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
     """What there is to know of an alarm, whenever it is raised."""
 
+    severity: Severity
     means: str
     """What is the matter."""
 
@@ -93,6 +123,84 @@ class Kind:
     """Who can end it, where that is waited for though it may forbid nothing."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alarm:
+    """Something that must be seen, for as long as it lasts."""
+
+    name: str
+    since_ns_utc: int
+    text: str
+    """What was found, and what to do."""
+
+    seen_ns_utc: int = 0
+    """When it was last found to be so."""
+
+    t_ns_utc: int = 0
+    """When it was raised, by the RTC's clock: telemetry from before does not tell that it is over.
+    0: not known."""
+
+    own: Kind | None = None
+    """Where it is otherwise than the table has it; None: as there."""
+
+    @property
+    def kind(self) -> Kind:
+        """What there is to know of it; of a name that is in no table, nothing."""
+        listed = self.own or ALARMS.get(self.name)
+        return listed or Kind(severity=Severity.WARNING, means="", do="")
+
+
+class Attention(StrEnum):
+    """How far an alarm has come with operators."""
+
+    ACTIVE = "active"
+    """It lasts, and nobody has said that they know."""
+
+    ACKNOWLEDGED = "acknowledged"
+    """It lasts, and somebody knows: once it is over, it is forgotten."""
+
+    STALE = "stale"
+    """It is over, and nobody has seen it: it stays until somebody acknowledges it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Remark:
+    """What an operator has said of an alarm."""
+
+    by: str
+    reason: str
+    t_ns_utc: int
+    until_ns_utc: int | None = None
+    """When it counts no more, of one that mutes; None: never."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Note:
+    """What is kept of an alarm besides whether it lasts: what it has been, who has seen it."""
+
+    name: str
+    worst: Severity | None = None
+    """The most severe it has been since somebody last was done with it; None: it was not raised."""
+
+    since_ns_utc: int = 0
+    text: str = ""
+    """As it was when it was raised; of a stale one, at its end."""
+
+    over_ns_utc: int | None = None
+    """When it went; None: it lasts, or was not raised."""
+
+    acknowledged: Remark | None = None
+    muted: Remark | None = None
+
+    @property
+    def attention(self) -> Attention | None:
+        """How far it has come with operators; None: it was not raised."""
+        if self.worst is None:
+            return None
+        if self.acknowledged is not None:
+            return Attention.ACKNOWLEDGED
+        return Attention.ACTIVE if self.over_ns_utc is None else Attention.STALE
+
+
 def _read() -> dict[str, Kind]:
     text = files(__package__).joinpath("alarms.toml").read_text(encoding="utf-8")
     return msgspec.convert(tomllib.loads(text), dict[str, Kind])
@@ -102,12 +210,19 @@ ALARMS: Final = _read()
 """By name, as alarms.toml tells."""
 
 
-def forbidding(state: TrackerState, act: Act) -> Alarm | None:
+class Alarmed(Protocol):
+    """Whatever has alarms that last."""
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """Those."""
+
+
+def forbidding(state: Alarmed, act: Act) -> Alarm | None:
     """Return an alarm that forbids this now, or None."""
     return next((alarm for alarm in state.alarms if forbids(alarm, act)), None)
 
 
 def forbids(alarm: Alarm, act: Act) -> bool:
     """Return whether this alarm forbids this."""
-    kind = ALARMS.get(alarm.name)
-    return kind is not None and act in kind.forbids
+    return act in alarm.kind.forbids

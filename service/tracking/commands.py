@@ -14,6 +14,7 @@ from annotated_types import Ge, Gt, Le, Len, MaxLen
 from typing_extensions import override
 
 from service.errors import shown
+from service.tracking.alarms import Severity
 from service.tracking.products import ModeSet
 from service.tracking.state import Mode
 from service.wire import DitherKind, Pattern, Pointing
@@ -22,6 +23,7 @@ MOST_SINES = 64
 MOST_MODES = 100_000
 MOST_GROUPS = 1000
 LONGEST_NOISY_S = 3600.0
+LONGEST_MUTE_S = 43_200.0
 
 Positive = Annotated[float, Gt(0.0)]
 Count = Annotated[int, Ge(1)]
@@ -58,6 +60,12 @@ class Instruction:
             unseen = next((char for char in text if shown(char) != char), None)
             if unseen is not None:
                 raise ValueError(f"found {unseen!r} in {name}, expected printable characters")
+
+    @property
+    def signed(self) -> str:
+        """Who asks, and why, for the log."""
+        why = f" ({self.reason})" if self.reason else ""
+        return f"by {self.by or 'an operator'}{why}"
 
     def said(self) -> dict[str, Any]:
         """Return the fields by name, for a command that says the same and more."""
@@ -371,9 +379,52 @@ class Resume(Instruction):
     """Release what was stopped: mode and dither are as they were ordered before."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeenAlarm(Instruction):
+    """What may be said of an alarm that is acknowledged."""
+
+    severity: Severity | None = None
+    """The worst that was seen of it: refused where it has been worse; None: however bad it was."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AcknowledgeAlarm(SeenAlarm):
+    """Say that an alarm is known of; it stays for as long as it lasts."""
+
+    name: str
+    """Of the alarm."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MuteTime(Instruction):
+    """For how long an alarm is not to be shown."""
+
+    for_s: Annotated[float, Gt(0.0), Le(LONGEST_MUTE_S)]
+    """Seconds, at most twelve hours."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MuteAlarm(MuteTime):
+    """Show and tell an alarm no more for a time; it is counted."""
+
+    name: str
+    """Of the alarm."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnmuteAlarm(Instruction):
+    """Show and tell an alarm again."""
+
+    name: str
+    """Of the alarm."""
+
+
 Command = (
     StopEverything
     | Resume
+    | AcknowledgeAlarm
+    | MuteAlarm
+    | UnmuteAlarm
     | Acquire
     | AbortAcquisition
     | SetMode

@@ -339,8 +339,8 @@ def _ask(turn: Turn, rtc: Status, wish: Wish) -> None:
     reason = why_unusable(dither, rtc, turn.policy)
     if reason is not None:
         text = (
-            f"no usable dither: {reason}; random signs need no lines, and α can be measured with "
-            'them: POST /v1/dither with kind "binary"'
+            f"no usable dither: {reason}; a dither of random signs needs no lines, and α can be "
+            "measured with one"
         )
         turn.put_off(dither_s=60.0)
         turn.alarm(NO_DITHER, text)

@@ -13,7 +13,7 @@ from service.telemetry.estimate import DitheredEstimate, model_error
 from service.telemetry.kalman import Drift, Joint, begin_joint, predicted
 from service.telemetry.lockin import MAX_LAG_FRAMES
 from service.telemetry.random_dither import RandomEstimate
-from service.tracking.alarms import ALARMS, DISAGREES, SUSPECTED, Act, forbidding
+from service.tracking.alarms import DISAGREES, SUSPECTED, Act, forbidding
 from service.tracking.jumps import last_of
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
@@ -379,4 +379,4 @@ def why_no_measurement(state: TrackerState, when: Taken) -> str | None:
     alarm = forbidding(state, Act.MEASURE)
     if alarm is None:
         return why_void(state, when)
-    return f"{ALARMS[alarm.name].because}: its telemetry is no measurement"
+    return f"{alarm.kind.because}: its telemetry is no measurement"

@@ -50,6 +50,7 @@ def orders_of(state: TrackerState) -> Orders:
         settings_mode=state.settings_mode,
         dither_stopped=state.dither_stopped,
         stopped=state.stopped_because,
+        seen=state.notes,
     )
 
 
@@ -61,7 +62,7 @@ def obey(turn: Turn, orders: Orders) -> None:
     """
     if orders.dither_stopped:
         allow(turn, allowed=False)
-        text = "by an operator before the restart; POST /v1/dither with start lets it dither again"
+        text = "by an operator before the restart; start the dither to let it dither again"
         turn.warn("dither.stopped", text)
     of_settings, ordered = turn.state.mode, orders.mode
     if ordered is None or ordered is of_settings:
@@ -74,7 +75,7 @@ def obey(turn: Turn, orders: Orders) -> None:
     else:
         text = (
             f"mode is {ordered}, as an operator set it before the restart, and not {of_settings} "
-            "as the settings say: PUT /v1/mode changes it"
+            "as the settings say; set the mode to change it"
         )
         _order(turn, ordered, of_settings)
     turn.warn("mode", text)

@@ -359,7 +359,7 @@ def on_margin(turn: Turn, event: ev.MarginJudged) -> None:
     if verdict.accepted:
         turn.calm(SHORT_MARGIN)
     else:
-        turn.alarm(SHORT_MARGIN, f"{event.id}: {verdict.reason}")
+        turn.alarm(SHORT_MARGIN, f"{event.id}: {verdict.reason}", critical=verdict.unstable)
 
 
 def _sendable(turn: Turn, matrix_id: str) -> tuple[ReconstructorRecord, Status]:

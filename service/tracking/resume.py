@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.tracking.acquisition import inherit, left_behind
+from service.tracking.attention import take_over
 from service.tracking.events import Tick
 from service.tracking.operator import obey, orders_of
 from service.tracking.policy import SECOND_NS, Policy
@@ -81,6 +82,7 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
     if saved.orders is not None and saved.system == state.system:
         obey(turn, saved.orders)
         stay_stopped(turn, saved.orders)
+        take_over(turn, saved.orders)
     reason = _why_not(state, saved, now_ns)
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
+from service.tracking.alarms import Alarm, Note, Party
 from service.tracking.dither_request import Dither, Dithering
 from service.tracking.loop import LoopCommand
 from service.tracking.products import (
@@ -29,35 +30,6 @@ class Level(StrEnum):
     INFO = "info"
     WARNING = "warning"
     ALARM = "alarm"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Alarm:
-    """Something that must be seen, for as long as it lasts."""
-
-    name: str
-    since_ns_utc: int
-    text: str
-    """What was found, and what to do."""
-
-    seen_ns_utc: int = 0
-    """When it was last found to be so."""
-
-    t_ns_utc: int = 0
-    """When it was raised, by the RTC's clock: telemetry from before does not tell that it is over.
-    0: not known."""
-
-
-class Party(StrEnum):
-    """Whom the service waits for."""
-
-    RTC = "rtc"
-    OPERATOR = "operator"
-    WORKER = "worker"
-    """The service's own, which computes."""
-
-    SERVICE = "service"
-    """Another one, of the same system."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -380,6 +352,11 @@ class TrackerState:
     """Who has stopped everything, and why; empty: nobody, or it was released."""
 
     alarms: tuple[Alarm, ...] = ()
+    """Those that last."""
+
+    notes: tuple[Note, ...] = ()
+    """What is kept of alarms that last, went unseen or are muted."""
+
     log: tuple[LogEntry, ...] = ()
     """Oldest first, bounded."""
 
@@ -440,6 +417,9 @@ class Orders:
     dither_stopped: bool = False
     stopped: str = ""
     """Who has stopped everything, and why; empty: nobody."""
+
+    seen: tuple[Note, ...] = ()
+    """What operators have seen of alarms, and what nobody has seen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

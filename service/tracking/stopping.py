@@ -23,11 +23,9 @@ def stop(turn: Turn, command: cmd.StopEverything) -> None:
     ends by itself; only opening the loop would end it sooner.
     """
     if not turn.state.stopped_because:
-        who = f" by {command.by}" if command.by else " by an operator"
-        why = f" ({command.reason})" if command.reason else ""
         ramp = ramping(turn.state, turn.now_ns)
         left = "" if ramp is None else f"; {ramp.id} is the RTC's and ends by itself"
-        _stay(turn, f"everything was stopped{who}{why}{left}")
+        _stay(turn, f"everything was stopped {command.signed}{left}")
     if turn.acquisition.under_way:
         abort(turn, "by the operator", held_off=True)
     for record in (turn.state.measuring, turn.state.gathering):
@@ -51,8 +49,7 @@ def resume(turn: Turn, command: cmd.Resume) -> None:
         raise CommandError("resume: nothing is stopped")
     turn.state = replace(turn.state, stopped_because="")
     turn.calm(STOPPED)
-    who = f"by {command.by}" if command.by else "by an operator"
-    turn.log("resumed", f"{who} ({command.reason})" if command.reason else who)
+    turn.log("resumed", command.signed)
 
 
 def stay_stopped(turn: Turn, orders: Orders) -> None:
@@ -69,6 +66,4 @@ def keep_stopped(turn: Turn) -> None:
 
 def _stay(turn: Turn, text: str) -> None:
     turn.state = replace(turn.state, stopped_because=text)
-    turn.alarm(
-        STOPPED, f"{text}: nothing is dithered, made or sent until POST /v1/resume releases it"
-    )
+    turn.alarm(STOPPED, f"{text}: nothing is dithered, made or sent until the stop is released")

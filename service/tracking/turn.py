@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
-from service.tracking.alarms import Act, forbidding
+from service.tracking.alarms import ALARMS, Act, Alarm, Kind, Severity, forbidding
 from service.tracking.dither_request import Dither, Dithering
 from service.tracking.events import Effect, Event
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
-from service.tracking.state import Acquisition, Alarm, Level, LogEntry, TrackerState
+from service.tracking.state import Acquisition, Level, LogEntry, TrackerState
 from service.wire import Status
 
 LOG_LENGTH = 500
@@ -132,13 +132,21 @@ class Turn:
         """Add a warning to the log."""
         self.log(name, text, Level.WARNING)
 
-    def alarm(self, name: str, text: str) -> None:
-        """Raise an alarm; one already raised keeps its beginning."""
+    def alarm(
+        self, name: str, text: str, own: Kind | None = None, *, critical: bool = False
+    ) -> None:
+        """Raise an alarm; one already raised keeps its beginning.
+
+        ``own``: what is to be known of it, where no table has it. ``critical``: it is worse now
+        than the table says.
+        """
+        if critical:
+            own = replace(ALARMS[name], severity=Severity.CRITICAL)
         before = next((alarm for alarm in self.state.alarms if alarm.name == name), None)
         t_ns = 0 if self.rtc is None else self.rtc.t_ns
         first = before or Alarm(name=name, since_ns_utc=self.now_ns, text=text, t_ns_utc=t_ns)
         others = tuple(alarm for alarm in self.state.alarms if alarm.name != name)
-        raised = replace(first, text=text, seen_ns_utc=self.now_ns)
+        raised = replace(first, text=text, seen_ns_utc=self.now_ns, own=own)
         self.state = replace(self.state, alarms=(*others, raised))
         if before is None:
             self.log(name, text, Level.ALARM)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.tracking.alarms import ALARMS, STALE, Act, forbids
+from service.tracking.alarms import STALE, Act, forbids
 from service.tracking.loop import separation_deg
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration, Standing, Validity
@@ -93,7 +93,7 @@ def end_alarm(turn: Turn, name: str, t_ns_utc: int = 0) -> None:
     alarm = next((alarm for alarm in turn.state.alarms if alarm.name == name), None)
     turn.calm(name)
     if alarm is not None and forbids(alarm, Act.MEASURE):
-        void(turn, ALARMS[name].because, t_ns_utc)
+        void(turn, alarm.kind.because, t_ns_utc)
 
 
 def tells_of(state: TrackerState, name: str, when: Taken) -> bool:

@@ -226,6 +226,10 @@ class StateMessage:
     waiting_for: tuple[Text, ...] = ()
     """Whom the service waits for and what they should do."""
 
+    operation: Text | None = None
+    """What the service is in and does, like "Operational, Tracking"; None: a service of before this
+    key said it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmMessage:
@@ -309,7 +313,8 @@ def _check_acknowledgement(said: Acknowledgement, where: str) -> None:
 
 def _state_fields(values: Map, where: str) -> Map:
     four = {key: read_four(values, key, where) for key in ("alpha", "sigma")}
-    return {**values, **four, "waiting_for": values.get("waiting_for") or ()}
+    absent = {"waiting_for": values.get("waiting_for") or (), "operation": values.get("operation")}
+    return {**values, **four, **absent}
 
 
 travels(

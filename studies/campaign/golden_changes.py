@@ -50,6 +50,8 @@ class Renewal:
         self._t_ns = entry["t"]
         if entry.get("event", {}).get("state") == "failed":
             entry = _failed(entry)
+        if "log" in entry:
+            entry = entry | {"log": [[_said(text) for text in line] for line in entry["log"]]}
         if entry.get("event", {}).get("is") == "GiveUpNoisy" and "refused" in entry:
             entry = entry | {"refused": _of_any_matrix(entry["refused"])}
         return {name: self._renewed(item) for name, item in entry.items()}
@@ -136,6 +138,19 @@ def _total(old: Record) -> Record:
     order = dict(old)
     total_m = order.pop("total_m", None)
     return order if total_m is None else order | {"total_amplitude_m": total_m}
+
+
+def _said(text: str) -> str:
+    """Return a line of the log as it says to a person what to do: in words, not in REST's."""
+    for rest, words in (
+        (
+            "POST /v1/dither with start lets it dither again",
+            "start the dither to let it dither again",
+        ),
+        (": PUT /v1/mode changes it", "; set the mode to change it"),
+    ):
+        text = text.replace(rest, words)
+    return text
 
 
 def _of_any_matrix(refused: str) -> str:

@@ -263,7 +263,7 @@ def test_everything_is_stopped_and_released_in_two_clicks_each(page):
     page.click("#stop")
     page.says("#order", "Nothing is made or sent")
     page.click("#order [value=send]")
-    page.says("#operation", "STOPPED")
+    page.says("#operation", "HOLD")
     page.says("#alarms", "stopped")
     assert page.night.state["stopped_because"]
     page.says("#answer", "everything was stopped")
@@ -281,13 +281,36 @@ def test_an_rtc_that_is_gone_is_seen_with_what_to_do(page):
     page.says("#alarms", "rtc-vanished", 10.0)
     page.says("#alarm-count", "1 alarm")
     page.says("#rtc", "waiting for the RTC")
-    page.says("#operation", "NO RTC")
+    page.says("#operation", "DEGRADED")
     assert page.js("document.querySelector('#loop').classList.contains('old')")
     page.says("#live", "rtc-vanished")
     assert "cannot be used now: no RTC is there" in page.js(
         "document.querySelector('[data-order=rollback]').title"
     )
     assert page.faults_of_access() == []
+
+
+def test_an_alarm_is_acknowledged_and_muted_also_by_keys_alone(page):
+    page.open()
+    vanished = "#alarms [data-name=rtc-vanished]"
+    page.driver.find_element("css selector", f"{vanished}[data-about=acknowledge]").send_keys("\n")
+    page.says("#order", "restart it")
+    page.driver.find_element("css selector", "#reason").send_keys("power is off\tAda\n")
+    page.says("#answer", "rtc-vanished is acknowledged; it stays until it is over")
+    page.says("#alarms", "Ada knows since")
+    page.says("#alarms", "power is off")
+    assert page.faults_of_access() == []
+    page.click(f"{vanished}[data-about=mute]")
+    page.says("#order", "it goes on to forbid")
+    page.driver.find_element("css selector", "#reason").send_keys("until noon\n")
+    page.says("#alarms", "muted by Ada until")
+    page.says("#alarm-count", "1 muted")
+    assert page.faults_of_access() == []
+    (muted,) = page.night.client.get("/v1/alarms").json()["muted_alarms"]
+    assert (muted["name"], muted["muted"]["reason"]) == ("rtc-vanished", "until noon")
+    page.click(f"{vanished}[data-about=unmute]")
+    page.click("#order [value=send]")
+    page.says("#alarm-count", "1 alarm")
 
 
 def test_a_service_that_is_gone_is_a_banner_and_its_return_the_end_of_it(page):
@@ -298,4 +321,4 @@ def test_a_service_that_is_gone_is_a_banner_and_its_return_the_end_of_it(page):
     assert page.faults_of_access() == []
     page.night.running = page.night.service("propose")
     page.until("document.querySelector('#lost').hidden", 15.0)
-    page.says("#operation", "NO RTC")
+    page.says("#operation", "READY")

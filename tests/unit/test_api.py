@@ -30,6 +30,7 @@ from service.errors import (
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.snapshot import Snapshot
+from service.tracking.alarms import Alarm
 from service.tracking.commands import (
     Approve,
     Publish,
@@ -60,7 +61,7 @@ from service.tracking.registration import (
     Validity,
     Watchdog,
 )
-from service.tracking.state import Alarm, Level, LogEntry, Mode, TrackerState
+from service.tracking.state import Level, LogEntry, Mode, TrackerState
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status
 
 SECOND = 1_000_000_000

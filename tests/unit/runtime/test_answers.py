@@ -173,7 +173,7 @@ def test_a_dither_is_over_when_the_status_shows_none():
     first, last = answered_in_the_end(world, order, 1.0)
     assert first[0].startswith("the RTC was told to stop dither-")
     assert not first[1]
-    assert last == ("no dither plays; no dither is started until POST /v1/dither with start", True)
+    assert last == ("no dither plays; no dither is started until one is asked for", True)
 
 
 def test_the_loop_tells_what_the_rtc_has_accepted():

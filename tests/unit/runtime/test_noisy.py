@@ -13,8 +13,9 @@ from service.runtime.estimates import NoisySums
 from service.telemetry.frames import FrameBlock
 from service.telemetry.random_dither import RandomDither, RandomPlan, accumulate
 from service.tracking import events as ev
+from service.tracking.alarms import Alarm
 from service.tracking.products import MeasurementRecord, MeasureState
-from service.tracking.state import Alarm, TrackerState
+from service.tracking.state import TrackerState
 from service.worker import OpticsWorker
 from tests.unit.runtime.small import COMPUTE, small_instrument
 from tests.unit.tracking.situations import rtc

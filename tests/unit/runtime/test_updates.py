@@ -18,9 +18,9 @@ from service.runtime.actions import (
     modes_that_hold,
 )
 from service.tracking import events as ev
+from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState
 from service.tracking.registration import ModeGain
-from service.tracking.state import Alarm
 from service.tracking.worth import fewer_than
 from service.wire import LoopRequest
 from service.worker import OpticsWorker

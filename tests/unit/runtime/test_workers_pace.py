@@ -4,7 +4,8 @@ import pytest
 
 from service.runtime import workers as workers_module
 from service.runtime.workers import PaceMeter
-from service.tracking.state import Alarm, TrackerState
+from service.tracking.alarms import Alarm
+from service.tracking.state import TrackerState
 
 QUIET = TrackerState(system="small")
 

@@ -9,7 +9,7 @@ from service.telemetry.windows import WindowRefused
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarms import ALARMS, Act, Kind
+from service.tracking.alarms import ALARMS, Act, Kind, Severity
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest, LoopRequest
@@ -88,7 +88,8 @@ def test_not_even_an_operator_sends_to_an_rtc_that_may_be_another(name):
 
 def test_where_only_new_matrices_are_forbidden_one_that_was_in_use_may_come_back(monkeypatch):
     forbids = frozenset({Act.DECIDE, Act.SEND_NEW})
-    kind = Kind(means="-", do="-", forbids=forbids, because="the model was wrong")
+    because = "the model was wrong"
+    kind = Kind(severity=Severity.SERIOUS, means="-", do="-", forbids=forbids, because=because)
     monkeypatch.setitem(ALARMS, "wrong-model", kind)
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=3)

@@ -53,7 +53,7 @@ class TestTheMode:
         (entry,) = [entry for entry in again.state.log if entry.name == "mode"]
         assert entry.level is Level.WARNING
         assert "mode is hold, as an operator set it" in entry.text
-        assert "not auto as the settings say: PUT /v1/mode" in entry.text
+        assert "not auto as the settings say; set the mode to" in entry.text
 
     def test_it_stands_through_two_restarts(self, rolled_back):
         assert restarted(restarted(rolled_back)).state.mode is Mode.HOLD
@@ -89,7 +89,7 @@ class TestTheDither:
         again.wait(60)
         assert not again.asked(DitherRequest)
         assert again.state.dithering.reason == "stopped by the operator"
-        assert "before the restart; POST /v1/dither" in again.state.log[0].text
+        assert "before the restart; start the dither" in again.state.log[0].text
         assert of_kind(again.tell(cmd.StartDither()), DitherRequest)
         assert not restarted(again).state.dither_stopped
 

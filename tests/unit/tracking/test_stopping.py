@@ -55,7 +55,7 @@ def test_nothing_is_asked_of_the_rtc_any_more_but_that_dithers_end(activity):
     assert [one for one in world.effects if not harmless(one)] == []
     assert world.playing is None or world.playing.request.id == "of-another-program"
     assert "by Ada (someone is on the platform)" in alarm(world).text
-    assert "POST /v1/resume" in alarm(world).text
+    assert "until the stop is released" in alarm(world).text
 
 
 def test_a_dither_ends_at_once():
@@ -116,7 +116,7 @@ def test_one_that_is_on_its_way_cannot_be_called_back():
     ],
 )
 def test_a_command_is_refused_with_who_stopped_it_and_how_it_is_released(command):
-    with pytest.raises(CommandError, match=r"stopped by Ada \(someone.*POST /v1/resume"):
+    with pytest.raises(CommandError, match=r"stopped by Ada \(someone.*release the stop"):
         stopped(idle()).tell(command)
 
 

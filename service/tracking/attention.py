@@ -1,0 +1,193 @@
+"""Who has seen which alarm: acknowledged, muted for a time, gone without anybody having seen it.
+
+As LSST's ts_watcher has it: an alarm is acknowledged, not dismissed; one that goes unseen stays
+as stale; the worst it has been is kept; an acknowledgement holds until the alarm is over, or worse
+than whoever gave it has seen. What an operator's order ends has been seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service.errors import CommandError, UnknownIdError
+from service.tracking import commands as cmd
+from service.tracking.alarms import ALARMS, Alarm, Attention, Note, Remark, Severity
+from service.tracking.events import Tick
+from service.tracking.policy import SECOND_NS
+from service.tracking.state import Orders, TrackerState
+from service.tracking.turn import Turn
+
+RAISED_AGAIN_S = 60.0
+"""After a restart of the service, for an alarm that lasts to be raised again."""
+
+
+def follow(turn: Turn) -> None:
+    """Keep the notes in step with the alarms, and with the time."""
+    timely = isinstance(turn.event, Tick)
+    if turn.state.alarms is turn.before.alarms and not timely:
+        return
+    notes = {note.name: note for note in turn.state.notes}
+    raised = {alarm.name: alarm for alarm in turn.state.alarms}
+    for alarm in raised.values():
+        notes[alarm.name] = _raised(notes.get(alarm.name, Note(name=alarm.name)), alarm)
+    for name, note in notes.items():
+        if name not in raised:
+            notes[name] = _not_raised(turn, note)
+    _keep(turn, {name: _unmuted(note, turn.now_ns) for name, note in notes.items()})
+
+
+def note_of(state: TrackerState, alarm: Alarm) -> Note:
+    """Return what is kept of an alarm that lasts."""
+    known = next((note for note in state.notes if note.name == alarm.name), Note(name=alarm.name))
+    return replace(_raised(known, alarm), text=alarm.text)
+
+
+def stale(state: TrackerState) -> tuple[Note, ...]:
+    """Return the alarms that have gone and nobody has seen."""
+    return tuple(note for note in state.notes if note.attention is Attention.STALE)
+
+
+def muted(state: TrackerState) -> tuple[Note, ...]:
+    """Return the alarms that are muted, whether they last or not."""
+    return tuple(note for note in state.notes if note.muted is not None)
+
+
+def worst(state: TrackerState) -> Severity | None:
+    """Return the most severe of what lasts, or went unseen; None: there is nothing."""
+    found: Severity | None = None
+    for note in state.notes:
+        if note.worst is not None and note.worst.above(found):
+            found = note.worst
+    return found
+
+
+def acknowledge(turn: Turn, command: cmd.AcknowledgeAlarm) -> None:
+    """Note that somebody knows of an alarm; one that is over is done with.
+
+    Raises
+    ------
+    CommandError
+        If there is nothing to acknowledge, or it has been worse than what was seen of it.
+    UnknownIdError
+        If no alarm has this name.
+    """
+    notes, note = _noted(turn, command.name)
+    seen = note.acknowledged
+    if note.worst is None:
+        raise CommandError(f"{note.name} neither lasts nor is stale: nothing to acknowledge")
+    if seen is not None:
+        raise CommandError(f"{note.name} was acknowledged by {seen.by}: nothing is left to do")
+    if command.severity is not None and note.worst.above(command.severity):
+        raise CommandError(
+            f"{note.name} has been {note.worst}, and {command.severity} was seen of it: look again"
+        )
+    known = replace(note, acknowledged=_remark(turn, command))
+    notes[note.name] = known if note.over_ns_utc is None else _done_with(note)
+    _keep(turn, notes)
+    turn.log("alarm.acknowledged", f"{note.name} {command.signed}")
+
+
+def mute(turn: Turn, command: cmd.MuteAlarm) -> None:
+    """Keep an alarm from being shown and told for a time; all it forbids, it goes on to forbid.
+
+    Raises
+    ------
+    UnknownIdError
+        If no alarm has this name.
+    """
+    notes, note = _noted(turn, command.name)
+    until_ns = turn.now_ns + round(command.for_s * SECOND_NS)
+    notes[note.name] = replace(note, muted=replace(_remark(turn, command), until_ns_utc=until_ns))
+    _keep(turn, notes)
+    turn.log("alarm.muted", f"{note.name} for {command.for_s:.0f} s {command.signed}")
+
+
+def unmute(turn: Turn, command: cmd.UnmuteAlarm) -> None:
+    """Show and tell an alarm again.
+
+    Raises
+    ------
+    CommandError
+        If it is not muted.
+    UnknownIdError
+        If no alarm has this name.
+    """
+    notes, note = _noted(turn, command.name)
+    if note.muted is None:
+        raise CommandError(f"{note.name} is not muted")
+    notes[note.name] = replace(note, muted=None)
+    _keep(turn, notes)
+    turn.log("alarm.unmuted", f"{note.name} {command.signed}")
+
+
+def take_over(turn: Turn, orders: Orders) -> None:
+    """Know what was known before a restart; what lasted then has yet to be raised again."""
+    over_ns = turn.now_ns
+    turn.state = replace(
+        turn.state,
+        notes=tuple(
+            replace(note, over_ns_utc=note.over_ns_utc or over_ns) if note.worst else note
+            for note in orders.seen
+        ),
+    )
+
+
+def _raised(note: Note, alarm: Alarm) -> Note:
+    severity = alarm.kind.severity
+    worse = severity.above(note.worst)
+    if note.worst is not None and note.over_ns_utc is None and not worse:
+        return note
+    return replace(
+        note,
+        worst=severity if worse else note.worst,
+        since_ns_utc=alarm.since_ns_utc,
+        text=alarm.text,
+        over_ns_utc=None,
+        acknowledged=None if worse else note.acknowledged,
+    )
+
+
+def _not_raised(turn: Turn, note: Note) -> Note:
+    """Return the note of an alarm that does not last."""
+    if note.worst is None:
+        return note
+    if note.over_ns_utc is None:
+        ordered = isinstance(turn.event, cmd.Instruction)
+        if ordered or note.acknowledged is not None:
+            return _done_with(note)
+        last = next((a.text for a in turn.before.alarms if a.name == note.name), note.text)
+        return replace(note, over_ns_utc=turn.now_ns, text=last)
+    waited_ns = turn.now_ns - note.over_ns_utc
+    if note.acknowledged is not None and waited_ns > RAISED_AGAIN_S * SECOND_NS:
+        return _done_with(note)
+    return note
+
+
+def _done_with(note: Note) -> Note:
+    return Note(name=note.name, muted=note.muted)
+
+
+def _unmuted(note: Note, now_ns: int) -> Note:
+    """Return a note without a mute that has had its time."""
+    until_ns = None if note.muted is None else note.muted.until_ns_utc
+    return note if until_ns is None or now_ns < until_ns else replace(note, muted=None)
+
+
+def _noted(turn: Turn, name: str) -> tuple[dict[str, Note], Note]:
+    """Return all notes by name, and one of them, or a new one."""
+    notes = {note.name: note for note in turn.state.notes}
+    if name not in notes and name not in ALARMS:
+        raise UnknownIdError(f"alarm {name}: nobody has heard of it")
+    return notes, notes.get(name, Note(name=name))
+
+
+def _keep(turn: Turn, notes: dict[str, Note]) -> None:
+    """Keep what says something, where it is not what is kept already."""
+    kept = tuple(note for note in notes.values() if note != Note(name=note.name))
+    if kept != turn.state.notes:
+        turn.state = replace(turn.state, notes=kept)
+
+
+def _remark(turn: Turn, command: cmd.Instruction) -> Remark:
+    by = command.by or "an operator"
+    return Remark(by=by, reason=command.reason, t_ns_utc=turn.now_ns)

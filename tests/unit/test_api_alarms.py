@@ -1,0 +1,83 @@
+"""Alarms over REST: what is shown of them, and what operators do about them."""
+
+from dataclasses import replace
+
+import pytest
+
+from service.tracking.alarms import Alarm, Note, Remark, Severity
+from service.tracking.commands import AcknowledgeAlarm, MuteAlarm, UnmuteAlarm
+from service.tracking.operation import Operation
+from tests.unit.test_api import (  # noqa: F401
+    SECOND,
+    archive,
+    body_of,
+    client,
+    metrics_of,
+    service,
+)
+
+ADA = Remark(by="Ada", reason="known", t_ns_utc=80 * SECOND)
+
+
+async def test_alarms_are_those_that_last_went_unseen_or_are_muted(client, service):  # noqa: F811
+    service.change(
+        alarms=(Alarm(name="loop-open", since_ns_utc=70 * SECOND, text="open"),),
+        notes=(
+            Note(name="loop-open", worst=Severity.WARNING, acknowledged=ADA),
+            Note(name="margin", worst=Severity.CRITICAL, text="bad", over_ns_utc=9 * SECOND),
+            Note(name="edge-slip", muted=replace(ADA, until_ns_utc=99 * SECOND)),
+        ),
+    )
+    body = await body_of(client, "/v1/alarms")
+    (lasting,), (stale,), (muted,) = (
+        body[name] for name in ("alarms", "stale_alarms", "muted_alarms")
+    )
+    assert (lasting["name"], lasting["severity"]) == ("loop-open", "warning")
+    assert lasting["attention"] == "acknowledged"
+    assert (lasting["acknowledged"]["by"], lasting["acknowledged"]["reason"]) == ("Ada", "known")
+    assert lasting["acknowledged"]["t_utc"] == "1970-01-01T00:01:20.000000Z"
+    assert (lasting["do"], lasting["text"]) == ("close it", "open")
+    assert (stale["severity"], stale["worst_severity"]) == (None, "critical")
+    assert (stale["attention"], stale["text"]) == ("stale", "bad")
+    assert "lower the gain" in stale["do"]
+    assert (muted["name"], muted["muted"]["until_ns_utc"]) == ("edge-slip", 99 * SECOND)
+    assert body["worst_severity"] == "critical"
+    state = await body_of(client, "/v1/state")
+    assert {name: state[name] for name in body} == body
+    assert state["operating"]["operation"] in set(Operation)
+    found = await metrics_of(client)
+    counted = ("alarms", "alarms_stale", "alarms_muted", "alarms_unacknowledged")
+    assert [found[name,] for name in counted] == [1, 1, 1, 0]
+    assert found["alarms_shown", "warning"] == 1
+    assert found["operation", state["operating"]["operation"]] == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "expected"),
+    [
+        ("margin/acknowledge", {"by": "Ada"}, AcknowledgeAlarm(name="margin", by="Ada")),
+        (
+            "margin/acknowledge",
+            {"severity": "serious"},
+            AcknowledgeAlarm(name="margin", severity=Severity.SERIOUS),
+        ),
+        ("margin/mute", {"for_s": 60.0}, MuteAlarm(name="margin", for_s=60.0)),
+        ("margin/unmute", {}, UnmuteAlarm(name="margin")),
+    ],
+)
+async def test_what_operators_do_about_an_alarm_is_an_order(
+    client,  # noqa: F811
+    service,  # noqa: F811
+    path,
+    body,
+    expected,
+):
+    answer = await client.post(f"/v1/alarms/{path}", json=body)
+    assert answer.status_code == 202
+    assert service.commands == [expected]
+
+
+@pytest.mark.parametrize("body", [{}, {"for_s": 0}, {"for_s": 43_201}, {"for_s": "an hour"}])
+async def test_a_mute_is_for_a_time_and_not_for_ever(client, service, body):  # noqa: F811
+    assert (await client.post("/v1/alarms/margin/mute", json=body)).status_code == 422
+    assert service.commands == []

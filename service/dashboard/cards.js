@@ -147,7 +147,7 @@ export function showReconstructors(service, orders) {
     make("td", { text: shortly(r.alpha, r.sigma), title: registrationOf(r.alpha, r.sigma) }),
     make("td", { text: `${r.gate && !r.gate.accepted ? "REFUSED, " : ""}${margin(r.gate)?.text ?? "not judged"}`, title: verdict(r.gate) }),
     make("td", { text: r.created_ns_utc > 0 ? ago(milliseconds(r.created_ns_utc), now) : DASH }),
-    make("td", { text: r.reason || DASH }),
+    make("td", { text: r.reason || DASH, title: r.reason }),
   ));
   if (!rows.length) rows.push(make("tr", {}, make("td", { colspan: "7", text: "no reconstructor is known yet" })));
   $("#reconstructors tbody").replaceChildren(...rows);

@@ -80,6 +80,6 @@ export class Glance {
     const most = Math.max(...known);
     grid(this.root.querySelector(".slopes"), rms.map((row) => row.map((v) => (present(v) ? (100 * v) / most : null))),
       { label: `Residual slopes, RMS in each subaperture, Sx beside Sy: at most ${number(most, 3)}` });
-    put(this.root.querySelector(".slopes-said"), `Sx | Sy, RMS, light ${number(most, 3)}`);
+    put(this.root.querySelector(".slopes-said"), `Sx | Sy, RMS, dark 0 to light ${number(most, 2)}`);
   }
 }

@@ -147,7 +147,7 @@ export class Orders {
     const { name, value, title } = this.#order;
     let why = this.whyNot(name);
     if (!why) await this.#look(name, value).catch((error) => (why = error.message));
-    const text = why ? `nothing to decide any more: ${why}. Cancel.` : "above is how it is now: look again, then send or cancel.";
+    const text = why ? `it cannot be ordered now: ${why}. Cancel, and look again.` : "above is how it is now: look again, then send or cancel.";
     put(this.#dialog.querySelector(".refused"), `The state has changed since you looked, and nothing was done; ${text}`);
     this.#dialog.querySelector("[value=send]").disabled = Boolean(why);
     this.say(`${title}: nothing was done, the state had changed`);

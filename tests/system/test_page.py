@@ -128,7 +128,9 @@ def test_what_is_known_is_seen_with_its_sigma_and_nobody_is_kept_out(page):
     for word in ("shift x", "shift y", "rotation", "magnification", "±"):
         page.says("#registration", word)
     page.says("#mirror .summary", "% of a subaperture")
-    assert page.js("document.querySelectorAll('.plot canvas').length") == 4
+    assert page.js("document.querySelectorAll('#registration .plot canvas').length") == 4
+    page.until("document.querySelectorAll('#glance .plot canvas').length === 2")
+    page.says("#glance", "RMS")
     proposal(page)
     assert page.faults_of_access() == []
 
@@ -213,6 +215,7 @@ def test_what_was_decided_on_a_state_that_has_changed_is_not_done(page):
     body = {"reason": "somebody was faster", "by": "another operator"}
     page.night.client.post("/v1/rollback", json=body).raise_for_status()
     theirs = page.night.state["in_use"]
+    page.says("#provenance", f"in use: {theirs}")
     page.press("too late\n")
     page.says("#order .refused", "The state has changed since you looked, and nothing was done")
     page.says("#order", f"in place of {theirs}")

@@ -18,7 +18,10 @@ from service.errors import PyrcalError, shown
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status: 0 done, 1 failed, 2 refused at the start."""
+    """Run the command line; return the exit status.
+
+    0 done, 1 failed, 2 refused at the start, 3 a service that was to be asked is not reached.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words and words[0] in OTHER_PROGRAMS:
         program, _ = OTHER_PROGRAMS[words[0]]
@@ -29,7 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.own_process = arguments is None
     try:
         check_files(options)
-        command = import_module(f"service.commands.{options.command.replace('-', '_')}")
+        module = getattr(options, "module", options.command.replace("-", "_"))
+        command = import_module(f"service.commands.{module}")
         if arguments is None and options.command != "run":
             signal.signal(signal.SIGINT, signal.default_int_handler)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)

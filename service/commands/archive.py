@@ -15,7 +15,7 @@ from typing import Any
 from service.archive import Archive
 from service.archive.records import to_json
 from service.archive.retention import Item, due, items, remove, verify
-from service.commands.arguments import say, show_progress
+from service.commands.terminal import say, show_progress
 from service.config import Settings, load_settings
 from service.config.policy import keeping_of
 from service.errors import UnknownIdError, shown

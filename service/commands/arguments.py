@@ -9,7 +9,6 @@ import argparse
 import math
 import os
 import re
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -17,7 +16,8 @@ from typing import NoReturn
 from typing_extensions import override
 
 from service import __version__
-from service.errors import ConfigurationError, shown
+from service.commands.remote import declare
+from service.errors import ConfigurationError
 from service.files import kind_of
 from service.files.request import parse_alpha, parse_arms, parse_modes
 
@@ -35,9 +35,15 @@ def command_line() -> argparse.ArgumentParser:
         prog="pyrcal", description="Calibration service of an adaptive telescope."
     )
     parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")
+    parser.add_argument(
+        "--completion",
+        action=_Completion,
+        choices=("bash", "zsh", "fish", "tcsh"),
+        help="print what teaches a shell these words: source <(pyrcal --completion bash)",
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     _describe_run(commands.add_parser("run", help="the service"))
-    _describe_status(commands.add_parser("status", help="what a running service is doing"))
+    declare(commands)
     _describe_key(commands.add_parser("key", help="who may ask: make, list, revoke API keys"))
     _describe_archive(commands.add_parser("archive", help="what is kept, and is it sound?"))
     _describe_check(commands.add_parser("check-rtc", help="does an RTC keep the contract?"))
@@ -70,18 +76,6 @@ def _describe_run(run: argparse.ArgumentParser) -> None:
     )
 
 
-def _describe_status(status: argparse.ArgumentParser) -> None:
-    status.description = "Ask a running service what it does, and say it on one screen."
-    status.epilog = "Exit status: 0 all is well, 1 not ready or an alarm, 2 nothing answers."
-    status.add_argument(
-        "--url",
-        default="http://127.0.0.1:8080",
-        metavar="URL",
-        help="of the service's REST API, default %(default)s",
-    )
-    status.add_argument("--json", action="store_true", help="print all that the service tells")
-
-
 def _describe_key(key: argparse.ArgumentParser) -> None:
     key.description = (
         "Make, list and revoke the keys of those who may ask a service, in its data_dir. A running "
@@ -106,7 +100,6 @@ def _describe_key(key: argparse.ArgumentParser) -> None:
 
 
 def _describe_archive(archive: argparse.ArgumentParser) -> None:
-    archive.set_defaults(module="archive")
     archive.description = (
         "Look through the matrices in a service's data_dir, check them, remove what is old. Reads "
         "beside a running service; prune refuses, for the service does it by itself."
@@ -367,6 +360,19 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}; {self.prog} --help\n")
 
 
+class _Completion(argparse.Action):
+    """Prints the completion of this command line, and ends the program."""
+
+    @override
+    def __call__(
+        self, parser: argparse.ArgumentParser, _options: object, shell: object, *_: object
+    ) -> NoReturn:
+        import shtab
+
+        print(shtab.complete(parser, str(shell)))
+        parser.exit()
+
+
 _NEGATIVE = re.compile(r"-[\d.][-+\d.eE]*,.*")
 
 
@@ -376,14 +382,3 @@ def with_negative_numbers(given: Sequence[str]) -> list[str]:
     It takes it for an option; a word with a blank in it, never.
     """
     return [f" {word}" if _NEGATIVE.fullmatch(word) else word for word in given]
-
-
-def say(line: str) -> None:
-    """Tell the user something beside the answer."""
-    sys.stderr.write(f"{shown(line)}\n")
-
-
-def show_progress(step: str) -> None:
-    """Tell somebody who watches how far it is; a log needs no such lines."""
-    if sys.stderr.isatty():
-        say(f"... {step}")

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.commands.arguments import say
+from service.commands.terminal import say
 from service.config import load_instrument
 from service.conformance.articles import ARTICLES, Checked, Outcome
 from service.conformance.ear import Ear

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from service.archive.store import write_whole
-from service.commands.arguments import say, show_progress
+from service.commands.terminal import say, show_progress
 from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.files.figures import check_plots, write_sheet

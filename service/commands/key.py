@@ -8,7 +8,7 @@ import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 
-from service.commands.arguments import say
+from service.commands.terminal import say
 from service.errors import ConfigurationError
 from service.keys import KeyFile, KeyScope
 

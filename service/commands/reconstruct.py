@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.archive.store import write_whole
-from service.commands.arguments import say, show_progress
+from service.commands.terminal import say, show_progress
 from service.config import load_instrument
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import InversionMethod, Prior, Provenance, Recipe, reconstruct

@@ -16,8 +16,8 @@ from service.errors import ConfigurationError
 PREFIX = "PYRCAL_"
 """Of the environment variables: ``PYRCAL_<SECTION>__<KEY>``, like ``PYRCAL_API__PORT``."""
 
-KEY_VARIABLE = f"{PREFIX}API_KEY"
-"""That of those who ask a service: it is no setting."""
+OF_CLIENTS = {"PYRCAL_URL", "PYRCAL_API_KEY"}
+"""Where a service is asked, and with which key: no settings of one."""
 
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -328,7 +328,7 @@ def load_settings(
     tables = read_toml(path) if path is not None else {}
     file_place = in_file(path) if path is not None else ".".join
     overrides: dict[_Key, tuple[str, object]] = {}
-    for name in sorted(n for n in env if n.startswith(PREFIX) and n != KEY_VARIABLE):
+    for name in sorted(n for n in env if n.startswith(PREFIX) and n not in OF_CLIENTS):
         key = _environment_key(name)
         overrides[key] = (f"environment: {name}", _environment_value(key, env[name]))
     for dotted, value in (command_line or {}).items():

@@ -247,7 +247,7 @@ def test_a_wrong_instrument_file_is_refused_in_one_line_with_file_and_key(write,
         ("mask.h5:/grey", "values other than 0 and 1"),
         ("mask.h5:/empty", "no valid subaperture"),
         ("mask.h5:/text", "expected numbers"),
-        ("text.h5:/valid", "expected an HDF5 or a FITS file"),
+        ("text.h5:/valid", "expected an HDF5, a FITS or a NumPy file"),
     ],
 )
 def test_a_mask_that_cannot_be_used_is_refused(write, tmp_path, reference, expected):
@@ -624,6 +624,10 @@ def test_command_line_beats_environment_beats_file_beats_default(write):
     assert settings.api.host == "environment"
     assert settings.dither.window_s == 4.0
     assert settings.dither.budget_m == 8e-9
+
+
+def test_where_a_client_asks_and_with_which_key_is_no_setting():
+    assert load_settings(None, {"PYRCAL_URL": "http://ao", "PYRCAL_API_KEY": "k"}) == Settings()
 
 
 def test_environment_values_take_the_type_of_their_key():

@@ -1,0 +1,244 @@
+"""A running service, asked over REST; nothing here takes long to import.
+
+Whoever answers is a stranger until the answer makes sense: it may be late, cut, endless, or of
+something else than pyrcal.
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+from urllib.parse import urlencode, urlsplit
+
+from service import __version__
+from service.errors import CommandError, ConfigurationError, LinkError
+
+Document = dict[str, Any]
+"""A JSON object that REST answers."""
+
+ANSWER_WITHIN_S = 5.0
+OBEYED_WITHIN_S = 30.0
+"""An order waits for the RTC."""
+
+LARGEST = 100_000_000
+"""Bytes of a document; the longest history has a third of that."""
+
+_CHUNK = 1 << 20
+_SAYS_PYRCAL = "urn:pyrcal:problem:"
+
+
+class UnreachableError(LinkError):
+    """Nothing answers in time, or something else than this version of pyrcal."""
+
+
+class RefusedError(CommandError):
+    """The service has answered that it does not do it, or has not got it."""
+
+
+class Fetched(NamedTuple):
+    """What was answered."""
+
+    document: Document
+    tag: str
+    """Its ETag; empty: it has none."""
+
+
+class Service:
+    """A running service at its REST address.
+
+    Parameters
+    ----------
+    url
+        ``http://HOST:PORT``, or https.
+    key
+        API key; empty: none is sent.
+
+    Raises
+    ------
+    ConfigurationError
+        If the address or the key is none.
+    """
+
+    def __init__(self, url: str, key: str = "") -> None:
+        try:
+            parts = urlsplit(url)
+            self._port = parts.port
+        except ValueError:
+            parts, self._port = urlsplit(""), None
+        usable = url.isascii() and url.isprintable() and " " not in url and not parts.query
+        if not (usable and parts.scheme in {"http", "https"} and parts.hostname):
+            raise ConfigurationError(
+                f"--url: found {url!r}, expected an address like http://127.0.0.1:8080"
+            )
+        if not (key.isascii() and key.isprintable()) or " " in key:
+            raise ConfigurationError("API key: found blanks or control characters, expected a word")
+        self.url = url
+        self._host, self._path = parts.hostname, parts.path.rstrip("/")
+        self._secure = parts.scheme == "https"
+        self._headers = {"User-Agent": f"pyrcal/{__version__}"}
+        if key:
+            self._headers["Authorization"] = f"Bearer {key}"
+
+    def get(self, path: str, **query: object) -> Fetched:
+        """Return the document at a path.
+
+        Raises
+        ------
+        RefusedError, UnreachableError
+            As :meth:`answered`; or what is answered is no document.
+        """
+        given = {name: value for name, value in query.items() if value is not None}
+        path = f"{path}?{urlencode(given)}" if given else path
+        with self.answered("GET", path, within_s=ANSWER_WITHIN_S) as response:
+            return self._read(response)
+
+    def order(self, method: str, path: str, body: Document, headers: Mapping[str, str]) -> Fetched:
+        """Return what an order is answered.
+
+        One whose answer is lost is sent again where its ``Idempotency-Key`` lets it be carried out
+        only once.
+
+        Raises
+        ------
+        RefusedError, UnreachableError
+            As :meth:`get`. It may have been carried out where the text says so.
+        """
+        sent = {"Content-Type": "application/json", **headers}
+        raw, again = json.dumps(body).encode(), "Idempotency-Key" in headers
+        while True:
+            try:
+                with self.answered(method, path, raw, sent, within_s=OBEYED_WITHIN_S) as response:
+                    return self._read(response)
+            except _LostError as error:
+                if not again:
+                    raise UnreachableError(
+                        f"{error}; the order was sent and may have been carried out: "
+                        "pyrcal status and pyrcal audit tell"
+                    ) from error
+                again = False
+
+    @contextmanager
+    def answered(
+        self,
+        method: str,
+        path: str,
+        body: bytes | None = None,
+        headers: Mapping[str, str] | None = None,
+        *,
+        within_s: float | None = None,
+        silent_s: float | None = None,
+    ) -> Iterator[http.client.HTTPResponse]:
+        """Yield the answer to a request, to be read.
+
+        Parameters
+        ----------
+        method, path, body, headers
+            The request.
+        within_s
+            Until the whole answer has been read, seconds; None: no limit but ``silent_s``.
+        silent_s
+            Without any byte, seconds; None: as long as a document may take.
+
+        Raises
+        ------
+        RefusedError
+            If pyrcal refuses.
+        UnreachableError
+            If nothing answers in time, or something else.
+        """
+        limit_s = within_s or silent_s or ANSWER_WITHIN_S
+        kind = http.client.HTTPSConnection if self._secure else http.client.HTTPConnection
+        connection = kind(self._host, self._port, timeout=limit_s)
+        late = threading.Event()
+        try:
+            connection.connect()
+        except OSError as error:
+            raise UnreachableError(
+                f"{self.url}: nothing answers ({error}); start the service with pyrcal run, or "
+                "name its address with --url or PYRCAL_URL"
+            ) from error
+        timer = threading.Timer(limit_s, _cut, (connection.sock, late))
+        timer.daemon = True
+        if within_s is not None:
+            timer.start()
+        try:
+            connection.request(
+                method, self._path + path, body, {**self._headers, **(headers or {})}
+            )
+            response = connection.getresponse()
+            if response.status >= http.client.BAD_REQUEST:
+                raise self._refusal(response)
+            yield response
+        except (OSError, http.client.HTTPException, UnreachableError) as error:
+            if late.is_set() or isinstance(error, TimeoutError):
+                raise _LostError(
+                    f"{self.url}: no answer within {limit_s:g} s; is it stopped?"
+                ) from error
+            if isinstance(error, UnreachableError):
+                raise
+            raise _LostError(f"{self.url}: the connection was lost ({error})") from error
+        finally:
+            timer.cancel()
+            connection.close()
+
+    def _read(self, response: http.client.HTTPResponse) -> Fetched:
+        """Return the JSON object that an answer is."""
+        raw = response.read(LARGEST + 1)
+        if response.length:
+            raise http.client.IncompleteRead(raw, response.length)
+        try:
+            document = json.loads(raw) if len(raw) <= LARGEST else None
+        except (ValueError, RecursionError):
+            document = None
+        if not isinstance(document, dict):
+            raise self.stranger("no JSON object")
+        return Fetched(document, response.headers.get("ETag", ""))
+
+    def _refusal(self, response: http.client.HTTPResponse) -> RefusedError | UnreachableError:
+        """Return what the answer is that is none."""
+        try:
+            problem = self._read(response).document
+        except UnreachableError:
+            problem = {}
+        kind, detail = problem.get("type"), problem.get("detail")
+        if isinstance(kind, str) and kind.startswith(_SAYS_PYRCAL) and isinstance(detail, str):
+            return RefusedError(detail)
+        return self.stranger(f"{response.status} {response.reason}")
+
+    def stranger(self, found: str) -> UnreachableError:
+        """Return the error that something else answers."""
+        return UnreachableError(
+            f"{self.url}: something answers, but it is not pyrcal, or not this version: {found}"
+        )
+
+
+class _LostError(UnreachableError):
+    """A request was sent, and no answer came."""
+
+
+def _cut(sock: socket.socket, late: threading.Event) -> None:
+    """End a connection whoever waits for it."""
+    late.set()
+    try:
+        sock.shutdown(socket.SHUT_RDWR)
+    except OSError:
+        return  # it has just ended
+
+
+def chunks(response: http.client.HTTPResponse) -> Iterator[bytes]:
+    """Yield what an answer holds.
+
+    Raises
+    ------
+    HTTPException
+        If it ends too early.
+    """
+    while chunk := response.read(_CHUNK):
+        yield chunk
+    if response.length:
+        raise http.client.IncompleteRead(b"", response.length)

@@ -1,0 +1,58 @@
+"""What a command prints: answers to standard output, all else to standard error, nothing raw."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+from service.errors import shown
+
+
+def say(line: str) -> None:
+    """Tell the user something beside the answer."""
+    sys.stderr.write(f"{shown(line)}\n")
+
+
+def show_progress(step: str) -> None:
+    """Tell somebody who watches how far it is; a log needs no such lines."""
+    if sys.stderr.isatty():
+        say(f"... {step}")
+
+
+def print_document(document: dict[str, Any], indent: int | None = 2) -> None:
+    """Print what REST has answered."""
+    print(json.dumps(document, indent=indent).replace("\x7f", "\\u007f"), flush=True)
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines that may quote strangers."""
+    sys.stdout.writelines(f"{shown(line)}\n" for line in lines)
+    sys.stdout.flush()
+
+
+def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Yield rows as lines with columns of equal width; the last one is as long as it is."""
+    clean = [[shown(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*clean, strict=True)]
+    for row in clean:
+        cells = [cell.ljust(width) for cell, width in zip(row[:-1], widths, strict=False)]
+        yield "  ".join([*cells, row[-1]])
+
+
+def clock(utc: str | None) -> str:
+    """Return a time of REST as people read it at night: UTC, to the second."""
+    return "?" if utc is None else f"{utc[:10]} {utc[11:19]}"
+
+
+def span(seconds: float) -> str:
+    """Return a time as people say it; seconds."""
+    for unit_s, unit, smaller_s, smaller in (
+        (86_400.0, "d", 3600.0, "h"),
+        (3600.0, "h", 60.0, "min"),
+        (60.0, "min", 1.0, "s"),
+    ):
+        if seconds >= unit_s:
+            return f"{seconds // unit_s:.0f} {unit} {seconds % unit_s // smaller_s:.0f} {smaller}"
+    return f"{seconds:.2g} s" if seconds < 10.0 else f"{seconds:.0f} s"

@@ -90,6 +90,7 @@ def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's
 
 
 _ID = _word("id", metavar="ID", help="a reconstructor, or in-use, previous, candidate")
+_ALARM = _word("id", metavar="ALARM", help="its name: pyrcal alarms")
 _CANDIDATE = _word(
     "id", metavar="ID", nargs="?", default="candidate", help="default: the one proposed last"
 )
@@ -220,6 +221,31 @@ REQUESTS = (
         "orders",
         "POST",
         "/v1/resume",
+    ),
+    Request(
+        "acknowledge",
+        "say that an alarm is known of; it stays for as long as it lasts",
+        "orders",
+        "POST",
+        "/v1/alarms/{id}/acknowledge",
+        (_ALARM,),
+    ),
+    Request(
+        "mute",
+        "show an alarm no more for a time; it is counted",
+        "orders",
+        "POST",
+        "/v1/alarms/{id}/mute",
+        (_ALARM, _word("for_s", type=float, metavar="SECONDS", help="twelve hours at most")),
+        body=("for_s",),
+    ),
+    Request(
+        "unmute",
+        "show an alarm again",
+        "orders",
+        "POST",
+        "/v1/alarms/{id}/unmute",
+        (_ALARM,),
     ),
     Request(
         "dither",

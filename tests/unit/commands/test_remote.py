@@ -123,6 +123,9 @@ ORDERS = [
     (["rollback", "--yes"], "Rollback", {}),
     (["measure", "--yes", "--no-wait", "--n-average", "3"], "Measure", {"n_average": 3}),
     (["measure-noisy", "--no-wait", "--duration-s", "9"], "MeasureNoisy", {"duration_s": 9.0}),
+    (["acknowledge", "margin"], "AcknowledgeAlarm", {"name": "margin", "severity": None}),
+    (["mute", "margin", "600"], "MuteAlarm", {"name": "margin", "for_s": 600.0}),
+    (["unmute", "margin"], "UnmuteAlarm", {"name": "margin"}),
     (["give-up", "im-1"], "GiveUp", {"id": "im-1"}),
 ]  # fmt: skip
 

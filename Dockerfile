@@ -1,9 +1,17 @@
 ARG BASE=python:3.12-slim
+FROM ${BASE} AS manual
+WORKDIR /opt
+COPY constraints.txt ./
+RUN pip install --no-cache-dir -c constraints.txt sphinx myst-parser
+COPY docs docs
+RUN python -m sphinx -q docs manual
+
 FROM ${BASE}
 
 WORKDIR /opt/pyrcal
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY service service
+COPY --from=manual /opt/manual service/manual
 COPY sim_rtc sim_rtc
 COPY studies studies
 RUN pip install --no-cache-dir -c constraints.txt . \

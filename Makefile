@@ -1,11 +1,12 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-long check paper clean FORCE
+.PHONY: help setup demo docs test test-long check paper clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
 STAMP := .venv/.installed-for
+MANUAL := service/manual/index.html
 # A hundred processes that each compile the service anew cost a minute.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(PY) -m pytest
 
@@ -20,10 +21,12 @@ endif
 help:
 	@grep -E '^[a-z-]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/:.*## /:\t/' | expand -t 11
 
-setup: $(STAMP) ## install pyrcal and its tools into .venv
+setup: $(STAMP) $(MANUAL) ## install pyrcal and its tools into .venv, build the manual
 
-demo: $(STAMP) ## service and simulated RTC together; ARGS="--seconds 60" and the like
+demo: $(STAMP) $(MANUAL) ## service and simulated RTC together; ARGS="--seconds 60" and the like
 	@.venv/bin/pyrcal demo $(ARGS)
+
+docs: $(MANUAL) ## build the manual, which the service shows at /manual/
 
 test: $(STAMP) ## all that a change needs, what is known soonest first; ARGS go to pytest
 	@$(PYTEST) -n 2 -m 'not long and not slow' $(ARGS)
@@ -41,9 +44,12 @@ paper: $(STAMP) ## the seed paper, figure by figure, as one HTML report; ARGS=--
 	@$(PY) -m studies.heritier2018 $(ARGS)
 
 clean: ## remove what make made; never var/, which holds calibration products
-	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+	rm -rf .venv build dist service/manual *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
 	    .import_linter_cache .coverage
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(MANUAL): $(STAMP) docs/conf.py docs/manual.css $(wildcard docs/*.md docs/*/*.md docs/*/*.png)
+	@$(PY) -m sphinx -q -d build/manual docs $(@D) && touch $@
 
 # A working environment is brought up to date in place; one made elsewhere or broken is made anew.
 $(STAMP): pyproject.toml constraints.txt
@@ -62,5 +68,5 @@ $(STAMP): pyproject.toml constraints.txt
 	    "$$python" -m venv --clear .venv || exit 1; \
 	fi
 	@echo "setup: installing pyrcal and its tools (the first time takes a minute or two)"
-	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,test,fits,plots]'
+	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,test,fits,plots,docs]'
 	@printf '%s\n' '$(CURDIR)' > $@

@@ -1,4 +1,4 @@
-"""Writes what docs repeat of the code: states.md, house.md, the tables of rtc.md, openapi.json.
+"""Writes what docs repeat of the code: states, files, the tables of rtc.md, the reference pages.
 
 Run: ``python -m studies.pages``, then ``git diff``; a test compares.
 """
@@ -16,12 +16,13 @@ from typing import Any, get_args
 
 from service.api import create_app
 from service.tracking.activity import ALLOWS
-from service.tracking.alarms import ALARMS, Act, Attention, Severity
+from service.tracking.alarms import Act, Attention, Severity
 from service.tracking.commands import Command
 from service.tracking.operation import OCCUPIES, Occupation, Operation
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.registration import Validity
 from service.tracking.state import AcquisitionStage, Mode
+from studies import reference
 from studies.contract_tables import table, with_tables
 
 ROOT = Path(__file__).parents[1]
@@ -58,9 +59,8 @@ def states() -> str:
         "goes unseen stays as stale until somebody acknowledges it; one that becomes worse has to "
         "be acknowledged again; one that an operator's order ends has been seen. A muted one "
         "is not shown for a time, of twelve hours at most, and forbids what it "
-        "forbids. Operators' acknowledgements and mutes outlive a restart. What one forbids: "
-        + "; ".join(f"*{_plain(act)}*: {_lower(text)}" for act, text in _described(Act).items()),
-        table(("alarm", "is", "it means", "do", "forbids"), _alarms()),
+        "forbids. Operators' acknowledgements and mutes outlive a restart.",
+        "[The runbook](runbook.md) has each: what is the matter, what to do, what it forbids.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -102,7 +102,28 @@ def _whole(number: str) -> float:
     return int(value) if value.is_integer() else value
 
 
-PAGES = {"states.md": states, "house.md": house, "rtc.md": rtc, "openapi.json": openapi}
+def rest() -> str:
+    """Return docs/rest.md."""
+    return reference.rest(json.loads(openapi()))
+
+
+def runbook() -> str:
+    """Return docs/runbook.md."""
+    acts = {act: _lower(text) for act, text in _described(Act).items()}
+    return reference.runbook(acts)
+
+
+PAGES = {
+    "states.md": states,
+    "house.md": house,
+    "rtc.md": rtc,
+    "openapi.json": openapi,
+    "settings.md": reference.settings,
+    "instrument.md": reference.instrument,
+    "cli.md": reference.commands,
+    "rest.md": rest,
+    "runbook.md": runbook,
+}
 
 
 def _refusals() -> list[tuple[str, ...]]:
@@ -114,19 +135,6 @@ def _refusals() -> list[tuple[str, ...]]:
             OCCUPIES.get(activity, ""),
         )
         for activity, allowed in ALLOWS.items()
-    ]
-
-
-def _alarms() -> list[tuple[str, ...]]:
-    return [
-        (
-            f"`{name}`",
-            kind.severity.value,
-            kind.means,
-            kind.do,
-            ", ".join(_plain(act) for act in Act if act in kind.forbids),
-        )
-        for name, kind in ALARMS.items()
     ]
 
 
@@ -146,10 +154,6 @@ def _described(kind: type[StrEnum]) -> dict[str, str]:
             case _:
                 pass
     return texts
-
-
-def _plain(act: str) -> str:
-    return act.replace("_", " ")
 
 
 def _lower(text: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from typing import Final
 
@@ -13,9 +14,11 @@ from fastapi import APIRouter, FastAPI, Response
 from fastapi.responses import FileResponse
 from numpy.typing import NDArray
 from starlette.datastructures import MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from typing_extensions import override
 
 from service.control.gate import LIMIT_M
 from service.model.instrument import Instrument, Mirror
@@ -28,7 +31,10 @@ router = APIRouter(prefix="/v1", tags=["what the service knows"])
 
 FILES: Final = Path(__file__).parent.parent / "dashboard"
 
-MANUAL: Final = Path(__file__).parent.parent / "swagger"
+MANUAL: Final = Path(__file__).parent.parent / "manual"
+"""Where ``make docs`` has put the manual."""
+
+SWAGGER: Final = Path(__file__).parent.parent / "swagger"
 """Swagger UI, which shows what REST answers and tries it out: no observatory needs the internet."""
 
 HEADERS: Final = {
@@ -45,6 +51,14 @@ HEADERS: Final = {
 
 MANUAL_HEADERS: Final = {
     **HEADERS,
+    # it can be searched
+    "Content-Security-Policy": HEADERS["Content-Security-Policy"].replace(
+        "form-action 'none'", "form-action 'self'"
+    ),
+}
+
+SWAGGER_HEADERS: Final = {
+    **HEADERS,
     # Swagger UI sets styles of elements, and has its icons in its style sheet
     "Content-Security-Policy": HEADERS["Content-Security-Policy"]
     .replace("style-src 'self'", "style-src 'self' 'unsafe-inline'")
@@ -53,19 +67,35 @@ MANUAL_HEADERS: Final = {
 
 
 def install(app: FastAPI) -> None:
-    """Serve the page at ``/``, what REST answers at ``/docs``, and what both are made of."""
+    """Serve the page at ``/``, what REST answers at ``/docs``, the manual, and their files."""
 
     @app.get("/", include_in_schema=False, openapi_extra=OPEN)
     async def page() -> Response:
         return FileResponse(FILES / "index.html", headers=HEADERS)
 
     @app.get("/docs", include_in_schema=False, openapi_extra=OPEN)
-    async def manual() -> Response:
-        return FileResponse(MANUAL / "index.html", headers=MANUAL_HEADERS)
+    async def swagger() -> Response:
+        return FileResponse(SWAGGER / "index.html", headers=SWAGGER_HEADERS)
 
     app.add_middleware(Packed)
     app.mount("/dashboard", _with_headers(StaticFiles(directory=FILES), HEADERS))
-    app.mount("/docs/files", _with_headers(StaticFiles(directory=MANUAL), MANUAL_HEADERS))
+    app.mount("/docs/files", _with_headers(StaticFiles(directory=SWAGGER), SWAGGER_HEADERS))
+    manual = _Manual(directory=MANUAL, html=True, check_dir=False)
+    app.mount("/manual", _with_headers(manual, MANUAL_HEADERS))
+
+
+class _Manual(StaticFiles):
+    """The manual, from the moment it has been built."""
+
+    @override
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if not (MANUAL / "index.html").is_file():
+            detail = (
+                "the manual has not been built: run make docs in the checkout; an image has it. "
+                "Its pages are the files of docs/"
+            )
+            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, detail)
+        await super().__call__(scope, receive, send)
 
 
 class Packed:

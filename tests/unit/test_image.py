@@ -31,9 +31,9 @@ def let_through(path: str, ignore: str) -> bool:
 
 
 def copied() -> list[str]:
-    """Return the sources of every COPY."""
+    """Return the sources of every COPY from the checkout."""
     lines = (ROOT / "Dockerfile").read_text().replace("\\\n", " ").splitlines()
-    words = [shlex.split(line)[1:] for line in lines if line.startswith("COPY ")]
+    words = [shlex.split(line)[1:] for line in lines if re.match("COPY (?!--from)", line)]
     return [source for line in words for source in line[:-1] if not source.startswith("--")]
 
 

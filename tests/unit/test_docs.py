@@ -1,0 +1,188 @@
+"""The manual: its commands are understood, its files are read, its links lead somewhere."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from importlib.util import find_spec
+from itertools import groupby
+
+import httpx
+import pytest
+
+from service.api import create_app
+from service.commands.arguments import command_line, with_negative_numbers
+from service.config import load_settings
+from service.config.instrument_schema import read_instrument_file
+from service.routes import page
+from service.tracking.alarms import ALARMS
+from sim_rtc.options import parse_options
+from studies.demo.arguments import demo_parser
+from tests.unit.test_api import archive, assert_problem, client, service
+from tests.unit.test_house import ROOT
+
+__all__ = ["archive", "client", "service"]  # fixtures
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SHELL_ALONE = {"cd", "docker", "export", "git", "grep", "zip"}
+"""Programs of others: that the shell understands them is all that is looked at."""
+
+
+REST = json.loads((ROOT / "docs" / "openapi.json").read_text(encoding="utf-8"))["paths"]
+
+
+def blocks(kind):
+    """Every fenced block of a kind: (page and number, text)."""
+    for path in PAGES:
+        found = re.findall(rf"^```{kind}\n(.*?)^```", path.read_text("utf-8"), re.M | re.S)
+        for number, text in enumerate(found):
+            yield pytest.param(text, id=f"{path.stem}-{number}")
+
+
+def commands(text):
+    """The commands of a block, as words."""
+    text = re.sub(r"(?<!\S)#.*", "", text.replace("\\\n", " "))
+    lexer = shlex.shlex(text, posix=True, punctuation_chars=";|&<>\n")
+    lexer.whitespace, lexer.whitespace_split = " \t", True
+    for ends, words in groupby(lexer, lambda word: not set(word) - set(";|&\n")):
+        if not ends:
+            words = list(words)
+            yield words[: words.index(">")] if ">" in words else words
+
+
+def check_pyrcal(words):
+    """See that a command line is understood."""
+    name, *rest = words
+    try:
+        match name:
+            case "demo":
+                demo_parser().parse_args(with_negative_numbers(rest))
+            case "sim":
+                parse_options([word.replace("bench.toml", "flao-lbt") for word in rest])
+            case _:
+                command_line().parse_args(with_negative_numbers(words))
+    except SystemExit as ended:
+        if ended.code:  # --help ends with 0
+            raise AssertionError(words) from ended
+
+
+def check_make(words):
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M)
+    target = next(word for word in words if "=" not in word)
+    assert target in targets
+    given = [shlex.split(word.partition("=")[2]) for word in words if word.startswith("ARGS=")]
+    if target == "demo" and given:
+        check_pyrcal(["demo", *given[0]])
+
+
+async def check_curl(words, client):
+    """Ask the application: whatever it is that is not there, the request itself is right."""
+    method, url, body, headers = "GET", "", None, {}
+    words = iter(words)
+    for word in words:
+        if word == "-X":
+            method = next(words)
+        elif word == "-d":
+            body = next(words)
+        elif word == "-H":
+            name, _, value = next(words).partition(": ")
+            headers[name] = value
+        elif word in {"-o", "-T"}:
+            next(words)
+        else:
+            assert not word.startswith("-"), word
+            url = word
+    assert re.match(r"http://(127\.0\.0\.1|ao-pc):8080/", url), f"{url!r} is no URL"
+    path = re.sub(r"^http://[^/]*", "", url)
+    if path.startswith("/v1/fits"):  # a desk of its own, which is not there
+        assert method.lower() in REST[re.sub(r"ID|\?.*", lambda m: "{id}" * (m[0] == "ID"), path)]
+        return
+    answer = await client.request(method, path, content=body, headers=headers)
+    if answer.status_code == 404:
+        assert answer.json()["type"] == "urn:pyrcal:problem:unknown-id", (path, answer.text)
+    else:
+        assert answer.status_code in {200, 202, 204}, (method, path, body, answer.text)
+
+
+@pytest.mark.parametrize("text", list(blocks("sh")))
+async def test_a_command_of_the_manual_is_understood(text, client):
+    for program, *words in commands(text):
+        match program.removeprefix(".venv/bin/"):
+            case "pyrcal":
+                check_pyrcal(words)
+            case "make":
+                check_make(words)
+            case "curl":
+                await check_curl(words, client)
+            case "python":
+                assert find_spec(words[words.index("-m") + 1])
+            case other:
+                assert other in SHELL_ALONE, other
+
+
+@pytest.mark.parametrize("text", list(blocks("sh")))
+def test_a_block_of_the_manual_is_one_that_the_shell_reads(text):
+    subprocess.run(["bash", "-n"], input=text, text=True, check=True)
+
+
+@pytest.mark.parametrize("text", list(blocks("toml")))
+def test_a_file_of_the_manual_is_read(text, tmp_path):
+    path = tmp_path / "it.toml"
+    path.write_text(text, encoding="utf-8")
+    if text.startswith("[instrument]"):
+        assert read_instrument_file(path)
+    elif text.startswith("[service]"):
+        assert load_settings(path, {})
+
+
+@pytest.mark.long
+def test_every_page_can_be_read_and_every_link_leads_somewhere(tmp_path):
+    """Sphinx itself says what does not; the HTML is made by make docs."""
+    words = ["-q", "-W", "--keep-going", "-b", "dummy", "-d", str(tmp_path / "trees")]
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", *words, str(ROOT / "docs"), str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def headings(name):
+    """The anchors of a page, as Sphinx makes them."""
+    text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+    for title in re.findall(r"^##+ (.*)$", text, re.M):
+        words = re.findall(r"[a-z0-9]+", title.lower())
+        yield "-".join(words)
+
+
+def test_the_help_of_the_page_leads_into_the_manual():
+    text = (page.FILES / "index.html").read_text(encoding="utf-8")
+    links = re.findall(r'href="manual/(?:([a-z]+)\.html)?(?:#([a-z0-9-]+))?"', text)
+    assert len(links) > 4
+    for name, anchor in links:
+        assert (ROOT / "docs" / f"{name or 'index'}.md").is_file(), name
+        assert not anchor or anchor in headings(name), anchor
+
+
+def test_every_alarm_is_in_the_runbook():
+    assert set(ALARMS) <= set(headings("runbook"))
+
+
+def test_a_picture_is_small():
+    pictures = list((ROOT / "docs").rglob("*.png"))
+    assert {path.name for path in pictures if path.stat().st_size > 100_000} == set()
+
+
+async def test_the_manual_is_served_once_it_is_built(service, monkeypatch, tmp_path):
+    monkeypatch.setattr(page, "MANUAL", tmp_path)
+    transport = httpx.ASGITransport(create_app(service))
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+        answer = await client.get("/manual/")
+        assert_problem(answer, 503, "http", "make docs")
+        (tmp_path / "index.html").write_text("built", encoding="utf-8")
+        answer = await client.get("/manual/")
+        assert (answer.status_code, answer.text) == (200, "built")
+        assert "script-src 'self'" in answer.headers["content-security-policy"]
+        assert "unsafe" not in answer.headers["content-security-policy"]
+        assert (await client.get("/manual/../../pyproject.toml")).status_code == 404

@@ -50,8 +50,8 @@ export function showConnection(service) {
   if (banner.hidden === lost) banner.hidden = !lost;
   document.body.classList.toggle("lost", lost);
   if (!lost) return;
-  const text = service.state
-    ? `■ CONNECTION LOST: nothing below is of now; the last was heard ${span(service.age_s)} ago. Trying again.`
+  const text = service.locked ? "■ This service wants a key: log in, at the top of the page."
+    : service.state ? `■ CONNECTION LOST: nothing below is of now; the last was heard ${span(service.age_s)} ago. Trying again.`
     : "◐ Waiting for the service: nothing has been heard yet. Trying again.";
   put(banner, text);
 }

@@ -52,6 +52,7 @@ export class Orders {
 
   // Why something cannot be ordered now; empty: it can. The service has the last word.
   whyNot(name, value) {
+    if (this.#service.forbidden) return this.#service.forbidden;
     if (!this.#service.fresh) return "the connection to the service is lost";
     const { state, work } = this;
     if (BUSY.has(name) && state.stopped_because) return `everything is stopped: ${state.stopped_because}; release it first`;

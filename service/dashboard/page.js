@@ -6,9 +6,11 @@ import { MirrorOnSensor } from "./mirror.js";
 import { Orders } from "./orders.js";
 import { Registration } from "./registration.js";
 import { choose, scheme } from "./scheme.js";
+import { Session } from "./session.js";
 import { Service } from "./stream.js";
 
 const service = new Service();
+new Session(service);
 const orders = new Orders(service);
 const registration = new Registration(service, document.querySelector("#registration"));
 const mirror = new MirrorOnSensor(service, document.querySelector("#mirror"));

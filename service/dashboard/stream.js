@@ -9,6 +9,8 @@ export class Service extends EventTarget {
   reconstructors = [];
   connected = false;
   lostSince = Date.now();
+  locked = false; // until somebody logs in
+  forbidden = ""; // why nothing can be ordered from here
   #heard = 0; // performance.now() of the last message
   #source = null;
   #hiding = 0;
@@ -44,8 +46,10 @@ export class Service extends EventTarget {
     source.addEventListener("reset", () => this.#readLog());
     source.onerror = () => {
       this.#lose();
-      // a browser gives up for good on an answer that is no stream, such as 503
-      if (source.readyState === EventSource.CLOSED) setTimeout(() => source === this.#source && this.start(), 2000);
+      // a browser gives up for good on an answer that is no stream, such as 401 or 503
+      if (source.readyState !== EventSource.CLOSED) return;
+      this.#tell("closed");
+      setTimeout(() => source === this.#source && !this.locked && this.start(), 2000);
     };
   }
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from service.keys import KeyFile, KeyScope
 from tests.system.night import a_night, wait_for
 from tests.system.pace import patience
 
@@ -276,6 +277,47 @@ def test_everything_is_stopped_and_released_in_two_clicks_each(page):
     page.click("#order [value=send]")
     page.says("#answer", "released")
     page.says("#operation", "TRACKING", 20.0)
+
+
+def test_once_there_are_keys_the_page_asks_for_one_and_says_why_it_may_not_order(page):
+    page.open()
+    keys = KeyFile(page.night.directory / "data")
+    look, order = keys.add("looks", KeyScope.READ), keys.add("orders", KeyScope.OPERATE)
+
+    def log_in(secret):
+        page.until("document.querySelector('#login').open")
+        field = page.driver.find_element("css selector", "#login-key")
+        field.clear()
+        field.send_keys(secret)
+        page.click("#login [type=submit]")
+
+    page.says("#lost", "wants a key")
+    log_in("pyrcal_guess")
+    page.says("#login", "found a key that is none")
+    assert page.faults_of_access() == []
+    log_in(look)
+    page.until("document.querySelector('#lost').hidden")
+    page.says("#who", "looks (read)")
+    page.press("h")
+    page.says("#answer", "Hold cannot be ordered now: key looks may look, not order")
+    assert "key looks may look" in page.js("document.querySelector('#stop').title")
+    keys.revoke("looks")
+    log_in(order)
+    page.until("document.querySelector('#lost').hidden")
+    page.press("h")
+    page.click("#order [value=send]")
+    page.says("#answer", "mode is hold")
+    assert page.js("document.cookie") == "", "no script can read it"
+    headers = {"Authorization": f"Bearer {order}"}
+    trail = page.night.client.get("/v1/audit", headers=headers).json()["entries"]
+    told = [(e["name"], e["who"], e["address"], e["whence"]) for e in trail]
+    assert ("SetMode.answered", "orders", "127.0.0.1", "page") in told
+    assert ("request.wrong-key", "127.0.0.1", "127.0.0.1", "page") in told
+    page.click("#who")
+    page.until("document.querySelector('#login').open")
+    keys.path.unlink()
+    page.open()
+    assert page.js("document.querySelector('#who').hidden")
 
 
 def test_an_rtc_that_is_gone_is_seen_with_what_to_do(page):

@@ -41,15 +41,16 @@ TOGETHER = {
     "POST /v1/noisy-matrix": "any of them twice",
     "POST /v1/loop": "at least one of loop|gains or effective_gain|no mode in two groups|first <=",
     "POST /v1/loop/ramp": "no mode in two groups|first <=",
-    "GET /v1/alpha/history": "a time in nanoseconds or as RFC 3339|since <= until",
-    "GET /v1/audit": "a time in nanoseconds or as RFC 3339|since <= until",
     "POST /v1/fits": r"query\.(modes|start|instrument): found|unusable-matrix ",
     "GET /v1/fits/{id}": "unusable-matrix ",
 }
 """Of each operation, rules that JSON Schema cannot say: what is refused by one of them is meant."""
 
-ANYWHERE = r"expected printable characters|found [-\d.e+]+, expected a valid integer"
-"""Names and reasons that act on a terminal; a whole number that is written as 36.0."""
+ANYWHERE = (
+    r"expected printable characters|found [-\d.e+]+, expected a valid integer|"
+    "a time in nanoseconds or as RFC 3339|since <= until"
+)
+"""Names and reasons that act on a terminal; a whole number that is written as 36.0; times."""
 
 
 class Bridge(HandmadeBridge):

@@ -18,4 +18,4 @@ html_css_files = ["manual.css"]
 html_copy_source = False
 html_use_index = False
 myst_heading_anchors = 3
-html_sidebars = {"**": ["about.html", "searchfield.html", "navigation.html"]}  # no inline script
+html_sidebars = {"**": ["about.html", "searchfield.html", "navigation.html"]}

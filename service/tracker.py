@@ -12,6 +12,7 @@ from service.tracking import (
     evidence,
     measuring,
     operator,
+    probation,
     reconstructors,
     rtc,
     stopping,
@@ -60,6 +61,7 @@ def step(
     turn = Turn(state, event, policy, now_ns)
     measuring.watch_measurement(turn)
     _react(turn)
+    probation.follow(turn)
     note_declined(turn)
     _go_on(turn)
     attention.follow(turn)
@@ -123,6 +125,8 @@ def _react_to_answer(turn: Turn) -> None:  # noqa: C901 - one line for each even
     match turn.event:
         case ev.MatrixMade(record=made) if turn.acquisition.under_way:
             reconstructors.propose(turn, made)
+        case ev.MatrixMade() as event if probation.is_way_back(turn.state, event):
+            probation.go_back(turn, event)
         case ev.MatrixMade() as event:
             reconstructors.on_matrix(turn, event)
         case ev.MatrixFetched(record=fetched):
@@ -144,6 +148,8 @@ def _react_to_answer(turn: Turn) -> None:  # noqa: C901 - one line for each even
             if loud is not None:
                 measuring.cut_off(turn, f"its dither was too strong: {heard.text}")
                 dither.stop_too_strong(turn, heard.id, loud)
+        case ev.Compared() as event:
+            probation.on_compared(turn, event)
         case ev.Vibrations() as vibrations:
             dither.hear_vibrations(turn, vibrations)
         case ev.JobFailed() as failed:

@@ -19,7 +19,7 @@ from service.tracking.activity import ALLOWS
 from service.tracking.alarms import Act, Attention, Severity
 from service.tracking.commands import Command
 from service.tracking.operation import OCCUPIES, Occupation, Operation
-from service.tracking.products import MatrixState, MeasureState
+from service.tracking.products import MatrixState, MeasureState, ProbationState
 from service.tracking.registration import Validity
 from service.tracking.state import AcquisitionStage, Mode
 from studies import reference
@@ -34,6 +34,7 @@ _STATES: dict[str, type[StrEnum]] = {
     "What α is worth": Validity,
     "An acquisition's way": AcquisitionStage,
     "A reconstructor's way": MatrixState,
+    "The probation of a matrix": ProbationState,
     "A measured matrix's way": MeasureState,
     "How much an alarm matters": Severity,
     "What operators have done about an alarm": Attention,

@@ -37,6 +37,7 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.runtime.supervisor import Supervisor
 from service.snapshot import AlarmShown, Alpha, GainTableShown, Pace, Rtc, Snapshot
+from service.telemetry.probation import ProbationFinding
 from service.tracking.alarms import Alarm, Note, Remark
 from service.tracking.commands import GainGroup
 from service.tracking.dither_request import Dither, Dithering, DitherPlan
@@ -47,6 +48,7 @@ from service.tracking.products import (
     MeasurementRecord,
     ModeLimit,
     NoisyFinding,
+    Probation,
     ReconstructorRecord,
 )
 from service.tracking.registration import HistoryEntry, ModeGain, Watchdog
@@ -350,6 +352,8 @@ view("ModeGainView", ModeGain, "mode gain gain_sigma=sigma gain_scatter=scatter 
 view("VerdictView", GateVerdict)
 view("ExpectedGainView", ExpectedGain)
 view("AssessmentView", Assessment)
+view("ProbationFindingView", ProbationFinding)
+view("ProbationView", Probation, "id before state text since_ns_utc until_ns_utc finding rollback")
 view("ModeLimitView", ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
 ALPHA = view(
     "AlphaView",
@@ -475,13 +479,13 @@ STATE = view(
     "StateView",
     Snapshot,
     "tracker.system tracker.mode tracker.stopped_because ready ready_reason now_ns uptime_s "
-    "registration=alpha tracker.in_use tracker.margin tracker.assessment tracker.mode_limit rtc "
-    "tracker.pointing tracker.basis_id tracker.config_id tracker.dither tracker.dithering "
-    "tracker.vibrations_hz tracker.measuring tracker.gathering tracker.acquisition "
-    "tracker.loop_command tracker.dither_due_since_ns_utc tracker.dither_due_reason "
-    "tracker.watchdog tracker.unwatched waiting_for operating alarms stale_alarms muted_alarms "
-    "worst_severity tracker.windows_accepted "
-    "tracker.windows_refused tracker.windows_outlying pace link",
+    "registration=alpha tracker.in_use tracker.margin tracker.assessment tracker.mode_limit "
+    "tracker.probation rtc tracker.pointing tracker.basis_id tracker.config_id tracker.dither "
+    "tracker.dithering tracker.vibrations_hz tracker.measuring tracker.gathering "
+    "tracker.acquisition tracker.loop_command tracker.dither_due_since_ns_utc "
+    "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating alarms "
+    "stale_alarms muted_alarms worst_severity tracker.windows_accepted tracker.windows_refused "
+    "tracker.windows_outlying pace link",
     "What the service knows, at one glance.",
     measuring=MEASURING,
     gathering=GATHERING,

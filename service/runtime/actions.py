@@ -200,7 +200,9 @@ class Actions:
         matrix = await asyncio.to_thread(self.matrix, effect.source)
         gate, judged, why = None, None, effect.why
         gains = commanded_gains(rtc, len(matrix))
-        if registration is not None and any(gains):
+        if not effect.judged and source is not None:
+            gate, judged = source.gate, source.judged
+        elif registration is not None and any(gains):
             gate = await self._verdict(matrix, gains, state)
             judged = judged_now(state, gains)
         else:
@@ -219,7 +221,7 @@ class Actions:
             sha256=checksum(matrix),
         )
         await self._keep(record, matrix, None, why)
-        return ev.MatrixMade(record=record, wanted=True)
+        return ev.MatrixMade(record=record, wanted=effect.judged)
 
     async def _judge(
         self, effect: ev.JudgeMatrix | ev.JudgeProposal, state: TrackerState

@@ -214,6 +214,9 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
         if (trouble is not None) is not known:
             text, t_ns = trouble or over, streams.heard_ns_utc
             found.append(ev.Trouble(name=name, text=text, over=known, t_ns_utc=t_ns))
+    judged, trial = streams.comparison.found, state.probation
+    if judged is not None and trial is not None and trial.awaits(judged.before, judged.after):
+        found.append(ev.Compared(finding=judged))
     return found
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.telemetry import loopcheck, passive
+from service.telemetry import loopcheck, passive, probation
 from service.telemetry.frames import FrameBlock
 from service.telemetry.health import (
     EdgeHealth,
@@ -23,10 +23,17 @@ from service.telemetry.lockin import LockIn, Spectra
 from service.telemetry.loopcheck import LoopCheck, LoopLaw, Obedience
 from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, measured
+from service.telemetry.probation import Comparison
 from service.telemetry.random_dither import Correlated, RandomDither
 from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.tracking.dither_request import SETTLING_S, Dither, asked_of, lock_in_plan, random_plan
-from service.tracking.loop import last_seq, same_loop, same_rate, why_open
+from service.tracking.loop import (
+    last_seq,
+    same_but_for_modes,
+    same_loop,
+    same_rate,
+    why_open,
+)
 from service.wire import DitherKind, Status
 from service.worker import Description
 
@@ -108,6 +115,12 @@ class Streams:
     unlawful: tuple[str, ...] = ()
     """What the last verdicts on the loop's law found to be otherwise than told, without a break."""
 
+    comparison: Comparison = field(default_factory=Comparison)
+    """Of telemetry with the matrix in use and with the one before."""
+
+    compared: Status | None = None
+    """The loop that both must be of, but for how many modes are controlled."""
+
 
 Window = Spectra | Correlated | WindowRefused
 
@@ -129,7 +142,10 @@ def with_rtc(streams: Streams, rtc: Status | None) -> Streams:
             law=LoopLaw(),
             unlawful=(),
             edge_watch=None,
+            comparison=Comparison(),
+            compared=None,
         )
+    streams = _comparable(streams, rtc)
     if before is not None and before.session != rtc.session:
         streams = replace(streams, health=LoopHealth())
     streams = _lawful(streams, before, rtc)
@@ -155,6 +171,15 @@ def with_rtc(streams: Streams, rtc: Status | None) -> Streams:
         monitor = VibrationMonitor.begin(rtc.n_slopes)
         return replace(streams, vibrations=monitor, passive=memory)
     return _cut(replace(streams, passive=memory), rtc)
+
+
+def _comparable(streams: Streams, rtc: Status) -> Streams:
+    """Compare only what one loop does, under two matrices; gains may follow the seeing."""
+    before = streams.compared
+    if before is None or not same_but_for_modes(before, rtc):
+        begun = probation.begun_anew(streams.comparison, "the loop was changed after the swap")
+        return replace(streams, comparison=begun, compared=rtc)
+    return streams if streams.comparison.before is not None else replace(streams, compared=rtc)
 
 
 def _watching_the_edge(streams: Streams, rtc: Status) -> Streams:
@@ -281,13 +306,18 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     if terms is not None:
         check, law = loopcheck.observe(check, block, terms), loopcheck.follow(law, block, terms)
     vibrations, sums, edge = streams.vibrations, streams.passive, streams.edge
+    lines = () if streams.dither is None else streams.dither.frequency_hz
     if vibrations is not None and sums is not None and len(streams.in_loop):
-        lines = () if streams.dither is None else streams.dither.frequency_hz
         vibrations = vibrations.update(block, lines)
         sums = passive.accumulate(sums, _moving(streams, block))
     health = observe(streams.health, block, streams.description.mode_variance_m2, streams.in_loop)
     if streams.edge_watch is not None and not health.absurd:
         edge = observe_edge(edge, block, streams.edge_watch)
+    comparison = streams.comparison
+    if len(streams.in_loop) and not health.absurd:
+        comparison = probation.observe(
+            comparison, block, streams.in_loop, lines, streams.edge_watch
+        )
     streams = replace(
         streams,
         heard_ns_utc=block.next_t_ns - block.dt_ns,
@@ -297,6 +327,7 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
         passive=sums,
         health=health,
         edge=edge,
+        comparison=comparison,
     )
     streams, ended = _dithered(_listening(streams, rtc, block), rtc, block)
     if ended:

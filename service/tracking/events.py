@@ -10,6 +10,7 @@ from service.model.misregistration import Misregistration
 from service.telemetry.lockin import WindowEstimate
 from service.telemetry.openloop import FarEstimate
 from service.telemetry.passive import PassiveEstimate
+from service.telemetry.probation import ProbationFinding
 from service.telemetry.random_dither import RandomEstimate
 from service.telemetry.windows import WindowRefused
 from service.tracking.commands import Command
@@ -42,6 +43,8 @@ class CopyMatrix:
 
     source: str
     why: str
+    judged: bool = True
+    """Ask the gate; False: nobody has asked for it, and what the gate said of the earlier holds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -287,6 +290,13 @@ class DitherMeasured:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Compared:
+    """Telemetry with the matrix in use has been compared with that of the one before."""
+
+    finding: ProbationFinding
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Vibrations:
     """The vibration lines in the slopes are others than before."""
 
@@ -331,6 +341,7 @@ Event = (
     | Answered
     | DitherSilent
     | DitherMeasured
+    | Compared
     | Vibrations
     | MatrixMeasured
     | JobFailed

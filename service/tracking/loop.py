@@ -70,6 +70,17 @@ def same_loop(one: Status, other: Status) -> bool:
     )
 
 
+def same_but_for_modes(one: Status, other: Status) -> bool:
+    """Return whether two loops differ in nothing but how many modes they control."""
+    n_modes = min(one.n_controlled, other.n_controlled)
+    some, others = (
+        (float(n_modes), rtc.leak, rtc.delay_frames, rtc.frame_rate_hz, *rtc.gains[:n_modes])
+        for rtc in (one, other)
+    )
+    same = one.session == other.session and one.loop == other.loop
+    return same and same_numbers(some, others)
+
+
 def extended_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
     """Return gains for ``n_modes`` controlled modes: those in force, the last one for new modes."""
     last = rtc.gains[rtc.n_controlled - 1]

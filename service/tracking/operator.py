@@ -7,6 +7,7 @@ from dataclasses import replace
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.alarms import PROBATION
 from service.tracking.commands import GainGroup, ModeGroup
 from service.tracking.dither import allow, ask_for
 from service.tracking.dither_plan import by_hand
@@ -40,6 +41,7 @@ def set_mode(turn: Turn, mode: Mode) -> None:
     """Go on in the mode an operator orders; that of the settings is remembered."""
     of_settings = turn.state.settings_mode or turn.state.mode
     _order(turn, mode, None if mode is of_settings else of_settings)
+    turn.calm(PROBATION)
     turn.log("mode", f"mode is {mode}")
 
 
@@ -230,9 +232,14 @@ def _copy(turn: Turn, source: str, why: str) -> None:
     """Offer an earlier matrix again; hold, or the service would replace it at once."""
     if turn.rtc is None:
         raise CommandError("no RTC is there")
+    make(turn, ev.CopyMatrix(source=source, why=why))
+    hold(turn, why)
+
+
+def hold(turn: Turn, why: str) -> None:
+    """Do nothing unasked until an operator sets another mode."""
     of_settings = turn.state.settings_mode or turn.state.mode
     _order(turn, Mode.HOLD, None if of_settings is Mode.HOLD else of_settings)
-    make(turn, ev.CopyMatrix(source=source, why=why))
     turn.log("mode", f"hold: {why}")
 
 

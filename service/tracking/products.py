@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration, at_boundary
+from service.telemetry.probation import ProbationFinding
 from service.tracking.registration import ModeGain
 from service.wire import Manifest, MatrixLayout, MeasuredManifest, Pattern, Status
 
@@ -43,7 +44,8 @@ class MatrixState(StrEnum):
     """The RTC refused it; the reason is the RTC's."""
 
     FAILED = "failed"
-    """No acknowledgement came in time, or the RTC holds other numbers; the reason says which."""
+    """No acknowledgement came in time, the RTC holds other numbers, or the loop was worse with it
+    and the service went back; the reason says which."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -174,6 +176,69 @@ class ModeLimit:
 
     reason: str
     """What was said of more: the words of the gate, the RTC or the operator."""
+
+
+class ProbationState(StrEnum):
+    """How far the probation of a matrix is that has been applied."""
+
+    RUNNING = "running"
+    """Telemetry is being compared with that of the matrix before."""
+
+    OVERDUE = "overdue"
+    """Telemetry is late: the verdict counts when it comes, and nothing waits for it."""
+
+    PASSED = "passed"
+    """The loop is as good as before, or better."""
+
+    ROLLING_BACK = "rolling-back"
+    """It is worse: the matrix before is on its way back."""
+
+    ROLLED_BACK = "rolled-back"
+    """It was worse; the matrix before is in use again."""
+
+    KEPT = "kept"
+    """It is worse, and the service could not go back; the text says why."""
+
+    NOT_JUDGED = "not-judged"
+    """There was nothing to compare with; the text says why."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Probation:
+    """The matrix applied last, on probation: against the one before."""
+
+    id: str
+    """Of the one on probation."""
+
+    before: str
+    """Of the one that was in use before."""
+
+    state: ProbationState
+    text: str
+    """What is found or done, or why nothing is."""
+
+    since_ns_utc: int
+    until_ns_utc: int
+    """The verdict comes by then, where telemetry does."""
+
+    loop: Status | None = None
+    """As it was with the matrix before; None: it was not known."""
+
+    finding: ProbationFinding | None = None
+    """The numbers that were compared; None: not yet, or there are none."""
+
+    rollback: str | None = None
+    """Id under which the matrix before was sent again; None: it was not."""
+
+    def awaits(self, before: str, after: str) -> bool:
+        """Return whether a verdict on these two is waited for."""
+        waits = self.state in {ProbationState.RUNNING, ProbationState.OVERDUE}
+        return waits and (before, after) == (self.before, self.id)
+
+    @property
+    def under_way(self) -> bool:
+        """Whether nothing else is to be sent meanwhile."""
+        return self.state in {ProbationState.RUNNING, ProbationState.ROLLING_BACK}
 
 
 class MeasureState(StrEnum):

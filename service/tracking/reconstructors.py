@@ -435,7 +435,7 @@ def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
 def _may_follow(state: TrackerState) -> bool:
     """Return whether a reconstructor that nobody asked for may be sent."""
     rtc, known = state.rtc, state.registration
-    if state.mode is not Mode.AUTO or rtc is None or not rtc.in_loop:
+    if state.mode is not Mode.AUTO or state.on_probation or rtc is None or not rtc.in_loop:
         return False
     if forbidding(state, Act.DECIDE) is not None:
         return False

@@ -18,6 +18,7 @@ from service.tracking.products import (
     MatrixState,
     MeasurementRecord,
     ModeLimit,
+    Probation,
     ReconstructorRecord,
 )
 from service.tracking.registration import HistoryEntry, Registration, Watchdog
@@ -275,6 +276,9 @@ class TrackerState:
     assessment: Assessment | None = None
     """What the matrix in use loses against a new one; None: not known yet."""
 
+    probation: Probation | None = None
+    """Of the matrix applied last; None: none has been, in this run of the service."""
+
     mode_limit: ModeLimit | None = None
     """How many modes the gate lets be controlled; None: as many as are wanted."""
 
@@ -368,6 +372,11 @@ class TrackerState:
     def reconstructor(self, matrix_id: str) -> ReconstructorRecord | None:
         """Return the record of this id, or None."""
         return next((r for r in reversed(self.reconstructors) if r.id == matrix_id), None)
+
+    @property
+    def on_probation(self) -> bool:
+        """Whether nothing is sent unasked: a matrix is on probation, or being rolled back."""
+        return self.probation is not None and self.probation.under_way
 
     @property
     def previous(self) -> str | None:

@@ -87,7 +87,7 @@ def _judgement_due(state: TrackerState, known: Registration, now_ns: int) -> boo
 def _choose_update(turn: Turn, rtc: Status) -> None:
     """Compute a reconstructor when it is worthwhile, or could command more modes."""
     state, known, now_ns = turn.state, turn.known, turn.now_ns
-    if state.mode is Mode.HOLD or known is None or not settled(known):
+    if state.mode is Mode.HOLD or state.on_probation or known is None or not settled(known):
         return
     if not rtc.in_loop or state.making_since_ns_utc is not None:
         return

@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from service.config import load_settings
 from service.config.policy import policy_of
+from service.control.reconstructor import Recipe, reconstruct
 from service.errors import LinkError, PyrcalError
 from service.tracking import events as ev
 from service.tracking.commands import Command
@@ -23,6 +24,7 @@ from service.worker import OpticsWorker
 from studies.campaign.golden import Entry, Teller
 from studies.campaign.golden_codec import encoded
 from studies.campaign.observatory import Observatory
+from studies.campaign.observatory_checks import true_radius
 from studies.campaign.observatory_link import OwnHands
 from studies.campaign.small import SETTINGS as SMALL_SETTINGS
 from studies.campaign.small import SMALL, latencies_of
@@ -129,6 +131,7 @@ class GoldenNight(Observatory):
 
         words = [*(w for w in WORDS if not _again(w, plan.words)), *plan.words]
         self._n_slopes = bench.describe().n_slopes
+        self._bench = bench
         super().__init__(
             words,
             policy_of(load_settings(None, {}, self._settings)),
@@ -207,6 +210,16 @@ class GoldenNight(Observatory):
                 sha256="0" * 64,
             )
             self._post(ev.MatrixMeasured(record=stored))
+
+    def unstable(self, radius: float) -> None:
+        """Force a matrix through whose loop has this largest pole radius on this telescope."""
+        alpha, recipe = self.dome.alpha, Recipe(n_modes=self.dome.status().n_controlled)
+        found = 0.0
+        while found < radius:
+            alpha = replace(alpha, shift_x_subap=alpha.shift_x_subap + 0.1)
+            matrix = reconstruct(self._bench.response(alpha), recipe).matrix
+            found = true_radius(matrix, self.dome.optics, self.dome.computer.settings)
+        self.force(matrix)
 
     def proposed(self) -> str:
         """Return the id of the last proposal, or of nothing."""

@@ -74,6 +74,16 @@ COMMANDED = (
         ),
     ),
     Plan(
+        name="probation",
+        seconds=26.0,
+        deeds=(
+            (10.0, lambda night: night.unstable(1.02)),
+            (16.0, ask(cmd.SetMode(mode=Mode.AUTO))),
+            (20.0, lambda night: night.unstable(1.1)),
+            (20.8, ask(cmd.StopEverything())),
+        ),
+    ),
+    Plan(
         name="hold",
         seconds=26.0,
         mode=Mode.HOLD,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import PyrcalError
-from service.runtime.actions import Actions, Publishing
+from service.runtime.actions import Actions, Publishing, judged_now
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.supervisor import WATCH_INTERVAL_S
@@ -30,9 +30,11 @@ from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
+from service.tracking.loop import commanded_gains
 from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
-from service.wire import CHUNK_LIMIT, Manifest, Status
+from service.wire import CHUNK_LIMIT, Manifest, Status, checksum
 from service.worker import OpticsWorker
 from studies.campaign.observatory_checks import Publication, Swap, published, true_radius
 from studies.campaign.observatory_dome import Dome
@@ -132,10 +134,11 @@ class Observatory:
 
         self._link = link(self.dome)
         self._workers = OwnHands(workbench)
+        self._shelf = Shelf()
         self._actions = Actions(
             bridge=self._link,
             workers=self._workers,
-            archive=Shelf(),
+            archive=self._shelf,
             instrument=self.dome.instrument,
             publishing=Publishing(
                 system=system, chunk_bytes=CHUNK_LIMIT, pole_radius_bound=pole_radius_bound
@@ -187,6 +190,27 @@ class Observatory:
     def matrix(self, matrix_id: str) -> NDArray[np.float32]:
         """Return one of the last reconstructors ``(n_modes, n_slopes)``."""
         return self._actions.matrix(matrix_id)
+
+    def force(self, matrix: NDArray[np.float32]) -> None:
+        """Have the service send a matrix that the gate has never seen as if it had accepted it."""
+        state, n_modes = self.state, len(matrix)
+        known, rtc, margin = state.registration, state.rtc, state.margin
+        if known is None or rtc is None or margin is None:
+            raise ValueError("force: found no α, no RTC or no verdict; expected a night under way")
+        record = ReconstructorRecord(
+            id=f"forced-{self.dome.frame}",
+            state=MatrixState.PROPOSED,
+            n_modes=n_modes,
+            created_ns_utc=self.dome.now_ns,
+            alpha=known.alpha,
+            sigma=known.sigma,
+            parent=state.in_use,
+            sha256=checksum(matrix),
+            gate=margin,
+            judged=judged_now(state, commanded_gains(rtc, n_modes)),
+        )
+        self._shelf.reconstructors.store(record, matrix, known.total_covariance, {})
+        self._post(ev.MatrixMade(record=record, wanted=True))
 
     def publications(self) -> list[Publication]:
         """Return what has come of every matrix that was swapped in, so far."""
@@ -408,11 +432,11 @@ class Observatory:
                 return "make", wait.make_s
             case ev.JudgeMatrix():
                 return "margin", wait.judge_s
-            case ev.CopyMatrix() | ev.JudgeProposal():
+            case ev.CopyMatrix(judged=True) | ev.JudgeProposal():
                 return "judge", wait.judge_s
             case ev.FetchMatrix():
                 return "", wait.fetch_s
-            case ev.SendMatrix() | ev.Ask() | ev.FinishNoisy():
+            case ev.CopyMatrix() | ev.SendMatrix() | ev.Ask() | ev.FinishNoisy():
                 return "", wait.command_s
             case _:
                 raise TypeError(

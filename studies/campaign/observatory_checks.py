@@ -116,14 +116,14 @@ def true_radius(
 ) -> float:
     """Return the largest pole radius of the loop of these optics, its gains and this matrix."""
     n_modes = len(reconstructor)
-    coupling = reconstructor @ _response(optics, n_modes)
+    coupling = reconstructor @ true_response(optics, n_modes)
     gains = np.array(settings.gains[:n_modes], np.float32)
     eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
     radii = pole_radius(eigenvalues, leak=settings.leak, delay_frames=settings.delay_frames)
     return float(radii.max())
 
 
-def _response(optics: Optics, n_modes: int) -> NDArray[np.float32]:
+def true_response(optics: Optics, n_modes: int) -> NDArray[np.float32]:
     """Return the true interaction matrix ``(n_slopes, n_modes)``: known, or pushed and pulled."""
     if isinstance(optics, LinearOptics):
         return optics.slopes_per_command[:, :n_modes]

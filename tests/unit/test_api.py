@@ -881,7 +881,6 @@ async def test_what_records_say_of_themselves_is_true_of_json(client):
 UNITS = ("_s", "_m", "_hz", "_ns", "_ns_utc", "_deg", "_subap", "_frames", "_seq")
 DIMENSIONLESS = {
     "bound",
-    "busy_ratio",
     "condition_number",
     "effective_gain",
     "first",
@@ -892,12 +891,12 @@ DIMENSIONLESS = {
     "innovation",
     "last",
     "leak",
+    "limit",
     "magnification",
     "magnitude",
     "max_dither_modes",
     "misfit",
     "mode",
-    "obscuration_ratio",
     "optical_gain",
     "seed",
     "snr",
@@ -921,4 +920,4 @@ async def test_every_number_carries_its_unit_in_its_name(client):
     }
     assert {"rotation_deg", "frame_rate_hz", "amplitude_m"} <= numbers
     for name in numbers - DIMENSIONLESS:
-        assert name.endswith(("_radius", *UNITS)) or name.startswith(COUNTS), name
+        assert name.endswith(("_radius", "_ratio", *UNITS)) or name.startswith(COUNTS), name

@@ -36,7 +36,7 @@ def quiet():
     world.pass_(2.0)
     world.tell(cmd.StopDither())
     world.tell(cmd.SetMode(mode=Mode.PROPOSE))
-    world.pass_(3.0)
+    world.pass_(4.0)
     assert world.state.in_use == "cm-1"
     assert not under_way(world.state, world.now_ns)
     return world

@@ -85,7 +85,8 @@ class Store(Generic[Record]):
         """
         self._index.forget_numbers(self._table, product_id)
         try:
-            for path in (self.path_of(product_id).with_suffix(".json"), self.path_of(product_id)):
+            # what became of it goes last: without that a file taken in again would be as when made
+            for path in (self.path_of(product_id), self.path_of(product_id).with_suffix(".json")):
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise StorageError(f"{path}: cannot be removed: {error}") from error

@@ -17,13 +17,14 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.errors import ConfigurationError, PyrcalError
+from service.files.recording import Recording
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import Ahead, message_frames
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch, FrameClock, Pace
 from sim_rtc.faults import ComputerFaults, FaultPlan
 from sim_rtc.link.link import Link
-from sim_rtc.link.record import Recorder, Recording
+from sim_rtc.link.record import Recorder
 from sim_rtc.link.replay import Replay
 from sim_rtc.options import Options, parse_options
 from sim_rtc.truth import TruthRecorder, write_snapshot

@@ -13,14 +13,20 @@ from datetime import UTC, datetime
 from typing import Any
 
 from service.archive import Archive
+from service.archive.nights import HOUR_NS, MOST_THINNED
 from service.archive.records import to_json
 from service.archive.retention import Item, due, items, remove, verify
 from service.commands.terminal import say, show_progress
 from service.config import Settings, load_settings
 from service.config.policy import keeping_of
-from service.errors import UnknownIdError, shown
+from service.errors import ConfigurationError, UnknownIdError, shown
 
 DONE, DAMAGED = 0, 1
+
+BESIDE_NS = HOUR_NS
+"""So long before and after telemetry α is told beside it."""
+
+FOREVER_NS = (1 << 63) - 1
 
 
 def main(options: argparse.Namespace) -> int:
@@ -33,6 +39,8 @@ def main(options: argparse.Namespace) -> int:
     """
     given = {} if options.data_dir is None else {"service.data_dir": options.data_dir}
     settings = load_settings(options.config, os.environ, given)
+    if options.action == "aot":
+        return _aot(options, settings)
     if options.action == "prune":
         return _prune(settings, dry_run=options.dry_run, as_json=options.json)
     with _looked_at(settings) as archive:
@@ -140,6 +148,36 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
         for item, why in gone:
             print(shown(f"{_line(item)}  {'would go' if dry_run else 'removed'}: {why}"))
         say(f"{len(gone)} products, {sum(item.n_bytes for item, _ in gone) / 1e6:.1f} MB")
+    return DONE
+
+
+def _aot(options: argparse.Namespace, settings: Settings) -> int:
+    """Write what was measured in a night, or beside a recording, as AOT FITS."""
+    from service.config import load_instrument
+    from service.files.aot import excerpt, write_aot
+
+    if (options.night is None) is (options.recording is None):
+        raise ConfigurationError("expected --night DATE for α alone, or --recording FILE")
+    instrument = load_instrument(options.instrument or settings.service.instrument)
+    taken, span = None, (0, FOREVER_NS)
+    if options.recording is not None:
+        taken = excerpt(options.recording, options.skip, options.seconds)
+        span = (taken.first_ns_utc - BESIDE_NS, taken.last_ns_utc + BESIDE_NS)
+    with _looked_at(settings) as archive:
+        if options.night is not None:
+            nights = archive.nights.between(*span)
+            night = next((night for night in nights if night.date == options.night), None)
+            if night is None:
+                raise UnknownIdError(f"{options.night}: nothing was measured in this night")
+            span = (night.since_ns_utc, night.until_ns_utc)
+        estimates = archive.nights.estimates(*span, MOST_THINNED)
+    write_aot(options.output, instrument, estimates, taken)
+    n_frames = 0 if taken is None else sum(batch.header.n for batch in taken.batches)
+    n_damaged = 0 if taken is None else taken.n_damaged
+    say(
+        f"{options.output}: {len(estimates)} estimates of α, {n_frames} frames"
+        + (f"; {n_damaged} damaged messages left out" if n_damaged else "")
+    )
     return DONE
 
 

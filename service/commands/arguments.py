@@ -114,6 +114,15 @@ def _describe_archive(archive: argparse.ArgumentParser) -> None:
     show = actions.add_parser("show", parents=[where], help="what is known of one")
     show.add_argument("id", metavar="ID")
     actions.add_parser("verify", parents=[where], help="read all of them and compare checksums")
+    aot = actions.add_parser("aot", parents=[where], help="α and telemetry as an AOT FITS file")
+    aot.add_argument("output", type=Path, metavar="FILE.fits")
+    aot.add_argument("--instrument", metavar="NAME|FILE", help="default: that of the settings")
+    aot.add_argument("--recording", type=Path, metavar="FILE", help="of pyrcal sim --record")
+    aot.add_argument("--skip", type=_seconds, default=0.0, metavar="S", help="of the recording")
+    aot.add_argument(
+        "--seconds", type=_seconds, default=10.0, metavar="S", help="of it, default %(default)g"
+    )
+    aot.add_argument("--night", metavar="DATE", help="of the evening, UTC; else of the recording")
     prune = actions.add_parser("prune", parents=[where], help="remove what [archive] lets go")
     prune.add_argument("--dry-run", action="store_true", help="only say what would go")
 

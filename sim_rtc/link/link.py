@@ -21,13 +21,14 @@ import zenoh
 import zenoh.ext
 from typing_extensions import override
 
+from service.files.recording import RecordedKind
 from service.wire import Encodings, Keys, Role, encode, split
 from sim_rtc.computer.feed import Background
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of
 from sim_rtc.faults import FaultPlan, WireFaults
 from sim_rtc.link.matrices import Matrices
-from sim_rtc.link.record import Kind, Recorder
+from sim_rtc.link.record import Recorder
 from sim_rtc.link.replies import Replies
 from sim_rtc.options import Options
 from sim_rtc.telescope.detector import Detector
@@ -139,7 +140,7 @@ class Link(Background):
                 header, rows = frames_of(batch, self._computer.identity, t0_ns, self._clock.dt_ns)
                 for payload, attachment in self._faults.messages(header, rows, time_s):
                     frames.put(payload, attachment=attachment)
-                    self._record(Kind.FRAMES, payload, attachment)
+                    self._record(RecordedKind.FRAMES, payload, attachment)
             if self._computer.has_news:
                 matrices.look()
             token.show(visible=not self._absent.is_set())
@@ -147,7 +148,7 @@ class Link(Background):
             if now_s >= next_status_s and not self._absent.is_set():
                 data = self._status()
                 status.put(data)
-                self._record(Kind.STATUS, data)
+                self._record(RecordedKind.STATUS, data)
                 next_status_s = now_s + _STATUS_PERIOD_S
                 if lifeline.cut(session, now_s):
                     _log.warning("link.cut-off", text=lifeline.text)
@@ -160,9 +161,9 @@ class Link(Background):
         self._recorded_cm_id = cm_id
         active = self._computer.reconstructor
         matrix = b"".join(split(active.matrix, active.manifest.layout.chunk_bytes))
-        self._record(Kind.MATRIX, matrix, encode(active.manifest))
+        self._record(RecordedKind.MATRIX, matrix, encode(active.manifest))
 
-    def _record(self, kind: Kind, payload: bytes, attachment: bytes = b"") -> None:
+    def _record(self, kind: RecordedKind, payload: bytes, attachment: bytes = b"") -> None:
         if self._recorder is not None:
             self._recorder.put(kind, payload, attachment)
 
@@ -309,7 +310,7 @@ class Token:
         if visible is (self._token is not None):
             return
         if self._recorder is not None:
-            self._recorder.put(Kind.LIVELINESS, bytes([visible]))
+            self._recorder.put(RecordedKind.LIVELINESS, bytes([visible]))
         if self._token is None:
             self._token = self._session.liveliness().declare_token(self._key)
         else:

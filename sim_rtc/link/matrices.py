@@ -12,6 +12,7 @@ import zenoh
 from typing_extensions import override
 
 from service.errors import WireError
+from service.files.recording import RecordedKind
 from service.wire import (
     CHUNK_LIMIT,
     Acknowledgement,
@@ -30,7 +31,7 @@ from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.reconstructors import Outcome, Staging
 from sim_rtc.computer.telemetry import Reconstructor
 from sim_rtc.faults import Fault, FaultKind, FaultPlan
-from sim_rtc.link.record import Kind, Recorder
+from sim_rtc.link.record import Recorder
 from sim_rtc.link.replies import acknowledge
 
 _log = structlog.get_logger("sim_rtc")
@@ -239,7 +240,7 @@ class Matrices(Background):
             return
         data = encode(said)
         if self._recorder is not None:
-            self._recorder.put(Kind.ACKNOWLEDGEMENT, data)
+            self._recorder.put(RecordedKind.ACKNOWLEDGEMENT, data)
         acknowledge(self._session, self._keys, data)
 
     def _send(self, measured: Measurement) -> None:

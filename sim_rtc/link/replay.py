@@ -18,6 +18,7 @@ import zenoh
 import zenoh.ext
 
 from service.errors import WireError
+from service.files.recording import Message, RecordedKind, Recording
 from service.wire import (
     Acknowledgement,
     AckState,
@@ -31,7 +32,6 @@ from service.wire import (
     encode,
 )
 from sim_rtc.link.link import Token, frames_publisher, open_session, status_publisher
-from sim_rtc.link.record import Kind, Message, Recording
 from sim_rtc.link.replies import acknowledge, answer_applied, answer_commands
 
 _log = structlog.get_logger("sim_rtc")
@@ -96,16 +96,16 @@ class Replay:
                 n_messages += 1
                 self._acknowledge_refusals(session)
                 match message.kind:
-                    case Kind.FRAMES:
+                    case RecordedKind.FRAMES:
                         frames.put(message.payload, attachment=message.attachment)
-                    case Kind.STATUS:
+                    case RecordedKind.STATUS:
                         self._status = decode(Status, message.payload)
                         status.put(message.payload)
-                    case Kind.ACKNOWLEDGEMENT:
+                    case RecordedKind.ACKNOWLEDGEMENT:
                         acknowledge(session, self._keys, message.payload)
-                    case Kind.LIVELINESS:
+                    case RecordedKind.LIVELINESS:
                         token.show(visible=message.payload != b"\x00")
-                    case Kind.MATRIX:
+                    case RecordedKind.MATRIX:
                         self._matrix = message
         return n_messages
 

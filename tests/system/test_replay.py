@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
+from service.files.recording import RecordedKind, Recording
 from service.link.intake import Intake
 from service.link.session import Endpoint
 from service.model.misregistration import PARAMETERS, Misregistration
@@ -22,7 +23,6 @@ from service.tracking.products import ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
 from service.wire import DitherRequest, Manifest, decode
 from service.worker import Compute, OpticsWorker
-from sim_rtc.link.record import Kind, Recording
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
 from tests.unit.tracking.situations import dither_answered
@@ -56,11 +56,11 @@ class Tracker:
         for message in recording.messages():
             self.now_s = message.time_s
             match message.kind:
-                case Kind.FRAMES:
+                case RecordedKind.FRAMES:
                     self.intake.frames(message.payload, message.attachment)
-                case Kind.STATUS:
+                case RecordedKind.STATUS:
                     self.intake.status(message.payload)
-                case Kind.MATRIX:
+                case RecordedKind.MATRIX:
                     self.keep(message)
             self.look()
 
@@ -212,5 +212,5 @@ def test_a_replay_cannot_be_disturbed_or_found_nowhere(tmp_path):
     assert "plays a file as it is" in both.stderr
     missing = run("--replay", str(tmp_path / "none.h5"))
     assert missing.returncode == 2
-    assert "--replay: cannot read" in missing.stderr
+    assert "none.h5: cannot be read" in missing.stderr
     assert "Traceback" not in missing.stderr

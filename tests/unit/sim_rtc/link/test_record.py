@@ -7,16 +7,18 @@ import h5py
 import pytest
 
 from service.errors import ConfigurationError
-from sim_rtc.link.record import Kind, Recorder, Recording
+from service.files.recording import RecordedKind, Recording
+from sim_rtc.link.record import Recorder
 from tests.system.pace import in_time
 
 WRITER = """
 import sys, time
 from pathlib import Path
-from sim_rtc.link.record import Kind, Recorder
+from service.files.recording import RecordedKind
+from sim_rtc.link.record import Recorder
 with Recorder(Path(sys.argv[1]), system="small") as recorder:
     for number in range(10**6):
-        recorder.put(Kind.FRAMES, number.to_bytes(8, "little") * 1000, b"header")
+        recorder.put(RecordedKind.FRAMES, number.to_bytes(8, "little") * 1000, b"header")
         if number % 100 == 0:
             print(number, flush=True)
         time.sleep(0.002)
@@ -31,10 +33,10 @@ def read(path):
 def test_messages_come_back_byte_for_byte_in_order(tmp_path):
     path = tmp_path / "night.h5"
     given = [
-        (Kind.LIVELINESS, b"\x01", b""),
-        (Kind.MATRIX, b"matrix" * 300_000, b"manifest"),
-        *[(Kind.FRAMES, bytes([k % 256]) * k, b"attachment") for k in range(1000)],
-        (Kind.STATUS, b"status", b""),
+        (RecordedKind.LIVELINESS, b"\x01", b""),
+        (RecordedKind.MATRIX, b"matrix" * 300_000, b"manifest"),
+        *[(RecordedKind.FRAMES, bytes([k % 256]) * k, b"attachment") for k in range(1000)],
+        (RecordedKind.STATUS, b"status", b""),
     ]
     with Recorder(path, system="small") as recorder:
         for message in given:
@@ -53,7 +55,7 @@ def test_what_waits_is_bounded_and_what_is_dropped_is_counted(tmp_path):
     with Recorder(path, system="small", backlog_bytes=1000) as recorder:
         began = time.monotonic()
         for _ in range(100):
-            recorder.put(Kind.FRAMES, bytes(100))
+            recorder.put(RecordedKind.FRAMES, bytes(100))
         assert in_time(began, 0.4)
     with Recording(path) as recording:
         n_found = len(list(recording.messages()))
@@ -87,7 +89,7 @@ def test_a_killed_writer_leaves_a_file_that_lacks_at_most_two_seconds(tmp_path):
 def test_a_file_that_is_still_being_written_can_be_read(tmp_path):
     path = tmp_path / "night.h5"
     with Recorder(path, system="small") as recorder:
-        recorder.put(Kind.STATUS, b"one")
+        recorder.put(RecordedKind.STATUS, b"one")
         deadline = time.monotonic() + 10.0
         while not read(path) and time.monotonic() < deadline:
             time.sleep(0.1)
@@ -112,5 +114,5 @@ def test_other_files_are_refused_with_what_was_expected(tmp_path):
     with pytest.raises(ConfigurationError, match=r"expected .*pyrcal-telemetry"), Recording(path):
         pass
     path.write_bytes(b"no hdf5")
-    with pytest.raises(ConfigurationError, match="cannot read"), Recording(path):
+    with pytest.raises(ConfigurationError, match="cannot be read"), Recording(path):
         pass

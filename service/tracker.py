@@ -15,6 +15,7 @@ from service.tracking import (
     probation,
     reconstructors,
     rtc,
+    rules,
     stopping,
 )
 from service.tracking import commands as cmd
@@ -59,9 +60,11 @@ def step(
     """
     refuse_if_occupied(state, event, now_ns)
     turn = Turn(state, event, policy, now_ns)
+    rules.judge(turn)
     measuring.watch_measurement(turn)
     _react(turn)
     probation.follow(turn)
+    rules.judge(turn)
     note_declined(turn)
     _go_on(turn)
     attention.follow(turn)
@@ -189,6 +192,8 @@ def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
             operator.set_mode(turn, mode)
         case cmd.SetPointing(pointing=pointing):
             point(turn, pointing)
+        case cmd.SetValue() as command:
+            rules.tell(turn, command)
         case cmd.SetLoop() as command:
             operator.set_loop(turn, command)
         case cmd.Ramp() as command:

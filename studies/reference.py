@@ -57,8 +57,9 @@ def _tables(whole: type[Table]) -> Iterator[str]:
     described = whole.model_json_schema()
     kinds: dict[str, Schema] = described["$defs"]
     for section, place in described["properties"].items():
-        kind = kinds[place["$ref"].rpartition("/")[2]]
-        yield f"## [{section}]"
+        of_each = place.get("items", place)
+        kind = kinds[of_each["$ref"].rpartition("/")[2]]
+        yield f"## [{section}]" if of_each is place else f"## [[{section}]]"
         yield _text(kind).partition(": ")[2].capitalize()
         needed = kind.get("required", ())
         yield table(

@@ -12,7 +12,8 @@ from service.config.settings import Settings
 from service.control.reconstructor import InversionMethod
 from service.model.misregistration import BOUNDARY_SCALE
 from service.prepared import usual_folder
-from service.tracking.policy import Policy
+from service.tracking.alarms import Act, Severity
+from service.tracking.policy import Policy, Rule
 from service.worker import Compute
 
 FLAT = (0.004, 0.01, 0.001)
@@ -82,6 +83,19 @@ def policy_of(settings: Settings) -> Policy:
         update_gain_m=control.update_gain_nm * 1e-9,
         update_margin=control.update_margin,
         minimum_interval_s=control.minimum_interval_s,
+        rules=tuple(
+            Rule(
+                name=rule.name,
+                about=rule.when[0],
+                how=rule.when[1],
+                than=rule.when[2],
+                blocks=frozenset(Act(act) for act in rule.blocks),
+                severity=Severity(rule.severity),
+                text=rule.text,
+                holds_unknown=rule.unknown == "holds",
+            )
+            for rule in settings.rules
+        ),
     )
 
 

@@ -285,6 +285,57 @@ class ArchiveTable(Table):
     """UTC hour of local noon, where one night ends and the next begins."""
 
 
+Scalar = bool | float | str
+
+
+class RuleTable(Table):
+    """``[[rules]]``: what operators want forbidden, and when."""
+
+    name: Id
+    """Its alarm is ``rule.NAME``."""
+
+    when: tuple[str, Literal["==", "!=", "<", "<=", ">", ">="], Scalar] = Field(strict=False)
+    """Name of a value told with ``PUT /v1/values/{name}``, or of a field such as
+    ``state.elevation_deg``; how it is compared; with what."""
+
+    blocks: Tuple[Literal["measure", "decide", "send_new", "send_known", "ask"]] = ()
+    """What is forbidden while it holds, as docs/states.md says of alarms."""
+
+    severity: Literal["warning", "serious", "critical"] = "serious"
+    """How much it matters."""
+
+    text: str = Field(min_length=1, max_length=300)
+    """What is the matter and what to do, in a sentence."""
+
+    unknown: Literal["holds", "does-not-hold"] = "holds"
+    """While nobody tells the value."""
+
+    @model_validator(mode="after")
+    def _compared_with_sense(self) -> RuleTable:
+        name, how, than = self.when
+        if name.startswith("state.") and name not in STATE_FIELDS:
+            raise ValueError(f"found {name!r} in when{nearest(name, STATE_FIELDS)}")
+        if how not in {"==", "!="} and (isinstance(than, bool | str)):
+            raise ValueError(f"found {than!r} after {how}, expected a number")
+        expected = STATE_FIELDS.get(name)
+        if expected is not None and isinstance(than, str) is not (expected is str):
+            raise ValueError(f"found {than!r} for {name}, expected a {_WORD[expected]}")
+        return self
+
+
+STATE_FIELDS: dict[str, type] = {
+    "state.mode": str,
+    "state.loop": str,
+    "state.n_controlled": float,
+    "state.magnitude": float,
+    "state.elevation_deg": float,
+    "state.azimuth_deg": float,
+}
+"""What a rule may ask of the state."""
+
+_WORD = {str: "text", float: "number"}
+
+
 class Settings(Table):
     """Everything the user may decide about the service."""
 
@@ -298,6 +349,21 @@ class Settings(Table):
     compute: ComputeTable = ComputeTable()
     fits: FitsTable = FitsTable()
     archive: ArchiveTable = ArchiveTable()
+    rules: Tuple[RuleTable] = ()
+
+    @model_validator(mode="after")
+    def _one_kind_for_each_value(self) -> Settings:
+        names = [rule.name for rule in self.rules]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"found rules {', '.join(twice)} twice, expected a name for each")
+        kinds: dict[str, type] = {}
+        for rule in self.rules:
+            about, _, than = rule.when
+            kind = bool if isinstance(than, bool) else str if isinstance(than, str) else float
+            if kinds.setdefault(about, kind) is not kind:
+                raise ValueError(f"found {than!r} for {about}: another rule compares it otherwise")
+        return self
 
 
 _Key = tuple[str, ...]
@@ -352,7 +418,7 @@ def _environment_key(name: str) -> _Key:
             f"environment: {name}: expected {PREFIX}<SECTION>__<KEY>, like {PREFIX}API__PORT"
         )
     section, key = match[1].lower(), match[2].lower()
-    if section not in Settings.model_fields:
+    if section not in Settings.model_fields or section == "rules":
         raise ConfigurationError(
             f"environment: {name}: unknown section {section}"
             f"{nearest(section, Settings.model_fields)}"

@@ -183,7 +183,7 @@ def _line(schema: type[Table], problem: ErrorDetails, place: Place) -> str:
 
 def _known_keys(schema: type[Table], key: tuple[str, ...]) -> Iterable[str]:
     fields = schema.model_fields
-    for part in key:
+    for part in (part for part in key if not part.isdigit()):
         annotation = fields[part].annotation
         alternatives = (annotation, *get_args(annotation))
         fields = next(

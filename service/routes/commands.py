@@ -39,9 +39,11 @@ from service.tracking.commands import (
     SetLoop,
     SetMode,
     SetPointing,
+    SetValue,
     StartDither,
     StopDither,
     StopEverything,
+    ToldValue,
     UnmuteAlarm,
 )
 from service.tracking.state import TrackerState
@@ -137,7 +139,7 @@ def _link(matrix_id: str) -> str:
 
 _ALL = "/v1/reconstructors"
 
-AlarmName = Annotated[str, Path(max_length=64)]
+AlarmName = Annotated[str, Path(max_length=128)]
 
 
 @router.post("/refit", status_code=202)
@@ -276,6 +278,17 @@ async def acquisition(
     the loop closes on as many modes as the gate allows, then on more.
     """
     return await client.orders(command)
+
+
+@observatory.put("/values/{name}", status_code=202, responses={**UNKNOWN})
+async def value(
+    client: ClientDep, name: AlarmName, said: Annotated[ToldValue, body(ToldValue)]
+) -> AcceptedView:
+    """Tell a value that operators' own rules ask for; it counts for the time that is said.
+
+    What is told again unchanged is not written into the audit trail again.
+    """
+    return await client.orders(about(SetValue, said, name=name), alarms="/v1/alarms")
 
 
 @observatory.put("/pointing", status_code=202)

@@ -52,7 +52,7 @@ from service.tracking.products import (
     ReconstructorRecord,
 )
 from service.tracking.registration import HistoryEntry, ModeGain, Watchdog
-from service.tracking.state import Acquisition, LogEntry, TrackerState, Waiting
+from service.tracking.state import Acquisition, LogEntry, ObservatoryValue, TrackerState, Waiting
 from service.wire import Pointing
 
 Record = TypeVar("Record")
@@ -464,6 +464,7 @@ view(
 view("RaisedView", Alarm, "name since_ns_utc text")
 view("MutedView", Note, "name muted")
 view("OperatingView", Operating)
+view("ObservatoryValueView", ObservatoryValue)
 view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times")
 EVENTS = view("EventsView", TrackerState, "alarms log", "What happened, and what is wrong now.")
 view("WaitingView", Waiting)
@@ -483,9 +484,9 @@ STATE = view(
     "tracker.probation rtc tracker.pointing tracker.basis_id tracker.config_id tracker.dither "
     "tracker.dithering tracker.vibrations_hz tracker.measuring tracker.gathering "
     "tracker.acquisition tracker.loop_command tracker.dither_due_since_ns_utc "
-    "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating alarms "
-    "stale_alarms muted_alarms worst_severity tracker.windows_accepted tracker.windows_refused "
-    "tracker.windows_outlying pace link",
+    "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating "
+    "tracker.told alarms stale_alarms muted_alarms worst_severity tracker.windows_accepted "
+    "tracker.windows_refused tracker.windows_outlying pace link",
     "What the service knows, at one glance.",
     measuring=MEASURING,
     gathering=GATHERING,

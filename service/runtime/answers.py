@@ -13,6 +13,7 @@ from service.tracking.dither_request import total_m
 from service.tracking.loop import CommandState
 from service.tracking.products import MatrixState, MeasureState, ReconstructorRecord
 from service.tracking.reconstructors import why_unsendable
+from service.tracking.rules import said
 from service.tracking.state import TrackerState
 from service.tracking.turn import new_lines
 
@@ -65,6 +66,8 @@ class Given:
                 return Answer(f"released: mode is {now.mode}{off if now.dither_stopped else ''}")
             case cmd.SetPointing():
                 return _pointing(now)
+            case cmd.SetValue(name=name, value=value, for_s=for_s):
+                return Answer(f"{name} is {said(value)} for {for_s:g} s")
             case cmd.Acquire():
                 return Answer(f"an acquisition is under way: {now.acquisition.text}")
             case cmd.AbortAcquisition():

@@ -37,6 +37,7 @@ from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.products import MeasureState
+from service.tracking.rules import is_news
 from service.tracking.state import Level, TrackerState, Waiting
 from service.tracking.turn import new_lines
 from service.wire import TEXT_LIMIT, AlarmMessage
@@ -153,7 +154,10 @@ class Supervisor:
         StorageError
             If it cannot be recorded; nothing has been done.
         """
-        if isinstance(command, cmd.SetPointing):  # told every second, and decides nothing
+        told = isinstance(command, cmd.SetValue) and not is_news(
+            self._engine.state, command, time.time_ns()
+        )
+        if told or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
             return await self._carried_out(command)
         try:
             await self._recorder.ordered(command, caller)

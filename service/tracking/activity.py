@@ -55,6 +55,7 @@ _ALWAYS = _SEEN | frozenset[type](
         cmd.Resume,
         cmd.SetMode,
         cmd.SetPointing,
+        cmd.SetValue,
         cmd.StopEverything,
         cmd.StopDither,
     }
@@ -71,8 +72,7 @@ ALLOWS: dict[Activity, frozenset[type]] = {
     # it makes way for what needs the loop, and an RTC measures under no dither
     Activity.OWN_DITHER: _ALL - {cmd.Measure, cmd.StartDither},
     Activity.OTHER_DITHER: _ALL - {cmd.Measure, cmd.StartDither, cmd.MeasureNoisy},
-    Activity.STANDING_BY: _SEEN
-    | frozenset[type]({cmd.Reject, cmd.SetMode, cmd.SetPointing, cmd.StopEverything, cmd.Resume}),
+    Activity.STANDING_BY: _ALWAYS - {cmd.AbortAcquisition, cmd.GiveUp, cmd.StopDither},
     Activity.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish, cmd.Rollback},
     Activity.SENDING: _ALL - {cmd.Measure},
 }

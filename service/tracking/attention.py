@@ -14,6 +14,7 @@ from service.tracking import commands as cmd
 from service.tracking.alarms import ALARMS, Alarm, Attention, Note, Remark, Severity
 from service.tracking.events import Tick
 from service.tracking.policy import SECOND_NS
+from service.tracking.rules import PREFIX
 from service.tracking.state import Orders, TrackerState
 from service.tracking.turn import Turn
 
@@ -176,7 +177,8 @@ def _unmuted(note: Note, now_ns: int) -> Note:
 def _noted(turn: Turn, name: str) -> tuple[dict[str, Note], Note]:
     """Return all notes by name, and one of them, or a new one."""
     notes = {note.name: note for note in turn.state.notes}
-    if name not in notes and name not in ALARMS:
+    own = {f"{PREFIX}{rule.name}" for rule in turn.policy.rules}
+    if name not in notes and name not in ALARMS and name not in own:
         raise UnknownIdError(f"alarm {name}: nobody has heard of it")
     return notes, notes.get(name, Note(name=name))
 

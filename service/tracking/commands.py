@@ -24,6 +24,11 @@ MOST_MODES = 100_000
 MOST_GROUPS = 1000
 LONGEST_NOISY_S = 3600.0
 LONGEST_MUTE_S = 43_200.0
+LONGEST_TOLD_S = 86_400.0
+LONGEST_TEXT = 200
+
+Value = bool | float | str
+"""What operators' own rules compare."""
 
 Positive = Annotated[float, Gt(0.0)]
 Count = Annotated[int, Ge(1)]
@@ -266,6 +271,31 @@ class SetPointing(Instruction):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ToldValue(Instruction):
+    """What the observatory tells of something that operators' own rules ask for."""
+
+    value: Value
+    """A number, a text, or true or false, as the rule compares it."""
+
+    for_s: Annotated[float, Gt(0.0), Le(LONGEST_TOLD_S)] = 60.0
+    """How long it counts, seconds: then it is not known, until it is told again."""
+
+    @override
+    def __post_init__(self) -> None:
+        Instruction.__post_init__(self)
+        if isinstance(self.value, str) and len(self.value) > LONGEST_TEXT:
+            raise ValueError(f"a text of at most {LONGEST_TEXT} characters")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetValue(ToldValue):
+    """Tell a value."""
+
+    name: str
+    """As the rules have it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ModeGroup:
     """A range of modes."""
 
@@ -440,6 +470,7 @@ Command = (
     | MeasureNoisy
     | SetLoop
     | SetPointing
+    | SetValue
     | Ramp
 )
 

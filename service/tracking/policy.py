@@ -8,8 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
+from service.tracking.alarms import Act, Severity
 
 SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rule:
+    """An operators' own rule, as the settings have it."""
+
+    name: str
+    about: str
+    """Name of a value that is told, or of a field of the state."""
+
+    how: str
+    """``==``, ``!=``, ``<``, ``<=``, ``>`` or ``>=``."""
+
+    than: bool | float | str
+    blocks: frozenset[Act]
+    """What is forbidden while it holds."""
+
+    severity: Severity
+    text: str
+    """What is the matter, and what to do."""
+
+    holds_unknown: bool
+    """Whether it holds while nobody tells the value."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -95,6 +119,9 @@ class Policy:
 
     minimum_interval_s: float = 5.0
     """Least time between two reconstructors."""
+
+    rules: tuple[Rule, ...] = ()
+    """Operators' own."""
 
     refused_interval_s: float = 30.0
     """The same after one was refused, rejected or not acknowledged."""

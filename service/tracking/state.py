@@ -73,6 +73,19 @@ class LogEntry:
         return self.t_ns_utc, self.name, self.text
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObservatoryValue:
+    """A value that the observatory tells, for operators' own rules."""
+
+    name: str
+    value: bool | float | str
+    until_ns_utc: int
+    """It counts before this."""
+
+    by: str
+    """Who told it; empty: nobody said."""
+
+
 class Mode(StrEnum):
     """How much the service may do by itself."""
 
@@ -354,6 +367,9 @@ class TrackerState:
 
     stopped_because: str = ""
     """Who has stopped everything, and why; empty: nobody, or it was released."""
+
+    told: tuple[ObservatoryValue, ...] = ()
+    """Values that operators' own rules ask for, as they were told last."""
 
     alarms: tuple[Alarm, ...] = ()
     """Those that last."""

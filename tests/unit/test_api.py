@@ -901,6 +901,7 @@ DIMENSIONLESS = {
     "seed",
     "snr",
     "status",
+    "value",  # of an operators' own rule, in whatever they tell it in
 }
 COUNTS = ("n_", "frames_", "windows_")
 

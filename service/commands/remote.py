@@ -13,7 +13,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from service.commands.rest import RefusedError, Service, UnreachableError
 from service.commands.terminal import say
 from service.errors import ConfigurationError
 
@@ -358,6 +357,9 @@ def main(options: argparse.Namespace) -> int:
     ConfigurationError
         If the address or the key is none.
     """
+    # HTTP takes longer to import than all the commands are told with
+    from service.commands.rest import RefusedError, Service, UnreachableError
+
     request: Request = options.request
     service = Service(options.url or os.environ.get(URL) or USUAL_URL, _key(options.key_file))
     try:

@@ -43,8 +43,12 @@ LAG = 5
 gain of a half makes loops ring at a twentieth; with 3 it shows half as well, with 8 none at an
 eighth."""
 
-WORSE = 1.3
-"""Power of a mode over its own before: less is not worth a swap, whatever is known of it."""
+WORSE = 2.0
+"""Power of a mode over its own before: less is not worth a swap, whatever is known of it. Of
+hundreds of modes the one that a good matrix makes worst has 1.6 after three seconds."""
+
+LASTING = 3
+"""Parts in a row in each of which a mode moves so much more: turbulence does that for one."""
 
 SIGMAS = 4.5
 """Of a part's scatter beyond that: hundreds of modes are looked at thirty times."""
@@ -326,7 +330,8 @@ def compared(
 
     A mode's power is compared with its own; what all have in common is taken out, unless it has
     become less: then a mode that has not is no worse. A mode is worse beyond ``WORSE`` times by
-    ``SIGMAS`` of what the logarithm of its power scatters from part to part before.
+    ``SIGMAS`` of what the logarithm of its power scatters from part to part before, and in each of
+    the last ``LASTING`` parts beyond ``WORSE``.
     """
     after = _mean(parts)
     moving = modes[after[modes] > 0.0]
@@ -338,14 +343,15 @@ def compared(
     worst = int(np.argmax(single))
     scatter = before.scatter * np.sqrt(1.0 / before.n_parts + 1.0 / len(parts))
     limit = float(np.log(WORSE) + SIGMAS * scatter)
+    rings = single[worst] > limit and _lasts(before, parts, int(moving[worst]), max(common, 0.0))
     slopes = _log_ratio(before.power[_SLOPES], after[_SLOPES])
     ring = None
-    rings = [power[k] for power in (before.power, after) for k in (_OUTER, _INNER)]
-    if min(rings) > 0.0:
-        ring = _log_ratio(rings[0] / rings[1], rings[2] / rings[3])
+    edges = [power[k] for power in (before.power, after) for k in (_OUTER, _INNER)]
+    if min(edges) > 0.0:
+        ring = _log_ratio(edges[0] / edges[1], edges[2] / edges[3])
     slow = len(parts) >= SLOW_PARTS
     worse = (
-        single[worst] > limit
+        rings
         or common > np.log(COMMON_WORSE)
         or (slow and slopes > np.log(SLOPES_WORSE))
         or (slow and ring is not None and ring > np.log(RING_WORSE))
@@ -371,6 +377,13 @@ def compared(
         slopes_ratio=rms[3],
         ring_ratio=ring_rms,
     )
+
+
+def _lasts(before: Before, parts: tuple[Part, ...], mode: int, common: float) -> bool:
+    """Return whether a mode moves more in each of the last parts, not only in one of them."""
+    least = WORSE * np.exp(common) * before.power[mode]
+    last = parts[-LASTING:]
+    return len(last) == LASTING and all(part.power[mode] > least * part.n_frames for part in last)
 
 
 def _mean(parts: tuple[Part, ...]) -> Array:

@@ -76,7 +76,7 @@ def test_a_few_modes_at_the_edge_of_stability_are_found(turns):
     found = judged([("a", residual(rng, BEFORE_S)), ("b", after)])
     assert found.verdict is Verdict.WORSE
     assert 40 <= found.mode < 44
-    assert found.after_s < 1.0
+    assert found.after_s < 2.0
     assert found.common_ratio == pytest.approx(1.0, abs=0.1)
 
 
@@ -102,13 +102,13 @@ def test_the_verdict_comes_within_three_seconds_and_no_sooner_if_all_is_well():
 
 @pytest.mark.parametrize("first", [True, False])
 def test_a_dither_that_begins_or_ends_with_the_swap_does_not_count(first):
-    """Its lines stand in every mode, as strong as all noise; two modes outside the loop play it."""
+    """Its lines stand in every mode, above all noise; two modes outside the loop play it."""
     rng = np.random.default_rng(6)
     before, after = residual(rng, BEFORE_S), residual(rng, AFTER_S)
     t = np.arange(len(before) + len(after)) * 1e-9 * DT_NS
     plays = (t < BEFORE_S) if first else (t >= BEFORE_S)
     tone = (np.sin(2.0 * np.pi * np.outer(t, LINE_HZ)) * plays[:, None]).sum(axis=1)
-    seen = 3e-9 * tone[:, None] * np.linspace(0.0, 1.0, N_MODES)
+    seen = 6e-9 * tone[:, None] * np.linspace(0.0, 1.0, N_MODES)
     dither = np.zeros((len(t), N_MODES))
     dither[:, -2:] = 2e-8 * tone[:, None]
     parts = [("a", before + seen[: len(before)]), ("b", after + seen[len(before) :])]
@@ -145,3 +145,11 @@ def test_modes_that_only_one_of_them_controls_do_not_count():
         state = observe(state, block, np.arange(50 if block.cm_id == "a" else N_MODES))
     assert state.found.verdict is Verdict.AS_GOOD
     assert state.found.mode < 50
+
+
+def test_a_burst_in_one_mode_right_after_the_swap_is_turbulence():
+    """FLAO, 400 modes: one of them moved 1.65 times as much in the first tenth of a second."""
+    rng = np.random.default_rng(8)
+    after = residual(rng, AFTER_S)
+    after[30:130, 35] *= 3.0
+    assert judged([("a", residual(rng, BEFORE_S)), ("b", after)]).verdict is Verdict.AS_GOOD

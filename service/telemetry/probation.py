@@ -43,12 +43,13 @@ LAG = 5
 gain of a half makes loops ring at a twentieth; with 3 it shows half as well, with 8 none at an
 eighth."""
 
-WORSE = 2.0
+WORSE = 1.7
 """Power of a mode over its own before: less is not worth a swap, whatever is known of it. Of
 hundreds of modes the one that a good matrix makes worst has 1.6 after three seconds."""
 
 LASTING = 3
-"""Parts in a row in each of which a mode moves so much more: turbulence does that for one."""
+"""Parts in a row, two at least, in each of which a mode moves so much more: turbulence does that
+for one. A loop that is being lost has no time for more: soon everything moves."""
 
 SIGMAS = 4.5
 """Of a part's scatter beyond that: hundreds of modes are looked at thirty times."""
@@ -383,7 +384,7 @@ def _lasts(before: Before, parts: tuple[Part, ...], mode: int, common: float) ->
     """Return whether a mode moves more in each of the last parts, not only in one of them."""
     least = WORSE * np.exp(common) * before.power[mode]
     last = parts[-LASTING:]
-    return len(last) == LASTING and all(part.power[mode] > least * part.n_frames for part in last)
+    return len(last) > 1 and all(part.power[mode] > least * part.n_frames for part in last)
 
 
 def _mean(parts: tuple[Part, ...]) -> Array:

@@ -127,7 +127,7 @@ export function showProvenance(service, orders) {
   if (!record.alpha) return put($("#provenance"), `in use: ${record.id}, ${record.n_modes} modes; the RTC's own, for an unknown registration`);
   const frame = present(record.applied_frame_seq) ? `, applied at frame ${record.applied_frame_seq}` : "";
   const sent = record.published_ns_utc ? `, sent ${when(record.published_ns_utc, now)}` : "";
-  const trial = [state.probation?.id, state.probation?.rollback].includes(record.id) ? `; probation: ${state.probation.state}, ${state.probation.text}` : "";
+  const trial = [state.probation?.id, state.probation?.rollback].includes(record.id) ? `; probation: ${state.probation.state}` + (state.probation.state === "passed" ? "" : `, ${state.probation.text}`) : "";
   return put($("#provenance"), `in use: ${record.id}, ${record.n_modes} modes${frame}${sent}, for ${shortly(record.alpha, record.sigma)}${trial}`);
 }
 

@@ -73,7 +73,8 @@ def house() -> str:
         "Written by `python -m studies.pages` from the first line of each file; change those.",
     ]
     for top in ("service", "sim_rtc"):
-        folders = sorted({path.parent for path in (ROOT / top).rglob("*.py")})
+        # packages: the built manual holds copies of the examples
+        folders = sorted(path.parent for path in (ROOT / top).rglob("__init__.py"))
         for folder in folders:
             rows = [
                 (f"`{path.name}`", (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""))

@@ -40,6 +40,9 @@ INSERT = f"INSERT INTO estimate ({_COLUMNS}) VALUES ({', '.join('?' * (4 + len(_
 HOUR_NS = 3_600_000_000_000
 DAY_NS = 24 * HOUR_NS
 
+FOREVER_NS = (1 << 63) - 1
+"""After all that can be recorded: SQLite's largest integer."""
+
 MOST_THINNED = 300_000
 """Estimates that are looked through at once: a week of telemetry."""
 

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from service.archive import Archive
-from service.archive.nights import HOUR_NS, MOST_THINNED
+from service.archive.nights import FOREVER_NS, HOUR_NS, MOST_THINNED
 from service.archive.records import to_json
 from service.archive.retention import Item, due, items, remove, verify
 from service.commands.terminal import say, show_progress
@@ -25,8 +25,6 @@ DONE, DAMAGED = 0, 1
 
 BESIDE_NS = HOUR_NS
 """So long before and after telemetry α is told beside it."""
-
-FOREVER_NS = (1 << 63) - 1
 
 
 def main(options: argparse.Namespace) -> int:

@@ -76,15 +76,21 @@ def _describe_run(run: argparse.ArgumentParser) -> None:
     )
 
 
+def _of_a_folder() -> argparse.ArgumentParser:
+    """Return what commands that work in a service's folder have in common."""
+    where = argparse.ArgumentParser(add_help=False)
+    where.add_argument("--config", type=Path, metavar="FILE", help="the service's settings, TOML")
+    where.add_argument("--data-dir", metavar="DIR", help="the service's data_dir, default var")
+    return where
+
+
 def _describe_key(key: argparse.ArgumentParser) -> None:
     key.description = (
         "Make, list and revoke the keys of those who may ask a service, in its data_dir. A running "
         "service goes by them at once. docs/operating.md says how a key is shown."
     )
     key.epilog = "Exit status: 0 done, 2 it cannot be done."
-    where = argparse.ArgumentParser(add_help=False)
-    where.add_argument("--config", type=Path, metavar="FILE", help="the service's settings, TOML")
-    where.add_argument("--data-dir", metavar="DIR", help="the service's data_dir, default var")
+    where = _of_a_folder()
     actions = key.add_subparsers(dest="action", required=True)
     add = actions.add_parser("add", parents=[where], help="make a key, and show it this once")
     revoke = actions.add_parser("revoke", parents=[where], help="make one worthless")
@@ -105,9 +111,7 @@ def _describe_archive(archive: argparse.ArgumentParser) -> None:
         "beside a running service; prune refuses, for the service does it by itself."
     )
     archive.epilog = "Exit status: 0 done, 1 something is damaged, 2 it cannot be done."
-    where = argparse.ArgumentParser(add_help=False)
-    where.add_argument("--config", type=Path, metavar="FILE", help="the service's settings, TOML")
-    where.add_argument("--data-dir", metavar="DIR", help="the service's data_dir, default var")
+    where = _of_a_folder()
     where.add_argument("--json", action="store_true", help="print JSON")
     actions = archive.add_subparsers(dest="action", required=True)
     actions.add_parser("list", parents=[where], help="all, oldest first, and why one stays")

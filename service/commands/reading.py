@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from service.commands.remote import DONE, NOT_DONE, Request, named
 from service.commands.rest import Document, Service
-from service.commands.status import registration_lines, status_lines, verdict
+from service.commands.status import lasting, registration_lines, status_lines, verdict
 from service.commands.terminal import clock, print_document, print_lines, span, table
 
 
@@ -86,16 +86,9 @@ def _alpha(document: Document) -> Iterator[str]:
 
 
 def _alarms(state: Document) -> Iterator[str]:
-    lasting = [
-        (
-            alarm["name"],
-            span(max(0.0, (state["now_ns"] - alarm["since_ns_utc"]) / 1e9)),
-            alarm["text"],
-        )
-        for alarm in state["alarms"]
-    ]
-    yield from table(lasting)
-    yield f"{len(lasting)} alarms" if lasting else "no alarm lasts"
+    rows = [(alarm["name"], lasting(alarm, state), alarm["text"]) for alarm in state["alarms"]]
+    yield from table(rows)
+    yield f"{len(rows)} alarms" if rows else "no alarm lasts"
 
 
 def _audit(document: Document) -> Iterator[str]:

@@ -15,12 +15,12 @@ _ALPHA = {
 
 def status_lines(state: Document) -> list[str]:
     """Return the screen: first whether all is well and what is not, then what there is."""
-    now_ns = state["now_ns"]
     ready = "ready" if state["ready"] else f"NOT READY: {state['ready_reason']}"
     lines = [f"{state['system']}, mode {state['mode']}, up {span(state['uptime_s'])}: {ready}"]
-    for alarm in state["alarms"]:
-        lasting_s = max(0.0, (now_ns - alarm["since_ns_utc"]) / 1e9)
-        lines.append(f"ALARM {alarm['name']} for {span(lasting_s)}: {alarm['text']}")
+    lines += [
+        f"ALARM {alarm['name']} for {lasting(alarm, state)}: {alarm['text']}"
+        for alarm in state["alarms"]
+    ]
     alarms = {alarm["name"] for alarm in state["alarms"]}
     lines += [
         f"waits for the {wait['party']}: {wait['text']}"
@@ -28,6 +28,11 @@ def status_lines(state: Document) -> list[str]:
         if wait["name"] not in alarms
     ]
     return [*lines, "", *_rtc(state), *_alpha(state), *_matrix(state), *_doing(state)]
+
+
+def lasting(alarm: Document, state: Document) -> str:
+    """Return for how long an alarm has lasted."""
+    return span(max(0.0, (state["now_ns"] - alarm["since_ns_utc"]) / 1e9))
 
 
 def _rtc(state: Document) -> list[str]:

@@ -21,10 +21,9 @@ from service.model.instrument import Instrument, Mirror
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.misregistration import Misregistration, rotation
 from service.model.slopes import to_conventions
+from service.tracking.policy import SECOND_NS
 from service.tracking.registration import HistoryEntry
 from service.wire import FrameBatch, Manifest, Status, decode, decode_frames
-
-SECOND_NS = 1_000_000_000
 
 
 @dataclass(slots=True, kw_only=True)

@@ -27,7 +27,7 @@ from service.errors import ConfigurationError
 from service.keys import Key, KeyFile, KeyScope, is_loopback
 from service.routes.connections import RETRY_S, bounded, to_its_end
 from service.routes.problems import problem
-from service.runtime.recording import Whence
+from service.runtime.recording import Caller, Whence
 
 COOKIE = "pyrcal_key"
 """Under which a browser keeps the key."""
@@ -220,6 +220,14 @@ class Refusals:
 def address_of(request: Request) -> str:
     """Return the address of whoever asks; empty: it is not known."""
     return "" if request.client is None else request.client.host
+
+
+def caller_of(request: Request) -> Caller:
+    """Return who asks, once they are let through."""
+    key: Key | None = request.user
+    return Caller(
+        address=address_of(request), key="" if key is None else key.name, whence=whence_of(request)
+    )
 
 
 def whence_of(request: Request) -> Whence:

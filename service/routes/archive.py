@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import shutil
-import time
 from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Response
 from fastapi.concurrency import run_in_threadpool
 
-from service.archive import Archive, AuditEntry, Pin
+from service.archive import Archive, Pin
 from service.archive.retention import Item, items
-from service.routes.commands import AcceptedView, Client, ClientDep
+from service.routes.commands import AcceptedView, ClientDep
 from service.routes.orders import Said
 from service.routes.problems import INVALID, UNKNOWN
 from service.routes.views import ServiceDep, answer, shows, view
 from service.runtime.housekeeping import needed
-from service.tracking.commands import Instruction
 
 router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
 
@@ -58,7 +56,7 @@ def _kept(kept: Archive, in_use: frozenset[str]) -> Kept:
 @router.put("/archive/{id}/pin", status_code=202, responses=UNKNOWN)
 async def pin(client: ClientDep, product_id: ProductId, said: Said) -> AcceptedView:
     """Keep a matrix for ever, whatever its age: who and why are kept with it."""
-    entry = _entry(client, "archive.pinned", product_id, said)
+    entry = client.caller.entry("archive.pinned", product_id, by=said.by, why=said.reason)
     made = Pin(id=product_id, who=entry.who, why=entry.why)
     await run_in_threadpool(client.service.archive.pin, made)
     client.service.audit(entry)
@@ -69,21 +67,10 @@ async def pin(client: ClientDep, product_id: ProductId, said: Said) -> AcceptedV
 async def unpin(client: ClientDep, product_id: ProductId, said: Said) -> AcceptedView:
     """Let a matrix go when it is old."""
     await run_in_threadpool(client.service.archive.unpin, product_id)
-    client.service.audit(_entry(client, "archive.unpinned", product_id, said))
+    client.service.audit(
+        client.caller.entry("archive.unpinned", product_id, by=said.by, why=said.reason)
+    )
     return AcceptedView(text=f"{product_id} goes when it is old", links=_LINKS)
 
 
 _LINKS = {"archive": "/v1/archive"}
-
-
-def _entry(client: Client, name: str, product_id: str, said: Instruction) -> AuditEntry:
-    caller = client.caller
-    return AuditEntry(
-        t_ns_utc=time.time_ns(),
-        who=caller.key or said.by or caller.address,
-        name=name,
-        text=product_id,
-        why=said.reason,
-        address=caller.address,
-        whence=caller.whence,
-    )

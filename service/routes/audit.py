@@ -17,8 +17,9 @@ from fastapi.responses import StreamingResponse
 from pydantic import Field
 
 from service.archive import Archive, AuditEntry, Range
+from service.archive.nights import FOREVER_NS
 from service.routes.problems import INVALID
-from service.routes.reading import FOREVER_NS, TimeParameters
+from service.routes.reading import TimeParameters
 from service.routes.views import ServiceDep, answer, clock_of, is_time, picture, shows, view
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})

@@ -14,7 +14,7 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Discriminator
 
 from service.errors import StaleError, UntaggedError
-from service.routes.admission import address_of, whence_of
+from service.routes.admission import caller_of
 from service.routes.numbers import MatrixId
 from service.routes.orders import Said, about, body
 from service.routes.problems import COMMAND, DECISION, INVALID, UNKNOWN
@@ -121,12 +121,9 @@ class Client:
 
 
 def _client_of(request: Request, service: ServiceDep) -> Client:
-    sent, key = request.headers, request.user
+    sent = request.headers
     strict = "handling=strict" in sent.get("prefer", "").replace(" ", "").lower()
-    caller = Caller(
-        address=address_of(request), key="" if key is None else key.name, whence=whence_of(request)
-    )
-    return Client(service, caller, sent.get("if-match"), strict)
+    return Client(service, caller_of(request), sent.get("if-match"), strict)
 
 
 ClientDep = Annotated[Client, Depends(_client_of)]

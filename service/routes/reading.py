@@ -13,6 +13,7 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import AwareDatetime, BeforeValidator, Field, model_validator
 
 from service.archive import Archive, Mark, Night
+from service.archive.nights import FOREVER_NS
 from service.errors import CommandError
 from service.routes import views
 from service.routes.numbers import (
@@ -98,9 +99,6 @@ class RangeParameters(TimeParameters):
     """At most so many entries of the whole range, whatever the limit: the lowest and the highest of
     each parameter in each part of it."""
 
-
-FOREVER_NS = (1 << 63) - 1
-"""Nobody asks for later."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

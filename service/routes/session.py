@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from service.archive import AuditEntry
 from service.errors import UnknownIdError
 from service.keys import Key, KeyFile, KeyScope
-from service.routes.admission import COOKIE, OPEN, address_of, needs, shown_key, whence_of
+from service.routes.admission import COOKIE, OPEN, caller_of, needs, shown_key
 from service.routes.problems import INVALID, UNKNOWN
 from service.routes.views import answer, shows, view
 
@@ -63,7 +61,7 @@ async def log_in(request: Request) -> Response:
     if request.user is not None and secret is not None:
         safe = request.headers.get("origin", "").startswith("https:")
         answered.set_cookie(COOKIE, secret, secure=safe, httponly=True, samesite="strict")
-        _take_down(request, "session.begun")
+        request.app.state.service.audit(caller_of(request).entry("session.begun"))
     return answered
 
 
@@ -87,22 +85,9 @@ async def revoke(request: Request, name: Annotated[str, Path(description="Of the
     if request.user is None:
         raise UnknownIdError(f"key {name!r:.80}: no such key; there are none at all")
     await run_in_threadpool(_file(request).revoke, name)
-    _take_down(request, "key.revoked", name)
+    request.app.state.service.audit(caller_of(request).entry("key.revoked", name))
 
 
 def _file(request: Request) -> KeyFile:
     file: KeyFile = request.app.state.keys
     return file
-
-
-def _take_down(request: Request, name: str, text: str = "") -> None:
-    request.app.state.service.audit(
-        AuditEntry(
-            t_ns_utc=time.time_ns(),
-            who=request.user.name,
-            name=name,
-            text=text,
-            address=address_of(request),
-            whence=whence_of(request),
-        )
-    )

@@ -69,6 +69,21 @@ class Caller:
     check: Callable[[], None] = lambda: None
     """Raises where what the order was decided on has changed."""
 
+    def entry(
+        self, name: str, text: str = "", *, by: str = "", why: str = "", answer: str = ""
+    ) -> AuditEntry:
+        """Return a line of the audit trail on what they do; ``by``: what they call themselves."""
+        return AuditEntry(
+            t_ns_utc=time.time_ns(),
+            who=self.key or by or self.address or "operator",
+            name=name,
+            text=text,
+            address=self.address,
+            whence=self.whence,
+            why=why,
+            answer=answer,
+        )
+
 
 class Recorder:
     """Writes reconstructors' records, the audit trail and what the next service needs.
@@ -154,13 +169,10 @@ class Recorder:
         self._order(command, caller, ".refused", str(error))
 
     def _order(self, command: Command, caller: Caller, end: str = "", answer: str = "") -> None:
-        entry = AuditEntry(
-            t_ns_utc=time.time_ns(),
-            who=caller.key or command.by or caller.address or "operator",
-            name=f"{type(command).__name__}{end}",
-            text=asked_for(command, caller),
-            address=caller.address,
-            whence=caller.whence,
+        entry = caller.entry(
+            f"{type(command).__name__}{end}",
+            asked_for(command, caller),
+            by=command.by,
             why=command.reason,
             answer=answer,
         )

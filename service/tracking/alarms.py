@@ -1,6 +1,6 @@
 """The alarms by name: how much each matters, what it forbids, and what operators did about it.
 
-The one table of them is alarms.toml; docs/states.md shows it. What operators do about them is as
+The one table of them is alarms.toml; docs/runbook.md shows it. What operators do about them is as
 LSST's ts_watcher has it (doc/displaying_alarms.rst there).
 """
 

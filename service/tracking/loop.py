@@ -38,9 +38,11 @@ def same_rate(one_hz: float, other_hz: float) -> bool:
 
 def loop_numbers(rtc: Status | None) -> tuple[float, ...]:
     """Return all of the loop that the bias of its passive estimate depends on; empty: no RTC."""
-    if rtc is None:
-        return ()
-    return (float(rtc.n_controlled), rtc.leak, rtc.delay_frames, rtc.frame_rate_hz, *rtc.gains)
+    return () if rtc is None else _numbers(rtc, rtc.n_controlled, rtc.gains)
+
+
+def _numbers(rtc: Status, n_modes: int, gains: tuple[float, ...]) -> tuple[float, ...]:
+    return (float(n_modes), rtc.leak, rtc.delay_frames, rtc.frame_rate_hz, *gains)
 
 
 def same_numbers(some: tuple[float, ...], others: tuple[float, ...]) -> bool:
@@ -63,22 +65,18 @@ def same_loop(one: Status, other: Status) -> bool:
 
     Its gains may follow the seeing; one that enters or leaves 0 makes it another.
     """
-    return (
-        one.session == other.session
-        and one.loop == other.loop
-        and same_numbers(loop_numbers(one), loop_numbers(other))
-    )
+    return _same_state(one, other) and same_numbers(loop_numbers(one), loop_numbers(other))
 
 
 def same_but_for_modes(one: Status, other: Status) -> bool:
     """Return whether two loops differ in nothing but how many modes they control."""
     n_modes = min(one.n_controlled, other.n_controlled)
-    some, others = (
-        (float(n_modes), rtc.leak, rtc.delay_frames, rtc.frame_rate_hz, *rtc.gains[:n_modes])
-        for rtc in (one, other)
-    )
-    same = one.session == other.session and one.loop == other.loop
-    return same and same_numbers(some, others)
+    some, others = (_numbers(rtc, n_modes, rtc.gains[:n_modes]) for rtc in (one, other))
+    return _same_state(one, other) and same_numbers(some, others)
+
+
+def _same_state(one: Status, other: Status) -> bool:
+    return one.session == other.session and one.loop == other.loop
 
 
 def extended_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ from typing import NoReturn
 from typing_extensions import override
 
 from service import __version__
-from service.commands.remote import declare
+from service.commands.remote import add, declare, words
 from service.errors import ConfigurationError
 from service.files import kind_of
 from service.files.request import parse_alpha, parse_arms, parse_modes
@@ -61,27 +61,26 @@ def _describe_run(run: argparse.ArgumentParser) -> None:
         "Run the service. Precedence: command line > environment (PYRCAL_<SECTION>__<KEY>) > "
         "TOML file > defaults."
     )
-    run.add_argument("--config", type=Path, metavar="FILE", help="settings, TOML")
-    run.add_argument("--instrument", metavar="NAME|FILE", help="packaged name or TOML file")
-    run.add_argument("--mode", choices=["auto", "propose", "hold"], help="default: propose")
-    run.add_argument("--data-dir", metavar="DIR", help="products, index, audit trail; default var")
-    run.add_argument("--listen", metavar="ENDPOINT", help="zenoh, default tcp/127.0.0.1:7447")
-    run.add_argument("--connect", metavar="ENDPOINT", help="an observatory's own zenoh router")
-    run.add_argument("--host", help="of the REST API, default 127.0.0.1")
-    run.add_argument("--port", type=int, help="of the REST API, default 8080")
-    run.add_argument(
-        "--log-format",
-        choices=["auto", "text", "json"],
-        help="default: text on a terminal, else a JSON object a line",
+    formats = "default: text on a terminal, else a JSON object a line"
+    add(
+        run,
+        words("--config FILE", "settings, TOML", type=Path),
+        words("--instrument NAME|FILE", "packaged name or TOML file"),
+        words("--mode", "default: propose", choices=["auto", "propose", "hold"]),
+        words("--data-dir DIR", "products, index, audit trail; default var"),
+        words("--listen ENDPOINT", "zenoh, default tcp/127.0.0.1:7447"),
+        words("--connect ENDPOINT", "an observatory's own zenoh router"),
+        words("--host HOST", "of the REST API, default 127.0.0.1"),
+        words("--port PORT", "of the REST API, default 8080", type=int),
+        words("--log-format", formats, choices=["auto", "text", "json"]),
     )
 
 
-def _of_a_folder() -> argparse.ArgumentParser:
-    """Return what commands that work in a service's folder have in common."""
-    where = argparse.ArgumentParser(add_help=False)
-    where.add_argument("--config", type=Path, metavar="FILE", help="the service's settings, TOML")
-    where.add_argument("--data-dir", metavar="DIR", help="the service's data_dir, default var")
-    return where
+_OF_A_FOLDER = (
+    words("--config FILE", "the service's settings, TOML", type=Path),
+    words("--data-dir DIR", "the service's data_dir, default var"),
+)
+"""What commands that work in a service's folder have in common."""
 
 
 def _describe_key(key: argparse.ArgumentParser) -> None:
@@ -90,19 +89,20 @@ def _describe_key(key: argparse.ArgumentParser) -> None:
         "service goes by them at once. docs/operating.md says how a key is shown."
     )
     key.epilog = "Exit status: 0 done, 2 it cannot be done."
-    where = _of_a_folder()
-    actions = key.add_subparsers(dest="action", required=True)
-    add = actions.add_parser("add", parents=[where], help="make a key, and show it this once")
-    revoke = actions.add_parser("revoke", parents=[where], help="make one worthless")
-    actions.add_parser("list", parents=[where], help="who has a key, and for what")
-    for action in (add, revoke):
-        action.add_argument("name", metavar="NAME", help="of the person, program or place")
-    add.add_argument(
+    name = words("name NAME", "of the person, program or place")
+    scope = words(
         "--scope",
+        "read: look; operate: give orders, too; admin: also see who has a key, and revoke one",
         choices=("read", "operate", "admin"),
         required=True,
-        help="read: look; operate: give orders, too; admin: also see who has a key, and revoke one",
     )
+    actions = key.add_subparsers(dest="action", required=True)
+    for action, purpose, more in (
+        ("add", "make a key, and show it this once", (name, scope)),
+        ("revoke", "make one worthless", (name,)),
+        ("list", "who has a key, and for what", ()),
+    ):
+        add(actions.add_parser(action, help=purpose), *_OF_A_FOLDER, *more)
 
 
 def _describe_archive(archive: argparse.ArgumentParser) -> None:
@@ -111,24 +111,24 @@ def _describe_archive(archive: argparse.ArgumentParser) -> None:
         "beside a running service; prune refuses, for the service does it by itself."
     )
     archive.epilog = "Exit status: 0 done, 1 something is damaged, 2 it cannot be done."
-    where = _of_a_folder()
-    where.add_argument("--json", action="store_true", help="print JSON")
-    actions = archive.add_subparsers(dest="action", required=True)
-    actions.add_parser("list", parents=[where], help="all, oldest first, and why one stays")
-    show = actions.add_parser("show", parents=[where], help="what is known of one")
-    show.add_argument("id", metavar="ID")
-    actions.add_parser("verify", parents=[where], help="read all of them and compare checksums")
-    aot = actions.add_parser("aot", parents=[where], help="α and telemetry as an AOT FITS file")
-    aot.add_argument("output", type=Path, metavar="FILE.fits")
-    aot.add_argument("--instrument", metavar="NAME|FILE", help="default: that of the settings")
-    aot.add_argument("--recording", type=Path, metavar="FILE", help="of pyrcal sim --record")
-    aot.add_argument("--skip", type=_seconds, default=0.0, metavar="S", help="of the recording")
-    aot.add_argument(
-        "--seconds", type=_seconds, default=10.0, metavar="S", help="of it, default %(default)g"
+    aot = (
+        words("output FILE.fits", type=Path),
+        words("--instrument NAME|FILE", "default: that of the settings"),
+        words("--recording FILE", "of pyrcal sim --record", type=Path),
+        words("--skip S", "of the recording", type=_seconds, default=0.0),
+        words("--seconds S", "of it, default %(default)g", type=_seconds, default=10.0),
+        words("--night DATE", "of the evening, UTC; else of the recording"),
     )
-    aot.add_argument("--night", metavar="DATE", help="of the evening, UTC; else of the recording")
-    prune = actions.add_parser("prune", parents=[where], help="remove what [archive] lets go")
-    prune.add_argument("--dry-run", action="store_true", help="only say what would go")
+    actions = archive.add_subparsers(dest="action", required=True)
+    for action, purpose, more in (
+        ("list", "all, oldest first, and why one stays", ()),
+        ("show", "what is known of one", (words("id ID"),)),
+        ("verify", "read all of them and compare checksums", ()),
+        ("aot", "α and telemetry as an AOT FITS file", aot),
+        ("prune", "remove what [archive] lets go", (words("--dry-run", "only say what would go"),)),
+    ):
+        parser = actions.add_parser(action, help=purpose)
+        add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
 
 
 _CHECK_EPILOG = """
@@ -145,30 +145,26 @@ def _describe_check(check: argparse.ArgumentParser) -> None:
         "contract of docs/rtc.md. End the service first, or --connect to its router with --passive."
     )
     check.epilog = _CHECK_EPILOG
-    check.add_argument(
-        "--instrument", default="flao-lbt", metavar="NAME|FILE", help="default %(default)s"
+    add(
+        check,
+        words("--instrument NAME|FILE", "default %(default)s", default="flao-lbt"),
+        words("--system NAME", "of the keys, default the instrument's name"),
     )
-    check.add_argument(
-        "--system", metavar="NAME", help="of the keys, default the instrument's name"
+    add(
+        check.add_mutually_exclusive_group(),
+        words("--listen ENDPOINT", "default tcp/127.0.0.1:7447"),
+        words("--connect ENDPOINT", "a router that is there already"),
     )
-    where = check.add_mutually_exclusive_group()
-    where.add_argument("--listen", metavar="ENDPOINT", help="default tcp/127.0.0.1:7447")
-    where.add_argument("--connect", metavar="ENDPOINT", help="a router that is there already")
-    check.add_argument(
-        "--seconds", type=_seconds, default=8.0, metavar="S", help="to listen, default %(default)g"
+    add(
+        check,
+        words("--seconds S", "to listen, default %(default)g", type=_seconds, default=8.0),
+        words("--wait S", "for the RTC, default %(default)g", type=_seconds, default=30.0),
+        words("--only CHECK,...", "these checks and no others", type=_names, default=()),
+        words("--passive", "only listen: ask and move nothing"),
+        words("--open-loop", "also what opens the loop: loop, measure"),
+        words("--yes", "move what is said without asking"),
+        words("--json", "print one JSON object at the end"),
     )
-    check.add_argument(
-        "--wait", type=_seconds, default=30.0, metavar="S", help="for the RTC, default %(default)g"
-    )
-    check.add_argument(
-        "--only", type=_names, default=(), metavar="CHECK,...", help="these checks and no others"
-    )
-    check.add_argument("--passive", action="store_true", help="only listen: ask and move nothing")
-    check.add_argument(
-        "--open-loop", action="store_true", help="also what opens the loop: loop, measure"
-    )
-    check.add_argument("--yes", action="store_true", help="move what is said without asking")
-    check.add_argument("--json", action="store_true", help="print one JSON object at the end")
 
 
 _FIT = """
@@ -190,111 +186,78 @@ everything they were made of. As many modes as the basis has may be controlled, 
 measured.
 """
 
+_INSTRUMENT = words("instrument INSTRUMENT", "TOML file, or a packaged name")
+
 
 def _describe_fit(fit: argparse.ArgumentParser) -> None:
     fit.description, fit.epilog = _FIT, _FIT_EPILOG
-    fit.add_argument("instrument", metavar="INSTRUMENT", help="TOML file, or a packaged name")
-    fit.add_argument("reference", metavar="REFERENCE", type=Path, help="HDF5, FITS or NumPy file")
-    fit.add_argument("--dataset", metavar="NAME", help="of the matrix, default interaction_matrix")
-    fit.add_argument(
-        "--method",
-        choices=("joint", "paper", "sensitivity"),
-        default="joint",
-        help="joint: all four together (default); paper: one at a time, with parabolas; "
-        "sensitivity: projection on sensitivity matrices",
+    methods = (
+        "joint: all four together (default); paper: one at a time, with parabolas; "
+        "sensitivity: projection on sensitivity matrices"
     )
-    fit.add_argument(
-        "--modes",
-        type=_read_by(parse_modes),
-        metavar="FIRST:END",
-        help="basis indices to use, like 0:400 (400 is not) or 3,5,9; default all",
+    modes = "basis indices to use, like 0:400 (400 is not) or 3,5,9; default all"
+    start = "where to begin: subapertures, degrees, ratio"
+    flux = "mean counts of the four pupil images, array flux (4, n, n): the model is lit as it says"
+    reference = "a flux map of another day: by how much the light is turned since is told"
+    arms = (
+        "the spider's arms at rotation 0: the rotation is told that their shadows in the "
+        "flux map have"
     )
-    fit.add_argument(
-        "--start",
-        type=_read_by(parse_alpha),
-        metavar="X,Y,ROT,MAG",
-        help="where to begin: subapertures, degrees, ratio",
+    add(
+        fit,
+        _INSTRUMENT,
+        words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
+        words("--dataset NAME", "of the matrix, default interaction_matrix"),
+        words("--method", methods, choices=("joint", "paper", "sensitivity"), default="joint"),
+        words("--modes FIRST:END", modes, type=_read_by(parse_modes)),
+        words("--start X,Y,ROT,MAG", start, type=_read_by(parse_alpha)),
+        words("--flux-map FILE", flux, type=Path),
     )
-    fit.add_argument(
-        "--flux-map",
-        type=Path,
-        metavar="FILE",
-        help="mean counts of the four pupil images, array flux (4, n, n): the model is lit as it "
-        "says",
+    add(
+        fit.add_mutually_exclusive_group(),
+        words("--flux-reference FILE", reference, type=Path),
+        words("--arms WIDTH:DEG,DEG...", arms, type=_read_by(parse_arms)),
     )
-    turned = fit.add_mutually_exclusive_group()
-    turned.add_argument(
-        "--flux-reference",
-        type=Path,
-        metavar="FILE",
-        help="a flux map of another day: by how much the light is turned since is told",
-    )
-    turned.add_argument(
-        "--arms",
-        type=_read_by(parse_arms),
-        metavar="WIDTH:DEG,DEG...",
-        help="the spider's arms at rotation 0: the rotation is told that their shadows in the "
-        "flux map have",
-    )
-    fit.add_argument("--gain-map", action="store_true", help="fit a gain over the pupil, too")
-    fit.add_argument("--anamorphosis", action="store_true", help="fit a stretched image, too")
-    fit.add_argument("--json", action="store_true", help="print one JSON object, not a table")
-    fit.add_argument("--plot", type=Path, metavar="FILE.png", help="write the paper's figures")
-    fit.add_argument("--output", type=Path, metavar="FILE.h5", help="write all that was found")
-    fit.add_argument(
-        "--threads",
-        type=_count,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="default: one for every core",
+    cores = os.cpu_count() or 1
+    add(
+        fit,
+        words("--gain-map", "fit a gain over the pupil, too"),
+        words("--anamorphosis", "fit a stretched image, too"),
+        words("--json", "print one JSON object, not a table"),
+        words("--plot FILE.png", "write the paper's figures", type=Path),
+        words("--output FILE.h5", "write all that was found", type=Path),
+        words("--threads N", "default: one for every core", type=_count, default=cores),
     )
 
 
 def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
     make.description = _RECONSTRUCT
     make.epilog = "Exit status: 0 written, 2 input that cannot be used."
-    make.add_argument("instrument", metavar="INSTRUMENT", help="TOML file, or a packaged name")
-    make.add_argument(
-        "alpha",
-        metavar="ALPHA",
-        help="X,Y,ROT,MAG (subapertures, degrees, ratio), or a file that pyrcal fit wrote with "
-        "--json or --output",
+    alpha = (
+        "X,Y,ROT,MAG (subapertures, degrees, ratio), or a file that pyrcal fit wrote with "
+        "--json or --output"
     )
-    make.add_argument(
-        "--modes",
-        type=_count,
-        required=True,
-        metavar="N",
-        help="the first N modes",
+    methods = (
+        "svd: least squares, weak singular values left out (default); map: with noise and "
+        "turbulence as priors"
     )
-    make.add_argument("--output", type=Path, required=True, metavar="FILE.h5")
-    make.add_argument(
-        "--method",
-        choices=("svd", "map"),
-        default="svd",
-        help="svd: least squares, weak singular values left out (default); map: with noise and "
-        "turbulence as priors",
+    noise = "of map: 1 sigma of one slope in one frame, default %(default)g"
+    gains = "leave the columns as the model has them; by default they take the gains of the fit"
+    condition = words(
+        "--max-condition MAX_CONDITION", "of svd, default %(default)g", type=float, default=100.0
     )
-    make.add_argument(
-        "--max-condition", type=float, default=100.0, help="of svd, default %(default)g"
-    )
-    make.add_argument(
-        "--slope-noise",
-        type=float,
-        default=0.05,
-        metavar="RMS",
-        help="of map: 1 sigma of one slope in one frame, default %(default)g",
-    )
-    make.add_argument(
-        "--no-gains",
-        action="store_true",
-        help="leave the columns as the model has them; by default they take the gains of the fit",
-    )
-    make.add_argument(
-        "--flux-map", type=Path, metavar="FILE", help="as of pyrcal fit: the model is lit like it"
-    )
-    make.add_argument(
-        "--reference", type=Path, metavar="FILE", help="the measured matrix, for its checksum"
+    add(
+        make,
+        _INSTRUMENT,
+        words("alpha ALPHA", alpha),
+        words("--modes N", "the first N modes", type=_count, required=True),
+        words("--output FILE.h5", type=Path, required=True),
+        words("--method", methods, choices=("svd", "map"), default="svd"),
+        condition,
+        words("--slope-noise RMS", noise, type=float, default=0.05),
+        words("--no-gains", gains),
+        words("--flux-map FILE", "as of pyrcal fit: the model is lit like it", type=Path),
+        words("--reference FILE", "the measured matrix, for its checksum", type=Path),
     )
 
 

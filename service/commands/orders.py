@@ -64,7 +64,8 @@ def carry_out(service: Service, request: Request, options: argparse.Namespace) -
     if request.method == "POST":
         headers["Idempotency-Key"] = str(uuid.uuid4())
     who = _login() if options.who is None else options.who
-    body = named(options, request.body) | dict(request.always) | {"reason": why, "by": who}
+    given = named(options, request.body.split())
+    body = {**given, **request.always, "reason": why, "by": who}
     answer = service.order(request.method, path_of(request.path, options), body, headers).document
     with understood(service):
         text = str(answer["text"])

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,10 +31,26 @@ line that makes no sense, 3 the service is not reached. PYRCAL_URL and PYRCAL_AP
 
 
 class Words(NamedTuple):
-    """An option or an operand, as argparse adds it."""
+    """An option or an operand: ``--name VALUE``, a flag ``--name``, ``operand VALUE``."""
 
-    names: tuple[str, ...]
+    form: str
+    purpose: str | None
     how: dict[str, Any]
+    """What else argparse is told."""
+
+
+def words(form: str, purpose: str | None = None, **how: Any) -> Words:  # noqa: ANN401 - argparse's own
+    """Return an option or an operand; one with ``choices`` is no flag."""
+    return Words(form, purpose, how)
+
+
+def add(to: Any, *every: Words) -> None:  # noqa: ANN401 - argparse's own, whose type is private
+    """Add options and operands to a command, or to a group of them."""
+    for form, purpose, how in every:
+        name, _, value = form.partition(" ")
+        flag = name.startswith("-") and not value and "choices" not in how
+        named = {"metavar": value} if value else {"action": "store_true"} if flag else {}
+        to.add_argument(name, help=purpose, **named, **how)
 
 
 class Request(NamedTuple):
@@ -45,15 +61,14 @@ class Request(NamedTuple):
     module: str
     """Of this package; its ``carry_out`` does the work."""
 
-    method: str
-    path: str
-    """Of REST; words in braces are options."""
+    call: str
+    """Method and path of REST; words in braces are options."""
 
     words: tuple[Words, ...] = ()
-    body: tuple[str, ...] = ()
+    body: str = ""
     """Options that the body of an order says; ``reason`` and ``by`` are of every one."""
 
-    always: tuple[tuple[str, str], ...] = ()
+    always: Mapping[str, str] = {}
     """What the body says besides."""
 
     decides_on: str = ""
@@ -69,9 +84,23 @@ class Request(NamedTuple):
     follows: str = ""
     """Path of what is looked at until the work is done; empty: the answer is the end."""
 
+    @property
+    def method(self) -> str:
+        """Of REST."""
+        return self.call.partition(" ")[0]
 
-def _word(*names: str, **how: Any) -> Words:  # noqa: ANN401 - argparse's own
-    return Words(names, how)
+    @property
+    def path(self) -> str:
+        """Of REST; words in braces are options."""
+        return self.call.partition(" ")[2]
+
+
+def _reads(name: str, purpose: str, path: str, *every: Words, by: str = "reading") -> Request:
+    return Request(name, purpose, by, f"GET {path}", every)
+
+
+def _orders(name: str, purpose: str, call: str, *every: Words, **more: Any) -> Request:  # noqa: ANN401
+    return Request(name, purpose, "orders", call, every, **more)
 
 
 def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's own
@@ -88,241 +117,180 @@ def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's
     return read
 
 
-_ID = _word("id", metavar="ID", help="a reconstructor, or in-use, previous, candidate")
-_ALARM = _word("id", metavar="ALARM", help="its name: pyrcal alarms")
-_CANDIDATE = _word(
-    "id", metavar="ID", nargs="?", default="candidate", help="default: the one proposed last"
-)
-_MODES = _word("--modes", type=_numbers(int), metavar="N,...|controlled|all", help="of the basis")
-_LASTS = _word("--duration-s", type=float, metavar="S", help="how long")
-_EACH = _word("--amplitude-m", type=float, metavar="M", help="RMS of each mode, metres OPD")
-_LINES = _word("--frequency-hz", type=_numbers(float), metavar="HZ,...", help="a line for each")
-_TOTAL = _word("--total-amplitude-m", type=float, metavar="M", help="RMS of all random signs")
-_OVER = _word("--over-budget", action="store_true", default=None, help="more than it is meant")
-_NO_WAIT = _word("--no-wait", action="store_true", help="do not wait for its end")
-_SINCE = _word("--since", metavar="TIME", help="RFC 3339, like 2026-03-01T20:00:00Z")
-_UNTIL = _word("--until", metavar="TIME", help="up to this time")
+_ID = words("id ID", "a reconstructor, or in-use, previous, candidate")
+_ALARM = words("id ALARM", "its name: pyrcal alarms")
+_CANDIDATE = words("id ID", "default: the one proposed last", nargs="?", default="candidate")
+_MODES = words("--modes N,...|controlled|all", "of the basis", type=_numbers(int))
+_LASTS = words("--duration-s S", "how long", type=float)
+_EACH = words("--amplitude-m M", "RMS of each mode, metres OPD", type=float)
+_LINES = words("--frequency-hz HZ,...", "a line for each", type=_numbers(float))
+_TOTAL = words("--total-amplitude-m M", "RMS of all random signs", type=float)
+_OVER = words("--over-budget", "more than it is meant", default=None)
+_NO_WAIT = words("--no-wait", "do not wait for its end")
+_SINCE = words("--since TIME", "RFC 3339, like 2026-03-01T20:00:00Z")
+_UNTIL = words("--until TIME", "up to this time")
 
 _ONE = "/v1/reconstructors/{id}"
 _RESUMES = "pyrcal mode propose, or auto, ends it"
 
 REQUESTS = (
-    Request("status", "what the service does, on one screen", "reading", "GET", "/v1/state"),
-    Request("alpha", "where the mirror is, and how sure that is", "reading", "GET", "/v1/alpha"),
-    Request(
+    _reads("status", "what the service does, on one screen", "/v1/state"),
+    _reads("alpha", "where the mirror is, and how sure that is", "/v1/alpha"),
+    _reads(
         "reconstructors",
         "the reconstructors, or all about one",
-        "reading",
-        "GET",
         "/v1/reconstructors",
-        (_word("id", nargs="?", metavar="ID", help="one, or in-use, previous, candidate"),),
+        words("id ID", "one, or in-use, previous, candidate", nargs="?"),
     ),
-    Request("alarms", "the alarms that last, and what to do", "reading", "GET", "/v1/state"),
-    Request(
+    _reads("alarms", "the alarms that last, and what to do", "/v1/state"),
+    _reads(
         "audit",
         "who ordered what, why, and what came of it",
-        "reading",
-        "GET",
         "/v1/audit",
-        (_SINCE, _UNTIL, _word("--limit", type=int, metavar="N", help="newest entries; 200")),
+        *(_SINCE, _UNTIL, words("--limit N", "newest entries; 200", type=int)),
     ),
-    Request("watch", "what it does, live, until Ctrl-C", "watch", "GET", "/v1/stream"),
-    Request(
+    _reads("watch", "what it does, live, until Ctrl-C", "/v1/stream", by="watch"),
+    _reads(
         "export",
         "the history of alpha, the audit trail or a matrix, to a file",
-        "export",
-        "GET",
         "",
-        (
-            _word(
-                "what",
-                choices=("alpha", "audit", "reconstructor", "measurement", "noisy-matrix"),
-                help="alpha: what the service remembers of it; the others: from its archive",
-            ),
-            _word("id", nargs="?", metavar="ID", help="of a matrix; or in-use, previous"),
-            _word("--format", metavar="F", help="alpha, audit: csv, jsonl; matrices: npy, hdf5..."),
-            _word("--output", type=Path, metavar="FILE", help="default: a name of its own, here"),
-            _SINCE,
-            _UNTIL,
+        words(
+            "what",
+            "alpha: what the service remembers of it; the others: from its archive",
+            choices=("alpha", "audit", "reconstructor", "measurement", "noisy-matrix"),
         ),
+        words("id ID", "of a matrix; or in-use, previous", nargs="?"),
+        words("--format F", "alpha, audit: csv, jsonl; matrices: npy, hdf5..."),
+        words("--output FILE", "default: a name of its own, here", type=Path),
+        *(_SINCE, _UNTIL),
+        by="export",
     ),
-    Request(
+    _orders(
         "approve",
         "send the reconstructor that is proposed",
-        "orders",
-        "POST",
-        f"{_ONE}/approve",
-        (_CANDIDATE, _NO_WAIT),
+        f"POST {_ONE}/approve",
+        *(_CANDIDATE, _NO_WAIT),
         decides_on=_ONE,
         asks="send it to the RTC",
         follows=_ONE,
     ),
-    Request(
+    _orders(
         "reject",
         "discard the reconstructor that is proposed",
-        "orders",
-        "POST",
-        f"{_ONE}/reject",
-        (_CANDIDATE,),
+        f"POST {_ONE}/reject",
+        _CANDIDATE,
         decides_on=_ONE,
         needs_why=True,
     ),
-    Request(
+    _orders(
         "publish",
         "send a known reconstructor again",
-        "orders",
-        "POST",
-        f"{_ONE}/publish",
-        (_ID,),
+        f"POST {_ONE}/publish",
+        _ID,
         decides_on=_ONE,
         asks="send it to the RTC again",
     ),
-    Request(
+    _orders(
         "rollback",
         "go back to the reconstructor before; mode becomes hold",
-        "orders",
-        "POST",
-        "/v1/rollback",
+        "POST /v1/rollback",
         decides_on="/v1/reconstructors",
         asks="go back to the one before; mode becomes hold",
         needs_why=True,
         then=_RESUMES,
     ),
-    Request(
+    _orders(
         "hold",
         "only measure: make and send nothing by itself",
-        "orders",
-        "PUT",
-        "/v1/mode",
-        always=(("mode", "hold"),),
+        "PUT /v1/mode",
+        always={"mode": "hold"},
         then=_RESUMES,
     ),
-    Request(
+    _orders(
         "mode",
         "how much it may do by itself",
-        "orders",
-        "PUT",
-        "/v1/mode",
-        (_word("mode", choices=("auto", "propose", "hold")),),
-        body=("mode",),
+        "PUT /v1/mode",
+        words("mode", choices=("auto", "propose", "hold")),
+        body="mode",
     ),
-    Request(
+    _orders(
         "stop",
         "stop everything: dither off, nothing made or sent",
-        "orders",
-        "POST",
-        "/v1/stop",
+        "POST /v1/stop",
         then="pyrcal resume releases it",
     ),
-    Request(
+    _orders(
         "resume",
         "release what pyrcal stop has stopped (hold is ended by pyrcal mode)",
-        "orders",
-        "POST",
-        "/v1/resume",
+        "POST /v1/resume",
     ),
-    Request(
+    _orders(
         "acknowledge",
         "say that an alarm is known of; it stays for as long as it lasts",
-        "orders",
-        "POST",
-        "/v1/alarms/{id}/acknowledge",
-        (_ALARM,),
+        "POST /v1/alarms/{id}/acknowledge",
+        _ALARM,
     ),
-    Request(
+    _orders(
         "mute",
         "show an alarm no more for a time; it is counted",
-        "orders",
-        "POST",
-        "/v1/alarms/{id}/mute",
-        (_ALARM, _word("for_s", type=float, metavar="SECONDS", help="twelve hours at most")),
-        body=("for_s",),
+        "POST /v1/alarms/{id}/mute",
+        *(_ALARM, words("for_s SECONDS", "twelve hours at most", type=float)),
+        body="for_s",
     ),
-    Request(
-        "unmute",
-        "show an alarm again",
-        "orders",
-        "POST",
-        "/v1/alarms/{id}/unmute",
-        (_ALARM,),
-    ),
-    Request(
+    _orders("unmute", "show an alarm again", "POST /v1/alarms/{id}/unmute", _ALARM),
+    _orders(
         "dither",
         "start or stop the dither",
-        "orders",
-        "POST",
-        "/v1/dither",
-        (
-            _word("action", choices=("start", "stop")),
-            _word("--kind", choices=("sine", "binary"), help="binary: random signs"),
-            *(_MODES, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
-        ),
-        body=(
-            *("action", "kind", "modes", "amplitude_m", "frequency_hz", "total_amplitude_m"),
-            *("duration_s", "over_budget"),
-        ),
+        "POST /v1/dither",
+        words("action", choices=("start", "stop")),
+        words("--kind", "binary: random signs", choices=("sine", "binary")),
+        *(_MODES, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
+        body="action kind modes amplitude_m frequency_hz total_amplitude_m duration_s over_budget",
     ),
-    Request(
+    _orders(
         "refit",
         "compute a reconstructor for the alpha of now",
-        "orders",
-        "POST",
-        "/v1/refit",
-        (_word("--n-modes", type=int, metavar="N", help="to control; default: as many as now"),),
-        body=("n_modes",),
+        "POST /v1/refit",
+        words("--n-modes N", "to control; default: as many as now", type=int),
+        body="n_modes",
     ),
-    Request(
-        "abort",
-        "end an acquisition under way",
-        "orders",
-        "POST",
-        "/v1/acquisition",
-        always=(("action", "abort"),),
+    _orders(
+        "abort", "end an acquisition under way", "POST /v1/acquisition", always={"action": "abort"}
     ),
-    Request(
+    _orders(
         "acquire",
         "find alpha from nothing: open the loop, look, close it step by step",
-        "orders",
-        "POST",
-        "/v1/acquisition",
-        (_NO_WAIT,),
-        always=(("action", "start"),),
+        "POST /v1/acquisition",
+        _NO_WAIT,
+        always={"action": "start"},
         asks="open the loop and dither strongly; the image is lost for tens of seconds",
         needs_why=True,
         follows="/v1/state",
     ),
-    Request(
+    _orders(
         "measure",
         "have the RTC measure an interaction matrix; all but a sine open the loop",
-        "orders",
-        "POST",
-        "/v1/measurements",
-        (
-            _word("--pattern", metavar="NAME", help="push-pull-modal, hadamard, sine, ..."),
-            _word("--n-average", type=int, metavar="N", help="pushes, and pulls, of each"),
-            *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
-        ),
-        body=("pattern", "n_average", "modes", "amplitude_m", "frequency_hz", "duration_s"),
+        "POST /v1/measurements",
+        words("--pattern NAME", "push-pull-modal, hadamard, sine, ..."),
+        words("--n-average N", "pushes, and pulls, of each", type=int),
+        *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
+        body="pattern n_average modes amplitude_m frequency_hz duration_s",
         asks="have the RTC measure; all patterns but sine open the loop",
         follows="/v1/measurements/{id}",
     ),
-    Request(
+    _orders(
         "measure-noisy",
         "measure a noisy interaction matrix on sky, by random signs",
-        "orders",
-        "POST",
-        "/v1/noisy-matrix",
-        (_MODES, _TOTAL, _LASTS, _OVER, _NO_WAIT),
-        body=("modes", "total_amplitude_m", "duration_s", "over_budget"),
+        "POST /v1/noisy-matrix",
+        *(_MODES, _TOTAL, _LASTS, _OVER, _NO_WAIT),
+        body="modes total_amplitude_m duration_s over_budget",
         follows="/v1/noisy-matrix/{id}",
     ),
-    Request(
+    _orders(
         "give-up",
         "wait no longer for a matrix that is measured",
-        "orders",
-        "DELETE",
-        "/v1/measurements/{id}",
-        (_word("id", metavar="ID", help="of the measurement"),),
+        "DELETE /v1/measurements/{id}",
+        words("id ID", "of the measurement"),
     ),
 )
 """What there is, in the order of ``pyrcal --help``."""
@@ -335,18 +303,18 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
             request.name, help=request.purpose, description=request.purpose, epilog=_EPILOG
         )
         parser.set_defaults(request=request, module="remote")
-        for word in request.words:
-            parser.add_argument(*word.names, **word.how)
+        add(parser, *request.words)
         if request.module == "orders":
-            parser.add_argument("--why", default="", help="kept in the audit trail")
-            parser.add_argument("--who", help="your name; default: the login name")
+            add(parser, words("--why WHY", "kept in the audit trail", default=""))
+            add(parser, words("--who WHO", "your name; default: the login name"))
         if request.asks:
-            parser.add_argument("--yes", action="store_true", help="do it without asking")
-        parser.add_argument("--json", action="store_true", help="print what REST answers")
-        parser.add_argument(
-            "--url", metavar="URL", help=f"of the service, default {URL}, else {USUAL_URL}"
+            add(parser, words("--yes", "do it without asking"))
+        add(
+            parser,
+            words("--json", "print what REST answers"),
+            words("--url URL", f"of the service, default {URL}, else {USUAL_URL}"),
+            words("--key-file FILE", f"default {KEY}", type=Path),
         )
-        parser.add_argument("--key-file", type=Path, metavar="FILE", help=f"default {KEY}")
 
 
 def main(options: argparse.Namespace) -> int:

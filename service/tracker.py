@@ -7,6 +7,7 @@ night therefore replays exactly, and every reaction of the service can be tested
 from __future__ import annotations
 
 from service.tracking import (
+    alarms,
     attention,
     dither,
     evidence,
@@ -103,6 +104,8 @@ def _react(turn: Turn) -> None:  # noqa: C901 - one line for each event
             rtc.on_services(turn, met)
         case ev.Trouble(name=name, over=True, t_ns_utc=t_ns):
             end_alarm(turn, name, t_ns)
+        case ev.Trouble(name=alarms.MIRROR_SILENT, text=text):
+            dither.stop_unanswered(turn, text)
         case ev.Trouble(name=name, text=text):
             turn.alarm(name, text)
         case ev.Noted(name=name, text=text, level=level):
@@ -154,7 +157,7 @@ def _react_to_answer(turn: Turn) -> None:  # noqa: C901 - one line for each even
         case ev.Compared() as event:
             probation.on_compared(turn, event)
         case ev.Vibrations() as vibrations:
-            dither.hear_vibrations(turn, vibrations)
+            rtc.hear_vibrations(turn, vibrations)
         case ev.JobFailed() as failed:
             _react_to_failure(turn, failed.effect, failed.text)
         case _:

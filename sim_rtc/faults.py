@@ -55,6 +55,7 @@ class FaultKind(StrEnum):
     LATE_SWAP = "late-swap"
     DITHER_LOST = "dither-lost"
     DITHER_LATE = "dither-late"
+    MIRROR_SILENT = "mirror-silent"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +114,10 @@ FORMS: Final[dict[FaultKind, tuple[tuple[Argument, ...], str]]] = {
     ),
     FaultKind.DITHER_LOST: ((_SECONDS,), "dithers are accepted and never reach the mirror"),
     FaultKind.DITHER_LATE: ((_DELAY, _SECONDS), "dithers begin DELAY after the announced frame"),
+    FaultKind.MIRROR_SILENT: (
+        (_SECONDS,),
+        "dithers are in the telemetry and never reach the mirror",
+    ),
 }
 
 
@@ -273,6 +278,8 @@ class ComputerFaults:
                 self._target.limit_stroke(1e-9 * fault.value("STROKE_NM"))
             case FaultKind.DITHER_LOST:
                 self._target.delay_dithers(_NEVER_FRAMES)
+            case FaultKind.MIRROR_SILENT:
+                self._target.hide_dithers()
             case FaultKind.DITHER_LATE:
                 self._target.delay_dithers(round(1e9 * fault.value("DELAY") / self._clock.dt_ns))
             case _:
@@ -286,6 +293,8 @@ class ComputerFaults:
                 self._target.limit_stroke(None)
             case FaultKind.DITHER_LOST | FaultKind.DITHER_LATE:
                 self._target.delay_dithers(0)
+            case FaultKind.MIRROR_SILENT:
+                self._target.hide_dithers(hidden=False)
             case _:
                 pass
 

@@ -33,6 +33,7 @@ from service.tracking import events as ev
 from service.tracking.alarms import (
     DIVERGING,
     EDGE_SLIP,
+    MIRROR_SILENT,
     NOT_AS_ASKED,
     OFF_LOOP,
     OTHER_INSTRUMENT,
@@ -206,6 +207,7 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
         found.append(ev.DitherSilent(id=dither.id, silent_s=silent_s))
     if dither is not None and streams.played is not None:
         found += _misplayed(dither.id, streams.played, state)
+        found += _answered(streams, state)
     lines = () if streams.vibrations is None else streams.vibrations.lines_hz
     if streams.vibrations is not None and lines != state.vibrations_hz:
         found.append(ev.Vibrations(lines_hz=lines))
@@ -233,6 +235,21 @@ def _misplayed(dither_id: str, played: Finding, state: TrackerState) -> list[Eve
             id=dither_id, found_m=played.found_m, asked_m=played.asked_m, text=played.text
         )
     ]
+
+
+def _answered(streams: Streams, state: TrackerState) -> list[Event]:
+    """Return that the slopes do not answer the dither, or do so again.
+
+    Of an open loop, and of one that is being closed, the optical gain may be next to nothing.
+    """
+    found = None if streams.played is None else streams.played.unanswered
+    raised = any(alarm.name == MIRROR_SILENT for alarm in state.alarms)
+    closed = len(streams.in_loop) > 0 and not state.acquisition.under_way
+    if found is None or not closed or not (found or raised):
+        return []
+    text = found or "the slopes answer the dither again"
+    t_ns = streams.heard_ns_utc
+    return [ev.Trouble(name=MIRROR_SILENT, text=text, over=not found, t_ns_utc=t_ns)]
 
 
 def shape_news(streams: Streams, state: TrackerState) -> Event | None:

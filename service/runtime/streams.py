@@ -290,7 +290,7 @@ def with_dither(streams: Streams, dither: Dither | None, window_s: float) -> Str
         streams,
         cutter=cutter,
         dither=dither,
-        meter=Meter(asked=asked_of(dither, rtc)),
+        meter=Meter(asked=asked_of(dither, rtc, streams.description.mode_response)),
         played=None,
         dither_seen_seq=seen_seq,
         dither_silent_s=0.0,

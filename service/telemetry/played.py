@@ -1,8 +1,9 @@
-"""What the frames hold of a dither: whether it is what was asked for, whatever a status says.
+"""What the frames hold of a dither: whether it is what was asked for, whether the slopes answer.
 
 The telemetry has the dither's part of every command in columns of its own, and modes outside the
 loop move by nothing else. Once a second the strength of each mode, on its line, is compared with
-what was asked for.
+what was asked for, and the power of the slopes on the lines with what a mirror that obeys would
+make of it; the noise of that is read off beside the lines.
 """
 
 from __future__ import annotations
@@ -30,6 +31,18 @@ STRAY = 0.2
 
 _NAMED = 4
 
+SIDES_HZ = (-13, -11, -9, -7, -5, -3, 3, 5, 7, 9, 11, 13)
+"""Where the noise of the slopes is measured, relative to a line; whole periods of a second."""
+
+HEARD_LINES = 4
+"""Lines on which the slopes are looked at: those that should show most."""
+
+UNANSWERED = 0.03
+"""Share of the power expected below which, by 3 σ, nothing has moved: an optical gain of 0.17."""
+
+REPEATED = 0.02
+"""Share of frames with the very slopes of the frame before: these are frozen, and tell nothing."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Asked:
@@ -52,6 +65,17 @@ class Asked:
     own: tuple[bool, ...]
     """Whether a mode is outside the loop: all that its command does is the dither."""
 
+    response: tuple[float, ...] = ()
+    """Of each mode, the sum of the squares of the slopes it makes, per metre²; empty: not known."""
+
+    @property
+    def heard(self) -> list[int]:
+        """Which of the modes asked for are looked for in the slopes."""
+        if not self.frequency_hz or not self.response:
+            return []
+        expected = np.square(self.amplitude_m) * self.response
+        return [int(k) for k in np.argsort(expected)[::-1][:HEARD_LINES]]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
@@ -63,6 +87,9 @@ class Finding:
     asked_m: float
     text: str
     """What is otherwise than it was asked for; empty: nothing."""
+
+    unanswered: str | None = None
+    """How the slopes do not answer it; empty: they do; None: there is too little light to tell."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,6 +112,16 @@ class Meter:
     next_seq: int = 0
     """The frame those are followed by."""
 
+    slopes: Array | None = None
+    """``(n_heard * (1 + n_sides), n_slopes)`` slopes, demodulated on and beside each line heard."""
+
+    n_repeated: int = 0
+    """Frames with the very slopes of the frame before."""
+
+    powers: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the slopes on the lines, its variance, and what is expected, summed until it can be told
+    whether they answer."""
+
 
 def measured(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
     """Add a block of frames; return what was found if a second of them is full."""
@@ -100,6 +137,7 @@ def measured(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
         return meter, None
     squares = np.einsum("km,km->m", dither, dither).astype(float)
     meter, lines = _demodulated(meter, block, rows, dither[:, list(asked.modes)])
+    meter = _heard(meter, block.slopes[rows], block.first_seq + rows.start)
     meter = replace(
         meter,
         n_frames=meter.n_frames + len(dither),
@@ -108,8 +146,12 @@ def measured(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
     )
     if meter.n_frames < max(round(CHECK_S * asked.frame_rate_hz), LEAST_FRAMES):
         return meter, None
+    powers = _powers(meter)
+    unanswered = _unanswered(powers, asked)
     begun = Meter(asked=asked, last_m=meter.last_m, next_seq=meter.next_seq)
-    return begun, _found(meter)
+    if unanswered is None:
+        begun = replace(begun, powers=powers)
+    return begun, replace(_found(meter), unanswered=unanswered)
 
 
 def _demodulated(
@@ -131,6 +173,58 @@ def _demodulated(
     phasors = np.exp(-2j * np.pi * np.outer(seq / asked.frame_rate_hz, asked.frequency_hz))
     meter = replace(meter, last_m=commands[-1], next_seq=first_seq + len(commands))
     return meter, np.stack([(phasors * dither).sum(axis=0), (phasors * steps).sum(axis=0)])
+
+
+def _heard(meter: Meter, slopes: Array, first_seq: int) -> Meter:
+    """Add slopes to the sums on and beside the lines."""
+    asked = meter.asked
+    lines = np.array(asked.frequency_hz)[asked.heard]
+    if not len(lines):
+        return meter
+    bins_hz = (lines[:, None] + np.array([0, *SIDES_HZ])).ravel()
+    seq = first_seq - asked.first_seq + np.arange(len(slopes))
+    phasors = np.exp(-2j * np.pi * np.outer(bins_hz / asked.frame_rate_hz, seq))
+    parts = np.concatenate([phasors.real, phasors.imag]).astype(np.float32) @ slopes
+    summed = parts[: len(bins_hz)] + 1j * parts[len(bins_hz) :]
+    same = np.count_nonzero((slopes[1:] == slopes[:-1]).all(axis=1))
+    return replace(
+        meter,
+        slopes=summed if meter.slopes is None else meter.slopes + summed,
+        n_repeated=meter.n_repeated + int(same),
+    )
+
+
+def _powers(meter: Meter) -> tuple[float, float, float]:
+    """Return the power on the lines beyond the noise, its variance, and what is expected.
+
+    What earlier seconds have told is in it, where that was too little for a verdict.
+    """
+    asked, heard, before = meter.asked, meter.asked.heard, meter.powers
+    if meter.slopes is None or meter.lines is None or meter.n_repeated > REPEATED * meter.n_frames:
+        return before
+    power = np.sum(np.abs(meter.slopes) ** 2, axis=1).reshape(len(heard), -1)
+    sides = power[:, 1:]
+    beyond = np.sum(power[:, 0] - sides.mean(axis=1))
+    variance = np.sum(sides.var(axis=1, ddof=1)) * (1.0 + 1.0 / sides.shape[1])
+    expected = np.sum(np.abs(meter.lines[0][heard]) ** 2 * np.array(asked.response)[heard])
+    return before[0] + beyond, before[1] + variance, before[2] + expected
+
+
+def _unanswered(powers: tuple[float, float, float], asked: Asked) -> str | None:
+    """Return how the slopes do not answer the dither; empty: they do; None: nobody can tell."""
+    beyond, variance, expected = powers
+    if not expected:
+        return None
+    share, sigma = beyond / expected, np.sqrt(variance) / expected
+    if share - 3.0 * sigma > UNANSWERED:
+        return ""
+    if share + 3.0 * sigma > UNANSWERED:
+        return None
+    modes = ", ".join(str(asked.modes[k]) for k in sorted(asked.heard))
+    return (
+        f"the slopes hold {100.0 * max(share, 0.0):.1f} ± {100.0 * sigma:.1f} % of the power that "
+        f"modes {modes} should put on their lines"
+    )
 
 
 def _found(meter: Meter) -> Finding:

@@ -13,9 +13,9 @@ import numpy as np
 from service.control.dither import forgetting_mean, measured_ratio
 from service.telemetry.lockin import WindowEstimate
 from service.telemetry.random_dither import RandomEstimate
+from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.activity import GONE_WITHIN_S
-from service.tracking.alarms import DITHER_LOST, NO_DITHER, NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
 from service.tracking.dither_plan import (
     ROUNDING,
     SHORTEST_PAUSE_S,
@@ -48,7 +48,7 @@ MEASURED = 1.1
 """What a second of frames may hold more than is allowed, before it is too strong."""
 
 CALM_S = 60.0
-"""After one that was too strong, before another is tried."""
+"""After one that was too strong, or that nothing answered, before another is tried."""
 
 TELL_EVERY_S = 2.0
 
@@ -71,8 +71,6 @@ MEMORY_S = 600.0
 
 _ON_ITS_WAY_S = 2.0
 """For a status made before the dither began, where it does not tell its own frame."""
-
-_SAME_LINE_HZ = 2.5
 
 
 def choose_dither(turn: Turn, rtc: Status) -> None:
@@ -165,27 +163,18 @@ def on_answer(turn: Turn, request: DitherRequest, reply: Reply) -> None:
         return
     if reply.accepted:
         turn.dither = replace(turn.dither, start_seq=reply.start_seq, asked_ns_utc=turn.now_ns)
-        turn.calm(NO_DITHER)
+        turn.calm(alarms.NO_DITHER)
         turn.log("dither.started", f"{request.id} starts at frame {reply.start_seq}")
         return
     turn.put_off(dither_s=10.0)
     turn.dither = None
-    turn.alarm(NO_DITHER, f"the RTC refused the dither: {reply.reason}")
+    turn.alarm(alarms.NO_DITHER, f"the RTC refused the dither: {reply.reason}")
 
 
 def on_stop_answer(turn: Turn, reply: Reply) -> None:
     """Put on record that the RTC goes on; it is asked again for as long as it must be."""
     if not reply.accepted:
         turn.warn("job.failed", f"the RTC did not stop the dither: {reply.reason}")
-
-
-def hear_vibrations(turn: Turn, event: ev.Vibrations) -> None:
-    """Note where the slopes vibrate; the next dither keeps clear of it."""
-    before, lines = turn.state.vibrations_hz, event.lines_hz
-    turn.state = replace(turn.state, vibrations_hz=lines)
-    # a line between two bins of the spectrum shows now in one, now in the other
-    if not all(any(abs(line - known) < _SAME_LINE_HZ for known in before) for line in lines):
-        turn.log("vibrations", f"vibrations at {', '.join(f'{f:.0f}' for f in lines)} Hz")
 
 
 def follow_status(turn: Turn, rtc: Status) -> None:
@@ -209,7 +198,7 @@ def follow_status(turn: Turn, rtc: Status) -> None:
     if asked_to_stop or played_s >= dither.request.duration_s - SILENT_S:
         turn.dithering = replace(turn.dithering, ended_ns_utc=turn.now_ns)
         turn.dither = None
-        turn.calm(DITHER_LOST)
+        turn.calm(alarms.DITHER_LOST)
         turn.log("dither.ended", f"{dither.id} has ended")
         return
     if turn.state.dither_losses:
@@ -232,7 +221,7 @@ def on_silence(turn: Turn, event: ev.DitherSilent) -> None:
         "of it: α is not measured"
     )
     if event.silent_s < _patience_s(turn):
-        turn.alarm(DITHER_LOST, text)
+        turn.alarm(alarms.DITHER_LOST, text)
     else:
         _lose(turn, dither, text)
 
@@ -240,7 +229,7 @@ def on_silence(turn: Turn, event: ev.DitherSilent) -> None:
 def found_again(turn: Turn) -> None:
     """Miss it no more: a window held the dither, or none is wanted any more."""
     turn.state = replace(turn.state, dither_lost=None, dither_losses=0)
-    turn.calm(DITHER_LOST)
+    turn.calm(alarms.DITHER_LOST)
 
 
 def learn(turn: Turn, estimate: WindowEstimate | RandomEstimate) -> None:
@@ -267,8 +256,8 @@ def why_too_strong(turn: Turn, event: ev.DitherMeasured) -> str | None:
     rtc, dither = turn.rtc, turn.dither
     if not event.text:
         turn.dithering = replace(turn.dithering, loud_text="", amiss_id=None)
-        turn.calm(NOT_AS_ASKED)
-        turn.calm(OVER_BUDGET)
+        turn.calm(alarms.NOT_AS_ASKED)
+        turn.calm(alarms.OVER_BUDGET)
         return None
     if rtc is None or dither is None or dither.id != event.id:
         return None
@@ -276,7 +265,7 @@ def why_too_strong(turn: Turn, event: ev.DitherMeasured) -> str | None:
     most_m = budget_m(rtc, turn.policy)
     if event.found_m > MEASURED * max(event.asked_m, most_m):
         return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
-    turn.alarm(NOT_AS_ASKED, f"{event.text}; look at the RTC's dither")
+    turn.alarm(alarms.NOT_AS_ASKED, f"{event.text}; look at the RTC's dither")
     return None
 
 
@@ -286,6 +275,17 @@ def stop_too_strong(turn: Turn, dither_id: str, loud: str) -> None:
     turn.dithering = replace(turn.dithering, loud_id=dither_id, loud_text=loud)
     _blame(turn, dither_id, loud)
     tell_to_stop(turn)
+
+
+def stop_unanswered(turn: Turn, text: str) -> None:
+    """End a dither that the slopes do not answer, and try another in a while."""
+    if turn.dither is not None:
+        ended = f"{turn.dither.id} was ended, and another is tried after {CALM_S:.0f} s"
+        turn.alarm(alarms.MIRROR_SILENT, f"the mirror does not answer: {text}; {ended}")
+        _note_stop(turn, turn.dither.id)
+        turn.dither = None
+        turn.put_off(dither_s=CALM_S)
+        tell_to_stop(turn)
 
 
 def stop_unwanted(turn: Turn, rtc: Status) -> None:
@@ -305,7 +305,7 @@ def stop_unwanted(turn: Turn, rtc: Status) -> None:
             f"{why}, and the RTC goes on playing {running}: it is asked every {TELL_EVERY_S:.0f} s "
             "to stop it; stop it at the RTC"
         )
-        turn.alarm(NOT_STOPPED, text)
+        turn.alarm(alarms.NOT_STOPPED, text)
     if turn.now_ns - turn.dithering.told_ns_utc >= TELL_EVERY_S * SECOND_NS:
         tell_to_stop(turn)
 
@@ -314,7 +314,7 @@ def forget_unwanted(turn: Turn) -> None:
     """Note that no unwanted dither plays, or nobody knows of one."""
     if turn.dithering.unwanted_id is not None:
         turn.dithering = replace(turn.dithering, unwanted_id=None)
-        turn.calm(NOT_STOPPED)
+        turn.calm(alarms.NOT_STOPPED)
 
 
 def _begin(turn: Turn, rtc: Status, wish: Wish) -> None:
@@ -343,7 +343,7 @@ def _ask(turn: Turn, rtc: Status, wish: Wish) -> None:
             "measured with one"
         )
         turn.put_off(dither_s=60.0)
-        turn.alarm(NO_DITHER, text)
+        turn.alarm(alarms.NO_DITHER, text)
         return
     shaken = on_vibrations(dither, wish.choice.avoid_hz)
     if shaken and dither.frequency_hz != turn.dithering.lines_hz:
@@ -396,7 +396,7 @@ def _adopt(turn: Turn, rtc: Status) -> bool:
         )
         if why_unusable(dither, rtc, turn.policy) is None:
             turn.dither = dither
-            turn.calm(NO_DITHER)
+            turn.calm(alarms.NO_DITHER)
             turn.log("dither.adopted", f"{running.id} runs since frame {begun_seq}")
             return True
     return False
@@ -450,7 +450,7 @@ def _correct(turn: Turn, asked: Dither, shown: DitherStatus) -> None:
 
 
 def _lose(turn: Turn, dither: Dither, text: str) -> None:
-    turn.alarm(DITHER_LOST, text)
+    turn.alarm(alarms.DITHER_LOST, text)
     turn.warn("dither.lost", text)
     turn.dither = None
     losses = turn.state.dither_losses + 1
@@ -483,7 +483,7 @@ def _blame(turn: Turn, running: str, loud: str) -> None:
         "at the RTC's dither, or stop the dither to do without"
     )
     turn.dithering = replace(turn.dithering, loud_ns_utc=turn.now_ns)
-    turn.alarm(OVER_BUDGET, text)
+    turn.alarm(alarms.OVER_BUDGET, text)
 
 
 def _forgive(turn: Turn, rtc: Status) -> None:
@@ -493,6 +493,6 @@ def _forgive(turn: Turn, rtc: Status) -> None:
     fine = not by_frames and own is not None and rtc.dither_id == own.id
     given_up = turn.state.dither_stopped or not turn.policy.dither_enabled
     if given_up:
-        turn.calm(NOT_AS_ASKED)
+        turn.calm(alarms.NOT_AS_ASKED)
     if fine or given_up:
-        turn.calm(OVER_BUDGET)
+        turn.calm(alarms.OVER_BUDGET)

@@ -181,9 +181,13 @@ def lock_in_plan(dither: Dither, rtc: Status, window_s: float) -> LockInPlan:
     )
 
 
-def asked_of(dither: Dither, rtc: Status) -> Asked:
-    """Return a dither as the frames should hold it."""
+def asked_of(dither: Dither, rtc: Status, response: NDArray[np.float64] | None = None) -> Asked:
+    """Return a dither as the frames should hold it.
+
+    ``response`` ``(n_modes,)`` is what ``Description`` has; None: nobody knows what it should show.
+    """
     first_seq, request = dither.start_seq or 0, dither.request
+    known = () if response is None else tuple(response[list(request.modes)].tolist())
     return Asked(
         modes=request.modes,
         amplitude_m=request.amplitude_m,
@@ -192,6 +196,7 @@ def asked_of(dither: Dither, rtc: Status) -> Asked:
         first_seq=first_seq,
         stop_seq=first_seq + round(request.duration_s * rtc.frame_rate_hz),
         own=tuple(mode not in rtc.in_loop for mode in request.modes),
+        response=known,
     )
 
 

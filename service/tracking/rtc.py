@@ -7,6 +7,7 @@ from dataclasses import replace
 from service.tracking import events as ev
 from service.tracking.alarms import (
     LOOP_OPEN,
+    MIRROR_SILENT,
     NOT_ACKNOWLEDGED,
     OTHER_BASIS,
     OTHER_SUM,
@@ -41,6 +42,8 @@ FORGOTTEN_AFTER_S = 15.0
 """An alarm the link repeats while it lasts is over after this much silence."""
 
 _RENEWED = (SECOND_RTC, OTHER_BASIS)
+
+_SAME_LINE_HZ = 2.5
 
 COMPUTE_WITHIN_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
@@ -104,6 +107,15 @@ def on_status(turn: Turn, rtc: Status) -> None:
     follow_status(turn, rtc)
 
 
+def hear_vibrations(turn: Turn, event: ev.Vibrations) -> None:
+    """Note where the slopes vibrate; the next dither keeps clear of it."""
+    before, lines = turn.state.vibrations_hz, event.lines_hz
+    turn.state = replace(turn.state, vibrations_hz=lines)
+    # a line between two bins of the spectrum shows now in one, now in the other
+    if not all(any(abs(line - known) < _SAME_LINE_HZ for known in before) for line in lines):
+        turn.log("vibrations", f"vibrations at {', '.join(f'{f:.0f}' for f in lines)} Hz")
+
+
 def _tell_of_gains(turn: Turn, before: Status | None, rtc: Status) -> None:
     """Say how many modes are in the loop where it is not all that are controlled."""
     n_before = rtc.n_controlled if before is None else len(before.in_loop)
@@ -137,6 +149,7 @@ def on_new_session(turn: Turn, session: str) -> None:
     turn.retry_all()
     turn.state = replace(turn.state, rtc=None)
     found_again(turn)
+    turn.calm(MIRROR_SILENT)
     forget_unwanted(turn)
     turn.calm(OTHER_SUM)
     turn.log("rtc.session", f"the RTC started session {session}")

@@ -122,6 +122,7 @@ class OpticsWorker:
             mode_variance_m2=self._model.basis.variance_m2,
             actuators=actuators_of(self._model),
             mode_information=information(linearisation),
+            mode_response=np.sum(np.square(linearisation.matrix, dtype=np.float64), axis=0),
             start=self._start,
         )
 

@@ -74,6 +74,9 @@ class Description:
     mode_information: NDArray[np.float64] | None = None
     """``(n_modes, 4, 4)`` what a dither of each mode tells of α; None: not worked out."""
 
+    mode_response: NDArray[np.float64] | None = None
+    """``(n_modes,)`` sum of the squares of the slopes of each mode, per metre²; None: not known."""
+
     start: Misregistration = field(default_factory=Misregistration)
     """Where a fit starts while nothing is known of α: the mirror's nominal rotation."""
 

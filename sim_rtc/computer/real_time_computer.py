@@ -99,6 +99,7 @@ class RealTimeComputer:
         self._terms: LoopTerms | None = None
         self._block: Block | None = None
         self._row = 0
+        self._hides_dithers = False
         self.batch_frames = BATCH_FRAMES
         """Frames of a batch."""
         self._optics = optics
@@ -116,7 +117,11 @@ class RealTimeComputer:
             self._swap()
             terms = self._current_terms(block.optics)
             activities = self._activities
-            result = block.run(row, self._loop, terms, activities.commands(self._seq, n_frames))
+            added = activities.commands(self._seq, n_frames)
+            hidden = added if self._hides_dithers and activities.telemetry_dithers else None
+            result = block.run(row, self._loop, terms, added if hidden is None else None)
+            if hidden is not None:
+                result.commands_m, result.dither_m = result.commands_m + hidden, hidden
             batch = Batch(
                 session=self._session,
                 seq0=self._seq,
@@ -157,6 +162,11 @@ class RealTimeComputer:
         """Let dithers to come begin so many frames after the announced one."""
         with self._lock:
             self._activities.late_dither_frames = n_frames
+
+    def hide_dithers(self, *, hidden: bool = True) -> None:
+        """Tell of dithers in the telemetry that never reach the mirror."""
+        with self._lock:
+            self._hides_dithers = hidden
 
     @property
     def has_news(self) -> bool:

@@ -213,3 +213,20 @@ def test_nothing_is_published_that_nobody_approved(bench, policy):
     night.command(cmd.Approve(id=proposed.id))
     night.advance(0.5)
     assert [swap.id for swap in night.swaps] == [proposed.id]
+
+
+def test_a_mirror_that_does_not_answer_is_named_within_a_second_and_the_dither_is_ended(
+    bench, policy
+):
+    night = short(bench, policy, 1.5, Mode.HOLD)
+    assert night.state.dither is not None
+    night.dome.computer.hide_dithers()
+    night.advance(2.1)  # the second under way had an answer, the next has none
+    (alarm,) = [alarm for alarm in night.state.alarms if alarm.name == "mirror-silent"]
+    assert "of the power that modes" in alarm.text
+    assert night.state.dither is None
+    assert night.state.rtc.dither is None
+    night.dome.computer.hide_dithers(hidden=False)
+    night.command(cmd.StartDither())
+    night.advance(1.3)
+    assert "mirror-silent" not in {alarm.name for alarm in night.state.alarms}

@@ -36,7 +36,7 @@ def columns(first_seq, n, *, asked=ASKED, by=1.0, shift_hz=0.0, modes=None):
     return out
 
 
-def played(dither, *, asked=ASKED, commands=None, seconds=1):
+def played(dither, *, asked=ASKED, commands=None, slopes=None, seconds=1):
     meter, found = Meter(asked=asked), []
     for k in range(20 * seconds):
         first_seq, n = asked.first_seq + 50 * k, 50
@@ -47,7 +47,7 @@ def played(dither, *, asked=ASKED, commands=None, seconds=1):
             first_seq=first_seq,
             t0_ns_utc=first_seq * 1_000_000,
             dt_ns=1_000_000,
-            slopes=np.zeros((n, 4), np.float32),
+            slopes=np.zeros((n, 4), np.float32) if slopes is None else slopes(held),
             commands_m=moved,
             dither_m=held,
             cm_id="initial",
@@ -120,3 +120,35 @@ def test_slow_turbulence_played_on_the_mirror_is_no_dither():
 
     (found,) = played(columns, commands=moved)
     assert found.text == ""
+
+
+SENSOR = 1e6 * np.random.default_rng(1).standard_normal((N_MODES, 40)).astype(np.float32)
+ANSWERED = replace(ASKED, response=tuple(np.sum(SENSOR[8:] ** 2, axis=1).tolist()))
+
+
+def answered(gain, noise, *, asked=ANSWERED):
+    rng = np.random.default_rng(5)
+
+    def slopes(held):
+        made = gain * held @ SENSOR + noise * rng.standard_normal((len(held), 40))
+        return made.astype(np.float32)
+
+    (found,) = played(columns, asked=asked, slopes=slopes)
+    return found.unanswered
+
+
+def test_slopes_that_answer_and_slopes_that_do_not_are_told_apart():
+    assert answered(1.0, 1e-3) == ""
+    assert answered(0.3, 1e-3) == "", "an optical gain of bad seeing"
+    assert "modes 8, 9, 10, 11 should put on their lines" in answered(0.0, 1e-3)
+    assert answered(0.0, 1e-3).startswith("the slopes hold 0.0 ±")
+
+
+def test_too_little_light_says_neither():
+    assert answered(0.0, 0.1) is None
+    assert answered(1.0, 0.5) is None
+
+
+def test_frozen_slopes_and_an_unknown_response_tell_nothing_of_the_mirror():
+    assert answered(0.0, 0.0) is None
+    assert answered(0.0, 1e-3, asked=ASKED) is None

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 from service.commands.reading import reconstructor_lines, understood
-from service.commands.remote import DONE, NOT_DONE, Request, named
+from service.commands.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request, named
 from service.commands.rest import Document, Service
 from service.commands.terminal import print_document, print_lines, say
 from service.errors import ConfigurationError, shown
@@ -91,13 +91,34 @@ def _show(service: Service, request: Request, options: argparse.Namespace) -> st
     about = document
     if "id" not in options:
         about = service.get(f"{request.decides_on}/previous").document
+    options.known = _reconstructors(service) if request.follows == RECONSTRUCTORS else {}
     with understood(service):
         lines = list(reconstructor_lines(about))
+        options.source = str(about["id"])
         if "id" in options:
             options.id = str(document["id"])
     for line in lines:
         say(line)
     return tag
+
+
+def _reconstructors(service: Service) -> dict[str, Document]:
+    """Return what is known of each, by id, oldest first."""
+    document = service.get(RECONSTRUCTORS).document
+    with understood(service):
+        return {one["id"]: one for one in document["reconstructors"]}
+
+
+def _looked_at(service: Service, request: Request, options: argparse.Namespace) -> Document:
+    """Return how far the work is; a reconstructor that goes out again does so as a copy."""
+    if request.follows != RECONSTRUCTORS:
+        return service.get(path_of(request.follows, options)).document
+    every = _reconstructors(service).items()
+    copies = [
+        one for name, one in every if name not in options.known and one["parent"] == options.source
+    ]
+    judged = {"id": options.source, "state": "proposed", "reason": "judged before it is sent again"}
+    return copies[-1] if copies else judged
 
 
 def _asked(request: Request, question: str, option: str) -> str:
@@ -131,12 +152,11 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
         TextColumn("{task.description}", markup=False),
     )
     began_s, told = time.monotonic(), ""
-    path = path_of(request.follows, options)
     try:
         with Progress(*columns, console=console, transient=True) as bar:
             task = bar.add_task("", total=None)
             while True:
-                document = service.get(path).document
+                document = _looked_at(service, request, options)
                 lasted_s = time.monotonic() - began_s
                 with understood(service):
                     step = _step(document, lasted_s)

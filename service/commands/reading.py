@@ -9,7 +9,13 @@ from urllib.parse import quote
 
 from service.commands.remote import DONE, NOT_DONE, Request, named
 from service.commands.rest import Document, Service
-from service.commands.status import lasting, registration_lines, status_lines, verdict
+from service.commands.status import (
+    alarm_line,
+    registration_lines,
+    status_lines,
+    verdict,
+    worst_first,
+)
 from service.commands.terminal import clock, print_document, print_lines, span, table
 
 
@@ -86,9 +92,18 @@ def _alpha(document: Document) -> Iterator[str]:
 
 
 def _alarms(state: Document) -> Iterator[str]:
-    rows = [(alarm["name"], lasting(alarm, state), alarm["text"]) for alarm in state["alarms"]]
-    yield from table(rows)
-    yield f"{len(rows)} alarms" if rows else "no alarm lasts"
+    lasting, gone, muted = worst_first(state), state["stale_alarms"], state["muted_alarms"]
+    for alarm in lasting:
+        yield alarm_line(alarm, state)
+        yield f"    do: {alarm['do']}"
+    for alarm in gone:
+        yield f"{alarm['name']} ({alarm['worst_severity']}) is over, and was not acknowledged:"
+        yield f"    {alarm['text']}"
+    for note in muted:
+        who, until = note["muted"]["by"] or "nobody named", clock(note["muted"]["until_utc"])
+        yield f"{note['name']} is muted until {until} UTC by {who}"
+    many = f"{len(lasting)} alarms" if lasting else "no alarm lasts"
+    yield f"{many}, {len(gone)} gone unseen, {len(muted)} muted"
 
 
 def _audit(document: Document) -> Iterator[str]:

@@ -82,7 +82,8 @@ class Request(NamedTuple):
     """What to do afterwards."""
 
     follows: str = ""
-    """Path of what is looked at until the work is done; empty: the answer is the end."""
+    """Path of what is looked at until the work is done, of all reconstructors: the copy that goes
+    out; empty: the answer is the end."""
 
     @property
     def method(self) -> str:
@@ -130,7 +131,8 @@ _NO_WAIT = words("--no-wait", "do not wait for its end")
 _SINCE = words("--since TIME", "RFC 3339, like 2026-03-01T20:00:00Z")
 _UNTIL = words("--until TIME", "up to this time")
 
-_ONE = "/v1/reconstructors/{id}"
+RECONSTRUCTORS = "/v1/reconstructors"
+_ONE = f"{RECONSTRUCTORS}/{{id}}"
 _RESUMES = "pyrcal mode propose, or auto, ends it"
 
 REQUESTS = (
@@ -186,18 +188,21 @@ REQUESTS = (
         "publish",
         "send a known reconstructor again",
         f"POST {_ONE}/publish",
-        _ID,
+        *(_ID, _NO_WAIT),
         decides_on=_ONE,
         asks="send it to the RTC again",
+        follows=RECONSTRUCTORS,
     ),
     _orders(
         "rollback",
         "go back to the reconstructor before; mode becomes hold",
         "POST /v1/rollback",
-        decides_on="/v1/reconstructors",
+        _NO_WAIT,
+        decides_on=RECONSTRUCTORS,
         asks="go back to the one before; mode becomes hold",
         needs_why=True,
         then=_RESUMES,
+        follows=RECONSTRUCTORS,
     ),
     _orders(
         "hold",

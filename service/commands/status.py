@@ -17,10 +17,9 @@ def status_lines(state: Document) -> list[str]:
     """Return the screen: first whether all is well and what is not, then what there is."""
     ready = "ready" if state["ready"] else f"NOT READY: {state['ready_reason']}"
     lines = [f"{state['system']}, mode {state['mode']}, up {span(state['uptime_s'])}: {ready}"]
-    lines += [
-        f"ALARM {alarm['name']} for {lasting(alarm, state)}: {alarm['text']}"
-        for alarm in state["alarms"]
-    ]
+    lines += [f"ALARM {alarm_line(alarm, state)}" for alarm in worst_first(state)]
+    gone = ", ".join(alarm["name"] for alarm in state["stale_alarms"])
+    lines += [f"gone, and nobody has acknowledged: {gone}; pyrcal alarms has them"] if gone else []
     alarms = {alarm["name"] for alarm in state["alarms"]}
     lines += [
         f"waits for the {wait['party']}: {wait['text']}"
@@ -30,9 +29,22 @@ def status_lines(state: Document) -> list[str]:
     return [*lines, "", *_rtc(state), *_alpha(state), *_matrix(state), *_doing(state)]
 
 
-def lasting(alarm: Document, state: Document) -> str:
-    """Return for how long an alarm has lasted."""
-    return span(max(0.0, (state["now_ns"] - alarm["since_ns_utc"]) / 1e9))
+def worst_first(state: Document) -> list[Document]:
+    """Return the alarms that last and are not muted: the worst first, the unseen before others."""
+    shown = [alarm for alarm in state["alarms"] if alarm["muted"] is None]
+    return sorted(
+        shown, key=lambda one: (-_SEVERITIES.index(one["severity"]), one["attention"] != "active")
+    )
+
+
+_SEVERITIES = ("warning", "serious", "critical")
+
+
+def alarm_line(alarm: Document, state: Document) -> str:
+    """Return what is the matter, how much it matters, for how long, and whether it was seen."""
+    lasts = span(max(0.0, (state["now_ns"] - alarm["since_ns_utc"]) / 1e9))
+    seen = "" if alarm["acknowledged"] is None else ", acknowledged"
+    return f"{alarm['name']} ({alarm['severity']}{seen}) for {lasts}: {alarm['text']}"
 
 
 def _rtc(state: Document) -> list[str]:

@@ -119,8 +119,8 @@ ORDERS = [
     (["acquire", "--yes", "--no-wait"], "Acquire", {}),
     (["approve", "--yes", "--no-wait"], "Approve", {"id": "cm-1"}),
     (["reject"], "Reject", {"id": "cm-1"}),
-    (["publish", "previous", "--yes"], "Publish", {"id": "cm-0"}),
-    (["rollback", "--yes"], "Rollback", {}),
+    (["publish", "previous", "--yes", "--no-wait"], "Publish", {"id": "cm-0"}),
+    (["rollback", "--yes", "--no-wait"], "Rollback", {}),
     (["measure", "--yes", "--no-wait", "--n-average", "3"], "Measure", {"n_average": 3}),
     (["measure-noisy", "--no-wait", "--duration-s", "9"], "MeasureNoisy", {"duration_s": 9.0}),
     (["acknowledge", "margin"], "AcknowledgeAlarm", {"name": "margin", "severity": None}),
@@ -189,7 +189,7 @@ def test_where_nobody_can_be_asked_nothing_is_ordered(capsys, service, words):
 @pytest.mark.parametrize(("said", "status"), [("", 1), ("n", 1), ("yes", 0)])
 def test_only_a_yes_is_one(service, monkeypatch, said, status):
     monkeypatch.setattr(orders, "_asked", lambda *_: said)
-    assert main(["publish", "cm-0"]) == status
+    assert main(["publish", "cm-0", "--no-wait"]) == status
     assert len(service.commands) == (status == 0)
 
 
@@ -199,6 +199,20 @@ def test_an_approval_is_done_when_the_rtc_has_applied_it(capsys, service, monkey
     at_the_next_look(monkeypatch, lambda: becomes(service, "cm-1", end))
     assert main(["approve", "cm-1", "--yes"]) == status
     assert capsys.readouterr().out.splitlines()[-1].startswith(f"cm-1 is {end}")
+
+
+@pytest.mark.parametrize("words", [["rollback", "--why", "so"], ["publish", "cm-0"]])
+def test_what_goes_out_again_is_followed_until_the_rtc_has_applied_it(
+    capsys, service, monkeypatch, words
+):
+    copy = replace(BEFORE, id="cm-2", parent="cm-0", state=MatrixState.STAGED)
+    known = service.now.tracker.reconstructors
+    coming = iter((known, (*known, copy), (*known, replace(copy, state=MatrixState.APPLIED))))
+    at_the_next_look(monkeypatch, lambda: service.change(reconstructors=next(coming)))
+    assert main([*words, "--yes"]) == 0
+    told = capsys.readouterr()
+    assert "cm-0 is proposed: judged before it is sent again" in told.err
+    assert told.out.splitlines()[-1] == "cm-2 is applied"
 
 
 def test_an_rtc_that_never_applies_it_is_not_waited_for_for_ever(capsys, service):

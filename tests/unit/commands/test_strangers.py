@@ -219,7 +219,7 @@ def test_the_screen_says_what_it_is_how_old_and_nothing_raw():
     latest = watch.Latest(state=state, at_s=100.0, log=(line("a"), line("b\x07")), lost="")
     text = drawn(latest, 102.0)
     assert text.startswith("connected, the state came 2 s ago")
-    assert "ALARM rtc.silent for 30 s: \\x1b[2Jgone" in text
+    assert "ALARM rtc.silent (warning) for 30 s: \\x1b[2Jgone" in text
     assert text.index("b\\x07 (2 times)") < text.index("1970-01-01 00:00:09  alarm    a")
 
 

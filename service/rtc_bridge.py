@@ -17,6 +17,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
+from service import wire
 from service.errors import LinkError, UnknownIdError, WireError
 from service.link import session as link
 from service.link.intake import Intake
@@ -25,26 +26,6 @@ from service.link.rivals import Standby
 from service.link.session import Endpoint
 from service.link.statistics import LinkStatistics
 from service.telemetry.frames import FrameBlock
-from service.wire import (
-    ATTACHMENT_LIMIT,
-    BATCH_LIMIT,
-    CHUNK_LIMIT,
-    MESSAGE_LIMIT,
-    STATUS_LIMIT,
-    Acknowledgement,
-    AckState,
-    AlarmMessage,
-    Command,
-    Encodings,
-    Keys,
-    Manifest,
-    Reply,
-    Role,
-    StateMessage,
-    decode,
-    encode,
-    layout_of,
-)
 
 if TYPE_CHECKING:
     import zenoh
@@ -63,7 +44,7 @@ class Bridge:
 
     def __init__(self, endpoint: Endpoint) -> None:
         self._endpoint = endpoint
-        self._keys = Keys(endpoint.system)
+        self._keys = wire.Keys(endpoint.system)
         self._log = structlog.get_logger().bind(system=endpoint.system)
         self._intake = Intake(endpoint)
         self._measured = MeasuredIntake(self._keys)
@@ -174,7 +155,7 @@ class Bridge:
         """Return all counters of the link."""
         return self._intake.statistics()
 
-    def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+    def offer(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> None:
         """Let an RTC ask for a reconstructor without sending it.
 
         Raises
@@ -196,7 +177,7 @@ class Bridge:
         """
         self._outbox.set_current(matrix_id)
 
-    async def publish(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+    async def publish(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> None:
         """Send a reconstructor: its parts, then the commit that orders staging and swap.
 
         Parameters
@@ -216,7 +197,7 @@ class Bridge:
         """
         await asyncio.to_thread(self._publish, manifest, matrix)
 
-    async def command(self, command: Command) -> Reply:
+    async def command(self, command: wire.Command) -> wire.Reply:
         """Send a command and return the RTC's answer, accepted or not.
 
         Raises
@@ -229,7 +210,7 @@ class Bridge:
         """
         return await asyncio.to_thread(self._command, command)
 
-    async def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
+    async def fetch_applied(self) -> tuple[wire.Manifest, NDArray[np.float32]]:
         """Return the reconstructor the RTC uses, checked against its manifest.
 
         Raises
@@ -241,13 +222,13 @@ class Bridge:
         """
         return await asyncio.to_thread(link.fetch_applied, self._opened(), self._keys)
 
-    def publish_state(self, message: StateMessage) -> None:
+    def publish_state(self, message: wire.StateMessage) -> None:
         """Tell whoever listens what the service knows; dropped while the network is slow."""
-        self._tell(self._keys.state, encode(message), Encodings.STATE)
+        self._tell(self._keys.state, wire.encode(message), wire.Encodings.STATE)
 
-    def publish_alarm(self, message: AlarmMessage) -> None:
+    def publish_alarm(self, message: wire.AlarmMessage) -> None:
         """Tell whoever listens that an alarm came or went; dropped while the network is slow."""
-        self._tell(self._keys.alarm, encode(message), Encodings.ALARM)
+        self._tell(self._keys.alarm, wire.encode(message), wire.Encodings.ALARM)
 
     def _declare(self, session: zenoh.Session) -> None:
         keys = self._keys
@@ -259,7 +240,7 @@ class Bridge:
             link.subscribe(session, keys.acknowledgement, self._guarded("ack", self._on_ack)),
             link.subscribe(session, keys.status, self._guarded("status", self._on_status)),
             link.subscribe(session, keys.all_measured, self._guarded("im", self._on_measured)),
-            link.watch(session, keys.alive(Role.RTC), self._guarded("alive", self._on_alive)),
+            link.watch(session, keys.alive(wire.Role.RTC), self._guarded("alive", self._on_alive)),
             link.subscribe_frames(session, keys.frames, self._guarded("frames", self._on_frames)),
         ]
 
@@ -267,7 +248,7 @@ class Bridge:
         """Be the service of this system: the RTC may ask from now on."""
         return [
             link.serve(session, self._keys.all_matrices, self._answer),
-            link.announce(session, self._keys.alive(Role.SERVICE)),
+            link.announce(session, self._keys.alive(wire.Role.SERVICE)),
         ]
 
     def _guarded(self, kind: str, take: Callable[[_T], None]) -> Callable[[_T], None]:
@@ -289,28 +270,28 @@ class Bridge:
         if session is None:
             return
         self._intake.frames(
-            link.bytes_of(sample.payload, BATCH_LIMIT, "a frame batch"),
+            link.bytes_of(sample.payload, wire.BATCH_LIMIT, "a frame batch"),
             None
             if attachment is None
-            else link.bytes_of(attachment, ATTACHMENT_LIMIT, "an attachment"),
+            else link.bytes_of(attachment, wire.ATTACHMENT_LIMIT, "an attachment"),
             recoverable=sample.source_info is not None,
             latency_s=link.latency_s(session, sample, time.time_ns()),
         )
 
     def _on_status(self, sample: zenoh.Sample) -> None:
-        self._intake.status(link.bytes_of(sample.payload, STATUS_LIMIT, "a status"))
+        self._intake.status(link.bytes_of(sample.payload, wire.STATUS_LIMIT, "a status"))
 
     def _on_ack(self, sample: zenoh.Sample) -> None:
-        data = link.bytes_of(sample.payload, MESSAGE_LIMIT, "an acknowledgement")
-        acknowledgement = decode(Acknowledgement, data)
+        data = link.bytes_of(sample.payload, wire.MESSAGE_LIMIT, "an acknowledgement")
+        acknowledgement = wire.decode(wire.Acknowledgement, data)
         matrix_id = acknowledgement.id
         known = matrix_id is None or self._outbox.knows(matrix_id)
-        if matrix_id is not None and acknowledgement.state is AckState.APPLIED:
+        if matrix_id is not None and acknowledgement.state is wire.AckState.APPLIED:
             self._outbox.adopt(matrix_id, acknowledgement.sha256)
         self._intake.acknowledgement(acknowledgement, known=known)
 
     def _on_measured(self, sample: zenoh.Sample) -> None:
-        data = link.bytes_of(sample.payload, CHUNK_LIMIT, "a measured matrix")
+        data = link.bytes_of(sample.payload, wire.CHUNK_LIMIT, "a measured matrix")
         if (event := self._measured.take(str(sample.key_expr), data)) is not None:
             self._intake.event(event)
 
@@ -326,11 +307,11 @@ class Bridge:
             except (UnknownIdError, WireError) as error:
                 query.reply_err(str(error).encode())
             else:
-                encoding = Encodings.COMMIT if part is None else Encodings.BYTES
+                encoding = wire.Encodings.COMMIT if part is None else wire.Encodings.BYTES
                 query.reply(key, data, encoding=encoding)
 
-    def _prepare(self, manifest: Manifest, matrix: NDArray[np.float32]) -> Offer:
-        layout = layout_of(matrix, manifest.layout.chunk_bytes)
+    def _prepare(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> Offer:
+        layout = wire.layout_of(matrix, manifest.layout.chunk_bytes)
         if layout != manifest.layout:
             raise WireError(f"range: manifest {manifest.id} says {manifest.layout}, found {layout}")
         if manifest.system != self._endpoint.system:
@@ -342,22 +323,22 @@ class Bridge:
         self._outbox.add(offer)
         return offer
 
-    def _publish(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
+    def _publish(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> None:
         session = self._driven()
         offer = self._prepare(manifest, matrix)
         keys, name = self._keys, manifest.id
         for index, part in enumerate(offer.parts):
-            link.put(session, keys.chunk(name, index), part, Encodings.BYTES, urgent=False)
+            link.put(session, keys.chunk(name, index), part, wire.Encodings.BYTES, urgent=False)
         other = self._intake.other_session
         if other is not None:  # it may list its slopes otherwise
             raise LinkError(f"{name} was not sent: the RTC may have begun session {other}")
-        link.put(session, keys.commit(name), offer.commit, Encodings.COMMIT, urgent=True)
+        link.put(session, keys.commit(name), offer.commit, wire.Encodings.COMMIT, urgent=True)
         self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
 
-    def _command(self, command: Command) -> Reply:
+    def _command(self, command: wire.Command) -> wire.Reply:
         answer = link.send_command(self._driven(), self._endpoint, command)
         try:
-            reply = decode(Reply, answer)
+            reply = wire.decode(wire.Reply, answer)
         except WireError as error:
             self._intake.malformed("reply", error)
             raise LinkError(f"the reply to command {command.id} is unusable: {error}") from error

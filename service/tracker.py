@@ -6,7 +6,11 @@ night therefore replays exactly, and every reaction of the service can be tested
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, Final
+
 from service.tracking import (
+    acquisition,
     alarms,
     attention,
     dither,
@@ -18,10 +22,10 @@ from service.tracking import (
     rtc,
     rules,
     stopping,
+    validity,
 )
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition import abort_on_command, acquire, acquire_on_command
 from service.tracking.activity import refuse_if_occupied
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
@@ -30,7 +34,6 @@ from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
 from service.tracking.updates import decide, fetch_in_use
-from service.tracking.validity import age, end_alarm, point
 from service.tracking.worth import note_declined
 from service.wire import (
     Acknowledgement,
@@ -39,10 +42,8 @@ from service.wire import (
     LoopRequest,
     MeasureRequest,
     RampRequest,
-    Reply,
     Status,
 )
-from service.wire import Command as Request
 
 __all__ = ["Command", "Event", "Policy", "step"]
 
@@ -63,7 +64,7 @@ def step(
     turn = Turn(state, event, policy, now_ns)
     rules.judge(turn)
     measuring.watch_measurement(turn)
-    _react(turn)
+    REACTIONS[type(event)](turn, event)
     probation.follow(turn)
     rules.judge(turn)
     note_declined(turn)
@@ -80,7 +81,7 @@ def _go_on(turn: Turn) -> None:
     if turn.state.stopped_because:
         stopping.keep_stopped(turn)
         return
-    acquire(turn)
+    acquisition.acquire(turn)
     if turn.acquisition.under_way:
         return
     measuring.follow_noisy(turn)
@@ -88,158 +89,117 @@ def _go_on(turn: Turn) -> None:
         decide(turn)
 
 
-def _react(turn: Turn) -> None:  # noqa: C901 - one line for each event
-    match turn.event:
-        case ev.Tick():
-            rtc.on_tick(turn)
-            age(turn)
-            operator.close_again(turn)
-        case Status() as status:
-            rtc.on_status(turn, status)
-        case ev.SessionStarted(session=session):
-            rtc.on_new_session(turn, session)
-        case ev.RtcVanished():
-            rtc.on_vanished(turn)
-        case ev.ServicesMet() as met:
-            rtc.on_services(turn, met)
-        case ev.Trouble(name=name, over=True, t_ns_utc=t_ns):
-            end_alarm(turn, name, t_ns)
-        case ev.Trouble(name=alarms.MIRROR_SILENT, text=text):
-            dither.stop_unanswered(turn, text)
-        case ev.Trouble(name=name, text=text):
-            turn.alarm(name, text)
-        case ev.Noted(name=name, text=text, level=level):
-            turn.log(name, text, level)
-        case ev.FarFitted():
-            pass  # an acquisition's
-        case ev.WindowFitted() if turn.state.measuring is not None:
-            evidence.refuse_window(turn, measuring.MEASURING)
-        case ev.WindowFitted(estimate=estimate) as fitted:
-            evidence.on_window(turn, fitted)
-            dither.learn(turn, estimate)
-        case ev.WindowLost(refused=refused):
-            evidence.refuse_window(turn, refused.reason, mistold=refused.mistold)
-        case ev.Watched() as watched:
-            evidence.on_watchdog(turn, watched)
-        case ev.Unwatched(text=text):
-            evidence.cannot_watch(turn, text)
-        case _:
-            _react_to_answer(turn)
+def _on_tick(turn: Turn, _: ev.Tick) -> None:
+    rtc.on_tick(turn)
+    validity.age(turn)
+    operator.close_again(turn)
 
 
-def _react_to_answer(turn: Turn) -> None:  # noqa: C901 - one line for each event
-    match turn.event:
-        case ev.MatrixMade(record=made) if turn.acquisition.under_way:
-            reconstructors.propose(turn, made)
-        case ev.MatrixMade() as event if probation.is_way_back(turn.state, event):
-            probation.go_back(turn, event)
-        case ev.MatrixMade() as event:
-            reconstructors.on_matrix(turn, event)
-        case ev.MatrixFetched(record=fetched):
-            reconstructors.on_fetched(turn, fetched)
-        case ev.MarginJudged() as judged:
-            reconstructors.on_margin(turn, judged)
-        case ev.ProposalJudged() as verdict:
-            reconstructors.on_proposal_judged(turn, verdict)
-        case Acknowledgement() as acknowledged:
-            reconstructors.on_acknowledgement(turn, acknowledged)
-        case ev.MatrixMeasured(record=measured):
-            measuring.on_measured(turn, measured)
-        case ev.Answered() as answered:
-            _react_to_reply(turn, answered.request, answered.reply)
-        case ev.DitherSilent() as silent:
-            dither.on_silence(turn, silent)
-        case ev.DitherMeasured() as heard:
-            loud = dither.why_too_strong(turn, heard)
-            if loud is not None:
-                measuring.cut_off(turn, f"its dither was too strong: {heard.text}")
-                dither.stop_too_strong(turn, heard.id, loud)
-        case ev.Compared() as event:
-            probation.on_compared(turn, event)
-        case ev.Vibrations() as vibrations:
-            rtc.hear_vibrations(turn, vibrations)
-        case ev.JobFailed() as failed:
-            _react_to_failure(turn, failed.effect, failed.text)
-        case _:
-            _obey(turn)
+def _on_trouble(turn: Turn, trouble: ev.Trouble) -> None:
+    if trouble.over:
+        validity.end_alarm(turn, trouble.name, trouble.t_ns_utc)
+    elif trouble.name == alarms.MIRROR_SILENT:
+        dither.stop_unanswered(turn, trouble.text)
+    else:
+        turn.alarm(trouble.name, trouble.text)
 
 
-def _react_to_reply(turn: Turn, request: Request, reply: Reply) -> None:
-    match request:
-        case DitherRequest():
+def _on_window(turn: Turn, event: ev.WindowFitted) -> None:
+    if turn.state.measuring is not None:
+        evidence.refuse_window(turn, measuring.MEASURING)
+        return
+    evidence.on_window(turn, event)
+    dither.learn(turn, event.estimate)
+
+
+def _on_made(turn: Turn, made: ev.MatrixMade) -> None:
+    if turn.acquisition.under_way:
+        reconstructors.propose(turn, made.record)
+    elif probation.is_way_back(turn.state, made):
+        probation.go_back(turn, made)
+    else:
+        reconstructors.on_matrix(turn, made)
+
+
+def _on_dither_measured(turn: Turn, heard: ev.DitherMeasured) -> None:
+    loud = dither.why_too_strong(turn, heard)
+    if loud is not None:
+        measuring.cut_off(turn, f"its dither was too strong: {heard.text}")
+        dither.stop_too_strong(turn, heard.id, loud)
+
+
+def _on_answer(turn: Turn, answered: ev.Answered) -> None:
+    reply = answered.reply
+    match answered.request:
+        case DitherRequest() as request:
             dither.on_answer(turn, request, reply)
         case DitherStop():
             dither.on_stop_answer(turn, reply)
-        case MeasureRequest():
+        case MeasureRequest() as request:
             measuring.on_answer(turn, request, reply)
-        case LoopRequest() | RampRequest():
+        case LoopRequest() | RampRequest() as request:
             outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
             operator.on_loop_answer(turn, request.id, outcome, reply.reason)
 
 
-def _react_to_failure(turn: Turn, effect: Effect, text: str) -> None:
-    match effect:
+def _on_failure(turn: Turn, failed: ev.JobFailed) -> None:
+    match failed.effect:
         case ev.Ask(request=MeasureRequest(id=name)):
-            measuring.fail_by_id(turn, name, text)
+            measuring.fail_by_id(turn, name, failed.text)
         case ev.FinishNoisy(record=noisy):
-            measuring.fail(turn, noisy, text)
-        case ev.Ask(request=LoopRequest(id=command) | RampRequest(id=command)):
-            operator.on_loop_answer(turn, command, CommandState.FAILED, text)
-        case _:
-            rtc.on_failure(turn, effect, text)
+            measuring.fail(turn, noisy, failed.text)
+        case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):
+            operator.on_loop_answer(turn, name, CommandState.FAILED, failed.text)
+        case effect:
+            rtc.on_failure(turn, effect, failed.text)
 
 
-def _obey(turn: Turn) -> None:  # noqa: C901 - one line for each command
-    match turn.event:
-        case cmd.SetMode(mode=mode):
-            operator.set_mode(turn, mode)
-        case cmd.SetPointing(pointing=pointing):
-            point(turn, pointing)
-        case cmd.SetValue() as command:
-            rules.tell(turn, command)
-        case cmd.SetLoop() as command:
-            operator.set_loop(turn, command)
-        case cmd.Ramp() as command:
-            operator.ramp(turn, command)
-        case cmd.StopEverything() as command:
-            stopping.stop(turn, command)
-        case cmd.Resume() as command:
-            stopping.resume(turn, command)
-        case cmd.Acquire():
-            acquire_on_command(turn)
-        case cmd.AbortAcquisition():
-            abort_on_command(turn)
-        case cmd.StartDither() as command:
-            operator.start_dither(turn, command)
-        case cmd.StopDither():
-            dither.stop_by_operator(turn)
-        case cmd.Measure() as command:
-            measuring.measure(turn, command)
-        case cmd.GiveUp(id=name):
-            measuring.give_up(turn, name)
-        case cmd.MeasureNoisy() as command:
-            measuring.measure_noisy(turn, command)
-        case cmd.AcknowledgeAlarm() as command:
-            attention.acknowledge(turn, command)
-        case cmd.MuteAlarm() as command:
-            attention.mute(turn, command)
-        case cmd.UnmuteAlarm() as command:
-            attention.unmute(turn, command)
-        case _:
-            _obey_about_matrices(turn)
-
-
-def _obey_about_matrices(turn: Turn) -> None:
-    match turn.event:
-        case cmd.Refit(n_modes=n_modes):
-            operator.refit(turn, n_modes)
-        case cmd.Approve(id=name):
-            operator.approve(turn, name)
-        case cmd.Reject(id=name, reason=reason):
-            operator.reject(turn, name, reason)
-        case cmd.Publish(id=name):
-            operator.publish(turn, name)
-        case cmd.Rollback():
-            operator.roll_back(turn)
-        case _:
-            raise TypeError(f"an event the tracker does not know: {turn.event!r}")
+REACTIONS: Final[dict[type, Callable[[Turn, Any], object]]] = {
+    ev.Tick: _on_tick,
+    Status: rtc.on_status,
+    ev.SessionStarted: rtc.on_new_session,
+    ev.RtcVanished: rtc.on_vanished,
+    ev.ServicesMet: rtc.on_services,
+    ev.Trouble: _on_trouble,
+    ev.Noted: lambda turn, noted: turn.log(noted.name, noted.text, noted.level),
+    ev.FarFitted: lambda _turn, _event: None,  # an acquisition's
+    ev.WindowFitted: _on_window,
+    ev.WindowLost: evidence.on_lost,
+    ev.Watched: evidence.on_watchdog,
+    ev.Unwatched: lambda turn, unwatched: evidence.cannot_watch(turn, unwatched.text),
+    ev.MatrixMade: _on_made,
+    ev.MatrixFetched: reconstructors.on_fetched,
+    ev.MarginJudged: reconstructors.on_margin,
+    ev.ProposalJudged: reconstructors.on_proposal_judged,
+    Acknowledgement: reconstructors.on_acknowledgement,
+    ev.MatrixMeasured: lambda turn, measured: measuring.on_measured(turn, measured.record),
+    ev.Answered: _on_answer,
+    ev.DitherSilent: dither.on_silence,
+    ev.DitherMeasured: _on_dither_measured,
+    ev.Compared: probation.on_compared,
+    ev.Vibrations: rtc.hear_vibrations,
+    ev.JobFailed: _on_failure,
+    cmd.SetMode: operator.set_mode,
+    cmd.SetPointing: lambda turn, command: validity.point(turn, command.pointing),
+    cmd.SetValue: rules.tell,
+    cmd.SetLoop: operator.set_loop,
+    cmd.Ramp: operator.ramp,
+    cmd.StopEverything: stopping.stop,
+    cmd.Resume: stopping.resume,
+    cmd.Acquire: acquisition.acquire_on_command,
+    cmd.AbortAcquisition: acquisition.abort_on_command,
+    cmd.StartDither: operator.start_dither,
+    cmd.StopDither: dither.stop_by_operator,
+    cmd.Measure: measuring.measure,
+    cmd.GiveUp: lambda turn, command: measuring.give_up(turn, command.id),
+    cmd.MeasureNoisy: measuring.measure_noisy,
+    cmd.AcknowledgeAlarm: attention.acknowledge,
+    cmd.MuteAlarm: attention.mute,
+    cmd.UnmuteAlarm: attention.unmute,
+    cmd.Refit: operator.refit,
+    cmd.Approve: operator.approve,
+    cmd.Reject: operator.reject,
+    cmd.Publish: operator.publish,
+    cmd.Rollback: operator.roll_back,
+}
+"""What each event, and each command, does: there is one for every kind of either."""

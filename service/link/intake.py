@@ -11,6 +11,7 @@ from dataclasses import asdict
 from statistics import median
 from typing import Final
 
+from service import wire
 from service.errors import WireError
 from service.link.matrices import LinkEvent
 from service.link.ring import LEAP, FrameCounts, FrameRing
@@ -21,16 +22,6 @@ from service.telemetry.frames import FrameBlock
 from service.tracking import events as ev
 from service.tracking.alarms import OTHER_BASIS, SECOND_RTC
 from service.tracking.state import Level
-from service.wire import (
-    FRAMES_PER_BATCH,
-    Acknowledgement,
-    FrameBatch,
-    FrameHeader,
-    Status,
-    decode,
-    decode_frames,
-    essentials,
-)
 
 QUEUE_LENGTH: Final = 1024
 """Events kept; when more wait, the oldest are dropped and counted."""
@@ -139,7 +130,7 @@ class Intake:
         WireError
             If they break the contract.
         """
-        batch = decode_frames(payload, attachment)
+        batch = wire.decode_frames(payload, attachment)
         now_s = self._clock()
         with self._lock:
             self._patience_s = (
@@ -159,7 +150,7 @@ class Intake:
         WireError
             If it breaks the contract.
         """
-        found = essentials(data)
+        found = wire.essentials(data)
         now_s = self._clock()
         with self._lock:
             if self._superfluous(found, now_s):
@@ -182,7 +173,7 @@ class Intake:
         return self._changes > CHANGES
 
     def _take_status(self, data: bytes, found: tuple[object, ...]) -> None:
-        status = decode(Status, data)
+        status = wire.decode(wire.Status, data)
         now_s = self._clock()
         with self._lock:
             if not self._admit("status", status.session, 1, now_s):
@@ -194,7 +185,7 @@ class Intake:
             self._shape = (status.n_slopes, status.n_modes)
             self._put(status)
 
-    def acknowledgement(self, acknowledgement: Acknowledgement, *, known: bool) -> None:
+    def acknowledgement(self, acknowledgement: wire.Acknowledgement, *, known: bool) -> None:
         """Take the RTC's word on a reconstructor."""
         now_s = self._clock()
         with self._lock:
@@ -278,7 +269,7 @@ class Intake:
                 return
             self._spared, self._changes = None, 0
         try:
-            self._take_status(data, essentials(data))
+            self._take_status(data, wire.essentials(data))
         except WireError as error:
             self.malformed("status", error)
 
@@ -315,7 +306,7 @@ class Intake:
                 latency_p50_s=median(self._latency_s) if self._latency_s else None,
             )
 
-    def _belongs(self, header: FrameHeader, now_s: float) -> bool:
+    def _belongs(self, header: wire.FrameHeader, now_s: float) -> bool:
         """Return whether frames are of the session, basis, configuration and shape that count."""
         if not self._admit("frames", header.session, header.n, now_s):
             return False
@@ -325,7 +316,7 @@ class Intake:
             self._tally.add("frames", reason, header.n, now_s, text)
         return not wrong
 
-    def _misshapen(self, header: FrameHeader) -> tuple[str, str] | None:
+    def _misshapen(self, header: wire.FrameHeader) -> tuple[str, str] | None:
         """Return why frames are not of the sizes that the status says; None: they are."""
         found, expected = (header.n_slopes, header.n_modes), self._shape
         if expected is None or found == expected:
@@ -335,7 +326,7 @@ class Intake:
             "the RTC's status says"
         )
 
-    def _store(self, batch: FrameBatch, now_s: float) -> None:
+    def _store(self, batch: wire.FrameBatch, now_s: float) -> None:
         header = batch.header
         self._counted["batches"] += 1
         self._last_frame_s = now_s
@@ -352,7 +343,7 @@ class Intake:
         for each in batches:
             self._place(self._ring, each, now_s)
 
-    def _place(self, ring: FrameRing, batch: FrameBatch, now_s: float) -> None:
+    def _place(self, ring: FrameRing, batch: wire.FrameBatch, now_s: float) -> None:
         """Put frames in their places, and count what became of them."""
         counts = self._counts
         received, before = counts.received, [getattr(counts, name) for name in PLACED]
@@ -361,10 +352,10 @@ class Intake:
         for (name, text), n_before in zip(PLACED.items(), before, strict=True):
             self._tally.add("frames", name, getattr(counts, name) - n_before, now_s, text)
 
-    def _capacity(self, header: FrameHeader) -> int:
+    def _capacity(self, header: wire.FrameHeader) -> int:
         row_bytes = 4 * (header.n_slopes + 2 * header.n_modes)
         wanted = int(self._endpoint.ring_seconds * 1e9 / header.dt_ns)
-        return max(2 * FRAMES_PER_BATCH, min(wanted, self._endpoint.ring_bytes // row_bytes))
+        return max(2 * wire.FRAMES_PER_BATCH, min(wanted, self._endpoint.ring_bytes // row_bytes))
 
     def _admit(self, kind: str, session: str, n: int, now_s: float) -> bool:
         """Return whether ``n`` of a kind are of the session that counts, or count them."""

@@ -11,18 +11,9 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from service import wire
 from service.errors import UnknownIdError, WireError
 from service.tracking.events import Event
-from service.wire import (
-    ChunkAssembler,
-    Keys,
-    Manifest,
-    MeasuredManifest,
-    chunk_index,
-    decode,
-    encode,
-    split,
-)
 
 OFFERS: Final = 8
 """Most matrices kept, whatever their age; the current one is always among them."""
@@ -41,7 +32,7 @@ REMEMBERED_IDS: Final = 4096
 class MeasuredMatrix:
     """An interaction matrix the RTC has measured, or why it could not."""
 
-    manifest: MeasuredManifest
+    manifest: wire.MeasuredManifest
     matrix: NDArray[np.float32] | None
     """``(n_slopes, n_modes_measured)``, slope per metre OPD; None: see the manifest's reason."""
 
@@ -54,7 +45,7 @@ LinkEvent = Event | MeasuredMatrix
 class Offer:
     """One reconstructor in the form it travels in."""
 
-    manifest: Manifest
+    manifest: wire.Manifest
     commit: bytes
     """The encoded manifest."""
 
@@ -63,11 +54,11 @@ class Offer:
     """When, on a monotonic clock."""
 
     @classmethod
-    def of(cls, manifest: Manifest, matrix: NDArray[np.float32]) -> Self:
+    def of(cls, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> Self:
         """Return a matrix in the parts its manifest tells, offered from now on."""
-        parts = tuple(split(matrix, manifest.layout.chunk_bytes))
+        parts = tuple(wire.split(matrix, manifest.layout.chunk_bytes))
         return cls(
-            manifest=manifest, commit=encode(manifest), parts=parts, offered_s=time.monotonic()
+            manifest=manifest, commit=wire.encode(manifest), parts=parts, offered_s=time.monotonic()
         )
 
 
@@ -156,7 +147,7 @@ class Outbox:
             raise UnknownIdError(f"chunk {index} of {matrix_id}: there are {len(offer.parts)}")
         return offer.parts[index]
 
-    def asked(self, keys: Keys, key: str, part: str | None, now_s: float) -> bytes:
+    def asked(self, keys: wire.Keys, key: str, part: str | None, now_s: float) -> bytes:
         """Return what answers a query on ``cm/current`` or ``cm/{id}``, or for its ``?chunk=``.
 
         Raises
@@ -168,7 +159,7 @@ class Outbox:
         """
         if key == keys.current:
             return self.current_commit()
-        index = None if part is None else chunk_index(part, "a query")
+        index = None if part is None else wire.chunk_index(part, "a query")
         return self.answer(keys.matrix_id_of(key), index, now_s)
 
     def _forget(self, now_s: float) -> None:
@@ -182,10 +173,10 @@ class Outbox:
 class MeasuredIntake:
     """Collects parts and manifests of interaction matrices; used by one zenoh thread only."""
 
-    def __init__(self, keys: Keys) -> None:
+    def __init__(self, keys: wire.Keys) -> None:
         self._keys = keys
-        self._pending: OrderedDict[str, ChunkAssembler] = OrderedDict()
-        self._manifests: dict[str, MeasuredManifest] = {}
+        self._pending: OrderedDict[str, wire.ChunkAssembler] = OrderedDict()
+        self._manifests: dict[str, wire.MeasuredManifest] = {}
 
     def take(self, key: str, data: bytes) -> MeasuredMatrix | None:
         """Take a part or a manifest; return the matrix it completes.
@@ -208,8 +199,8 @@ class MeasuredIntake:
             self._manifests[name] = manifest
         return self._finished(name)
 
-    def _checked(self, name: str, data: bytes) -> MeasuredManifest:
-        manifest = decode(MeasuredManifest, data)
+    def _checked(self, name: str, data: bytes) -> wire.MeasuredManifest:
+        manifest = wire.decode(wire.MeasuredManifest, data)
         if (manifest.id, manifest.system) != (name, self._keys.system):
             raise WireError(
                 f"id: the manifest of {manifest.id} of system {manifest.system} came on the key "
@@ -217,11 +208,11 @@ class MeasuredIntake:
             )
         return manifest
 
-    def _assembler(self, name: str) -> ChunkAssembler:
+    def _assembler(self, name: str) -> wire.ChunkAssembler:
         if name not in self._pending:
             if len(self._pending) == PENDING:
                 self._forget(next(iter(self._pending)))
-            self._pending[name] = ChunkAssembler(LIMIT_BYTES)
+            self._pending[name] = wire.ChunkAssembler(LIMIT_BYTES)
         return self._pending[name]
 
     def _finished(self, name: str) -> MeasuredMatrix | None:

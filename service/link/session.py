@@ -17,20 +17,8 @@ import zenoh
 import zenoh.ext
 from numpy.typing import NDArray
 
+from service import wire
 from service.errors import LinkError, WireError
-from service.wire import (
-    CHUNK_LIMIT,
-    ChunkAssembler,
-    Command,
-    CommandKind,
-    Encodings,
-    Keys,
-    Manifest,
-    Reply,
-    command_kind,
-    decode,
-    encode,
-)
 
 HISTORY_S = 0.5
 """Telemetry asked for when the service comes late: asking for all of an RTC's cache stalled its
@@ -46,7 +34,7 @@ RETRY = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 
 ABSENT_PAUSE_S: Final = 0.3
 """Before a command is repeated: an RTC that is not there makes a query end at once."""
 
-OPTIONAL: Final = (CommandKind.RAMP,)
+OPTIONAL: Final = (wire.CommandKind.RAMP,)
 """Commands that an RTC need not know."""
 
 MATRIX_TIMEOUT_S: Final = 2.0
@@ -66,7 +54,7 @@ class Endpoint:
     connect: tuple[str, ...] = ()
     """Endpoints of an observatory's own routers, of which the service becomes a client."""
 
-    chunk_bytes: int = CHUNK_LIMIT
+    chunk_bytes: int = wire.CHUNK_LIMIT
     """Size of the parts of a reconstructor: a default zenoh-pico drops more than 4096."""
 
     lease_s: float = 2.0
@@ -283,7 +271,7 @@ def latency_s(session: zenoh.Session, sample: zenoh.Sample, now_ns: int) -> floa
     return (now_ns - stamp.get_time_as_ntp64().as_nanos()) * 1e-9
 
 
-def send_command(session: zenoh.Session, endpoint: Endpoint, command: Command) -> bytes:
+def send_command(session: zenoh.Session, endpoint: Endpoint, command: wire.Command) -> bytes:
     """Return the RTC's answer to a command, repeated with the same id until there is one.
 
     Raises
@@ -293,26 +281,30 @@ def send_command(session: zenoh.Session, endpoint: Endpoint, command: Command) -
     LinkError
         If there is none after all attempts.
     """
-    payload, kind = encode(command), command_kind(command)
-    selector = Keys(endpoint.system).command(kind)
+    payload, kind = wire.encode(command), wire.command_kind(command)
+    selector = wire.Keys(endpoint.system).command(kind)
     for attempt in range(endpoint.command_attempts):
         if attempt:
             time.sleep(ABSENT_PAUSE_S)
         timeout_s, began_s = endpoint.command_timeout_s, time.monotonic()
-        answer = ask(session, selector, timeout_s, payload, Encodings.COMMAND)
+        answer = ask(session, selector, timeout_s, payload, wire.Encodings.COMMAND)
         if answer is not None:
             return answer
         # zenoh ends a query at once that nobody serves
         if kind in OPTIONAL and time.monotonic() - began_s < timeout_s / 2:
             reason = f"unsupported: the RTC offers no {kind}"
-            return encode(Reply(id=command.id, accepted=False, reason=reason, start_seq=None))
+            return wire.encode(
+                wire.Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
+            )
     raise LinkError(
         f"no answer from the RTC to {kind} command {command.id} after "
         f"{endpoint.command_attempts} attempts: whether it was carried out is unknown"
     )
 
 
-def fetch_applied(session: zenoh.Session, keys: Keys) -> tuple[Manifest, NDArray[np.float32]]:
+def fetch_applied(
+    session: zenoh.Session, keys: wire.Keys
+) -> tuple[wire.Manifest, NDArray[np.float32]]:
     """Return the reconstructor the RTC uses, checked against its manifest.
 
     Raises
@@ -322,8 +314,8 @@ def fetch_applied(session: zenoh.Session, keys: Keys) -> tuple[Manifest, NDArray
     LinkError
         If the RTC does not answer or has none.
     """
-    manifest = decode(Manifest, _asked(session, keys.applied))
-    assembler = ChunkAssembler()
+    manifest = wire.decode(wire.Manifest, _asked(session, keys.applied))
+    assembler = wire.ChunkAssembler()
     assembler.announce(manifest.layout)
     for index in range(manifest.layout.n_chunks):
         assembler.add(index, _asked(session, f"{keys.applied}?chunk={index}"))

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from service import __version__
+from service import __version__, wire
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.errors import CommandError, LinkError, UnknownIdError
@@ -31,15 +31,6 @@ from service.tracking.products import (
 )
 from service.tracking.registration import Registration, table_of
 from service.tracking.state import TrackerState
-from service.wire import Command as Request
-from service.wire import (
-    DitherStop,
-    LoopRequest,
-    Reply,
-    Status,
-    checksum,
-    layout_of,
-)
 from service.worker import InUse, OpticsWorker
 
 UNKNOWN_PARENT = "unknown"
@@ -109,7 +100,7 @@ class Actions:
                 return await self._send(effect, state)
             case ev.FinishNoisy(record=record):
                 return await self.noisy.finish(record, state)
-            case ev.Ask(request=LoopRequest() as request, judged=True):
+            case ev.Ask(request=wire.LoopRequest() as request, judged=True):
                 return await self._ask_judged(request, state)
             case ev.Ask(request=request):
                 return await self._ask(request)
@@ -139,7 +130,7 @@ class Actions:
         if record is None or state.rtc is None:
             return
         matrix = self.matrix(record.id)
-        layout = layout_of(matrix, self._publishing.chunk_bytes)
+        layout = wire.layout_of(matrix, self._publishing.chunk_bytes)
         system = self._publishing.system
         self._bridge.offer(record.manifest(layout, state.rtc, system), matrix)
         self._bridge.set_current(record.id)
@@ -159,11 +150,11 @@ class Actions:
             await asyncio.to_thread(store, record, heard.matrix, instrument)
         return ev.MatrixMeasured(record=record)
 
-    async def _ask(self, request: Request) -> Event | None:
+    async def _ask(self, request: wire.Command) -> Event | None:
         reply = await self._bridge.command(request)
-        if isinstance(request, LoopRequest) and reply.accepted:
+        if isinstance(request, wire.LoopRequest) and reply.accepted:
             self._commanded_modes = request.n_controlled or self._commanded_modes
-        if isinstance(request, DitherStop) and reply.accepted:
+        if isinstance(request, wire.DitherStop) and reply.accepted:
             return None  # the next status tells
         return ev.Answered(request=request, reply=reply)
 
@@ -187,7 +178,7 @@ class Actions:
             condition_number=made.condition_number,
             gate=made.gate,
             judged=judged_now(state, gains[: len(made.matrix)]),
-            sha256=checksum(made.matrix),
+            sha256=wire.checksum(made.matrix),
         )
         await self._keep(record, made.matrix, registration, effect.why)
         return ev.MatrixMade(
@@ -218,7 +209,7 @@ class Actions:
             gate=gate,
             judged=judged,
             optical_gains=() if registration is None else registration.optical_gains,
-            sha256=checksum(matrix),
+            sha256=wire.checksum(matrix),
         )
         await self._keep(record, matrix, None, why)
         return ev.MatrixMade(record=record, wanted=effect.judged)
@@ -275,14 +266,16 @@ class Actions:
             self._publishing.pole_radius_bound,
         )
 
-    async def _ask_judged(self, request: LoopRequest, state: TrackerState) -> Event | None:
+    async def _ask_judged(self, request: wire.LoopRequest, state: TrackerState) -> Event | None:
         """Ask for gains only if the gate lets the matrix in use run with them."""
         if state.in_use is None or request.gains is None:
             raise CommandError("the reconstructor in use is not known: its gains cannot be judged")
         matrix = await asyncio.to_thread(self.matrix, state.in_use)
         verdict = await self._verdict(matrix, request.gains[: len(matrix)], state)
         if not verdict.accepted:
-            refused = Reply(id=request.id, accepted=False, reason=verdict.reason, start_seq=None)
+            refused = wire.Reply(
+                id=request.id, accepted=False, reason=verdict.reason, start_seq=None
+            )
             return ev.Answered(request=request, reply=refused)
         return await self._ask(request)
 
@@ -307,7 +300,7 @@ class Actions:
         commanded = self._commanded_modes or rtc.n_controlled
         if effect.gains is not None or commanded != effect.n_modes:
             await self._command_modes(effect)
-        layout = layout_of(matrix, self._publishing.chunk_bytes)
+        layout = wire.layout_of(matrix, self._publishing.chunk_bytes)
         manifest = record.manifest(layout, rtc, self._publishing.system)
         await self._bridge.publish(manifest, matrix)
         return None
@@ -315,7 +308,7 @@ class Actions:
     async def _command_modes(self, effect: ev.SendMatrix) -> None:
         """Tell the RTC how many modes the next matrix commands, and with which gains."""
         reply = await self._bridge.command(
-            LoopRequest(
+            wire.LoopRequest(
                 id=f"modes-{self._clock_ns()}", gains=effect.gains, n_controlled=effect.n_modes
             )
         )
@@ -367,7 +360,7 @@ class Actions:
     def _store_foreign(self, record: ReconstructorRecord, matrix: NDArray[np.float32]) -> None:
         """Archive the RTC's own matrix, once; another one under the same id is an error."""
         try:
-            same = checksum(self._archive.reconstructors.matrix(record.id)) == record.sha256
+            same = wire.checksum(self._archive.reconstructors.matrix(record.id)) == record.sha256
         except UnknownIdError:
             provenance = {"instrument": self.instrument.name, "why": record.reason}
             self._archive.reconstructors.store(record, matrix, None, provenance)
@@ -429,7 +422,7 @@ def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None
     return n_modes if same_gains(gains[:n_modes], rtc.gains[:n_modes]) else None
 
 
-def _there(state: TrackerState) -> Status:
+def _there(state: TrackerState) -> wire.Status:
     if state.rtc is None:
         raise LinkError("no RTC is there")
     return state.rtc

@@ -132,7 +132,7 @@ class Given:
             return Answer(f"{name} {words}", final=False)
         if record.state is MatrixState.FAILED:
             raise LinkError(record.reason)
-        if record.state not in {MatrixState.APPLIED, MatrixState.SUPERSEDED}:
+        if not record.was_used:
             raise CommandError(_why_not(record))
         return Answer(f"{name} sent, applied at frame {record.applied_frame_seq}")
 

@@ -29,20 +29,9 @@ from service.telemetry.played import LOUDER, Finding
 from service.telemetry.random_dither import Correlated
 from service.telemetry.windows import WindowRefused
 from service.tracker import step
+from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.alarms import (
-    DIVERGING,
-    EDGE_SLIP,
-    MIRROR_SILENT,
-    NOT_AS_ASKED,
-    OFF_LOOP,
-    OTHER_INSTRUMENT,
-    OVER_BUDGET,
-    WRONG_LOOP,
-    WRONG_UNIT,
-    Act,
-    forbidding,
-)
+from service.tracking.alarms import Act, forbidding
 from service.tracking.dither import SILENT_S
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
@@ -225,7 +214,7 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
 def _misplayed(dither_id: str, played: Finding, state: TrackerState) -> list[Event]:
     """Return what the frames hold of the dither, where it is told for the first time or is over."""
     told = state.dithering
-    raised = any(alarm.name in {NOT_AS_ASKED, OVER_BUDGET} for alarm in state.alarms)
+    raised = any(alarm.name in {alarms.NOT_AS_ASKED, alarms.OVER_BUDGET} for alarm in state.alarms)
     louder = played.found_m > LOUDER * told.amiss_m
     news = told.amiss_id != dither_id or louder if played.text else raised
     if not news:
@@ -243,13 +232,13 @@ def _answered(streams: Streams, state: TrackerState) -> list[Event]:
     Of an open loop, and of one that is being closed, the optical gain may be next to nothing.
     """
     found = None if streams.played is None else streams.played.unanswered
-    raised = any(alarm.name == MIRROR_SILENT for alarm in state.alarms)
+    raised = any(alarm.name == alarms.MIRROR_SILENT for alarm in state.alarms)
     closed = len(streams.in_loop) > 0 and not state.acquisition.under_way
     if found is None or not closed or not (found or raised):
         return []
     text = found or "the slopes answer the dither again"
     t_ns = streams.heard_ns_utc
-    return [ev.Trouble(name=MIRROR_SILENT, text=text, over=not found, t_ns_utc=t_ns)]
+    return [ev.Trouble(name=alarms.MIRROR_SILENT, text=text, over=not found, t_ns_utc=t_ns)]
 
 
 def shape_news(streams: Streams, state: TrackerState) -> Event | None:
@@ -257,11 +246,11 @@ def shape_news(streams: Streams, state: TrackerState) -> Event | None:
     if state.rtc is None:
         return None
     reason = shape_mismatch(streams.description, state.rtc)
-    known = any(alarm.name == OTHER_INSTRUMENT for alarm in state.alarms)
+    known = any(alarm.name == alarms.OTHER_INSTRUMENT for alarm in state.alarms)
     if (reason is not None) is known:
         return None
     text = reason or "the RTC's telemetry fits the instrument file again"
-    return ev.Trouble(name=OTHER_INSTRUMENT, text=text, over=known)
+    return ev.Trouble(name=alarms.OTHER_INSTRUMENT, text=text, over=known)
 
 
 def shape_mismatch(description: Description, rtc: Status) -> str | None:
@@ -296,9 +285,21 @@ def troubles(streams: Streams) -> list[tuple[str, str | None, str]]:
     )
     n_verdicts = len(streams.unlawful)
     return [
-        (WRONG_UNIT, absurd if health.absurd else None, "commands are what a mirror can play"),
-        (WRONG_LOOP, unlawful if n_verdicts >= VERDICTS else None, "the loop is as told again"),
-        (DIVERGING, diverging if health.diverging else None, "the high modes are calm"),
-        (EDGE_SLIP, slipped if edge.slipped else None, "the outer ring is back"),
-        (OFF_LOOP, None if off is None else off.text, "commands obey the loop equation again"),
+        (
+            alarms.WRONG_UNIT,
+            absurd if health.absurd else None,
+            "commands are what a mirror can play",
+        ),
+        (
+            alarms.WRONG_LOOP,
+            unlawful if n_verdicts >= VERDICTS else None,
+            "the loop is as told again",
+        ),
+        (alarms.DIVERGING, diverging if health.diverging else None, "the high modes are calm"),
+        (alarms.EDGE_SLIP, slipped if edge.slipped else None, "the outer ring is back"),
+        (
+            alarms.OFF_LOOP,
+            None if off is None else off.text,
+            "commands obey the loop equation again",
+        ),
     ]

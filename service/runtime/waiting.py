@@ -236,7 +236,7 @@ def _for_the_matrix(facts: Facts) -> Iterator[Waiting]:
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_told(state)}"
         yield Waiting(name="matrix-in-use", party=Party.RTC, text=text)
     for record in state.reconstructors:
-        if record.state in {MatrixState.PUBLISHED, MatrixState.STAGED}:
+        if record.on_its_way:
             text = f"reconstructor {record.id} was sent: acknowledge that it is applied"
             yield Waiting(name="acknowledgement", party=Party.RTC, text=text)
         elif record.state is MatrixState.PROPOSED and state.mode is not Mode.AUTO:

@@ -21,6 +21,7 @@ from service.errors import CommandError
 from service.telemetry.openloop import NOT_FOUND
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking import reconstructors, worth
 from service.tracking.acquisition_stages import (
     abort,
     begin,
@@ -43,10 +44,8 @@ from service.tracking.dither import allow, choose_dither, make_way
 from service.tracking.measuring import cut_off
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import change_state, make, send_with, why_unsendable
 from service.tracking.state import Acquisition, AcquisitionStage, Interruption, Mode, TrackerState
 from service.tracking.turn import Turn
-from service.tracking.worth import fewer_than, half_of, limit_modes, moved, why_worthless
 from service.wire import DitherRequest, LoopRequest, Reply, Status
 
 ENOUGH_WINDOWS = 2
@@ -63,7 +62,7 @@ PATIENCE_S = 180.0
 _LOST = (MatrixState.REJECTED, MatrixState.FAILED)
 
 
-def acquire_on_command(turn: Turn) -> None:
+def acquire_on_command(turn: Turn, _: cmd.Acquire) -> None:
     """Begin one because an operator says so.
 
     Raises
@@ -78,7 +77,7 @@ def acquire_on_command(turn: Turn) -> None:
     _begin(turn, turn.rtc, "the operator asks", commanded=True)
 
 
-def abort_on_command(turn: Turn) -> None:
+def abort_on_command(turn: Turn, _: cmd.AbortAcquisition) -> None:
     """End one because an operator says so.
 
     Raises
@@ -144,10 +143,10 @@ def _begin(turn: Turn, rtc: Status, why: str, *, commanded: bool) -> None:
     begin(turn, rtc, why=why, commanded=commanded)
     turn.log("acquisition.begun", why)
     if lost is not None:
-        most = half_of(rtc.n_controlled)
+        most = worth.half_of(rtc.n_controlled)
         first = min(turn.acquisition.n_modes, most)
         go_on(turn, replace(turn.acquisition, most_modes=most, n_modes=first))
-        limit_modes(turn, most, f"{lost} with {rtc.n_controlled} modes")
+        worth.limit_modes(turn, most, f"{lost} with {rtc.n_controlled} modes")
     far_stage(turn, rtc)
 
 
@@ -264,16 +263,18 @@ def _on_made(turn: Turn, made: ev.MatrixMade) -> None:
         restart(turn, f"{record.id} cannot be sent: no RTC is there")
         return
     gains = gains_for(found, record.n_modes, rtc.n_modes)
-    stale = why_worthless(turn.state, record.judged, gains[: record.n_modes])
+    stale = worth.why_worthless(turn.state, record.judged, gains[: record.n_modes])
     if stale is not None:
-        change_state(turn, record.id, MatrixState.DISCARDED, f"while it was made, {stale}")
+        reconstructors.change_state(
+            turn, record.id, MatrixState.DISCARDED, f"while it was made, {stale}"
+        )
         turn.log("reconstructor.discarded", f"{record.id}: {stale}")
         return
-    reason = why_unsendable(turn.state, record)
+    reason = reconstructors.why_unsendable(turn.state, record)
     if reason is not None:
         restart(turn, f"{record.id} cannot be sent: {reason}")
         return
-    send_with(turn, record.id, gains)
+    reconstructors.send_with(turn, record.id, gains)
     most = acquisition.most_modes
     if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
         most = record.n_modes
@@ -313,7 +314,7 @@ def _widen(turn: Turn, rtc: Status, record: ReconstructorRecord | None) -> None:
             acquisition = replace(acquisition, applied=record.id, windows=n_windows)
             go_on(turn, acquisition)
         seen, goal = turn.state.windows_accepted - acquisition.windows, _goal(acquisition)
-        if seen >= 1 and (record.n_modes < goal or moved(turn.state, record, turn.policy)):
+        if seen >= 1 and (record.n_modes < goal or worth.moved(turn.state, record, turn.policy)):
             _make(turn, goal, rtc, at_least=record.n_modes)
             return
         if seen >= ENOUGH_WINDOWS:
@@ -332,9 +333,9 @@ def _make(turn: Turn, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:
             n_modes=n_modes,
             why=f"acquisition: {n_modes} modes",
             gains=gains_for(found, n_modes, rtc.n_modes),
-            fewer=tuple(rung for rung in fewer_than(n_modes) if rung > at_least),
+            fewer=tuple(rung for rung in worth.fewer_than(n_modes) if rung > at_least),
         )
-        make(turn, effect)
+        reconstructors.make(turn, effect)
 
 
 def _goal(acquisition: Acquisition) -> int:

@@ -18,6 +18,7 @@ from service.control.dither import (
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking import validity
 from service.tracking.alarms import ACQUISITION, Act, forbidding, forbids
 from service.tracking.dither import ask_for, ask_to_stop, make_way
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
@@ -34,7 +35,6 @@ from service.tracking.state import (
     TrackerState,
 )
 from service.tracking.turn import Turn
-from service.tracking.validity import forget, hold, taken, void, why_void
 from service.tracking.worth import half_of, limit_modes
 from service.wire import DitherKind, DitherRequest, Status
 
@@ -162,8 +162,8 @@ def begin(turn: Turn, rtc: Status, *, why: str, commanded: bool) -> None:
         n_modes=first_closed(found.n_controlled),
         sent=left is not None and left.sent,
     )
-    void(turn, "the acquisition had not begun")
-    forget(turn)
+    validity.void(turn, "the acquisition had not begun")
+    validity.forget(turn)
     forget_verdict(turn)
 
 
@@ -249,9 +249,9 @@ def restart(turn: Turn, reason: str, *, slipped: bool = False) -> None:
         most = half_of(acquisition.n_modes)
         limit_modes(turn, most, reason)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    void(turn, "the acquisition had not begun anew")
+    validity.void(turn, "the acquisition had not begun anew")
     make_way(turn)
-    forget(turn)
+    validity.forget(turn)
     turn.acquisition = replace(
         acquisition,
         attempt=acquisition.attempt + 1,
@@ -271,7 +271,7 @@ def give_up(turn: Turn, reason: str) -> None:
     closed = turn.rtc is not None and turn.rtc.loop != "open"
     out_of_hand = turn.forbidden(Act.HOLD) is not None
     make_way(turn)
-    forget(turn)
+    validity.forget(turn)
     turn.acquisition = replace(turn.acquisition, windows=turn.state.windows_accepted)
     if closed and out_of_hand:
         request_loop(turn, cmd.SetLoop(loop="open"))
@@ -291,7 +291,7 @@ def abort(turn: Turn, why: str, *, held_off: bool = False) -> None:
     """
     make_way(turn)
     if turn.acquisition.stage not in _BELIEVED:
-        forget(turn)
+        validity.forget(turn)
     left, found = "left as it is", _to_give_back(turn.state)
     if found is not None:
         left = "closed as it was found"
@@ -321,7 +321,10 @@ def far_stage(turn: Turn, rtc: Status) -> None:
 def on_far(turn: Turn, event: ev.FarFitted) -> None:
     """Take over where a window puts the mirror, or hold it against where another one did."""
     rtc, before, estimate = turn.rtc, turn.acquisition, event.found.estimate
-    if why_void(turn.state, taken(event.began_ns_utc, estimate.t_ns_utc)) is not None:
+    if (
+        validity.why_void(turn.state, validity.taken(event.began_ns_utc, estimate.t_ns_utc))
+        is not None
+    ):
         return
     if rtc is None or not before.looks_afar or estimate.session != rtc.session:
         return
@@ -354,7 +357,7 @@ def on_far(turn: Turn, event: ev.FarFitted) -> None:
         basis_id=turn.state.basis_id,
         config_id=turn.state.config_id,
     )
-    hold(turn, registration)
+    validity.hold(turn, registration)
     make_way(turn)
     enter_stage(turn, AcquisitionStage.PARTIAL, f"{place}: closing the loop")
 

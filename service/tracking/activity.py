@@ -18,7 +18,6 @@ from service.tracking.dither_request import OUR_DITHERS, OWN_DITHER
 from service.tracking.events import Event
 from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState
 from service.tracking.state import TrackerState
 
 GONE_WITHIN_S = 3.0
@@ -171,9 +170,8 @@ def _of_matrices(state: TrackerState) -> tuple[Running, ...]:
     if state.making_since_ns_utc is not None:
         text = "a reconstructor is being computed; wait for it"
         found.append(Running(Activity.MAKING, text))
-    sent = (MatrixState.PUBLISHED, MatrixState.STAGED)
     for record in state.reconstructors:
-        if record.state in sent:
+        if record.on_its_way:
             text = f"reconstructor {record.id} is on its way to the RTC; wait for it"
             found.append(Running(Activity.SENDING, text))
     return tuple(found)

@@ -13,21 +13,11 @@ import numpy as np
 from service.control.dither import forgetting_mean, measured_ratio
 from service.telemetry.lockin import WindowEstimate
 from service.telemetry.random_dither import RandomEstimate
-from service.tracking import alarms
+from service.tracking import alarms, dither_plan
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.activity import GONE_WITHIN_S
-from service.tracking.dither_plan import (
-    ROUNDING,
-    SHORTEST_PAUSE_S,
-    Wish,
-    awaits_a_result,
-    budget_m,
-    too_strong,
-    wanted,
-    why_none,
-    why_unwanted,
-    window_lengths_s,
-)
+from service.tracking.dither_plan import Wish
 from service.tracking.dither_request import (
     NOISY_DITHER,
     OWN_DITHER,
@@ -81,11 +71,11 @@ def choose_dither(turn: Turn, rtc: Status) -> None:
     if dither is not None and not own_sine(dither.request):
         _show(turn, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
-    forbidden = why_none(turn.state, rtc, turn.policy)
+    forbidden = dither_plan.why_none(turn.state, rtc, turn.policy)
     if forbidden is not None:
         _show(turn, DitherPhase.OFF, forbidden)
         return
-    wish, plan = wanted(turn.state, rtc, turn.policy, turn.now_ns)
+    wish, plan = dither_plan.wanted(turn.state, rtc, turn.policy, turn.now_ns)
     turn.dithering = replace(
         turn.dithering,
         plan=plan,
@@ -142,7 +132,7 @@ def allow(turn: Turn, *, allowed: bool = True) -> None:
     turn.state = replace(turn.state, dither_stopped=not allowed)
 
 
-def stop_by_operator(turn: Turn) -> None:
+def stop_by_operator(turn: Turn, _: cmd.StopDither) -> None:
     """Stop the dither, and start none until told to."""
     drop(turn)
     allow(turn, allowed=False)
@@ -262,7 +252,7 @@ def why_too_strong(turn: Turn, event: ev.DitherMeasured) -> str | None:
     if rtc is None or dither is None or dither.id != event.id:
         return None
     turn.dithering = replace(turn.dithering, amiss_id=event.id, amiss_m=event.found_m)
-    most_m = budget_m(rtc, turn.policy)
+    most_m = dither_plan.budget_m(rtc, turn.policy)
     if event.found_m > MEASURED * max(event.asked_m, most_m):
         return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
     turn.alarm(alarms.NOT_AS_ASKED, f"{event.text}; look at the RTC's dither")
@@ -290,8 +280,8 @@ def stop_unanswered(turn: Turn, text: str) -> None:
 
 def stop_unwanted(turn: Turn, rtc: Status) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
-    running, loud = rtc.dither_id, too_strong(turn.state, rtc, turn.policy)
-    why = loud or why_unwanted(turn.state, rtc, turn.policy)
+    running, loud = rtc.dither_id, dither_plan.too_strong(turn.state, rtc, turn.policy)
+    why = loud or dither_plan.why_unwanted(turn.state, rtc, turn.policy)
     if running is None or why is None:
         forget_unwanted(turn)
         _forgive(turn, rtc)
@@ -330,7 +320,9 @@ def _begin(turn: Turn, rtc: Status, wish: Wish) -> None:
         turn.put_off(dither_s=2.0)
         _note_stop(turn, rtc.dither_id)
         ask_to_stop(turn)
-    elif turn.now_ns >= wish.next_ns_utc and not awaits_a_result(turn.state, wish, turn.now_ns):
+    elif turn.now_ns >= wish.next_ns_utc and not dither_plan.awaits_a_result(
+        turn.state, wish, turn.now_ns
+    ):
         _ask(turn, rtc, wish)
 
 
@@ -367,7 +359,7 @@ def _end_when_done(turn: Turn, dither: Dither, wish: Wish) -> None:
         return
     seen = turn.known is not None and turn.known.window_ns_utc > dither.asked_ns_utc
     pause_s = (wish.next_ns_utc - turn.now_ns) / SECOND_NS
-    done = seen and wish.phase is DitherPhase.SPARSE and pause_s >= SHORTEST_PAUSE_S
+    done = seen and wish.phase is DitherPhase.SPARSE and pause_s >= dither_plan.SHORTEST_PAUSE_S
     weak = wish.phase is DitherPhase.ACQUIRE and 2.0 * total_m(dither.request) < wish.choice.total_m
     if done or weak:
         _note_stop(turn, dither.id)
@@ -384,13 +376,13 @@ def _adopt(turn: Turn, rtc: Status) -> bool:
     if rtc.dither is None or rtc.dither_id == turn.state.dither_lost:
         return False
     running, begun_seq, dithering = rtc.dither.request, rtc.dither.start_seq, turn.dithering
-    over = own_sine(running) and total_m(running) > ROUNDING * dithering.budget_m
+    over = own_sine(running) and total_m(running) > dither_plan.ROUNDING * dithering.budget_m
     asked_to_stop = running.id == dithering.stopped_id
     # a recorded night stops nothing: what it goes on playing is read all the same
     heard_ns = dithering.stopped_ns_utc + round(STOPPED_WITHIN_S * SECOND_NS)
     if turn.now_ns < heard_ns if asked_to_stop else over:
         return False
-    for window_s in window_lengths_s(turn.policy):
+    for window_s in dither_plan.window_lengths_s(turn.policy):
         dither = Dither(
             request=running, start_seq=begun_seq, asked_ns_utc=turn.now_ns, window_s=window_s
         )
@@ -416,7 +408,7 @@ def _account(turn: Turn, rtc: Status) -> None:
         passive_ns = known.arrived_ns_utc
     turn.dithering = replace(
         dithering,
-        budget_m=budget_m(rtc, turn.policy),
+        budget_m=dither_plan.budget_m(rtc, turn.policy),
         mean_square_m2=float(dithering.mean_square_m2 * (1.0 - share) + power * share),
         seen_ns_utc=turn.now_ns,
         passive_ns_utc=passive_ns,
@@ -438,7 +430,7 @@ def _correct(turn: Turn, asked: Dither, shown: DitherStatus) -> None:
     if running == asked:
         return
     plays, meant = running.request, asked.request
-    if total_m(plays) > ROUNDING * max(total_m(meant), turn.dithering.budget_m):
+    if total_m(plays) > dither_plan.ROUNDING * max(total_m(meant), turn.dithering.budget_m):
         turn.dithering = replace(turn.dithering, loud_id=running.id, loud_text="")
     text = (
         f"{asked.id}: the RTC plays modes {plays.modes}, {running.frequency_hz} Hz, "

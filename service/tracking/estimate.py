@@ -13,6 +13,7 @@ from service.telemetry.estimate import DitheredEstimate, model_error
 from service.telemetry.kalman import Drift, Joint, begin_joint, predicted
 from service.telemetry.lockin import MAX_LAG_FRAMES
 from service.telemetry.random_dither import RandomEstimate
+from service.tracking import validity
 from service.tracking.alarms import DISAGREES, SUSPECTED, Act, forbidding
 from service.tracking.jumps import last_of
 from service.tracking.policy import SECOND_NS, Policy
@@ -27,19 +28,7 @@ from service.tracking.registration import (
 )
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
-from service.tracking.validity import (
-    CLOCK_SET_BACK_S,
-    USELESS_SIGMA,
-    Taken,
-    age,
-    flexure,
-    have_window,
-    hold,
-    pointing_at,
-    precedes,
-    slewed_deg,
-    why_void,
-)
+from service.tracking.validity import Taken
 
 MODES_KEPT = 64
 """More than any dither plays at once: of those measured longest ago the rest is forgotten."""
@@ -174,11 +163,11 @@ def brought_forward(
 ) -> Joint:
     """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
     elapsed_ns = t_ns_utc - known.t_ns_utc
-    if elapsed_ns < -CLOCK_SET_BACK_S * SECOND_NS:
+    if elapsed_ns < -validity.CLOCK_SET_BACK_S * SECOND_NS:
         # a clock that was set back, or another night played again: the service's own must do
         elapsed_ns = now_ns - known.arrived_ns_utc
     drift = Drift(alpha_rate=policy.drift_rate, bias_memory_s=policy.bias_memory_s)
-    bent = flexure(known.pointing, state.pointing, policy)
+    bent = validity.flexure(known.pointing, state.pointing, policy)
     return predicted(joint_of(known), drift, elapsed_ns / SECOND_NS, bent)
 
 
@@ -224,7 +213,9 @@ def remember(turn: Turn, entry: HistoryEntry) -> None:
 def counted(state: TrackerState, known: Registration, prior: Joint, policy: Policy) -> int:
     """Return how many windows agree after this one: it stands alone where α had gone stale."""
     sigma = np.sqrt(np.diag(prior.alpha_covariance) + known.floor**2)
-    alone = slewed_deg(state, known) > policy.slew_limit_deg or np.any(sigma > policy.stale_sigma)
+    alone = validity.slewed_deg(state, known) > policy.slew_limit_deg or np.any(
+        sigma > policy.stale_sigma
+    )
     return 1 if alone else known.n_windows + 1
 
 
@@ -256,20 +247,20 @@ def accept(turn: Turn, folded: Folded, measured: Measured, *, n_accepted: int = 
         jumped_ns_utc=_jumped_ns_utc(known, folded, turn.now_ns),
         doubt=known.doubt if known is not None and doubted else "",
         doubted_ns_utc=known.doubted_ns_utc if known is not None and doubted else 0,
-        pointing=pointing_at(turn.state, when.ended_ns_utc),
-        window_pointing=pointing_at(turn.state, when.began_ns_utc),
+        pointing=validity.pointing_at(turn.state, when.ended_ns_utc),
+        window_pointing=validity.pointing_at(turn.state, when.began_ns_utc),
         restored_ns_utc=known.restored_ns_utc if known is not None else None,
         basis_id=turn.state.basis_id,
         config_id=turn.state.config_id,
     )
-    hold(turn, registration)
+    validity.hold(turn, registration)
     turn.state = replace(turn.state, windows_accepted=turn.state.windows_accepted + n_accepted)
     if not doubted:
-        have_window(turn)
+        validity.have_window(turn)
         turn.calm(SUSPECTED)
         turn.calm(DISAGREES)
     remember(turn, entry_of(measured, registration, folded.innovation))
-    age(turn)
+    validity.age(turn)
 
 
 def _still_doubted(state: TrackerState, folded: Folded, when: Taken) -> bool:
@@ -283,7 +274,7 @@ def _still_doubted(state: TrackerState, folded: Folded, when: Taken) -> bool:
         return False
     if folded.jumped:
         when = replace(when, began_ns_utc=when.ended_ns_utc)
-    return precedes(state, when, known.doubted_ns_utc)
+    return validity.precedes(state, when, known.doubted_ns_utc)
 
 
 def _jumped_ns_utc(known: Registration | None, folded: Folded, now_ns: int) -> int | None:
@@ -361,7 +352,7 @@ def why_no_window(
             f"to {GAIN_RANGE[1]}: wrong instrument file, or the dither is not on the mirror"
         )
     sigma = np.sqrt(np.diag(estimate.covariance))
-    if np.any(sigma > USELESS_SIGMA):
+    if np.any(sigma > validity.USELESS_SIGMA):
         return "too uncertain: raise the dither's amplitude or the window's length"
     known = state.registration
     near = policy.start if known is None else known.alpha
@@ -378,5 +369,5 @@ def why_no_measurement(state: TrackerState, when: Taken) -> str | None:
     """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
     alarm = forbidding(state, Act.MEASURE)
     if alarm is None:
-        return why_void(state, when)
+        return validity.why_void(state, when)
     return f"{alarm.kind.because}: its telemetry is no measurement"

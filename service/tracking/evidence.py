@@ -14,30 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.telemetry.kalman import (
-    JUMP_THRESHOLD,
-    Joint,
-    allowing,
-    begin_joint,
-    dithered_innovation,
-    forgotten,
-    passive_innovation,
-    scattered,
-    widened,
-    with_dithered,
-    with_passive,
-)
+from service.telemetry import kalman
+from service.telemetry.kalman import JUMP_THRESHOLD, Joint
 from service.telemetry.passive import PassiveEstimate
 from service.telemetry.random_dither import RandomEstimate
+from service.tracking import alarms, jumps, validity
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import count_miss
-from service.tracking.alarms import (
-    DISAGREES,
-    DITHER_LOST,
-    MISALIGNED,
-    SUSPECTED,
-    WRONG_ANSWER,
-)
 from service.tracking.dither import found_again
 from service.tracking.estimate import (
     CAPTURE_RANGE,
@@ -56,16 +39,7 @@ from service.tracking.estimate import (
     why_no_measurement,
     why_no_window,
 )
-from service.tracking.jumps import (
-    Distance,
-    Reading,
-    look_surprise,
-    pair_surprise,
-    sum_of,
-    wholly_after,
-    window_before,
-    window_surprise,
-)
+from service.tracking.jumps import Distance, Reading
 from service.tracking.loop import loop_numbers, same_numbers
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import (
@@ -78,15 +52,6 @@ from service.tracking.registration import (
 )
 from service.tracking.state import Level, TrackerState
 from service.tracking.turn import Turn
-from service.tracking.validity import (
-    age,
-    hold,
-    pointing_at,
-    precedes,
-    taken,
-    tells_of,
-    want_window,
-)
 
 Array = NDArray[Any]
 
@@ -102,16 +67,16 @@ EXPECTED = ("the reconstructor changed", "the dither ended")
 def on_window(turn: Turn, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
-    when = taken(event.began_ns_utc, estimate.t_ns_utc)
+    when = validity.taken(event.began_ns_utc, estimate.t_ns_utc)
     reason = why_no_window(turn.state, estimate, when, turn.policy)
     if reason is not None:
         refuse_window(turn, reason)
         return
-    if tells_of(turn.state, DITHER_LOST, when):
+    if validity.tells_of(turn.state, alarms.DITHER_LOST, when):
         found_again(turn)
     random = isinstance(estimate, RandomEstimate)
-    for name in (MISALIGNED, *(() if random else (WRONG_ANSWER,))):
-        if tells_of(turn.state, name, when):
+    for name in (alarms.MISALIGNED, *(() if random else (alarms.WRONG_ANSWER,))):
+        if validity.tells_of(turn.state, name, when):
             turn.calm(name)
     known = turn.known
     modes, gains, gain_sigma = gains_of(estimate)
@@ -134,6 +99,11 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
     enter(turn, measured)
 
 
+def on_lost(turn: Turn, event: ev.WindowLost) -> None:
+    """Count a window that nothing could be made of."""
+    refuse_window(turn, event.refused.reason, mistold=event.refused.mistold)
+
+
 def refuse_window(turn: Turn, reason: str, *, mistold: bool = False) -> None:
     """Count a window that gave nothing, and say why.
 
@@ -142,9 +112,9 @@ def refuse_window(turn: Turn, reason: str, *, mistold: bool = False) -> None:
     _count_refused(turn)
     count_miss(turn, reason)
     if reason.startswith("columns misaligned"):
-        turn.alarm(MISALIGNED, reason)
+        turn.alarm(alarms.MISALIGNED, reason)
     if mistold:
-        turn.alarm(WRONG_ANSWER, reason)
+        turn.alarm(alarms.WRONG_ANSWER, reason)
     level = Level.INFO if reason.startswith(EXPECTED) else Level.WARNING
     turn.log("window.refused", reason, level)
 
@@ -153,16 +123,20 @@ def enter(turn: Turn, measured: Measured) -> None:
     """Fold a dithered window in, hold it, or have it decide about the one held before."""
     known = turn.known
     if known is None:
-        joint = begin_joint(measured.alpha.vector, measured.covariance)
+        joint = kalman.begin_joint(measured.alpha.vector, measured.covariance)
         accept(turn, Folded(joint=joint, n_windows=1, innovation=0.0), measured)
         return
     reading = _reading(measured, turn.state)
-    first = window_before(known)
-    if first is not None and pair_surprise(known, reading, turn.policy).far:
+    first = jumps.window_before(known)
+    if first is not None and jumps.pair_surprise(known, reading, turn.policy).far:
         _jump(turn, known, first, measured)
         return
-    far = window_surprise(known, reading, turn.policy)
-    if known.doubt and not far.far and precedes(turn.state, measured.when, known.doubted_ns_utc):
+    far = jumps.window_surprise(known, reading, turn.policy)
+    if (
+        known.doubt
+        and not far.far
+        and validity.precedes(turn.state, measured.when, known.doubted_ns_utc)
+    ):
         _count_refused(turn)
         turn.log("window.refused", TOO_EARLY)
         return
@@ -179,7 +153,7 @@ def enter(turn: Turn, measured: Measured) -> None:
         return
     prior = brought_forward(turn.state, known, measured.t_ns_utc, turn.policy, turn.now_ns)
     folded = Folded(
-        joint=with_dithered(prior, measured.alpha.vector, measured.covariance),
+        joint=kalman.with_dithered(prior, measured.alpha.vector, measured.covariance),
         n_windows=counted(turn.state, known, prior, turn.policy),
         innovation=_innovation(prior, measured),
     )
@@ -202,12 +176,12 @@ def _put_aside(turn: Turn, known: Registration, measured: Measured, far: Distanc
         innovation=innovation,
     )
     doubt = "a jump is suspected"
-    hold(turn, replace(_doubted(known, doubt, measured.t_ns_utc), candidate=candidate))
+    validity.hold(turn, replace(_doubted(known, doubt, measured.t_ns_utc), candidate=candidate))
     remember(turn, entry_of(measured, known, innovation, entered=False))
     turn.warn("registration.jump-suspected", text)
-    turn.alarm(SUSPECTED, text)
-    want_window(turn, doubt)
-    age(turn)
+    turn.alarm(alarms.SUSPECTED, text)
+    validity.want_window(turn, doubt)
+    validity.age(turn)
 
 
 def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> None:
@@ -218,20 +192,20 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
     policy = turn.policy
     prior = brought_forward(turn.state, known, measured.t_ns_utc, policy, turn.now_ns)
     noise = measured.covariance
-    whole = wholly_after(first, _reading(measured, turn.state), known.alpha.vector, policy)
+    whole = jumps.wholly_after(first, _reading(measured, turn.state), known.alpha.vector, policy)
     if whole:
         elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
         noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
-    joint = widened(prior, noise)
+    joint = kalman.widened(prior, noise)
     if whole:
-        joint = with_dithered(joint, first.alpha.vector, noise)
+        joint = kalman.with_dithered(joint, first.alpha.vector, noise)
     folded = Folded(
-        joint=with_dithered(joint, measured.alpha.vector, measured.covariance),
+        joint=kalman.with_dithered(joint, measured.alpha.vector, measured.covariance),
         n_windows=2 if whole else 1,
         innovation=_innovation(prior, measured),
         jumped=True,
     )
-    hold(turn, replace(known, passive_after_ns_utc=first.t_ns_utc))
+    validity.hold(turn, replace(known, passive_after_ns_utc=first.t_ns_utc))
     both = whole and known.candidate is not None
     accept(turn, folded, measured, n_accepted=2 if both else 1)
     turn.warn("registration.jump", f"jumped by {_step(measured, known)}, as two windows have seen")
@@ -252,12 +226,12 @@ def _reading(measured: Measured, state: TrackerState) -> Reading:
         value=measured.alpha.vector,
         noise=measured.covariance,
         t_ns_utc=measured.t_ns_utc,
-        pointing=pointing_at(state, measured.t_ns_utc),
+        pointing=validity.pointing_at(state, measured.t_ns_utc),
     )
 
 
 def _innovation(prior: Joint, measured: Measured) -> float:
-    return dithered_innovation(prior, measured.alpha.vector, measured.covariance)
+    return kalman.dithered_innovation(prior, measured.alpha.vector, measured.covariance)
 
 
 def _step(measured: Measured | Candidate, known: Registration) -> str:
@@ -276,14 +250,14 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         _show_alone(turn, event)
         return
     known = _expecting(known, estimate.bias_excess)
-    prior = allowing(
+    prior = kalman.allowing(
         brought_forward(turn.state, known, event.t_ns_utc, turn.policy, turn.now_ns),
         estimate.bias_excess,
     )
     if _mixed(known):
         text = "not used: its telemetry may be from both sides of a jump"
         bias = bias_of(joint_of(known), event.t_ns_utc, _loop(turn.state, known))
-        hold(turn, replace(known, bias=bias))
+        validity.hold(turn, replace(known, bias=bias))
         _show(turn, event, _reading_sigma(estimate, prior), prior.bias, text)
         return
     measured = estimate.alpha.vector
@@ -291,16 +265,16 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         value=measured,
         noise=prior.scatter * estimate.covariance,
         t_ns_utc=event.t_ns_utc,
-        pointing=pointing_at(turn.state, event.t_ns_utc),
+        pointing=validity.pointing_at(turn.state, event.t_ns_utc),
     )
-    far = look_surprise(known, joint_of(known), reading, turn.policy)
+    far = jumps.look_surprise(known, joint_of(known), reading, turn.policy)
     if far > JUMP_THRESHOLD:
         _doubt_by_look(turn, known, event, prior, far)
         return
-    joint = scattered(with_passive(prior, measured, estimate.covariance), far)
+    joint = kalman.scattered(kalman.with_passive(prior, measured, estimate.covariance), far)
     registration = _after_look(turn, known, joint, event)
-    hold(turn, registration)
-    age(turn)
+    validity.hold(turn, registration)
+    validity.age(turn)
     sigma = _reading_sigma(estimate, prior)
     entry = HistoryEntry(
         t_ns_utc=event.t_ns_utc,
@@ -308,7 +282,7 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         measured_sigma=sigma,
         filtered=registration.alpha,
         filtered_sigma=registration.sigma,
-        innovation=passive_innovation(prior, measured, estimate.covariance),
+        innovation=kalman.passive_innovation(prior, measured, estimate.covariance),
         misfit=estimate.misfit,
         source=Source.PASSIVE,
     )
@@ -334,7 +308,7 @@ def _why_no_look(state: TrackerState, event: ev.Watched) -> str | None:
     of_loop = loop_numbers(state.rtc)
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
-    return why_no_measurement(state, taken(event.began_ns_utc, event.t_ns_utc))
+    return why_no_measurement(state, validity.taken(event.began_ns_utc, event.t_ns_utc))
 
 
 def _why_known_already(state: TrackerState, event: ev.Watched) -> str | None:
@@ -342,8 +316,8 @@ def _why_known_already(state: TrackerState, event: ev.Watched) -> str | None:
     known = state.registration
     if known is None or not known.window_began_ns_utc:
         return None
-    since = taken(known.window_began_ns_utc, known.window_began_ns_utc)
-    if precedes(state, since, event.t_ns_utc):
+    since = validity.taken(known.window_began_ns_utc, known.window_began_ns_utc)
+    if validity.precedes(state, since, event.t_ns_utc):
         return None
     return "a dithered window taken since has been fitted before it"
 
@@ -370,7 +344,7 @@ def _expecting(known: Registration, excess: Array) -> Registration:
     """
     if known.bias is not None and known.bias.looked_ns_utc:
         return known
-    return replace(known, bias=bias_of(forgotten(joint_of(known), excess), 0, ()))
+    return replace(known, bias=bias_of(kalman.forgotten(joint_of(known), excess), 0, ()))
 
 
 def _loop(state: TrackerState, known: Registration) -> tuple[float, ...]:
@@ -399,14 +373,14 @@ def _doubt_by_look(
         "dithered window must tell which"
     )
     known = turn.known or known
-    gone = forgotten(prior, event.estimate.bias_excess)
+    gone = kalman.forgotten(prior, event.estimate.bias_excess)
     after = _after_look(turn, known, gone, event)
     bias = bias_of(gone, event.t_ns_utc, _loop(turn.state, known))
-    hold(turn, replace(_doubted(after, text, event.t_ns_utc), bias=bias))
+    validity.hold(turn, replace(_doubted(after, text, event.t_ns_utc), bias=bias))
     turn.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
-    turn.alarm(DISAGREES, text)
-    want_window(turn, text)
-    age(turn)
+    turn.alarm(alarms.DISAGREES, text)
+    validity.want_window(turn, text)
+    validity.age(turn)
     _show(turn, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
 
 
@@ -419,8 +393,8 @@ def _after_look(turn: Turn, known: Registration, joint: Joint, event: ev.Watched
         covariance=joint.alpha_covariance,
         t_ns_utc=max(event.t_ns_utc, known.t_ns_utc),
         arrived_ns_utc=turn.now_ns,
-        bias=bias_of(joint, event.t_ns_utc, loop, sum_of(known, joint_of(known))),
-        pointing=pointing_at(turn.state, event.t_ns_utc),
+        bias=bias_of(joint, event.t_ns_utc, loop, jumps.sum_of(known, joint_of(known))),
+        pointing=validity.pointing_at(turn.state, event.t_ns_utc),
     )
 
 

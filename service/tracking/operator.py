@@ -23,7 +23,7 @@ from service.tracking.dither_request import (
 )
 from service.tracking.loop import CommandState, LoopCommand, extended_gains
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import MatrixState, ModeSet
+from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
 from service.tracking.reconstructors import (
     change_state,
     known_record,
@@ -37,8 +37,9 @@ from service.tracking.worth import outdated
 from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
 
 
-def set_mode(turn: Turn, mode: Mode) -> None:
+def set_mode(turn: Turn, command: cmd.SetMode) -> None:
     """Go on in the mode an operator orders; that of the settings is remembered."""
+    mode = command.mode
     of_settings = turn.state.settings_mode or turn.state.mode
     _order(turn, mode, None if mode is of_settings else of_settings)
     turn.calm(PROBATION)
@@ -83,7 +84,7 @@ def obey(turn: Turn, orders: Orders) -> None:
     turn.warn("mode", text)
 
 
-def approve(turn: Turn, matrix_id: str) -> None:
+def approve(turn: Turn, command: cmd.Approve) -> None:
     """Send a proposal, judged anew where need be, unless α is no longer what it was made for.
 
     Raises
@@ -91,16 +92,15 @@ def approve(turn: Turn, matrix_id: str) -> None:
     CommandError
         If it is none, or cannot be sent.
     """
-    _check_proposed(turn, matrix_id)
-    known = turn.known
+    record, known = _proposed(turn, command.id), turn.known
     if known is not None and not known.usable:
-        raise CommandError(f"{matrix_id} cannot be judged: α is invalid ({known.standing.reason})")
-    if outdated(turn.state, known_record(turn.state, matrix_id)):
-        raise CommandError(f"{matrix_id} was made for another α than the present one: refit")
-    send_once_judged(turn, matrix_id)
+        raise CommandError(f"{record.id} cannot be judged: α is invalid ({known.standing.reason})")
+    if outdated(turn.state, record):
+        raise CommandError(f"{record.id} was made for another α than the present one: refit")
+    send_once_judged(turn, record.id)
 
 
-def reject(turn: Turn, matrix_id: str, reason: str) -> None:
+def reject(turn: Turn, command: cmd.Reject) -> None:
     """Discard a proposal.
 
     Raises
@@ -108,12 +108,12 @@ def reject(turn: Turn, matrix_id: str, reason: str) -> None:
     CommandError
         If it is none.
     """
-    _check_proposed(turn, matrix_id)
-    change_state(turn, matrix_id, MatrixState.DISCARDED, reason or "by the operator")
-    turn.log("reconstructor.discarded", matrix_id)
+    record = _proposed(turn, command.id)
+    change_state(turn, record.id, MatrixState.DISCARDED, command.reason or "by the operator")
+    turn.log("reconstructor.discarded", record.id)
 
 
-def publish(turn: Turn, matrix_id: str) -> None:
+def publish(turn: Turn, command: cmd.Publish) -> None:
     """Offer a reconstructor again; what has never been in use only if the gate can judge it.
 
     Raises
@@ -121,15 +121,15 @@ def publish(turn: Turn, matrix_id: str) -> None:
     CommandError
         If it cannot, or no RTC is there.
     """
-    used = {MatrixState.APPLIED, MatrixState.SUPERSEDED}
-    if known_record(turn.state, matrix_id).state not in used and turn.known is None:
+    record = known_record(turn.state, command.id)
+    if not record.was_used and turn.known is None:
         raise CommandError(
-            f"{matrix_id} cannot be judged: α is not known yet; start a dither, wait for a window"
+            f"{record.id} cannot be judged: α is not known yet; start a dither, wait for a window"
         )
-    _copy(turn, matrix_id, f"the operator publishes {matrix_id} again")
+    _copy(turn, record.id, f"the operator publishes {record.id} again")
 
 
-def roll_back(turn: Turn) -> None:
+def roll_back(turn: Turn, _: cmd.Rollback) -> None:
     """Offer the reconstructor again that was in use before.
 
     Raises
@@ -143,7 +143,7 @@ def roll_back(turn: Turn) -> None:
     _copy(turn, earlier, f"the operator goes back to {earlier}")
 
 
-def refit(turn: Turn, n_modes: int | None) -> None:
+def refit(turn: Turn, command: cmd.Refit) -> None:
     """Make a reconstructor for the present α.
 
     Raises
@@ -156,7 +156,7 @@ def refit(turn: Turn, n_modes: int | None) -> None:
         raise CommandError("refit: no RTC is there")
     if turn.known is None:
         raise CommandError("refit: α is not known yet; start a dither and wait for a window")
-    asked = n_modes or rtc.n_controlled
+    asked = command.n_modes or rtc.n_controlled
     if not 0 < asked <= rtc.n_modes:
         raise CommandError(f"refit: found {asked} modes; expected 1 to {rtc.n_modes}")
     make(turn, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
@@ -247,10 +247,11 @@ def _order(turn: Turn, mode: Mode, of_settings: Mode | None) -> None:
     turn.state = replace(turn.state, mode=mode, settings_mode=of_settings)
 
 
-def _check_proposed(turn: Turn, matrix_id: str) -> None:
+def _proposed(turn: Turn, matrix_id: str) -> ReconstructorRecord:
     record = known_record(turn.state, matrix_id)
     if record.state is not MatrixState.PROPOSED:
         raise CommandError(f"{matrix_id} is {record.state}, not proposed")
+    return record
 
 
 RAMP_GROUPS = ((0, 1), (2, 99), (100, None))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from service.telemetry.probation import WITHIN_S, Verdict
 from service.tracking import events as ev
+from service.tracking import reconstructors
 from service.tracking.alarms import PROBATION
 from service.tracking.loop import commanded_gains, same_but_for_modes, why_open
 from service.tracking.operator import hold
@@ -16,7 +17,6 @@ from service.tracking.products import (
     ProbationState,
     ReconstructorRecord,
 )
-from service.tracking.reconstructors import change_state, make, propose, send, why_unsendable
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
 from service.tracking.worth import why_of_another_loop
@@ -31,7 +31,6 @@ _OVER = frozenset(
     {MatrixState.FAILED, MatrixState.REJECTED, MatrixState.REFUSED, MatrixState.DISCARDED}
 )
 _GOING_BACK = frozenset({ProbationState.ROLLING_BACK, ProbationState.KEPT})
-_SENT = frozenset({MatrixState.PUBLISHED, MatrixState.STAGED})
 
 
 def follow(turn: Turn) -> None:
@@ -79,7 +78,7 @@ def on_compared(turn: Turn, event: ev.Compared) -> None:
     _set(turn, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
     turn.alarm(PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
-    make(turn, ev.CopyMatrix(source=trial.before, why=why, judged=False))
+    reconstructors.make(turn, ev.CopyMatrix(source=trial.before, why=why, judged=False))
 
 
 def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
@@ -97,14 +96,14 @@ def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
 def go_back(turn: Turn, made: ev.MatrixMade) -> None:
     """Send the matrix before under its new id, unless something forbids it by now."""
     trial = turn.state.probation
-    propose(turn, made.record)
+    reconstructors.propose(turn, made.record)
     if trial is None:
         return
     why = _why_no_way_back(turn, trial)
     if why is not None:
         _keep(turn, trial, why)
         return
-    send(turn, made.record.id)
+    reconstructors.send(turn, made.record.id)
     _set(turn, replace(trial, rollback=made.record.id))
 
 
@@ -114,7 +113,9 @@ def _on_swap(turn: Turn, before: str | None, in_use: str | None) -> None:
     if trial is not None and trial.state in _GOING_BACK and trial.rollback == in_use is not None:
         text = f"{_numbers(trial)}: the service went back to {trial.before}, as {in_use}"
         # an operator's rollback would go back to it
-        change_state(turn, trial.id, MatrixState.FAILED, f"rolled back, it {_numbers(trial)}")
+        reconstructors.change_state(
+            turn, trial.id, MatrixState.FAILED, f"rolled back, it {_numbers(trial)}"
+        )
         _end(turn, trial, ProbationState.ROLLED_BACK, text)
         turn.alarm(PROBATION, f"{trial.id} {text}; the mode is hold until an operator sets another")
         return
@@ -187,11 +188,13 @@ def _why_no_way_back(turn: Turn, trial: Probation) -> str | None:
         return "the gate has not accepted it" if record.gate is None else record.gate.reason
     if trial.loop is None or not same_but_for_modes(trial.loop, rtc):
         return "the loop has been changed since"
-    on_way = next((r.id for r in state.reconstructors if r.state in _SENT), None)
+    on_way = next((r.id for r in state.reconstructors if r.on_its_way), None)
     if on_way is not None:
         return f"{on_way} is on its way to the RTC"
     gains = commanded_gains(rtc, record.n_modes)
-    return why_unsendable(state, record) or why_of_another_loop(state, record.judged, gains)
+    return reconstructors.why_unsendable(state, record) or why_of_another_loop(
+        state, record.judged, gains
+    )
 
 
 def _numbers(trial: Probation) -> str:

@@ -48,6 +48,11 @@ class MatrixState(StrEnum):
     and the service went back; the reason says which."""
 
 
+_ON_ITS_WAY = (MatrixState.PUBLISHED, MatrixState.STAGED)
+_USED = (MatrixState.APPLIED, MatrixState.SUPERSEDED)
+"""Tuples: looked at hundreds of times a second, for every record, and faster than sets."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Judged:
     """What a verdict of the gate is of: of another loop, or of another α, it says nothing."""
@@ -113,6 +118,16 @@ class ReconstructorRecord:
 
     applied_frame_seq: int | None = None
     """First frame whose slopes it multiplied; None: not applied, or before this service came."""
+
+    @property
+    def on_its_way(self) -> bool:
+        """Whether it was sent, and the RTC has not said what became of it."""
+        return self.state in _ON_ITS_WAY
+
+    @property
+    def was_used(self) -> bool:
+        """Whether it is in use, or was until another took its place."""
+        return self.state in _USED
 
     @classmethod
     def brought(cls, manifest: Manifest) -> ReconstructorRecord:
@@ -275,7 +290,7 @@ _MEASURING = (
     MeasureState.ASKED,
     MeasureState.FINISHING,
 )
-"""A tuple: looked at hundreds of times a second, for every record, and faster than a set."""
+"""As above."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,18 +6,12 @@ from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
+from service.tracking import worth
 from service.tracking.alarms import NOT_ACKNOWLEDGED, OTHER_SUM, SHORT_MARGIN, Act, forbidding
 from service.tracking.loop import commanded_gains, extended_gains
 from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
 from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.turn import Turn
-from service.tracking.worth import (
-    note_limit,
-    outdated,
-    settled,
-    why_stale,
-    why_worthless,
-)
 from service.wire import Acknowledgement, AckState, Status
 
 RECONSTRUCTORS_KEPT = 200
@@ -30,8 +24,6 @@ UNSENT_KEPT = 50
 
 _UNSENT = frozenset({MatrixState.REFUSED, MatrixState.DISCARDED})
 _SPARE = frozenset({MatrixState.REJECTED, MatrixState.FAILED, MatrixState.SUPERSEDED})
-
-_SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
 
 
 def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
@@ -92,7 +84,7 @@ def judge_again(turn: Turn) -> None:
 def forget_session(turn: Turn) -> None:
     """Note that the RTC has begun a new session: nobody knows what it multiplies with."""
     for record in turn.state.reconstructors:
-        if record.state in _SENT:
+        if record.on_its_way:
             change_state(turn, record.id, MatrixState.FAILED, "the RTC restarted")
     turn.state = replace(
         turn.state,
@@ -145,7 +137,7 @@ def on_matrix(turn: Turn, made: ev.MatrixMade) -> None:
     overtaken = not wanted and _jumped_since(turn.state, record)
     propose(turn, record)
     if made.asked_modes is not None:
-        note_limit(turn, record, made.asked_modes, made.why_fewer)
+        worth.note_limit(turn, record, made.asked_modes, made.why_fewer)
     if record.state is MatrixState.REFUSED:
         return
     if overtaken:
@@ -182,7 +174,7 @@ def send_once_judged(turn: Turn, matrix_id: str, *, wanted: bool = True) -> None
     """
     record, rtc = _sendable(turn, matrix_id)
     gains = commanded_gains(rtc, record.n_modes)
-    stale = why_stale(turn.state, record.judged, gains)
+    stale = worth.why_stale(turn.state, record.judged, gains)
     if stale is None or (rtc.loop == "open" and record.gate is None):
         send(turn, matrix_id)
         return
@@ -212,7 +204,7 @@ def on_proposal_judged(turn: Turn, event: ev.ProposalJudged) -> None:
         alarm = turn.forbidden(Act.DECIDE)
         reason = f"{alarm.name}: {alarm.text}" if alarm else "the mode, the loop or α has changed"
     if rtc is not None and reason is None:
-        reason = why_stale(turn.state, record.judged, commanded_gains(rtc, record.n_modes))
+        reason = worth.why_stale(turn.state, record.judged, commanded_gains(rtc, record.n_modes))
     if reason is None:
         send(turn, record.id)
         return
@@ -275,7 +267,7 @@ def on_acknowledgement(turn: Turn, event: Acknowledgement) -> None:
         turn.calm(NOT_ACKNOWLEDGED)
         turn.calm(SHORT_MARGIN)
         gains = () if turn.rtc is None else commanded_gains(turn.rtc, record.n_modes)
-        of_other = why_worthless(turn.state, record.judged, gains)
+        of_other = worth.why_worthless(turn.state, record.judged, gains)
         turn.state = replace(
             turn.state,
             margin=None if of_other else record.gate,
@@ -288,13 +280,14 @@ def on_acknowledgement(turn: Turn, event: Acknowledgement) -> None:
         turn.warn("reconstructor.rejected", f"the RTC rejected {record.id}: {event.reason}")
 
 
-def on_fetched(turn: Turn, record: ReconstructorRecord) -> None:
+def on_fetched(turn: Turn, fetched: ev.MatrixFetched) -> None:
     """Keep the matrix the RTC uses, which the service did not make, or find its own again.
 
     Ids are not enough: an RTC that starts anew may list its slopes otherwise, and hold the matrix
     of an id that is known as it needs it then.
     """
     not_fetched(turn, "")
+    record = fetched.record
     known = turn.state.reconstructor(record.id)
     if known is not None and known.sha256 not in {"", record.sha256}:
         _distrust(turn, known, MatrixState.APPLIED, record.sha256)
@@ -317,7 +310,7 @@ def use_named(turn: Turn, matrix_id: str) -> None:
     if record is None or why_unread(turn.state, matrix_id):
         return
     use(turn, matrix_id)
-    if record.state in {*_SENT, MatrixState.FAILED}:
+    if record.on_its_way or record.state is MatrixState.FAILED:
         turn.calm(NOT_ACKNOWLEDGED)
     if record.state is MatrixState.FAILED:
         text = f"{matrix_id} is in use after all, by the RTC's status; nobody acknowledged it"
@@ -343,7 +336,7 @@ def on_margin(turn: Turn, event: ev.MarginJudged) -> None:
         return
     used = event.id == turn.state.in_use
     gains = () if turn.rtc is None else turn.rtc.gains[: record.n_modes]
-    if judged is not None and why_worthless(turn.state, judged, gains) is not None:
+    if judged is not None and worth.why_worthless(turn.state, judged, gains) is not None:
         if used:
             judge_again(turn)
         return
@@ -427,9 +420,8 @@ def why_unsendable(state: TrackerState, record: ReconstructorRecord) -> str | No
 
 def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether the very numbers of this reconstructor have been in use before."""
-    used = {MatrixState.APPLIED, MatrixState.SUPERSEDED}
-    same = (r for r in state.reconstructors if r.sha256 == record.sha256 and r.state in used)
-    return bool(record.sha256) and any(same)
+    same = (r for r in state.reconstructors if r.sha256 == record.sha256)
+    return bool(record.sha256) and any(r.was_used for r in same)
 
 
 def _may_follow(state: TrackerState) -> bool:
@@ -439,7 +431,7 @@ def _may_follow(state: TrackerState) -> bool:
         return False
     if forbidding(state, Act.DECIDE) is not None:
         return False
-    return known is not None and settled(known)
+    return known is not None and worth.settled(known)
 
 
 def _beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
@@ -453,21 +445,20 @@ def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
     known, began_ns = state.registration, state.making_since_ns_utc
     if known is None or known.jumped_ns_utc is None or began_ns is None:
         return False
-    return known.jumped_ns_utc >= began_ns and outdated(state, record)
+    return known.jumped_ns_utc >= began_ns and worth.outdated(state, record)
 
 
 def _why_unjudged(record: ReconstructorRecord) -> str:
     """Return why the gate has said nothing of one on its way to the RTC; empty: it has."""
-    on_its_way = {MatrixState.PROPOSED, MatrixState.PUBLISHED, MatrixState.STAGED}
-    return record.reason if record.gate is None and record.state in on_its_way else ""
+    going = record.on_its_way or record.state is MatrixState.PROPOSED
+    return record.reason if record.gate is None and going else ""
 
 
 def _meant(state: TrackerState, event: Acknowledgement) -> ReconstructorRecord | None:
     """Return which reconstructor is acknowledged: a commit nobody could read was the last one."""
     if event.id is not None:
         return state.reconstructor(event.id)
-    sent = {MatrixState.PUBLISHED, MatrixState.STAGED}
-    return next((r for r in reversed(state.reconstructors) if r.state in sent), None)
+    return next((r for r in reversed(state.reconstructors) if r.on_its_way), None)
 
 
 def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledgement) -> bool:

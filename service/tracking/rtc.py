@@ -4,35 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service.tracking import alarms, dither, reconstructors, validity
 from service.tracking import events as ev
-from service.tracking.alarms import (
-    LOOP_OPEN,
-    MIRROR_SILENT,
-    NOT_ACKNOWLEDGED,
-    OTHER_BASIS,
-    OTHER_SUM,
-    SECOND_RTC,
-    SECOND_SERVICE,
-    STANDING_BY,
-    VANISHED,
-)
-from service.tracking.dither import drop, follow_status, forget_unwanted, found_again
 from service.tracking.events import Effect
 from service.tracking.loop import loop_numbers, same_loop, same_numbers, why_open
 from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
-from service.tracking.reconstructors import (
-    change_state,
-    forget_session,
-    judge_again,
-    made_none,
-    not_fetched,
-    use_named,
-)
 from service.tracking.state import AcquisitionStage
 from service.tracking.turn import Turn, tell_bursts
-from service.tracking.validity import end_alarm, forget, forget_bias, point, unconfirm, void
 from service.wire import DitherRequest, DitherStop, Status
 
 ACKNOWLEDGE_WITHIN_S = 3.0
@@ -41,34 +21,32 @@ ACKNOWLEDGE_WITHIN_S = 3.0
 FORGOTTEN_AFTER_S = 15.0
 """An alarm the link repeats while it lasts is over after this much silence."""
 
-_RENEWED = (SECOND_RTC, OTHER_BASIS)
+_RENEWED = (alarms.SECOND_RTC, alarms.OTHER_BASIS)
 
 _SAME_LINE_HZ = 2.5
 
 COMPUTE_WITHIN_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
 
-_SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
-
 
 def on_tick(turn: Turn) -> None:
     """Give up what has been waited for too long."""
     for record in turn.state.reconstructors:
         sent_ns = record.published_ns_utc or turn.now_ns
-        if record.state in _SENT and turn.now_ns - sent_ns > ACKNOWLEDGE_WITHIN_S * SECOND_NS:
+        if record.on_its_way and turn.now_ns - sent_ns > ACKNOWLEDGE_WITHIN_S * SECOND_NS:
             text = (
                 f"{record.id} was not applied within {ACKNOWLEDGE_WITHIN_S:.0f} s; the RTC keeps "
                 "the old one: look at the RTC's log, then publish again"
             )
-            change_state(turn, record.id, MatrixState.FAILED, text)
-            turn.alarm(NOT_ACKNOWLEDGED, text)
+            reconstructors.change_state(turn, record.id, MatrixState.FAILED, text)
+            turn.alarm(alarms.NOT_ACKNOWLEDGED, text)
     for alarm in turn.state.alarms:
         silent_ns = turn.now_ns - alarm.seen_ns_utc
         if alarm.name in _RENEWED and silent_ns > FORGOTTEN_AFTER_S * SECOND_NS:
-            end_alarm(turn, alarm.name)
+            validity.end_alarm(turn, alarm.name)
     since_ns = turn.state.making_since_ns_utc
     if since_ns is not None and turn.now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
-        made_none(turn)
+        reconstructors.made_none(turn)
         text = f"no reconstructor came within {COMPUTE_WITHIN_S:.0f} s"
         turn.warn("reconstructor.lost", text)
     tell_bursts(turn)
@@ -77,34 +55,34 @@ def on_tick(turn: Turn) -> None:
 def on_status(turn: Turn, rtc: Status) -> None:
     """Take over what the RTC says of itself."""
     before, known = turn.rtc, turn.known
-    turn.calm(VANISHED)
+    turn.calm(alarms.VANISHED)
     if before is not None and not same_loop(before, rtc):
         # the margin is not what it was
-        judge_again(turn)
+        reconstructors.judge_again(turn)
     bias = None if known is None else known.bias
     if bias is not None and bias.looked_ns_utc and not same_numbers(bias.loop, loop_numbers(rtc)):
         # it was learnt in another loop, in whichever session
-        forget_bias(turn)
+        validity.forget_bias(turn)
     turn.state = replace(
         turn.state,
         rtc=rtc,
         basis_id=turn.state.basis_id or rtc.basis_id,
         config_id=turn.state.config_id or rtc.config_id,
     )
-    point(turn, rtc.pointing)
+    validity.point(turn, rtc.pointing)
     _drop_other_basis(turn)
     _tell_of_gains(turn, before, rtc)
     if rtc.cm_id is not None:
-        use_named(turn, rtc.cm_id)
+        reconstructors.use_named(turn, rtc.cm_id)
     measuring, acquisition = turn.state.measuring, turn.acquisition
     opened = acquisition.under_way or (measuring is not None and measuring.opens_loop)
     # its alarm tells more, and not to close the loop on any matrix
     opened = opened or acquisition.stage is AcquisitionStage.INTERRUPTED
     if not rtc.in_loop and not opened:
-        turn.alarm(LOOP_OPEN, f"{why_open(rtc)}: close it to calibrate")
+        turn.alarm(alarms.LOOP_OPEN, f"{why_open(rtc)}: close it to calibrate")
     else:
-        turn.calm(LOOP_OPEN)
-    follow_status(turn, rtc)
+        turn.calm(alarms.LOOP_OPEN)
+    dither.follow_status(turn, rtc)
 
 
 def hear_vibrations(turn: Turn, event: ev.Vibrations) -> None:
@@ -131,7 +109,7 @@ def _drop_other_basis(turn: Turn) -> None:
     if known is None or known.basis_id is None or known.config_id is None:
         return
     if (known.basis_id, known.config_id) != (state.basis_id, state.config_id):
-        forget(turn)
+        validity.forget(turn)
         text = (
             f"α was measured with {known.basis_id}, {known.config_id}; the RTC has "
             f"{state.basis_id}, {state.config_id}"
@@ -139,60 +117,60 @@ def _drop_other_basis(turn: Turn) -> None:
         turn.log("registration.void", text)
 
 
-def on_new_session(turn: Turn, session: str) -> None:
+def on_new_session(turn: Turn, started: ev.SessionStarted) -> None:
     """Void what belonged to the old session; α is the telescope's and stays, to be confirmed."""
-    forget_session(turn)
-    void(turn, "the RTC was in another session")
-    drop(turn)
+    reconstructors.forget_session(turn)
+    validity.void(turn, "the RTC was in another session")
+    dither.drop(turn)
     end_ramp(turn)
-    unconfirm(turn)
+    validity.unconfirm(turn)
     turn.retry_all()
     turn.state = replace(turn.state, rtc=None)
-    found_again(turn)
-    turn.calm(MIRROR_SILENT)
-    forget_unwanted(turn)
-    turn.calm(OTHER_SUM)
-    turn.log("rtc.session", f"the RTC started session {session}")
+    dither.found_again(turn)
+    turn.calm(alarms.MIRROR_SILENT)
+    dither.forget_unwanted(turn)
+    turn.calm(alarms.OTHER_SUM)
+    turn.log("rtc.session", f"the RTC started session {started.session}")
 
 
-def on_vanished(turn: Turn) -> None:
+def on_vanished(turn: Turn, _: ev.RtcVanished) -> None:
     """Forget what belonged to the RTC, and nothing else."""
-    drop(turn)
+    dither.drop(turn)
     turn.state = replace(turn.state, rtc=None)
-    found_again(turn)
-    forget_unwanted(turn)
+    dither.found_again(turn)
+    dither.forget_unwanted(turn)
     text = (
         "the RTC's token is gone: it has ended, stood still for over 2 s or lost the network; α "
         "and every reconstructor are kept; it comes back by itself if it runs, else restart it"
     )
-    turn.alarm(VANISHED, text)
+    turn.alarm(alarms.VANISHED, text)
 
 
 def on_services(turn: Turn, event: ev.ServicesMet) -> None:
     """Stand by while another service drives the RTC, or say that one stands by."""
     who = " and ".join(event.others)
-    stood_by = any(alarm.name == STANDING_BY for alarm in turn.state.alarms)
+    stood_by = any(alarm.name == alarms.STANDING_BY for alarm in turn.state.alarms)
     if not event.others:
-        turn.calm(SECOND_SERVICE)
+        turn.calm(alarms.SECOND_SERVICE)
     else:
         does = "drives the RTC" if event.drives else "stands by"
         text = (
             f"more than one service of system {turn.state.system}: beside this one, which {does}, "
             f"{who}: end all but one"
         )
-        turn.alarm(SECOND_SERVICE, text)
+        turn.alarm(alarms.SECOND_SERVICE, text)
     if not event.drives:
-        drop(turn)
+        dither.drop(turn)
         text = (
             f"another service drives the RTC: {who}; this one asks and sends nothing until that "
             "one has gone: end one of them"
         )
-        turn.alarm(STANDING_BY, text)
+        turn.alarm(alarms.STANDING_BY, text)
         return
     if stood_by:
         text = "the service that drove the RTC has gone: this one drives it from now on"
         turn.warn("service.takes-over", text)
-    turn.calm(STANDING_BY)
+    turn.calm(alarms.STANDING_BY)
 
 
 def on_failure(turn: Turn, effect: Effect, text: str) -> None:
@@ -200,16 +178,16 @@ def on_failure(turn: Turn, effect: Effect, text: str) -> None:
     match effect:
         case ev.MakeMatrix() | ev.CopyMatrix():
             turn.put_off(make_s=5.0)
-            made_none(turn)
+            reconstructors.made_none(turn)
         case ev.Ask(request=DitherRequest()):
             turn.put_off(dither_s=5.0)
-            drop(turn)
+            dither.drop(turn)
         case ev.Ask(request=DitherStop()):
             pass  # it is asked again while it must be; nothing else has to wait for that
         case ev.FetchMatrix():
-            not_fetched(turn, text)
+            reconstructors.not_fetched(turn, text)
         case ev.SendMatrix(id=matrix_id):
-            change_state(turn, matrix_id, MatrixState.FAILED, text)
+            reconstructors.change_state(turn, matrix_id, MatrixState.FAILED, text)
         case _:
             turn.put_off(make_s=5.0)
     turn.warn("job.failed", text)

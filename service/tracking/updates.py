@@ -33,8 +33,6 @@ JUDGE_AGAIN_S = 2.0
 NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 """A move of α that calls for a look at once (numeric units), if it is more than 1 σ."""
 
-_SENT = (MatrixState.PUBLISHED, MatrixState.STAGED)
-
 
 def fetch_in_use(turn: Turn) -> None:
     """Ask for the matrix in use until it was had once in this session."""
@@ -113,7 +111,7 @@ def _busy(state: TrackerState) -> bool:
     In auto nobody is going to decide on a proposal left from another mode or an absent RTC.
     """
     return any(
-        r.state in _SENT
+        r.on_its_way
         or (
             r.state is MatrixState.PROPOSED
             and state.mode is not Mode.AUTO

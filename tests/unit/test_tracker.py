@@ -1,19 +1,21 @@
 """Whole stories: what the service does, event after event, as a pure function of them."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.tracker import step
+from service.tracker import REACTIONS, step
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.events import Event
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode, TrackerState
 from service.wire import DitherRequest
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
-    START_NS,
     Story,
     dither_answered,
     moved,
@@ -154,6 +156,5 @@ def test_a_command_that_is_refused_changes_nothing():
     assert story.state.mode is Mode.PROPOSE
 
 
-def test_something_that_is_no_event_is_a_programming_error():
-    with pytest.raises(TypeError, match="does not know"):
-        step(TrackerState(system="flao"), object(), POLICY, START_NS)
+def test_there_is_a_reaction_to_every_event_and_command_and_to_nothing_else():
+    assert set(REACTIONS) == set(get_args(Event))

@@ -40,7 +40,7 @@ function rtcLine(state, fresh) {
   const rtc = state?.rtc;
   if (!fresh || !state) return `RTC ${DASH}`;
   if (!rtc) return "waiting for the RTC's status";
-  return `RTC ${number(rtc.frame_rate_hz, 0)} Hz, ${number(rtc.delay_frames, 1).replace(/\.0$/, "")} frames delay, ${state.link.frames_lost} lost`;
+  return `RTC ${number(rtc.frame_rate_hz, 0)} Hz, ${state.link.frames_lost} lost`;
 }
 
 // A banner across the page while nothing new comes.
@@ -96,7 +96,8 @@ export function showLoop(service, mirror) {
   root.classList.toggle("old", !fresh || !rtc);
   const expected = state?.assessment?.id === state?.in_use ? state?.assessment?.expected : null;
   const gains = (state?.registration?.optical_gains ?? []).map((g) => g.gain);
-  put($("#loop-state"), rtc ? `${rtc.loop}, ${rtc.n_controlled} of ${rtc.n_modes} modes` : DASH);
+  const delay = rtc ? number(rtc.delay_frames, 1).replace(/\.0$/, "") : DASH;
+  put($("#loop-state"), rtc ? `${rtc.loop}, ${rtc.n_controlled} of ${rtc.n_modes} modes, ${delay} frames delay` : DASH);
   put($("#wavefront"), expected ? `${nanometres(expected.wavefront_m)}, and ${nanometres(expected.loss_m)} lost by the matrix in use` : DASH);
   put($("#optical-gain"), gains.length ? `${number(Math.min(...gains))} to ${number(Math.max(...gains))}, ${gains.length} modes` : DASH);
   const judged = margin(state?.margin);

@@ -4,7 +4,7 @@
 import { colour } from "./scheme.js";
 import { make } from "./words.js";
 
-const STROKES = ["accent", "tolerance", "quiet"];
+const STROKES = ["accent", "tolerance", "quiet", "text"];
 
 // Lines over their common x: each {name, values, dots}; "log" for a logarithmic y. Draws again what it has drawn before.
 export class Lines {

@@ -45,7 +45,9 @@ export class Glance {
     const ids = new Set(roles.map(([, { id }]) => id));
     for (const id of this.#singular.keys()) if (!ids.has(id)) this.#singular.delete(id);
     for (const id of ids) if (!this.#singular.has(id)) this.#readSingular(id);
-    const shown = roles.map(([name, { id }]) => ({ name, values: this.#singular.get(id) })).filter((line) => line.values);
+    const shown = roles.map(([name, { id }]) => ({ name, values: this.#singular.get(id)?.values })).filter((line) => line.values);
+    const nominal = this.#singular.get(roles[0]?.[1].id)?.nominal;
+    if (shown.length && nominal) shown.push({ name: "nominal", values: nominal });
     const told = JSON.stringify(roles.map(([name, { id }]) => [name, id, Boolean(this.#singular.get(id))]));
     if (!shown.length || told === this.told) return;
     this.told = told;
@@ -60,7 +62,7 @@ export class Glance {
   async #readSingular(id) {
     this.#singular.set(id, null); // asked for
     try {
-      this.#singular.set(id, (await this.#service.get(`v1/reconstructors/${encodeURIComponent(id)}/singular-values`, "default")).values);
+      this.#singular.set(id, await this.#service.get(`v1/reconstructors/${encodeURIComponent(id)}/singular-values`, "default"));
     } catch {
       setTimeout(() => this.#singular.delete(id), GAINS_MS); // then it is asked for again
     }

@@ -13,7 +13,7 @@ from service.errors import UnknownIdError
 from service.files.drawn import as_maps
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
-from service.model.slopes import slopes_of, to_conventions, turned_mask
+from service.model.slopes import to_conventions, turned_mask
 from service.routes.numbers import MatrixId
 from service.routes.problems import INVALID, UNKNOWN, problem_response
 from service.routes.views import ServiceDep, answer, shows, view
@@ -32,6 +32,10 @@ class SingularValues:
     values: list[float]
     """One over each singular value of the reconstructor, largest first, slope per metre OPD: those
     of the interaction matrix it inverts, where none were left out."""
+
+    nominal: list[float] | None
+    """Of the model's interaction matrix of as many modes, the mirror where the instrument file has
+    it; null: the model is being prepared."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,17 +66,30 @@ SLOPES = view("SlopeMapsView", SlopeMaps)
 async def singular_values(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the singular values that a reconstructor stands for."""
     matrix = await run_in_threadpool(service.matrix, matrix_id)
-    values = await run_in_threadpool(_inverted, matrix)
-    found = answer(SingularValues(id=matrix_id, values=[float(f"{v:.4g}") for v in values]))
-    found.headers["Cache-Control"] = "private, max-age=86400"  # an id is never reused
+    known = service.description
+    products = None if known is None else known.products
+    found = answer(await run_in_threadpool(_singular_values, matrix_id, matrix, products))
+    if products is not None:
+        found.headers["Cache-Control"] = "private, max-age=86400"  # an id is never reused
     return found
 
 
-def _inverted(matrix: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return one over each singular value that is not lost in rounding."""
+def _singular_values(
+    matrix_id: str, matrix: NDArray[np.float32], products: NDArray[np.float32] | None
+) -> SingularValues:
+    """Return those that are not lost in rounding, of a reconstructor and of as many modes."""
     numbers = matrix.astype(np.float64)
     power = np.linalg.eigvalsh(numbers @ numbers.T)
-    return np.asarray(power[power > power[-1] * 1e-13] ** -0.5)
+    inverted = power[power > power[-1] * 1e-13] ** -0.5
+    nominal = None
+    if products is not None:
+        modelled = np.linalg.eigvalsh(products[: len(matrix), : len(matrix)].astype(np.float64))
+        nominal = _rounded(np.sqrt(np.maximum(modelled[::-1], 0.0)))
+    return SingularValues(id=matrix_id, values=_rounded(inverted), nominal=nominal)
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [float(f"{value:.4g}") for value in values]
 
 
 @router.get(
@@ -89,10 +106,11 @@ async def slopes(service: ServiceDep) -> Response:
 
 def _maps(block: FrameBlock, instrument: Instrument) -> SlopeMaps:
     valid = rtc_valid_subapertures(instrument)
-    recipe, orientation = instrument.slopes, instrument.slopes.assumed_orientation
-    ours = slopes_of(to_conventions(block.slopes.T, recipe.order, orientation, valid), recipe.kind)
-    rms = np.sqrt(np.mean(np.square(ours, dtype=np.float64), axis=-1)).reshape(-1)
-    maps = np.round(as_maps(rms, turned_mask(valid, orientation)), 4)
+    orientation = instrument.slopes.assumed_orientation
+    rms = np.sqrt(np.mean(np.square(block.slopes, dtype=np.float64), axis=0))
+    # a sign has no part in an RMS
+    ours = np.abs(to_conventions(rms, instrument.slopes.order, orientation, valid))
+    maps = np.round(as_maps(ours, turned_mask(valid, orientation)), 4)
     return SlopeMaps(
         t_ns_utc=block.t0_ns_utc,
         n_frames=block.n_frames,

@@ -168,7 +168,7 @@ def with_rtc(streams: Streams, rtc: Status | None) -> Streams:
     )
     if before is None or not same_rate(before.frame_rate_hz, rtc.frame_rate_hz):
         streams = replace(streams, cutter=None, dither=None)
-        monitor = VibrationMonitor.begin(rtc.n_slopes, streams.description.kind)
+        monitor = VibrationMonitor.begin(rtc.n_slopes)
         return replace(streams, vibrations=monitor, passive=memory)
     return _cut(replace(streams, passive=memory), rtc)
 
@@ -290,7 +290,7 @@ def with_dither(streams: Streams, dither: Dither | None, window_s: float) -> Str
         streams,
         cutter=cutter,
         dither=dither,
-        meter=Meter(asked=asked_of(dither, rtc, streams.description.mode_response)),
+        meter=Meter(asked=asked_of(dither, rtc, streams.description.products)),
         played=None,
         dither_seen_seq=seen_seq,
         dither_silent_s=0.0,

@@ -226,6 +226,11 @@ class Supervisor:
             for work in (self._listen, self._tick, self._fit, self._watch):
                 group.create_task(work())
 
+    @property
+    def description(self) -> Description | None:
+        """What the model expects of telemetry; None: it is being prepared."""
+        return None if self._engine.streams is None else self._engine.streams.description
+
     async def _described(self) -> Description:
         """Return what the model expects of telemetry; a worker that dies is replaced."""
         for _ in range(DESCRIBE_ATTEMPTS - 1):

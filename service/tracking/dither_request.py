@@ -181,13 +181,16 @@ def lock_in_plan(dither: Dither, rtc: Status, window_s: float) -> LockInPlan:
     )
 
 
-def asked_of(dither: Dither, rtc: Status, response: NDArray[np.float64] | None = None) -> Asked:
+def asked_of(dither: Dither, rtc: Status, products: NDArray[np.float32] | None = None) -> Asked:
     """Return a dither as the frames should hold it.
 
-    ``response`` ``(n_modes,)`` is what ``Description`` has; None: nobody knows what it should show.
+    ``products`` is what ``Description`` has; None: nobody knows what the slopes should show.
     """
     first_seq, request = dither.start_seq or 0, dither.request
-    known = () if response is None else tuple(response[list(request.modes)].tolist())
+    modes = list(request.modes)
+    response: tuple[float, ...] = ()
+    if products is not None and max(modes) < len(products):
+        response = tuple(products[modes, modes].tolist())
     return Asked(
         modes=request.modes,
         amplitude_m=request.amplitude_m,
@@ -196,7 +199,7 @@ def asked_of(dither: Dither, rtc: Status, response: NDArray[np.float64] | None =
         first_seq=first_seq,
         stop_seq=first_seq + round(request.duration_s * rtc.frame_rate_hz),
         own=tuple(mode not in rtc.in_loop for mode in request.modes),
-        response=known,
+        response=response,
     )
 
 

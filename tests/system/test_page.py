@@ -157,6 +157,7 @@ def test_on_a_narrow_screen_all_fits_and_state_comes_first(page):
 def test_on_a_wide_screen_nothing_is_scrolled_for(page):
     page.open()
     proposal(page)
+    assert page.js("document.querySelector('header').offsetHeight") < 50, "one row"
     assert page.js("document.documentElement.scrollHeight") <= WIDE[1]
     assert page.js("document.querySelector('#events').getBoundingClientRect().bottom") <= WIDE[1]
 

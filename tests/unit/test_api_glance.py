@@ -1,5 +1,7 @@
 """Singular values and slopes over real HTTP messages, with a hand-written service behind them."""
 
+from types import SimpleNamespace
+
 import httpx
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ class FakeService:
     def __init__(self):
         self.instrument = packaged_instrument("flao-lbt")
         self.newest_frames = None
+        self.description = None
         self.interaction = np.random.default_rng(3).normal(size=(12, 4)) * [1e7, 5e6, 2e6, 4e5]
 
     def matrix(self, matrix_id):
@@ -43,6 +46,12 @@ async def test_singular_values_are_those_of_the_matrix_it_inverts(client, servic
     response = await client.get("/v1/reconstructors/cm-1/singular-values")
     expected = np.linalg.svd(service.interaction, compute_uv=False)
     assert response.json()["values"] == pytest.approx(expected, rel=1e-3)
+    assert response.json()["nominal"] is None
+    nominal = np.random.default_rng(4).normal(size=(12, 6)).astype(np.float32)
+    service.description = SimpleNamespace(products=nominal.T @ nominal)
+    response = await client.get("/v1/reconstructors/cm-1/singular-values")
+    expected = np.linalg.svd(nominal[:, :4], compute_uv=False)
+    assert response.json()["nominal"] == pytest.approx(expected, rel=1e-3)
     assert "max-age" in response.headers["cache-control"], "it never changes"
     unknown = await client.get("/v1/reconstructors/cm-2/singular-values")
     assert_problem(unknown, 404, "unknown-id", "cm-2")

@@ -13,6 +13,7 @@ html_theme_options = {
     "font_family": "system-ui, sans-serif",
     "head_font_family": "system-ui, sans-serif",
 }
+templates_path = ["templates"]
 html_static_path = ["manual.css"]
 html_css_files = ["manual.css"]
 html_copy_source = False

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import time
 import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 
-from service.commands.terminal import say
-from service.errors import ConfigurationError
+from service.commands.terminal import login, say
+from service.errors import ArchiveError, ConfigurationError
 from service.keys import KeyFile, KeyScope
 
 DONE = 0
@@ -35,10 +36,12 @@ def main(options: argparse.Namespace) -> int:
     file = KeyFile(data_dir(options))
     if options.action == "add":
         secret = file.add(options.name, KeyScope(options.scope))
+        _recorded(file, "key.added", f"{options.name} may {options.scope}")
         say(f"{file.path}: {options.name} may {options.scope}; this is the key, shown only now:")
         print(secret)
     elif options.action == "revoke":
         file.revoke(options.name)
+        _recorded(file, "key.revoked", options.name)
         say(f"{file.path}: the key of {options.name} is worthless from now on")
     else:
         keys = file.all()
@@ -48,6 +51,28 @@ def main(options: argparse.Namespace) -> int:
         if not keys:
             say(f"{file.path}: no keys; {_WITHOUT[file.path.exists()]}")
     return DONE
+
+
+def _recorded(file: KeyFile, name: str, text: str) -> None:
+    """Write into the audit trail, beside a service that may be running, what was done.
+
+    Before the first start of a service there is no trail. What the disk refuses is only said: what
+    was done is done.
+    """
+    path = file.path.with_name("index.sqlite")
+    if not path.is_file():
+        return
+    from service.archive.index import AuditEntry, Index
+
+    index, now_ns = Index(path), time.time_ns()
+    try:
+        index.open()
+        entry = AuditEntry(t_ns_utc=now_ns, who=login(), name=name, text=text, whence="cli")
+        index.record((), (entry,))
+    except ArchiveError as error:
+        say(f"pyrcal: the audit trail does not have it: {error}")
+    finally:
+        index.close()
 
 
 def data_dir(options: argparse.Namespace) -> Path:

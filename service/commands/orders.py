@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import getpass
 import sys
 import time
 import uuid
@@ -13,7 +12,7 @@ from urllib.parse import quote
 from service.commands.reading import reconstructor_lines, understood
 from service.commands.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request, named
 from service.commands.rest import Document, Service
-from service.commands.terminal import print_document, print_lines, say
+from service.commands.terminal import login, print_document, print_lines, say
 from service.errors import ConfigurationError, shown
 
 LOOK_S = 0.5
@@ -63,7 +62,7 @@ def carry_out(service: Service, request: Request, options: argparse.Namespace) -
         return NOT_DONE
     if request.method == "POST":
         headers["Idempotency-Key"] = str(uuid.uuid4())
-    who = _login() if options.who is None else options.who
+    who = login() if options.who is None else options.who
     given = named(options, request.body.split())
     body = {**given, **request.always, "reason": why, "by": who}
     answer = service.order(request.method, path_of(request.path, options), body, headers).document
@@ -132,19 +131,12 @@ def _asked(request: Request, question: str, option: str) -> str:
     return sys.stdin.readline().strip()
 
 
-def _login() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a container may run under a number that has no name
-        return ""
-
-
 def _follow(service: Service, request: Request, options: argparse.Namespace) -> int:
     """Show how far it is until it has ended; return the exit status."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    console = Console(stderr=True)
+    console, n_looks = Console(stderr=True), 0
     columns = (
         SpinnerColumn(),
         TimeElapsedColumn(),
@@ -156,7 +148,7 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
         with Progress(*columns, console=console, transient=True) as bar:
             task = bar.add_task("", total=None)
             while True:
-                document = _looked_at(service, request, options)
+                document, n_looks = _looked_at(service, request, options), n_looks + 1
                 lasted_s = time.monotonic() - began_s
                 with understood(service):
                     step = _step(document, lasted_s)
@@ -174,7 +166,7 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
         raise
     if options.json:
         print_document(document)
-    else:
+    elif n_looks > 1 or not step.well:  # else the answer has said so
         print_lines([step.text])
     return DONE if step.well else NOT_DONE
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,6 +14,14 @@ from service.errors import shown
 def say(line: str) -> None:
     """Tell the user something beside the answer."""
     sys.stderr.write(f"{shown(line)}\n")
+
+
+def login() -> str:
+    """Return the login name; empty: there is none."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container may run under a number that has no name
+        return ""
 
 
 def show_progress(step: str) -> None:
@@ -42,8 +51,8 @@ def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def clock(utc: str | None) -> str:
-    """Return a time of REST as people read it at night: UTC, to the second."""
-    return "?" if utc is None else f"{utc[:10]} {utc[11:19]}"
+    """Return a time of REST as people read it at night: to the second, Z for UTC."""
+    return "?" if utc is None else f"{utc[:10]} {utc[11:19]}Z"
 
 
 def span(seconds: float) -> str:

@@ -10,7 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from service.__main__ import main
+from service.archive import Archive
 from service.commands import key as key_command
+from service.commands.terminal import login
 from service.config import Settings
 from service.errors import ConfigurationError, UnknownIdError
 from service.keys import KeyFile, KeyScope, is_loopback
@@ -150,6 +152,17 @@ def test_keys_are_made_listed_and_revoked(capsys, tmp_path):
     assert (told.out, "nobody may ask" in told.err) == ("", True)
     assert main(["key", "revoke", "ada"]) == 2
     assert "no such key" in capsys.readouterr().err
+
+
+def test_the_audit_trail_of_a_service_that_runs_has_who_made_and_revoked_a_key(tmp_path):
+    with Archive(tmp_path / "var") as archive:
+        archive.open()
+        assert main(["key", "add", "ada", "--scope", "operate"]) == 0
+        assert main(["key", "revoke", "ada"]) == 0
+        made, revoked = archive.audit_trail()
+    assert (made.name, made.text, made.whence) == ("key.added", "ada may operate", "cli")
+    assert (revoked.name, revoked.text) == ("key.revoked", "ada")
+    assert made.who == login()
 
 
 def test_keys_are_where_the_service_looks_for_them(monkeypatch, tmp_path, capsys):

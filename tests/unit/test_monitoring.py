@@ -19,6 +19,7 @@ from tests.unit.test_house import ROOT
 
 __all__ = ["archive", "client", "service"]  # fixtures
 
+SCRAPED = (ROOT / "deploy" / "prometheus.yml").read_text(encoding="utf-8")
 RULES = yaml.safe_load((ROOT / "deploy" / "alerts.yml").read_text(encoding="utf-8"))
 BOARD = json.loads((ROOT / "deploy" / "grafana.json").read_text(encoding="utf-8"))
 EXPRESSIONS = {
@@ -222,3 +223,11 @@ def test_what_alpha_is_worth_is_a_label_of_a_rule():
     assert {Validity.STALE, Validity.INVALID} == set(
         re.search(r'validity=~"([^"]+)"', rule)[1].split("|")
     )
+
+
+def test_what_prometheus_is_told_has_its_key_in_two_lines_more():
+    (plain,) = yaml.safe_load(SCRAPED)["scrape_configs"]
+    assert "authorization" not in plain
+    with_key = SCRAPED.replace("# authorization", "authorization").replace("#   cred", "  cred")
+    (keyed,) = yaml.safe_load(with_key)["scrape_configs"]
+    assert keyed == {**plain, "authorization": {"credentials_file": "pyrcal.key"}}

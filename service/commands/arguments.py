@@ -41,7 +41,7 @@ def command_line() -> argparse.ArgumentParser:
         choices=("bash", "zsh", "fish", "tcsh"),
         help="print what teaches a shell these words: source <(pyrcal --completion bash)",
     )
-    commands = parser.add_subparsers(dest="command", required=True)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _describe_run(commands.add_parser("run", help="the service"))
     declare(commands)
     _describe_key(commands.add_parser("key", help="who may ask: make, list, revoke API keys"))

@@ -88,7 +88,7 @@ def _alpha(document: Document) -> Iterator[str]:
     yield from registration_lines(document)
     yield f"last telemetry in it {span(document['age_s'])} ago, of {document['n_windows']} windows"
     if document["valid_until_utc"]:
-        yield f"valid until {clock(document['valid_until_utc'])} UTC"
+        yield f"valid until {clock(document['valid_until_utc'])}"
 
 
 def _alarms(state: Document) -> Iterator[str]:
@@ -101,9 +101,9 @@ def _alarms(state: Document) -> Iterator[str]:
         yield f"    {alarm['text']}"
     for note in muted:
         who, until = note["muted"]["by"] or "nobody named", clock(note["muted"]["until_utc"])
-        yield f"{note['name']} is muted until {until} UTC by {who}"
-    many = f"{len(lasting)} alarms" if lasting else "no alarm lasts"
-    yield f"{many}, {len(gone)} gone unseen, {len(muted)} muted"
+        yield f"{note['name']} is muted until {until} by {who}"
+    counts = ((lasting, "to be seen to"), (gone, "over, unseen"), (muted, "muted"))
+    yield ", ".join(f"{len(some)} {word}" for some, word in counts if some) or "no alarm lasts"
 
 
 def _audit(document: Document) -> Iterator[str]:

@@ -16,7 +16,9 @@ _ALPHA = {
 def status_lines(state: Document) -> list[str]:
     """Return the screen: first whether all is well and what is not, then what there is."""
     ready = "ready" if state["ready"] else f"NOT READY: {state['ready_reason']}"
-    lines = [f"{state['system']}, mode {state['mode']}, up {span(state['uptime_s'])}: {ready}"]
+    does, up = state["operating"], span(state["uptime_s"])
+    doing = f"{does['operation']}, {does['occupation']}"
+    lines = [f"{state['system']}: {doing}; mode {state['mode']}, up {up}: {ready}"]
     lines += [f"ALARM {alarm_line(alarm, state)}" for alarm in worst_first(state)]
     gone = ", ".join(alarm["name"] for alarm in state["stale_alarms"])
     lines += [f"gone, and nobody has acknowledged: {gone}; pyrcal alarms has them"] if gone else []

@@ -174,7 +174,7 @@ def screen(heard: Latest, now_s: float) -> Group:
         head = Text(shown(f"DISCONNECTED: {lost}; trying again{old}"), style="bold white on red")
     try:
         told = [] if heard.state is None else status_lines(_aged(heard.state, age_s))
-        log = [(_of_log(line), _LEVELS.get(line["level"], "")) for line in reversed(heard.log)]
+        log = [(_of_log(line)[11:], _LEVELS.get(line["level"], "")) for line in reversed(heard.log)]
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         told, log = [f"NOT this version of pyrcal: {error!r}"], []
     return Group(

@@ -246,7 +246,10 @@ def test_every_screen_is_there_and_json_is_what_rest_answers(capsys, service):
         (["reconstructors"], "cm-1   proposed    400 modes"),
         (["reconstructors", "in-use"], "rtc-0: applied"),
         (["alarms"], "no status: look at it"),
-        (["audit", "--limit", "2"], "1970-01-01 00:00:02  Ada: Stop: a\\x1b[2Jb (because: clouds)"),
+        (
+            ["audit", "--limit", "2"],
+            "1970-01-01 00:00:02Z  Ada: Stop: a\\x1b[2Jb (because: clouds)",
+        ),
     ):
         assert main(words) == 0
         assert part in capsys.readouterr().out

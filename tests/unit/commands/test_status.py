@@ -35,7 +35,7 @@ def told(tracker=STATE, *, ready=True, **changes):
 
 def test_the_first_line_says_whether_it_is_ready_and_the_next_what_is_wrong():
     lines = status_lines(told())
-    assert lines[0] == "flao-lbt, mode propose, up 1 min 0 s: ready"
+    assert lines[0] == "flao-lbt: Operational, Tracking; mode propose, up 1 min 0 s: ready"
     assert lines[1] == "ALARM rtc.silent (warning) for 30 s: no status: look at it"
     assert status_lines(told(ready=False))[0].endswith("NOT READY: no RTC is there")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument, KarhunenLoeve, TabulatedModes
-from service.model.kinds import Normalisation, SlopeOrder
+from service.model.kinds import Normalisation
 from service.model.modes import ModalBasis, analytic_basis, mirror_surface
 from service.model.slopes import Orientation
 from service.prepared import Prepared, usual_folder
@@ -287,7 +287,7 @@ def check_supported(instrument: Instrument) -> None:
         ),
         "mirror.parity = -1": instrument.mirror.y_sign < 0,
         'wfs.input = "frames"': instrument.frames is not None,
-        f'slopes.order = "{slopes.order}"': slopes.order is not SlopeOrder.XY,
+        f'slopes.order = "{slopes.order}"': slopes.order is not slopes.kind.orders[0],
         "another slopes.orientation": slopes.assumed_orientation != Orientation(),
         f'slopes.normalisation = "{slopes.normalisation}"': (
             slopes.normalisation is not Normalisation.GLOBAL

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ConfigurationError
+from service.model.slopes import slopes_of
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.feed import BATCH_FRAMES, Background
 from sim_rtc.computer.telemetry import Batch, FrameClock
@@ -315,7 +316,7 @@ def _moment(telescope: Telescope, batch: Batch, frame: int) -> Moment:
     n = len(plant.valid)
     share = light.sum(axis=(0, 2))[plant.valid].mean() / 4
     maps = np.full((2, n, n), np.nan)
-    maps[:, plant.valid] = batch.slopes[0].reshape(2, -1)
+    maps[:, plant.valid] = slopes_of(batch.slopes[0], plant.slope_errors.kind)
     left_nm = (opd_m - plant.weights @ opd_m) * 1e9
     return Moment(
         frame=frame,

@@ -26,6 +26,7 @@ from service.fit.dialect import Dialect, of_reconstructor
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
+from service.model.slopes import likely_kind
 from service.prepared import Prepared, usual_folder
 
 KEPT, BROKEN = 0, 1
@@ -111,6 +112,7 @@ def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> Dialect | s
             return (
                 f"the matrix in use is {list(matrix.shape)}, {instrument.name} has "
                 f"{len(response)} slopes and {response.shape[1]} modes"
+                f"{likely_kind(matrix.shape[1], len(response))}"
             )
         dialect = of_reconstructor(
             matrix, instrument, basis, near=instrument.start, response=response

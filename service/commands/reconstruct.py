@@ -128,6 +128,11 @@ def _oriented(instrument: Instrument, known: KnownFit) -> Instrument:
     """Return the instrument with the slopes as the fit found them."""
     recipe = instrument.slopes
     if known.orientation is not None and known.order is not None:
+        if known.order.kind is not recipe.kind:
+            raise MatrixError(
+                f'{known.origin}: found a fit of slopes.kind = "{known.order.kind}"; expected '
+                f'"{recipe.kind}", as the instrument file says'
+            )
         recipe = replace(recipe, orientation=known.orientation, order=known.order)
     elif recipe.orientation is None:
         say(
@@ -164,7 +169,9 @@ def _recipe(options: argparse.Namespace, model: RtcInteractionModel) -> Recipe:
     if options.method == InversionMethod.MAP:
         prior = Prior(
             variance_m2=model.basis.variance_m2,
-            slope_noise=np.full(model.n_slopes, options.slope_noise),
+            slope_noise=np.full(
+                model.n_slopes, options.slope_noise * model.instrument.slopes.kind.noise
+            ),
         )
     return Recipe(
         n_modes=options.modes,

@@ -113,9 +113,13 @@ def _slopes(tables: InstrumentFile, path: Path) -> SlopeRecipe:
         flips = table.orientation.model_dump(exclude={"sign"})
         sign_x, sign_y = table.orientation.sign
         orientation = Orientation(**flips, sign_x=sign_x, sign_y=sign_y)
-    return SlopeRecipe(
-        order=table.order, orientation=orientation, normalisation=table.normalisation
-    )
+    orders = table.kind.orders
+    order = table.order or orders[0]
+    if order not in orders:
+        refuse(
+            f"{path}: slopes.order", f'{order} beside kind = "{table.kind}"', " or ".join(orders)
+        )
+    return SlopeRecipe(order=order, orientation=orientation, normalisation=table.normalisation)
 
 
 def _frames(table: WfsTable, path: Path) -> FrameWindows | None:

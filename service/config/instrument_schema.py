@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field
 
 from service.config.sources import Id, Named, Table, in_file, read_toml, validated
 from service.errors import ConfigurationError
-from service.model.kinds import BasisKind, Influence, Normalisation, SlopeOrder, Stop
+from service.model.kinds import BasisKind, Influence, Normalisation, SignalKind, SlopeOrder, Stop
 
 Positive = Annotated[float, Field(gt=0.0)]
 Count = Annotated[int, Field(ge=1)]
@@ -183,11 +183,17 @@ class OrientationTable(Table):
 
 
 class SlopesTable(Table):
-    """``[slopes]``: the RTC's own order, sign and recipe."""
+    """``[slopes]``: the RTC's own signals: kind, order, sign and recipe."""
 
-    order: Named[SlopeOrder] = SlopeOrder.XY
+    kind: Named[SignalKind] = SignalKind.XY
+    """Two slopes for each subaperture, or its four normalised pixels."""
+
+    order: Named[SlopeOrder] | None = None
+    """`xy`, `yx`, `interleaved` of slopes, the others of pixels; None: `xy`, or `images`."""
+
     orientation: Annotated[OrientationTable | None, BeforeValidator(_auto_is_none)] = None
     normalisation: Named[Normalisation] = Normalisation.GLOBAL
+    """By the mean flux of a subaperture, or by each one's own: of its four pixels together."""
 
 
 class LoopTable(Table):

@@ -251,13 +251,15 @@ export class Measurements {
     this.figures.gains.show({ x: drawn.modes, label: "Gain of each mode", lines: [{ name: "measured over model", values: found.gains, dots: true }] });
     const left = drawn.residual_map.flat().filter((v) => v !== null);
     const most = Math.max(1, ...left);
-    grid(root.querySelector(".left canvas"), drawn.residual_map, { most, label: `Left over in each subaperture, Sx beside Sy: 0 to ${most} %` });
-    put(root.querySelector(".left .legend"), `Sx | Sy, dark 0 to light ${most} % of the measured RMS`);
+    const four = drawn.residual_map.length === drawn.residual_map[0].length;
+    const shown = four ? "the four images" : "Sx beside Sy";
+    grid(root.querySelector(".left canvas"), drawn.residual_map, { most, label: `Left over in each subaperture, ${shown}: 0 to ${most} %` });
+    put(root.querySelector(".left .legend"), `${four ? "Four images" : "Sx | Sy"}, dark 0 to light ${most} % of the measured RMS`);
     root.querySelector(".maps").replaceChildren(...drawn.maps.map((one) => {
       const canvases = ["measured", "synthetic", "difference"].map((name) => {
         const rows = one[name] ?? one.measured.map((row, y) => row.map((v, x) => (v === null ? null : v - one.synthetic[y][x])));
         const canvas = make("canvas");
-        grid(canvas, rows, { signed: true, label: `Mode ${one.mode}, ${name}, Sx beside Sy` });
+        grid(canvas, rows, { signed: true, label: `Mode ${one.mode}, ${name}, ${shown}` });
         return make("figure", {}, canvas, make("figcaption", { text: name === "synthetic" ? "model" : name }));
       });
       return make("div", { className: "map" }, make("h3", { text: `mode ${one.mode}` }), ...canvases);

@@ -99,10 +99,10 @@ def write_aot(
 ) -> None:
     """Write telemetry and α over time as AOT FITS.
 
-    Slopes are in the order, axes and signs of docs/conventions.md, ``(t, 2, n_valid)``; modal
-    commands are metres OPD, ``(t, n_modes)``. Each reconstructor in use has a loop of its own. α is
-    the ``transformation_matrix`` ``(3, 3, t)`` of the mirror: from metres in the pupil, as its
-    actuators are drawn, to metres on the sensor.
+    Slopes are in the order, axes and signs of docs/conventions.md, ``(t, 2, n_valid)``, pixels
+    ``(t, 4, n_valid)``; modal commands are metres OPD, ``(t, n_modes)``. Each reconstructor in use
+    has a loop of its own. α is the ``transformation_matrix`` ``(3, 3, t)`` of the mirror: from
+    metres in the pupil, as its actuators are drawn, to metres on the sensor.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def _system(aotpy: Any, instrument: Instrument, estimates: tuple[HistoryEntry, .
         uid="sensor",
         source=source,
         n_sides=4,
-        dimensions=2,
+        dimensions=instrument.slopes.kind.n_planes,
         n_valid_subapertures=int(valid.sum()),
         subaperture_mask=aotpy.Image("subaperture mask", places),
         wavelength=instrument.wfs.wavelength_m,
@@ -244,8 +244,8 @@ def _time(aotpy: Any, name: str, t_ns: NDArray[np.int64], seqs: NDArray[np.int64
 
 
 def _as_listed(values: NDArray[np.float32], instrument: Instrument) -> NDArray[np.float32]:
-    """Return what the RTC lists as ``(n, n_slopes)``, in our order: ``(n, 2, n_valid)``."""
+    """Return what the RTC lists as ``(n, n_slopes)``, in our order: ``(n, 2, n_valid)``, or 4."""
     recipe = instrument.slopes
     mask = rtc_valid_subapertures(instrument)
     ours = to_conventions(values.T, recipe.order, recipe.assumed_orientation, mask)
-    return np.ascontiguousarray(ours.T).reshape(len(values), 2, -1)
+    return np.ascontiguousarray(ours.T).reshape(len(values), recipe.kind.n_planes, -1)

@@ -22,7 +22,8 @@ MAPS = 4
 def numbers(fit: Fit) -> dict[str, Any]:
     """Return what a page draws a fit from, as JSON can hold it; null where nothing is known.
 
-    Maps are lists of rows from the lowest y on, Sx beside Sy, in whole percent: of the measured RMS
+    Maps are lists of rows from the lowest y on, Sx beside Sy, or the four images as they lie on the
+    detector, in whole percent: of the measured RMS
     for ``residual_map``, of three times a mode's own RMS for ``maps``, cut there.
     """
     shown = shown_modes(fit)
@@ -32,7 +33,7 @@ def numbers(fit: Fit) -> dict[str, Any]:
         "modes": fit.modes.tolist(),
         "residual_by_mode": _plain(fit.residual_by_mode, 4),
         "singular_values": singular,
-        "residual_map": _percent(np.hstack(list(fit.residual_map))),
+        "residual_map": _percent(side_by_side(fit.residual_map)),
         "maps": [_columns(fit, int(column)) for column in picked],
     }
 
@@ -53,10 +54,16 @@ def shown_modes(fit: Fit) -> NDArray[np.intp]:
 
 
 def as_maps(slopes: NDArray[np.floating], valid: NDArray[np.bool_]) -> Array:
-    """Return slopes ``(n_slopes,)`` as ``(n, 2 n)``: Sx beside Sy, NaN where none is valid."""
-    maps = np.full((2, *valid.shape), np.nan)
-    maps[:, valid] = slopes.reshape(2, -1)
-    return np.hstack(list(maps))
+    """Return signals ``(n_slopes,)`` as one map, NaN where none is valid: see ``side_by_side``."""
+    planes = slopes.reshape(-1, int(valid.sum()))
+    maps = np.full((len(planes), *valid.shape), np.nan)
+    maps[:, valid] = planes
+    return side_by_side(maps)
+
+
+def side_by_side(maps: Array) -> Array:
+    """Return Sx beside Sy ``(n, 2 n)``, or four images as they lie ``(2 n, 2 n)``."""
+    return np.vstack([np.hstack(list(maps[k : k + 2])) for k in range(0, len(maps), 2)])
 
 
 def _columns(fit: Fit, column: int) -> dict[str, Any]:

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
-from service.files.drawn import as_maps, shown_modes, singular_values_of
+from service.files.drawn import as_maps, shown_modes, side_by_side, singular_values_of
 from service.files.report import FitReport, verdict_line
 from service.fit.matrix import Fit
 from service.fit.methods import ScanStep
 from service.model.instrument import Instrument, TabulatedModes
+from service.model.kinds import SignalKind
 from service.model.misregistration import Misregistration, rotation
 
 if TYPE_CHECKING:
@@ -154,12 +155,16 @@ def landed(points: Array, alpha: Misregistration) -> Array:
     return np.asarray(alpha.magnification * turned + alpha.vector[:2])
 
 
+def _shown(fit: Fit) -> str:
+    return "Sx | Sy" if fit.order.kind is SignalKind.XY else "four images"
+
+
 def residual(axes: Axes, fit: Fit) -> None:
-    """Draw what is left over in every subaperture, Sx beside Sy."""
+    """Draw what is left over in every subaperture."""
     image = axes.imshow(
-        100.0 * np.hstack(list(fit.residual_map)), origin="lower", cmap="viridis", vmin=0.0
+        100.0 * side_by_side(fit.residual_map), origin="lower", cmap="viridis", vmin=0.0
     )
-    axes.set(title="left over: Sx | Sy, % of the measured RMS", xticks=[], yticks=[])
+    axes.set(title=f"left over: {_shown(fit)}, % of the measured RMS", xticks=[], yticks=[])
     axes.figure.colorbar(image, ax=axes, shrink=0.7)
 
 
@@ -185,7 +190,7 @@ _COLUMNS = ("synthetic", "measured", "difference")
 
 
 def slope_maps(figure: SubFigure, fit: Fit) -> None:
-    """Draw Sx beside Sy for a few modes; all three maps of a mode have one scale."""
+    """Draw the signals of a few modes; all three maps of a mode have one scale."""
     columns = shown_modes(fit)
     n_rows = _rows(columns, _MODES_ACROSS)
     places = figure.subplots(n_rows, _MODES_ACROSS * len(_COLUMNS), squeeze=False)
@@ -195,7 +200,7 @@ def slope_maps(figure: SubFigure, fit: Fit) -> None:
     for axes in triples[len(columns) :].ravel():
         axes.set_axis_off()
     for axes, name in zip(places[0], _COLUMNS * _MODES_ACROSS, strict=True):
-        axes.set_title(f"{name}: Sx | Sy", fontsize="small")
+        axes.set_title(f"{name}: {_shown(fit)}", fontsize="small")
 
 
 def _rows(shown: Sized, across: int) -> int:

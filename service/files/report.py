@@ -230,7 +230,7 @@ _DESCRIPTIONS = {
     "modes": "(n_used,) basis index of each column",
     "gains": "(n_used,) measured column over the model's, passes divided out",
     "residual_by_mode": "(n_used,) rms left over, as a fraction of the mode's own",
-    "residual_map": "(2, n, n) [x or y, row, column] rms left over, as a fraction of the measured",
+    "residual_map": "(n_planes, n, n) [x or y, or image] rms left over, over the measured",
     "synthetic": "(n_slopes, n_used) the model, slope per metre OPD, axes of conventions",
     "measured": "(n_slopes, n_used) the reference in the same axes and unit",
     "valid": "(n, n) [row, column] subapertures the slopes belong to",

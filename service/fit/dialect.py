@@ -104,7 +104,7 @@ def of_reconstructor(
             instrument,
             Reference(matrix=measured, modes=used),
             basis.subset(used),
-            list(settings_of()),
+            list(settings_of(instrument.slopes.kind.orders)),
             mapper=mapper,
         )
     except MatrixError as error:
@@ -136,7 +136,8 @@ def of_answer(slopes: Array, expected: Array, turns_rad: Array, instrument: Inst
     if as_told >= RESEMBLANCE and not LIKELY[0] < ratio < LIKELY[1]:
         unit = f"slopes answer commands {ratio:.2g} times as the model does: {_unit_named(ratio)}"
     every = {
-        setting: _resemblance(_planes(slopes, setting, mask), model) for setting in settings_of()
+        setting: _resemblance(_planes(slopes, setting, mask), model)
+        for setting in settings_of(told[0].kind.orders)
     }
     best = max(every.values())
     if best < RESEMBLANCE or as_told * ADVANTAGE > best or lagging > best:
@@ -240,14 +241,15 @@ def _unit_named(ratio: float) -> str:
 
 
 def _planes(rows: Array, setting: Setting, mask: NDArray[np.bool_]) -> Array:
-    """Return slopes ``(n_lines, n_slopes)`` as maps ``(2, n, n, n_lines)`` of the sensor's axes.
+    """Return slopes ``(n_lines, n_slopes)`` as maps ``(n_planes, n, n, n_lines)``.
 
-    ``mask`` ``(n, n)`` [y, x] are the valid subapertures in the RTC's own.
+    Of the sensor's axes; ``mask`` ``(n, n)`` [y, x] are the valid subapertures in the RTC's own.
     """
     order, axes = setting
     listed = to_conventions(rows.T, order, axes, mask)
-    planes = np.zeros((2, *mask.shape, len(rows)), dtype=listed.dtype)
-    planes[:, turned_mask(mask, axes)] = listed.reshape(2, -1, len(rows))
+    n_planes = order.kind.n_planes
+    planes = np.zeros((n_planes, *mask.shape, len(rows)), dtype=listed.dtype)
+    planes[:, turned_mask(mask, axes)] = listed.reshape(n_planes, -1, len(rows))
     return planes
 
 

@@ -96,8 +96,8 @@ class Fit:
     """RMS of what is left over RMS of the measurement, each mode counted alike."""
 
     residual_map: NDArray[np.float64]
-    """``(2, n, n)`` [x or y, row, column] RMS over modes of what is left, in units of the
-    measurement's own RMS; NaN outside the valid subapertures."""
+    """``(n_planes, n, n)`` [x or y, or image; row, column] RMS over modes of what is left, in units
+    of the measurement's own RMS; NaN outside the valid subapertures."""
 
     residual_by_mode: NDArray[np.float64]
     """``(n_used,)`` the same fraction for each mode."""
@@ -194,7 +194,7 @@ def fit_matrix(
         basis = modal_basis(instrument)
     usable = checked(
         _selected(reference, options.modes),
-        n_slopes=2 * int(rtc_valid_subapertures(instrument).sum()),
+        n_slopes=instrument.slopes.kind.n_planes * int(rtc_valid_subapertures(instrument).sum()),
         n_modes=basis.n_modes,
         wavelength_m=instrument.wfs.wavelength_m,
         stroke_known=instrument.mirror.stroke_known,
@@ -302,7 +302,10 @@ class _Found:
 
 def _found(models: FitModels, target: Target, start: Array, options: FitOptions) -> _Found:
     nuisances = nuisances_of(
-        target.valid, gain_map=options.gain_map, anamorphosis=options.anamorphosis
+        target.valid,
+        models.instrument.slopes.kind,
+        gain_map=options.gain_map,
+        anamorphosis=options.anamorphosis,
     )
     match options.method:
         case Method.JOINT:
@@ -324,7 +327,7 @@ def _answer(
     solution, target = found.solution, found.target
     seen = solution.projection
     values = np.concatenate([np.zeros(4), solution.nuisances])
-    regions = pupil_regions(target.valid)[target.rows]
+    regions = pupil_regions(target.valid, axes.order.kind.n_planes)[target.rows]
     by_mode = np.sqrt(
         np.sum(seen.residual**2, axis=0) / np.sum(target.matrix[target.rows] ** 2, axis=0)
     )
@@ -394,8 +397,9 @@ def _residual_map(found: _Found) -> Array:
     typical = np.sqrt(np.mean((target.matrix[target.rows] * scale) ** 2))
     by_slope = np.full(len(target.rows), np.nan)
     by_slope[target.rows] = np.sqrt(np.mean((seen.residual * scale) ** 2, axis=1)) / typical
-    maps = np.full((2, *target.valid.shape), np.nan)
-    maps[:, target.valid] = by_slope.reshape(2, -1)
+    planes = by_slope.reshape(-1, int(target.valid.sum()))
+    maps = np.full((len(planes), *target.valid.shape), np.nan)
+    maps[:, target.valid] = planes
     return maps
 
 

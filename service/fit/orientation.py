@@ -168,7 +168,8 @@ def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> Inte
         for swap, flip_x, flip_y in product(flags, flags, flags)
     ]
     every = replace(instrument.wfs, valid_subapertures=np.any(turned, axis=0))
-    plain = oriented(replace(instrument, wfs=every), SlopeOrder.XY, Orientation())
+    order = instrument.slopes.kind.orders[0]
+    plain = oriented(replace(instrument, wfs=every), order, Orientation())
     return InteractionModel(
         plain, basis, pupil_sampling=SAMPLING, detector_nodes=SAMPLING, mapper=mapper
     )
@@ -176,12 +177,12 @@ def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> Inte
 
 def _settings(order: SlopeOrder) -> Iterator[Setting]:
     """Yield every orientation, and the components exchanged where the order can say that."""
-    exchanged = {SlopeOrder.XY: SlopeOrder.YX, SlopeOrder.YX: SlopeOrder.XY}
-    orders = [order] if order not in exchanged else [order, exchanged[order]]
-    yield from settings_of(orders)
+    plain, exchanged = order.kind.orders[:2]
+    others = {plain: [exchanged], exchanged: [plain]}
+    yield from settings_of([order, *others.get(order, [])])
 
 
-def settings_of(orders: Iterable[SlopeOrder] = tuple(SlopeOrder)) -> Iterator[Setting]:
+def settings_of(orders: Iterable[SlopeOrder]) -> Iterator[Setting]:
     """Yield every orientation and pair of signs in each of these orders."""
     flags = (False, True)
     for listed, swap, flip_x, flip_y, sign_x, sign_y in product(
@@ -241,7 +242,7 @@ class _Turned:
     def pose(self, target: Target, order: SlopeOrder, orientation: Orientation) -> Pose:
         """Return the rotation at which the model explains these columns best."""
         low = target.matrix / np.linalg.norm(target.matrix, axis=0)
-        seen = np.tile(target.valid[self.valid], 2)
+        seen = np.tile(target.valid[self.valid], order.kind.n_planes)
         columns = self.columns if seen.all() else self.columns[:, :, seen]
         along = np.matmul(columns, low.T[:, :, None])[:, :, 0]
         norm = np.sqrt(np.einsum("las,las->la", columns, columns))

@@ -14,7 +14,7 @@ from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import unit_like
-from service.model.slopes import Orientation, to_conventions
+from service.model.slopes import Orientation, likely_kind, to_conventions
 
 Array = NDArray[Any]
 
@@ -112,6 +112,7 @@ def _check_shape(reference: Reference, n_slopes: int, n_modes: int) -> None:
     if matrix.shape[0] != n_slopes:
         turned = matrix.shape[1] == n_slopes
         hint = ": it is transposed, or a reconstructor" if turned else ""
+        expected += likely_kind(matrix.shape[0], n_slopes)
         raise MatrixError(f"reference: found shape {matrix.shape}{hint}; expected {expected}")
     if columns.shape != (matrix.shape[1],):
         raise MatrixError(

@@ -30,7 +30,9 @@ from numpy.typing import NDArray
 
 from service.fit.models import FitModels
 from service.model.interaction import InteractionModel
+from service.model.kinds import SignalKind
 from service.model.misregistration import Misregistration
+from service.model.slopes import signals_of_slopes, slopes_of
 
 Array = NDArray[np.float64]
 
@@ -244,8 +246,9 @@ class Nuisances:
         self, model: InteractionModel, alpha: Misregistration, matrix: NDArray[Any]
     ) -> Array:
         """Return ``(n_nuisances, n_slopes, n_modes)``: change of the matrix with each of them."""
-        along_x, along_y = np.split(matrix, 2)
-        found = [np.concatenate([-along_y, along_x])]
+        kind = model.instrument.slopes.kind
+        along_x, along_y = slopes_of(matrix, kind)
+        found = [signals_of_slopes(np.stack([-along_y, along_x]), kind)]
         if self.anamorphosis:
             found += list(model.stretch_derivatives(alpha))
         found += [pattern[:, None] * matrix for pattern in self.maps]
@@ -266,18 +269,22 @@ class Nuisances:
 
 
 def nuisances_of(
-    valid: NDArray[np.bool_], *, gain_map: bool = False, anamorphosis: bool = False
+    valid: NDArray[np.bool_],
+    kind: SignalKind,
+    *,
+    gain_map: bool = False,
+    anamorphosis: bool = False,
 ) -> Nuisances:
     """Return the unknowns beside the registration: the turn of the axes, and those asked for."""
     n = len(valid)
     y, x = (np.stack(np.nonzero(valid)) - (n - 1) / 2) / (n / 2)
     if not gain_map:
-        return Nuisances(maps=np.empty((0, 2 * len(x))), anamorphosis=anamorphosis)
+        return Nuisances(maps=np.empty((0, kind.n_planes * len(x))), anamorphosis=anamorphosis)
     order = GAIN_MAP_ORDER
     powers = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i) if i + j > 0]
     centred = np.array(powers) - np.mean(powers, axis=1, keepdims=True)
     orthonormal, _ = np.linalg.qr(centred.T)
-    maps = np.tile(orthonormal.T * np.sqrt(valid.sum()), 2)
+    maps = np.tile(orthonormal.T * np.sqrt(valid.sum()), kind.n_planes)
     return Nuisances(maps=maps, anamorphosis=anamorphosis)
 
 

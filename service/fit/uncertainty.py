@@ -130,14 +130,14 @@ def uncertainty(
     )
 
 
-def pupil_regions(valid: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the region, sector and ring of equal area, of every slope ``(n_slopes,)``."""
+def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:
+    """Return the region, sector and ring of equal area, of every signal ``(n_slopes,)``."""
     n = len(valid)
     y, x = np.stack(np.nonzero(valid)) - (n - 1) / 2
     sector = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * N_SECTORS).astype(np.intp)
     radius = np.hypot(x, y)
     ring = np.floor((radius / (radius.max() + 1e-9)) ** 2 * N_RINGS).astype(np.intp)
-    return np.tile(np.minimum(sector, N_SECTORS - 1) * N_RINGS + ring, 2)
+    return np.tile(np.minimum(sector, N_SECTORS - 1) * N_RINGS + ring, n_planes)
 
 
 def _sandwich(spread: Array, scores: Array) -> Array:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
-from service.model.interaction import differences_of, rtc_valid_subapertures
-from service.model.kinds import Normalisation
+from service.model.interaction import rtc_valid_subapertures, signals_of
+from service.model.kinds import Normalisation, SignalKind
 
 Array = NDArray[np.float64]
 
@@ -125,7 +125,8 @@ def slopes_from_frames(
     Returns
     -------
     slopes
-        All Sx, then all Sy, on the detector's own axes, by ``rtc_valid_subapertures``.
+        All Sx, then all Sy, or the four images, on the detector's own axes, by
+        ``rtc_valid_subapertures``.
 
     Raises
     ------
@@ -147,6 +148,7 @@ def slopes_from_frames(
             windows.cut(frames[start : start + _AT_ONCE]),
             valid,
             instrument.slopes.normalisation,
+            instrument.slopes.kind,
         )
         for start in range(0, len(frames), _AT_ONCE)
     ]
@@ -154,9 +156,13 @@ def slopes_from_frames(
 
 
 def slopes_per_unit(
-    rest: Array, images: Array, valid: NDArray[np.bool_], normalisation: Normalisation
+    rest: Array,
+    images: Array,
+    valid: NDArray[np.bool_],
+    normalisation: Normalisation,
+    kind: SignalKind = SignalKind.XY,
 ) -> Array:
-    """Return what the slopes do ``(n_slopes, n_modes)`` when the light changes.
+    """Return what the signals do ``(n_slopes, n_modes)`` when the light changes.
 
     ``rest`` is ``(2, n, 2, n)`` the mean light, ``images`` ``(n_modes, 2, n, 2, n)`` its change
     per unit of every mode. All Sx, then all Sy, of the subapertures ``valid`` ``(n, n)`` [y, x],
@@ -168,13 +174,13 @@ def slopes_per_unit(
     ModelError
         If a valid subaperture, or all of them together, sees no light.
     """
-    differences, flux = differences_of(rest, valid, normalisation)
-    changes, flux_changes = differences_of(images, valid, normalisation)
+    signals, flux = signals_of(rest, valid, normalisation, kind)
+    changes, flux_changes = signals_of(images, valid, normalisation, kind)
     if flux.min() <= 0.0:
         raise ModelError(
             f"flux frame: found {flux.min():g} counts in a valid subaperture, expected light in all"
         )
-    slopes = differences / flux
+    slopes = signals / flux
     return np.asarray(((changes - slopes * flux_changes) / flux).T)
 
 

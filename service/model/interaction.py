@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.model.instrument import Instrument
-from service.model.kinds import Normalisation, Stop
+from service.model.kinds import Normalisation, SignalKind, Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import Basis
 from service.model.pupil import Illumination, annular_pupil, instrument_pupil
@@ -92,6 +92,7 @@ class InteractionModel:
             dtype=dtype,
             halo=halo,
             normalisation=instrument.slopes.normalisation,
+            kind=instrument.slopes.kind,
         )
         self.valid = valid_subapertures(instrument)
         self._map = mapper
@@ -105,8 +106,8 @@ class InteractionModel:
 
     @property
     def n_slopes(self) -> int:
-        """Twice the number of valid subapertures."""
-        return 2 * int(self.valid.sum())
+        """Signals of a frame: two or four for each valid subaperture."""
+        return self.optics.kind.n_planes * int(self.valid.sum())
 
     def interaction_matrix(self, alpha: Misregistration) -> Array:
         """Return D(α), ``(n_slopes, n_modes)``, slope per metre of OPD.
@@ -159,7 +160,7 @@ class InteractionModel:
         centre = (len(self.valid) - 1) / 2
         seen = np.column_stack([x, y]) - centre - self._image_shift(alpha)
         distance, _ = scipy.spatial.cKDTree(self.pupil.points[unknown]).query(seen, p=np.inf)
-        return np.tile(distance <= 0.5 + UNKNOWN_REACH_SUBAP, 2)
+        return np.tile(distance <= 0.5 + UNKNOWN_REACH_SUBAP, self.optics.kind.n_planes)
 
     def _at_rest(self, shift: tuple[float, float]) -> Response:
         """Return the sensor's response with the images at ``shift``; derivatives use it again."""
@@ -291,49 +292,56 @@ def reference_slopes(
     images: Array,
     valid: NDArray[np.bool_],
     normalisation: Normalisation = Normalisation.GLOBAL,
+    kind: SignalKind = SignalKind.XY,
 ) -> tuple[Array, float]:
-    """Return the slopes ``(n_slopes,)`` of four images and the mean flux per valid subaperture.
+    """Return the signals ``(n_slopes,)`` of four images and the mean flux per valid subaperture.
 
     Signs of conventions.md. ``images`` is ``(2, n, 2, n)``.
     """
-    differences, flux = differences_of(images, valid, normalisation)
-    return differences / flux, float(flux.mean())
+    signals, flux = signals_of(images, valid, normalisation, kind)
+    return signals / flux, float(flux.mean())
 
 
-def differences_of(
-    images: Array, valid: NDArray[np.bool_], normalisation: Normalisation
+def signals_of(
+    images: Array, valid: NDArray[np.bool_], normalisation: Normalisation, kind: SignalKind
 ) -> tuple[Array, Array]:
-    """Return x then y differences of four images ``(..., 2, n, 2, n)``, and what normalises them.
+    """Return the signals of four images ``(..., 2, n, 2, n)``, and what normalises them.
 
-    The differences are ``(..., n_slopes)``. The flux is ``(..., 1)``, the mean per valid
-    subaperture, or ``(..., n_slopes)``, each one's own.
+    The signals are ``(..., n_slopes)``: x, then y differences, or the images. The flux is
+    ``(..., 1)``, the mean per valid subaperture, or ``(..., n_slopes)``, each one's own.
     """
     by_x, by_y = images.sum(axis=-4), images.sum(axis=-2)
-    x = (by_x[..., 0, :] - by_x[..., 1, :])[..., valid]
-    y = (by_y[..., 0, :, :] - by_y[..., 1, :, :])[..., valid]
     flux = by_y.sum(axis=-3)[..., valid]
+    if kind is SignalKind.INTENSITY:
+        sides = images.swapaxes(-3, -2)[..., valid]
+        signals = sides.reshape(*flux.shape[:-1], -1)
+    else:
+        x = (by_x[..., 0, :] - by_x[..., 1, :])[..., valid]
+        y = (by_y[..., 0, :, :] - by_y[..., 1, :, :])[..., valid]
+        signals = np.concatenate([x, y], axis=-1)
     if normalisation is Normalisation.LOCAL:
-        return np.concatenate([x, y], axis=-1), np.concatenate([flux, flux], axis=-1)
-    return np.concatenate([x, y], axis=-1), flux.mean(axis=-1, keepdims=True)
+        return signals, np.concatenate([flux] * kind.n_planes, axis=-1)
+    return signals, flux.mean(axis=-1, keepdims=True)
 
 
 def normalised_jacobian(response: Response, valid: NDArray[np.bool_]) -> Array:
-    """Return the gradient of the normalised slopes, ``(n_slopes, n_points)`` per radian.
+    """Return the gradient of the normalised signals, ``(n_slopes, n_points)`` per radian.
 
-    Of a response to shapes: their slopes, ``(n_slopes, n_shapes)``.
+    Of a response to shapes: their signals, ``(n_slopes, n_shapes)``.
     """
-    differences, flux = differences_of(response.images, valid, response.normalisation)
-    jacobian = response.gradient - _times(differences / flux, response.flux_gradient)
+    signals, flux = signals_of(response.images, valid, response.normalisation, response.kind)
+    jacobian = response.gradient - _times(signals / flux, response.flux_gradient)
     jacobian /= flux[:, None].astype(jacobian.dtype)
     return np.asarray(jacobian)
 
 
 def normalised_derivative(at_rest: Response, moving: Response, valid: NDArray[np.bool_]) -> Array:
     """Return the rate of ``normalised_jacobian`` when the images move, by the product rule."""
-    differences, flux = differences_of(at_rest.images, valid, at_rest.normalisation)
-    difference_rate, flux_rate = differences_of(moving.images, valid, at_rest.normalisation)
-    slopes = differences / flux
-    slope_rate = (difference_rate - slopes * flux_rate) / flux
+    recipe = (at_rest.normalisation, at_rest.kind)
+    signals, flux = signals_of(at_rest.images, valid, *recipe)
+    signal_rate, flux_rate = signals_of(moving.images, valid, *recipe)
+    slopes = signals / flux
+    slope_rate = (signal_rate - slopes * flux_rate) / flux
     rate = moving.gradient - _times(slopes, moving.flux_gradient)
     rate -= _times(slope_rate, at_rest.flux_gradient)
     rate -= normalised_jacobian(at_rest, valid) * flux_rate[:, None].astype(rate.dtype)
@@ -346,8 +354,8 @@ def _times(slopes: Array, flux_gradient: Array) -> Array:
     column = slopes[:, None].astype(flux_gradient.dtype)
     if flux_gradient.ndim == 1:
         return np.asarray(column * flux_gradient)
-    both = column.reshape(2, -1, 1) * flux_gradient
-    return both.reshape(len(slopes), -1)
+    planes = column.reshape(-1, len(flux_gradient), 1) * flux_gradient
+    return planes.reshape(len(slopes), -1)
 
 
 @dataclass(slots=True)

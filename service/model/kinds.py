@@ -1,4 +1,4 @@
-"""What kinds of telescope, mirror and slopes there are, by the names of an instrument file."""
+"""What kinds of telescope, mirror and signals there are, by the names of an instrument file."""
 
 from __future__ import annotations
 
@@ -32,8 +32,36 @@ class BasisKind(StrEnum):
     """The actuators themselves, in their order."""
 
 
+class SignalKind(StrEnum):
+    """What the RTC makes of the four pupil images of a frame."""
+
+    XY = "xy"
+    """Two slopes for each subaperture."""
+
+    INTENSITY = "intensity"
+    """The four pixels of each subaperture, normalised, those of a flat wavefront subtracted."""
+
+    @property
+    def n_planes(self) -> int:
+        """Signals of a subaperture."""
+        return 2 if self is SignalKind.XY else 4
+
+    @property
+    def noise(self) -> float:
+        """1 σ of a signal over that of a slope, which four pixels make."""
+        return 1.0 if self is SignalKind.XY else 0.5
+
+    @property
+    def orders(self) -> tuple[SlopeOrder, ...]:
+        """In which they may be listed; the first one where none is told."""
+        return tuple(order for order in SlopeOrder if order.kind is self)
+
+
 class SlopeOrder(StrEnum):
-    """How the two components follow one another in the RTC's slope vector."""
+    """How the signals of the subapertures follow one another in the RTC's vector.
+
+    Subapertures always follow one another row by row.
+    """
 
     XY = "xy"
     """All Sx, then all Sy."""
@@ -44,9 +72,30 @@ class SlopeOrder(StrEnum):
     INTERLEAVED = "interleaved"
     """Sx and Sy of one subaperture, then of the next."""
 
+    IMAGES = "images"
+    """One pupil image after the other, as they lie: at -x -y, +x -y, -x +y, +x +y."""
+
+    IMAGES_YX = "images-yx"
+    """The same, along y first: at -x -y, -x +y, +x -y, +x +y."""
+
+    AROUND = "around"
+    """The same, going round: at -x -y, +x -y, +x +y, -x +y."""
+
+    PIXELS = "pixels"
+    """The four pixels of one subaperture, as in ``images``, then of the next."""
+
+    DETECTOR = "detector"
+    """As the rows of the detector are read: a row of two images, and so on."""
+
+    @property
+    def kind(self) -> SignalKind:
+        """What is listed in this order."""
+        slopes = {SlopeOrder.XY, SlopeOrder.YX, SlopeOrder.INTERLEAVED}
+        return SignalKind.XY if self in slopes else SignalKind.INTENSITY
+
 
 class Normalisation(StrEnum):
-    """What the differences of intensity are divided by."""
+    """What the intensities and their differences are divided by."""
 
     GLOBAL = "global"
     """The mean flux per valid subaperture."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Pyramid
-from service.model.kinds import Normalisation
+from service.model.kinds import Normalisation, SignalKind
 from service.model.pupil import PupilGrid
 from service.model.turbulence import Halo
 
@@ -59,14 +59,18 @@ class Response:
     """``(2, n, 2, n)`` light at zero phase: image side along y, row, image side along x, column."""
 
     gradient: Array
-    """``(2 * n_valid, n_points)`` gradient of the x and y differences of the four images."""
+    """``(n_slopes, n_points)`` gradient of the x and y differences of the four images, or of the
+    images themselves."""
 
     flux_gradient: Array
-    """Gradient of what normalises the differences: ``(n_points,)`` of the mean flux per valid
-    subaperture; ``(n_valid, n_points)`` of each one's own flux with local normalisation."""
+    """Gradient of what normalises them: ``(n_points,)`` of the mean flux per valid subaperture;
+    ``(n_valid, n_points)`` of each one's own flux with local normalisation."""
 
     normalisation: Normalisation = Normalisation.GLOBAL
-    """What normalises the differences."""
+    """What normalises the signals."""
+
+    kind: SignalKind = SignalKind.XY
+    """What the signals are."""
 
     def to(self, shapes: Array, product: Callable[[Array, Array], Array]) -> Response:
         """Return the response to combinations of points, ``shapes`` ``(n_points, n_shapes)``.
@@ -111,6 +115,9 @@ class PyramidOptics:
 
     normalisation: Normalisation = Normalisation.GLOBAL
     """Whose flux a response has the gradient of."""
+
+    kind: SignalKind = SignalKind.XY
+    """Which signals a response has the gradient of."""
 
     def __post_init__(self) -> None:
         """Refuse a modulation that the formulas cannot fold.
@@ -157,9 +164,10 @@ class PyramidOptics:
         )
         return Response(
             images=self._images(fields, roof_y, roof_x),
-            gradient=np.concatenate([b[0] for b in blocks] + [b[1] for b in blocks]),
-            flux_gradient=self._flux_gradient([b[2] for b in blocks], int(valid.sum())),
+            gradient=np.concatenate([b[k] for k in range(self.kind.n_planes) for b in blocks]),
+            flux_gradient=self._flux_gradient([b[-1] for b in blocks], int(valid.sum())),
             normalisation=self.normalisation,
+            kind=self.kind,
         )
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
@@ -252,8 +260,8 @@ class PyramidOptics:
         roof_y: _Roof,
         along_y: Array,
         modulated_x: Array,
-    ) -> tuple[Array, Array, Array]:
-        """Return gradients of the x and y differences of one row, and of its flux.
+    ) -> tuple[Array, ...]:
+        """Return gradients of the signals of one row, x and y or the four images, and of its flux.
 
         With local normalisation the flux is that of every subaperture; else one line, their sum.
         """
@@ -269,9 +277,20 @@ class PyramidOptics:
             len(along_y), 2, len(columns), 2 * len(roof_y.weights), -1
         )
         by_image_x = np.matmul(left, modulated_x[:, :, columns])
+        local = self.normalisation is Normalisation.LOCAL
+        if self.kind is SignalKind.INTENSITY:
+            n = len(roof_y.weights)
+            images = [
+                self._fold(
+                    factor_y[:, [side]], by_image_x[:, along_x, :, side * n : (side + 1) * n]
+                )
+                for side in (0, 1)
+                for along_x in (0, 1)
+            ]
+            light = np.sum(images, axis=0)
+            return (*images, light if local else light.sum(axis=0, keepdims=True))
         total = by_image_x[:, 0] + by_image_x[:, 1]
         difference = by_image_x[:, 0] - by_image_x[:, 1]
-        local = self.normalisation is Normalisation.LOCAL
         light = total if local else total.sum(axis=1, keepdims=True)
         return (
             self._fold(factor_y, difference),

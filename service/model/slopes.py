@@ -1,8 +1,9 @@
-"""The slopes as the RTC lists them, and the way to conventions.md's order, axes and signs and back.
+"""The signals as the RTC lists them, and the way to conventions.md's order, axes, signs and back.
 
 An RTC has its own order of components, its own corner of the detector where rows and columns begin,
 and its own idea of which half of the light counts as positive. All of it is one permutation of the
-slope vector with one sign per element, so nothing is interpolated and the inverse is exact.
+signal vector with one sign per element, so nothing is interpolated and the inverse is exact. Of
+pixels it is a permutation only: a sign of theirs says which images are at which side.
 """
 
 from __future__ import annotations
@@ -14,9 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.kinds import Normalisation, SlopeOrder
+from service.model.kinds import Normalisation, SignalKind, SlopeOrder
 
 Scalar = TypeVar("Scalar", bound=np.generic)
+
+TO_SLOPES = {
+    SignalKind.XY: np.eye(2),
+    SignalKind.INTENSITY: np.array([[1.0, -1.0, 1.0, -1.0], [1.0, 1.0, -1.0, -1.0]]),
+}
+"""``(2, n_planes)``: Sx and Sy of the signals of a subaperture, in the axes of conventions.md."""
+
+_PLANE_PLACES = {
+    SlopeOrder.XY: [0, 1],
+    SlopeOrder.YX: [1, 0],
+    SlopeOrder.IMAGES: [0, 1, 2, 3],
+    SlopeOrder.IMAGES_YX: [0, 2, 1, 3],
+    SlopeOrder.AROUND: [0, 1, 3, 2],
+}
+"""Where each plane of conventions.md stands in the orders that list one after the other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,7 +42,8 @@ class Orientation:
     Applied from the RTC's slopes to ours in the order of the fields, bottom to top of the optics:
     signs of the components on the RTC's own grid, then the flips of the grid, then the swap. A
     flip or a swap moves the grid and the components together, as looking into a mirror does; a
-    sign changes a component only.
+    sign changes a component only. With pixels, -1 exchanges the images at -x and +x, or at -y and
+    +y, and leaves each image as it is.
     """
 
     swap_xy: bool = False
@@ -60,16 +77,21 @@ class Orientation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlopeRecipe:
-    """How the RTC makes and lists its slopes."""
+    """How the RTC makes and lists its signals."""
 
     order: SlopeOrder = SlopeOrder.XY
-    """Order of the components."""
+    """Order of the signals; it says of which kind they are, too."""
 
     orientation: Orientation | None = None
     """Axes and signs; None: not known ("auto"), to be found from a measured matrix."""
 
     normalisation: Normalisation = Normalisation.GLOBAL
-    """What the differences are divided by."""
+    """What the intensities are divided by."""
+
+    @property
+    def kind(self) -> SignalKind:
+        """What the signals are."""
+        return self.order.kind
 
     @property
     def assumed_orientation(self) -> Orientation:
@@ -83,12 +105,12 @@ def to_conventions(
     orientation: Orientation,
     mask: NDArray[np.bool_],
 ) -> NDArray[Scalar]:
-    """Return RTC slopes in the order, axes and signs of conventions.md.
+    """Return RTC signals in the order, axes and signs of conventions.md.
 
     Parameters
     ----------
     values
-        ``(n_slopes, ...)`` slopes, or a matrix of them, as the RTC lists them.
+        ``(n_slopes, ...)`` signals, or a matrix of them, as the RTC lists them.
     order, orientation
         The RTC's.
     mask
@@ -110,7 +132,7 @@ def to_rtc(
     orientation: Orientation,
     mask: NDArray[np.bool_],
 ) -> NDArray[Scalar]:
-    """Return slopes of conventions.md as the RTC lists them: the inverse of ``to_conventions``.
+    """Return signals of conventions.md as the RTC lists them: the inverse of ``to_conventions``.
 
     ``mask`` is in the RTC's own axes here too.
 
@@ -143,37 +165,73 @@ def _flipped(plane: NDArray[Scalar], orientation: Orientation) -> NDArray[Scalar
 def _listing(
     values: NDArray[Any], order: SlopeOrder, orientation: Orientation, mask: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
-    """Return for every slope of conventions.md its place in the RTC's list, and its sign."""
-    n_valid = int(mask.sum())
-    if len(values) != 2 * n_valid:
+    """Return for every signal of conventions.md its place in the RTC's list, and its sign."""
+    n_valid, n_planes = int(mask.sum()), order.kind.n_planes
+    if len(values) != n_planes * n_valid:
         raise ModelError(
-            f"slopes: found {len(values)} of them; expected {2 * n_valid}, two for each of the "
-            f"{n_valid} valid subapertures"
+            f"slopes: found {len(values)} of them; expected {n_planes * n_valid}, "
+            f"{n_planes} for each of the {n_valid} valid subapertures"
+            f"{likely_kind(len(values), n_planes * n_valid)}"
         )
-    planes = np.full((2, *mask.shape), -1, dtype=np.intp)
-    planes[:, mask] = _places(order, n_valid)
-    signs = [
-        -orientation.sign_x if orientation.flip_x else orientation.sign_x,
-        -orientation.sign_y if orientation.flip_y else orientation.sign_y,
-    ]
-    turned = [turned_mask(plane, orientation) for plane in planes]
-    if orientation.swap_xy:
-        turned.reverse()
-        signs.reverse()
+    planes = np.full((n_planes, *mask.shape), -1, dtype=np.intp)
+    planes[:, mask] = _places(order, mask)
     valid = turned_mask(mask, orientation)
-    index = np.concatenate([plane[valid] for plane in turned])
-    return index, np.repeat(np.array(signs, dtype=np.int8), n_valid)
+    turned = np.array([turned_mask(plane, orientation)[valid] for plane in planes])
+    signs = np.array(
+        [
+            -orientation.sign_x if orientation.flip_x else orientation.sign_x,
+            -orientation.sign_y if orientation.flip_y else orientation.sign_y,
+        ],
+        dtype=np.int8,
+    )
+    if order.kind is SignalKind.INTENSITY:
+        images = turned.reshape(2, 2, n_valid)[:: signs[1], :: signs[0]]
+        images = images.swapaxes(0, 1) if orientation.swap_xy else images
+        return images.reshape(-1), np.ones(len(values), dtype=np.int8)
+    if orientation.swap_xy:
+        turned, signs = turned[::-1], signs[::-1]
+    return turned.reshape(-1), np.repeat(signs, n_valid)
 
 
-def _places(order: SlopeOrder, n_valid: int) -> NDArray[np.intp]:
-    """Return where Sx and Sy of every valid subaperture stand in the list, ``(2, n_valid)``."""
-    match order:
-        case SlopeOrder.XY:
-            return np.arange(2 * n_valid).reshape(2, n_valid)
-        case SlopeOrder.YX:
-            return np.arange(2 * n_valid).reshape(2, n_valid)[::-1]
-        case SlopeOrder.INTERLEAVED:
-            return np.arange(2 * n_valid).reshape(n_valid, 2).T
+def likely_kind(n_found: int, n_expected: int) -> str:
+    """Return what so many signals instead of those expected look like; empty: like neither."""
+    words = {
+        2.0: '; they look like pixels: is it slopes.kind = "intensity"?',
+        0.5: '; they look like x and y slopes: is it slopes.kind = "xy"?',
+    }
+    return words.get(n_found / max(n_expected, 1), "")
+
+
+def slopes_of(signals: NDArray[Any], kind: SignalKind) -> NDArray[Any]:
+    """Return Sx and Sy ``(2, n_valid, ...)`` of signals ``(n_slopes, ...)`` of conventions.md."""
+    part = TO_SLOPES[kind].astype(signals.dtype)
+    return np.tensordot(part, signals.reshape(kind.n_planes, -1, *signals.shape[1:]), axes=1)
+
+
+def signals_of_slopes(slopes: NDArray[Any], kind: SignalKind) -> NDArray[Any]:
+    """Return the smallest signals ``(n_slopes, ...)`` that have these slopes ``(2, n_valid, ...)``.
+
+    Of ``slopes_of`` its pseudo-inverse.
+    """
+    rows = TO_SLOPES[kind]
+    part = (rows.T / (rows[0] @ rows[0])).astype(slopes.dtype)
+    return np.tensordot(part, slopes, axes=1).reshape(-1, *slopes.shape[2:])
+
+
+def _places(order: SlopeOrder, mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return where the signals of every valid subaperture stand in the list.
+
+    ``(n_planes, n_valid)``: of Sx and Sy, or of the images at -x -y, +x -y, -x +y, +x +y.
+    """
+    n_planes, n_valid = order.kind.n_planes, int(mask.sum())
+    places = np.arange(n_planes * n_valid)
+    if order in {SlopeOrder.INTERLEAVED, SlopeOrder.PIXELS}:
+        return places.reshape(n_valid, n_planes).T
+    if order is SlopeOrder.DETECTOR:
+        side_y, side_x, place = np.indices((2, 2, n_valid)).reshape(3, -1)
+        row, column = (axis[place] for axis in np.nonzero(mask))
+        return np.argsort(np.lexsort((column, side_x, row, side_y))).reshape(4, n_valid)
+    return places.reshape(n_planes, n_valid)[_PLANE_PLACES[order]]
 
 
 def _as_column(sign: NDArray[np.int8], values: NDArray[Any]) -> NDArray[Any]:

@@ -238,7 +238,10 @@ async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
 
 
 class FitMap(BaseModel):
-    """The slopes of one mode: rows from the lowest y on, Sx beside Sy; null: not valid."""
+    """The signals of one mode: rows from the lowest y on, Sx beside Sy; null: not valid.
+
+    Of pixels the four images, as they lie on the detector.
+    """
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 

@@ -13,7 +13,7 @@ from service.errors import UnknownIdError
 from service.files.drawn import as_maps
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
-from service.model.slopes import to_conventions, turned_mask
+from service.model.slopes import slopes_of, to_conventions, turned_mask
 from service.routes.numbers import MatrixId
 from service.routes.problems import INVALID, UNKNOWN, problem_response
 from service.routes.views import ServiceDep, answer, shows, view
@@ -106,11 +106,10 @@ async def slopes(service: ServiceDep) -> Response:
 
 def _maps(block: FrameBlock, instrument: Instrument) -> SlopeMaps:
     valid = rtc_valid_subapertures(instrument)
-    orientation = instrument.slopes.assumed_orientation
-    rms = np.sqrt(np.mean(np.square(block.slopes, dtype=np.float64), axis=0))
-    # a sign has no part in an RMS
-    ours = np.abs(to_conventions(rms, instrument.slopes.order, orientation, valid))
-    maps = np.round(as_maps(ours, turned_mask(valid, orientation)), 4)
+    recipe, orientation = instrument.slopes, instrument.slopes.assumed_orientation
+    ours = slopes_of(to_conventions(block.slopes.T, recipe.order, orientation, valid), recipe.kind)
+    rms = np.sqrt(np.mean(np.square(ours, dtype=np.float64), axis=-1)).reshape(-1)
+    maps = np.round(as_maps(rms, turned_mask(valid, orientation)), 4)
     return SlopeMaps(
         t_ns_utc=block.t0_ns_utc,
         n_frames=block.n_frames,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.model.slopes import likely_kind
 from service.runtime.streams import (
     VERDICTS,
     Streams,
@@ -260,6 +261,7 @@ def shape_mismatch(description: Description, rtc: Status) -> str | None:
     return (
         f"the RTC has {rtc.n_slopes} slopes and {rtc.n_modes} modes, the instrument file "
         f"{description.n_slopes} and {description.n_modes}: wrong instrument file?"
+        f"{likely_kind(rtc.n_slopes, description.n_slopes)}"
     )
 
 

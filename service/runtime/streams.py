@@ -168,7 +168,7 @@ def with_rtc(streams: Streams, rtc: Status | None) -> Streams:
     )
     if before is None or not same_rate(before.frame_rate_hz, rtc.frame_rate_hz):
         streams = replace(streams, cutter=None, dither=None)
-        monitor = VibrationMonitor.begin(rtc.n_slopes)
+        monitor = VibrationMonitor.begin(rtc.n_slopes, streams.description.kind)
         return replace(streams, vibrations=monitor, passive=memory)
     return _cut(replace(streams, passive=memory), rtc)
 

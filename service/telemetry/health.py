@@ -22,7 +22,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from service.model.kinds import SignalKind
 from service.model.misregistration import unit_like
+from service.model.slopes import TO_SLOPES
 from service.telemetry.frames import FrameBlock
 
 Array = NDArray[Any]
@@ -313,14 +315,14 @@ class VibrationMonitor:
     """Vibration lines as of the last look, lowest first."""
 
     @classmethod
-    def begin(cls, n_slopes: int) -> VibrationMonitor:
-        """Return the monitor of slopes of which nothing has been seen yet.
+    def begin(cls, n_slopes: int, kind: SignalKind = SignalKind.XY) -> VibrationMonitor:
+        """Return the monitor of signals of which nothing has been seen yet.
 
         It looks at the mean x and y slopes, and at fixed patterns of random signs.
         """
-        half = n_slopes // 2
         views = np.zeros((2 + _N_PATTERNS, n_slopes), np.float32)
-        views[0, :half] = views[1, half:] = 1.0 / np.sqrt(half)
+        tilts = np.repeat(TO_SLOPES[kind], n_slopes // kind.n_planes, axis=1)
+        views[:2, : tilts.shape[1]] = tilts / np.sqrt((tilts[0] != 0.0).sum())
         signs = np.random.default_rng(1).choice([-1.0, 1.0], size=(_N_PATTERNS, n_slopes))
         views[2:] = signs / np.sqrt(n_slopes)
         return cls(quiet=SlopeSpectra(views=views), dithered=SlopeSpectra(views=views))

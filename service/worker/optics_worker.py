@@ -122,6 +122,7 @@ class OpticsWorker:
             mode_variance_m2=self._model.basis.variance_m2,
             actuators=actuators_of(self._model),
             mode_information=information(linearisation),
+            kind=self._model.instrument.slopes.kind,
             products=linearisation.matrix.T @ linearisation.matrix,
             start=self._start,
         )
@@ -342,20 +343,20 @@ class OpticsWorker:
         seen = self._sensor.at_unit_gain(alpha).matrix_at(alpha)
         flat = seen if self._sensor.is_flat else model.interaction_matrix(alpha)
         fresh = reconstruct(flat, self._recipe(n_modes)).matrix
-        noise = self._compute.slope_noise
+        noise, kind = self._compute.slope_noise, model.instrument.slopes.kind
         if magnitude is not None:
             of_star = noise_of_star(
                 model.instrument,
                 magnitude=magnitude,
                 frame_rate_hz=loop.frame_rate_hz,
-                n_valid=model.n_slopes // 2,
+                n_valid=int(model.valid.sum()),
             )
             noise = float(of_star[0])
         sky = Sky(
             variance_m2=model.basis.variance_m2,
             beyond_m2=beyond_m2(model.basis.variance_m2),
             crossing_hz=self._compute.wind_m_s / model.instrument.diameter_m,
-            slope_noise=noise,
+            slope_noise=noise * kind.noise,
         )
         try:
             return expected_gain(in_use, fresh, seen, loop, sky)
@@ -365,9 +366,10 @@ class OpticsWorker:
     def _recipe(self, n_modes: int) -> Recipe:
         prior = None
         if self._compute.method is InversionMethod.MAP:
+            noise = self._compute.slope_noise * self._model.instrument.slopes.kind.noise
             prior = Prior(
                 variance_m2=self._model.basis.variance_m2,
-                slope_noise=np.full(self._model.n_slopes, self._compute.slope_noise),
+                slope_noise=np.full(self._model.n_slopes, noise),
             )
         return Recipe(
             n_modes=n_modes,

@@ -22,7 +22,7 @@ from service.control.reconstructor import MAX_CONDITION, InversionMethod
 from service.errors import ModelError
 from service.model.instrument import Instrument, Mirror
 from service.model.interaction import RtcInteractionModel
-from service.model.kinds import Influence
+from service.model.kinds import Influence, SignalKind
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.telemetry.health import Actuators
@@ -50,7 +50,8 @@ class Compute:
     """Of a truncated SVD."""
 
     slope_noise: float = 0.05
-    """1 σ of one slope in one frame: of a MAP inversion, and of a star of unknown magnitude."""
+    """1 σ of one slope in one frame: of a MAP inversion, and of a star of unknown magnitude. Of a
+    pixel it is half."""
 
     wind_m_s: float = 15.0
     """At which the expected loss of a reconstructor is computed."""
@@ -76,6 +77,9 @@ class Description:
 
     products: NDArray[np.float32] | None = None
     """``(n_modes, n_modes)`` DᵀD at ``start``, slope² per metre²; None: not worked out."""
+
+    kind: SignalKind = SignalKind.XY
+    """What the signals are."""
 
     start: Misregistration = field(default_factory=Misregistration)
     """Where a fit starts while nothing is known of α: the mirror's nominal rotation."""

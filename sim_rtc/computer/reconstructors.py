@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from service.errors import WireError
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
-from service.model.kinds import BasisKind
+from service.model.kinds import BasisKind, SignalKind
 from service.model.modes import ModalBasis
 from service.wire import (
     CHUNK_LIMIT,
@@ -267,6 +267,8 @@ def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:
     sensor.update(
         repr((wfs.wavelength_m, wfs.modulation_lambda_over_d, wfs.pupil_separation_subap)).encode()
     )
+    if instrument.slopes.kind is not SignalKind.XY:
+        sensor.update(instrument.slopes.kind.encode())
     return Identity(
         system=instrument.name,
         basis_id=f"{kind}-{instrument.modes.n_modes}-{basis.hexdigest()[:8]}",

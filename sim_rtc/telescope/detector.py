@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
+from service.model.interaction import signals_of
+from service.model.kinds import Normalisation, SignalKind
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -76,13 +78,19 @@ class Detector:
             instrument, magnitude=magnitude, frame_rate_hz=frame_rate_hz
         )
         """Detected in all four images together while no pixel is dead."""
+        kind = instrument.slopes.kind
         own = images.sum(axis=(0, 2))[valid] * self.electrons_per_frame
-        variance = camera.excess_noise * own + 4 * camera.read_noise_electrons**2
+        if kind is SignalKind.XY:
+            lights, n_pixels = np.tile(own, 2), 4
+        else:
+            pixels, _ = signals_of(images, valid, Normalisation.GLOBAL, kind)
+            lights, n_pixels = pixels * self.electrons_per_frame, 1
+        variance = camera.excess_noise * lights + n_pixels * camera.read_noise_electrons**2
         variance /= own.mean() ** 2
-        self.sigma: Array32 = np.sqrt(np.tile(variance, 2)).astype(np.float32)
-        """``(n_slopes,)`` 1 σ of a slope in one frame."""
+        self.sigma: Array32 = np.sqrt(variance).astype(np.float32)
+        """``(n_slopes,)`` 1 σ of a slope, or of a normalised pixel, in one frame."""
         if silent is not None:
-            self.sigma[np.tile(silent, 2)] = 0.0
+            self.sigma[np.tile(silent, kind.n_planes)] = 0.0
         # Drawn from by number, in a third of the time of a normal deviate; they end at 4.3 sigma.
         self._normal = _normal_values(2**16)
 

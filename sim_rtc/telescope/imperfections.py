@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.instrument import Pyramid
+from service.model.kinds import SignalKind
+from service.model.slopes import signals_of_slopes, slopes_of
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -86,8 +88,14 @@ class SlopeErrors:
     """
 
     def __init__(
-        self, valid: NDArray[np.bool_], imperfections: Imperfections, rng: np.random.Generator
+        self,
+        valid: NDArray[np.bool_],
+        imperfections: Imperfections,
+        rng: np.random.Generator,
+        kind: SignalKind = SignalKind.XY,
     ) -> None:
+        self.kind = kind
+        """What the sensor makes of the light."""
         n_valid = int(valid.sum())
         angle = np.deg2rad(imperfections.slope_rotation_deg)
         self._cosine, self._sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
@@ -116,14 +124,18 @@ class SlopeErrors:
         """Return what is read instead of ``slopes``, whose first axis is ``n_slopes``."""
         if self.absent:
             return slopes
-        along_x, along_y = np.split(slopes, 2)
-        read = np.concatenate(
+        along_x, along_y = before = slopes_of(slopes, self.kind)
+        turned = np.stack(
             [
                 self._cosine * along_x - self._sine * along_y,
                 self._sine * along_x + self._cosine * along_y,
             ]
         )
-        read[np.tile(self.silent, 2)] = 0.0
+        if self.kind is SignalKind.XY:
+            read = turned.reshape(slopes.shape)
+        else:
+            read = slopes + signals_of_slopes(turned - before, self.kind)
+        read[np.tile(self.silent, self.kind.n_planes)] = 0.0
         return np.asarray(read)
 
 

@@ -1,4 +1,4 @@
-"""Slopes over each subaperture's own flux: the exact Jacobian, against a non-linear FFT pyramid."""
+"""Slopes over each subaperture's own flux, and pixels: exact Jacobians, against an FFT pyramid."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.model.interaction import InteractionModel
-from service.model.kinds import Normalisation
+from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.slopes import SlopeRecipe
 from tests.numerics import SOMEWHERE, small_basis, small_instrument
@@ -17,6 +17,8 @@ from tests.physics.fft_pyramid import FftPyramid
 MODES = [0, 1, 2, 5, 11, 23, 39]
 STROKE_M = 1e-9
 LOCAL = SlopeRecipe(normalisation=Normalisation.LOCAL)
+PIXELS = SlopeRecipe(order=SlopeOrder.IMAGES)
+LOCAL_PIXELS = replace(LOCAL, order=SlopeOrder.IMAGES)
 
 
 def model_of(*, nodes=2, dtype=np.float32, recipe=LOCAL):
@@ -51,7 +53,19 @@ def local_slopes(images, valid):
     return np.concatenate([(across_x / flux)[valid], (across_y / flux)[valid]])
 
 
-def push_pull(model, alpha):
+def pixels(images, valid):
+    """The light over the mean of a subaperture, image after image, as they lie on the detector."""
+    mean = images.sum(axis=(0, 2))[valid].mean()
+    return np.concatenate([images[y, :, x][valid] for y in (0, 1) for x in (0, 1)]) / mean
+
+
+def local_pixels(images, valid):
+    """The same over the light of each subaperture's own four pixels."""
+    own = images.sum(axis=(0, 2))[valid]
+    return np.concatenate([images[y, :, x][valid] / own for y in (0, 1) for x in (0, 1)])
+
+
+def push_pull(model, alpha, signals):
     """The matrix an FFT pyramid measures by poking the modes by a nanometre."""
     sensor = fft_pyramid(model)
     shift = (alpha.shift_x_subap, alpha.shift_y_subap)
@@ -60,8 +74,8 @@ def push_pull(model, alpha):
     poke = STROKE_M
     columns = [
         (
-            local_slopes(sensor.images(poke * opd, shift), model.valid)
-            - local_slopes(sensor.images(-poke * opd, shift), model.valid)
+            signals(sensor.images(poke * opd, shift), model.valid)
+            - signals(sensor.images(-poke * opd, shift), model.valid)
         )
         / (2 * poke)
         for opd in opds
@@ -69,10 +83,15 @@ def push_pull(model, alpha):
     return np.stack(columns, axis=1)
 
 
-def test_the_matrix_is_what_an_fft_pyramid_measures_push_pull():
+@pytest.mark.parametrize(
+    ("recipe", "signals"),
+    [(LOCAL, local_slopes), (PIXELS, pixels), (LOCAL_PIXELS, local_pixels)],
+    ids=["local", "pixels", "local pixels"],
+)
+def test_the_matrix_is_what_an_fft_pyramid_measures_push_pull(recipe, signals):
     """0.4 %: light that the FFT wraps around, as with global normalisation."""
-    model = model_of()
-    expected = push_pull(model, SOMEWHERE)
+    model = model_of(recipe=recipe)
+    expected = push_pull(model, SOMEWHERE, signals)
     found = model.interaction_matrix(SOMEWHERE)[:, MODES]
     assert np.linalg.norm(found - expected) < 4e-3 * np.linalg.norm(expected)
 
@@ -87,9 +106,10 @@ def test_it_is_not_the_matrix_of_global_normalisation():
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_derivatives_agree_with_central_differences(axis):
+@pytest.mark.parametrize("recipe", [LOCAL, LOCAL_PIXELS], ids=["slopes", "pixels"])
+def test_derivatives_agree_with_central_differences(axis, recipe):
     """At 4 nodes edges and area agree to 0.2 % of a shift's derivative; a rotation's is exact."""
-    model = model_of(nodes=4, dtype=np.float64)
+    model = model_of(nodes=4, dtype=np.float64, recipe=recipe)
     step = 1e-4 * np.eye(4)[axis]
     ahead, behind = (
         model.interaction_matrix(Misregistration.from_vector(SOMEWHERE.vector + s * step))

@@ -78,7 +78,7 @@ masks = arrays.arrays(bool, st.tuples(st.integers(1, 6), st.integers(1, 6)))
 @given(masks, orientations, st.sampled_from(SlopeOrder))
 def test_an_rtcs_list_of_slopes_is_a_permutation_with_signs(mask, orientation, order):
     """Every slope is there once, its sign is 1 or -1, and the way back undoes the way there."""
-    listed = np.arange(1.0, 2 * mask.sum() + 1)
+    listed = np.arange(1.0, order.kind.n_planes * mask.sum() + 1)
     there = to_conventions(listed, order, orientation, mask)
     np.testing.assert_array_equal(np.sort(np.abs(there)), listed)
     np.testing.assert_array_equal(to_rtc(there, order, orientation, mask), listed)

@@ -13,7 +13,7 @@ from service.config.mirrors import coincident, grid, rings, typical_pitch
 from service.errors import ConfigurationError
 from service.model.instrument import LoopFacts
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
-from service.model.kinds import Influence, Normalisation, SlopeOrder, Stop
+from service.model.kinds import Influence, Normalisation, SignalKind, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Orientation
@@ -311,6 +311,13 @@ def test_the_rtcs_own_slopes_are_described_as_they_are(write):
     assert recipe.orientation == Orientation(swap_xy=True, flip_y=True, sign_x=-1, sign_y=-1)
 
 
+def test_pixels_are_described_by_their_kind_and_listed_image_after_image(write):
+    text = ABOUT + WFS + MIRROR + MODES + '[slopes]\nkind = "intensity"\n'
+    assert load_instrument(write(text)).slopes.order is SlopeOrder.IMAGES
+    recipe = load_instrument(write(text + 'order = "detector"\n')).slopes
+    assert (recipe.kind, recipe.order) == (SignalKind.INTENSITY, SlopeOrder.DETECTOR)
+
+
 def test_the_signs_of_the_two_components_may_differ(write):
     slopes = "[slopes]\norientation = { sign = [1, -1] }\n"
     recipe = load_instrument(write(ABOUT + WFS + MIRROR + MODES + slopes)).slopes
@@ -558,6 +565,14 @@ def test_without_astropy_a_fits_file_is_refused_with_what_to_install(write, tmp_
         (
             WFS + 'input = "frames"\n' + MIRROR + MODES + '[slopes]\norder = "xy"\n',
             "slopes.order: has no meaning beside wfs.input",
+        ),
+        (
+            WFS + MIRROR + MODES + '[slopes]\nkind = "intensity"\norder = "xy"\n',
+            'slopes.order: found xy beside kind = "intensity", expected images or images-yx or',
+        ),
+        (
+            WFS + MIRROR + MODES + '[slopes]\norder = "detector"\n',
+            'slopes.order: found detector beside kind = "xy", expected xy or yx or interleaved',
         ),
         (
             WFS + MIRROR + MODES + "[slopes]\norientation = { sign = 0 }\n",

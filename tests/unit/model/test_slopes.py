@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.kinds import SlopeOrder
+from service.model.kinds import SignalKind, SlopeOrder
 from service.model.slopes import (
     Orientation,
     SlopeRecipe,
     rtc_mask,
+    signals_of_slopes,
+    slopes_of,
     to_conventions,
     to_rtc,
     turned_mask,
@@ -66,11 +68,64 @@ def test_a_wavefront_seen_in_the_rtcs_axes_comes_out_in_ours(orientation):
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+def light(points, side_x, side_y, plane):
+    """The light at ``points`` of the image at a side: it is brighter where the wavefront falls."""
+    along_x, along_y = gradients(points, plane)
+    x, y = points.T
+    return 9.0 - side_x * along_x - side_y * along_y + side_x * side_y * (0.3 * x - 0.2 * y)
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS, ids=repr)
+def test_images_seen_in_the_rtcs_axes_come_out_in_ours(orientation):
+    """A flip mirrors the detector, where the images lie and what is in them; a sign only where."""
+    plane = (0.7, -1.1, 0.31, 0.17)
+    to_ours = np.eye(2)[::-1] if orientation.swap_xy else np.eye(2)
+    to_ours = to_ours @ np.diag(
+        [-1.0 if orientation.flip_x else 1.0, -1.0 if orientation.flip_y else 1.0]
+    )
+    listed = []
+    for side_y, side_x in product((-1, 1), (-1, 1)):
+        side = to_ours @ [side_x * orientation.sign_x, side_y * orientation.sign_y]
+        listed.append(light(positions(MASK) @ to_ours.T, *side, plane))
+    found = to_conventions(np.concatenate(listed), SlopeOrder.IMAGES, orientation, MASK)
+    ours = positions(turned_mask(MASK, orientation))
+    expected = [light(ours, x, y, plane) for y, x in product((-1, 1), (-1, 1))]
+    np.testing.assert_allclose(found, np.concatenate(expected), rtol=1e-12)
+    slopes = slopes_of(found, SignalKind.INTENSITY)
+    np.testing.assert_allclose(slopes, 4.0 * np.array(gradients(ours, plane)), atol=1e-12)
+
+
+def test_the_orders_of_pixels_are_what_their_names_say():
+    """Two subapertures above one: the pixels of a detector, numbered as they lie on it."""
+    mask = np.array([[1, 1], [0, 1]], bool)
+    detector = np.arange(16.0).reshape(4, 4)
+    left, right = detector[:2], detector[2:]
+    images = [part[mask] for half in (left, right) for part in (half[:, :2], half[:, 2:])]
+    seen = np.tile(mask, (2, 2))
+    for order, listed in (
+        (SlopeOrder.IMAGES, np.concatenate(images)),
+        (SlopeOrder.IMAGES_YX, np.concatenate([images[k] for k in (0, 2, 1, 3)])),
+        (SlopeOrder.AROUND, np.concatenate([images[k] for k in (0, 1, 3, 2)])),
+        (SlopeOrder.PIXELS, np.array(images).T.ravel()),
+        (SlopeOrder.DETECTOR, detector[seen]),
+    ):
+        found = to_conventions(listed, order, Orientation(), mask)
+        np.testing.assert_array_equal(found, np.concatenate(images), str(order))
+
+
+def test_slopes_of_the_smallest_signals_that_have_them_are_those():
+    slopes = np.random.default_rng(2).normal(size=(2, N, 3))
+    for kind in SignalKind:
+        signals = signals_of_slopes(slopes, kind)
+        assert signals.shape == (kind.n_planes * N, 3)
+        np.testing.assert_allclose(slopes_of(signals, kind), slopes, rtol=1e-12)
+
+
 @pytest.mark.parametrize("order", SlopeOrder)
 @pytest.mark.parametrize("orientation", ORIENTATIONS, ids=repr)
 def test_there_and_back_is_the_same_list_for_vectors_and_matrices(order, orientation):
-    rng = np.random.default_rng(1)
-    for values in (rng.normal(size=2 * N), rng.normal(size=(2 * N, 3)).astype(np.float32)):
+    rng, n = np.random.default_rng(1), order.kind.n_planes * N
+    for values in (rng.normal(size=n), rng.normal(size=(n, 3)).astype(np.float32)):
         there = to_conventions(values, order, orientation, MASK)
         assert there.dtype == values.dtype
         np.testing.assert_array_equal(to_rtc(there, order, orientation, MASK), values)
@@ -118,7 +173,7 @@ def test_an_unknown_orientation_is_taken_for_the_conventions_own():
 
 
 def test_a_list_that_does_not_fit_the_mask_is_refused():
-    with pytest.raises(ModelError, match=rf"found 5 of them; expected {2 * N}, two for each"):
+    with pytest.raises(ModelError, match=rf"found 5 of them; expected {2 * N}, 2 for each"):
         to_conventions(np.zeros(5), SlopeOrder.XY, Orientation(), MASK)
 
 

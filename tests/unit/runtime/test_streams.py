@@ -198,6 +198,10 @@ def test_an_rtc_of_another_shape_is_described_with_both_shapes():
     assert text == (
         "the RTC has 10 slopes and 8 modes, the instrument file 6 and 8: wrong instrument file?"
     )
+    pixels = shape_mismatch(DESCRIPTION, replace(RTC, n_slopes=2 * N_SLOPES))
+    assert pixels.endswith('they look like pixels: is it slopes.kind = "intensity"?')
+    slopes = shape_mismatch(DESCRIPTION, replace(RTC, n_slopes=N_SLOPES // 2))
+    assert slopes.endswith('they look like x and y slopes: is it slopes.kind = "xy"?')
 
 
 class TestCommandsOffTheLoop:

@@ -1,6 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from service.model.kinds import SlopeOrder
+from service.model.slopes import SlopeRecipe
 from sim_rtc.telescope.detector import Camera, Detector
 
 N = 10
@@ -61,3 +65,16 @@ def test_counts_keep_the_place_of_the_images(small_instrument, light):
     counts = detector(small_instrument, light, 8.0).counts(images)
     assert counts.shape == (4, N, N)
     assert counts[1].sum() == pytest.approx(2 * counts[0].sum(), rel=1e-5)
+
+
+def test_the_noise_of_pixels_is_each_pixels_own_and_makes_that_of_slopes(small_instrument, light):
+    pixels = replace(small_instrument, slopes=SlopeRecipe(order=SlopeOrder.IMAGES))
+    made = detector(pixels, light, 8.0, read_noise_electrons=3.0)
+    slopes = detector(small_instrument, light, 8.0, read_noise_electrons=3.0)
+    images, valid = light
+    own = images.sum(axis=(0, 2))[valid].mean()
+    first = images[0, :, 0][valid] * made.electrons_per_frame
+    expected = np.sqrt(first + 9.0) / (own * made.electrons_per_frame)
+    np.testing.assert_allclose(made.sigma[: len(first)], expected, rtol=1e-6)
+    variance = (made.sigma.reshape(4, -1) ** 2).sum(axis=0)
+    np.testing.assert_allclose(variance, slopes.sigma[: len(first)] ** 2, rtol=1e-5)

@@ -31,7 +31,7 @@ from service.tracking.products import (
 )
 from service.tracking.registration import Registration, table_of
 from service.tracking.state import TrackerState
-from service.worker import InUse, OpticsWorker
+from service.worker import OpticsWorker
 
 UNKNOWN_PARENT = "unknown"
 """Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""
@@ -232,25 +232,24 @@ class Actions:
         try:
             matrix = await asyncio.to_thread(self.matrix, effect.id)
             gains = rtc.gains[: len(matrix)]
-            question = InUse(
-                matrix=matrix,
-                alpha=registration.alpha,
-                covariance=registration.total_covariance,
-                loop=loop_to_judge(state, gains),
-                bound=self._publishing.pole_radius_bound,
-                optical_gain=expected_gains(registration, rtc.n_modes),
-                magnitude=rtc.magnitude,
+            verdict, expected = await self._workers.call(
+                OpticsWorker.margin,
+                matrix,
+                registration.alpha,
+                registration.total_covariance,
+                loop_to_judge(state, gains),
+                self._publishing.pole_radius_bound,
+                expected_gains(registration, rtc.n_modes),
+                rtc.magnitude,
             )
-            margin = await self._workers.call(OpticsWorker.margin, question)
         finally:
             self._judging.discard(effect.id)
-        judged = judged_now(state, gains)
         return ev.MarginJudged(
             id=effect.id,
-            verdict=margin.verdict,
-            alpha=margin.alpha,
-            expected=margin.expected,
-            judged=replace(judged, alpha=margin.alpha, sigma=margin.sigma, gains=margin.gains),
+            verdict=verdict,
+            alpha=registration.alpha,
+            expected=expected,
+            judged=judged_now(state, gains),
         )
 
     async def _verdict(

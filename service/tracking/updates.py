@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from service.tracking.activity import ramping
 from service.tracking.alarms import Act
 from service.tracking.dither import choose_dither, stop_unwanted
@@ -11,10 +9,16 @@ from service.tracking.events import MakeMatrix
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import fetch, judge, make
-from service.tracking.registration import Registration
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
-from service.tracking.worth import fewer_than, more_to_try, outdated, settled, why_worthwhile
+from service.tracking.worth import (
+    fewer_than,
+    look_is_old,
+    more_to_try,
+    outdated,
+    settled,
+    why_worthwhile,
+)
 from service.wire import Status
 
 ASK_FIRST_S = 3.0
@@ -23,15 +27,15 @@ ASK_FIRST_S = 3.0
 ASK_AGAIN_S = 10.0
 """Between two questions for a matrix that was not to be had, or has no name."""
 
-JUDGE_INTERVAL_S = 15.0
-"""Least time between two looks at the margin of the matrix in use, while α stays: with 594 modes
-it takes 2.4 s of a core."""
+JUDGE_INTERVAL_S = 60.0
+"""Between two looks at the margin of the matrix in use while the last one holds: it takes 2 s of a
+core with 500 modes, and only its star and its optical gains may be others."""
+
+JUDGE_REFUSED_S = 15.0
+"""The same where the margin is short, or no answer came: a smaller σ may let it pass."""
 
 JUDGE_AGAIN_S = 2.0
-"""The same when α has moved."""
-
-NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
-"""A move of α that calls for a look at once (numeric units), if it is more than 1 σ."""
+"""Least time between two looks when the last one holds no longer."""
 
 
 def fetch_in_use(turn: Turn) -> None:
@@ -62,24 +66,27 @@ def decide(turn: Turn) -> None:
 
 
 def _judge_in_use(turn: Turn) -> None:
-    """Look at the margin of the matrix in use once α is known, when it moves, and now and then."""
+    """Look at the margin of the matrix in use once α is known, and when the last look is too old.
+
+    Nothing is sent on such an answer: what is made, approved, copied or asked of the loop is judged
+    there and then.
+    """
     state, known = turn.state, turn.known
     if known is None or state.in_use is None or not settled(known):
         return
-    if state.making_since_ns_utc is None and _judgement_due(state, known, turn.now_ns):
+    if state.making_since_ns_utc is None and _judgement_due(state, state.in_use, turn.now_ns):
         judge(turn, state.in_use)
 
 
-def _judgement_due(state: TrackerState, known: Registration, now_ns: int) -> bool:
+def _judgement_due(state: TrackerState, in_use: str, now_ns: int) -> bool:
     if state.judged_ns_utc is None:
         return True
     waited_s = (now_ns - state.judged_ns_utc) / SECOND_NS
-    last = state.assessment
-    if waited_s > JUDGE_INTERVAL_S or last is None:
-        return waited_s > JUDGE_INTERVAL_S
-    moved = np.abs(known.alpha.vector - last.alpha.vector)
-    noise = np.sqrt(np.diag(known.covariance))
-    return waited_s > JUDGE_AGAIN_S and bool(np.any(moved > np.maximum(NOTICED, noise)))
+    record = state.reconstructor(in_use)
+    if state.margin is None or record is None or record.judged is None:
+        return waited_s > JUDGE_REFUSED_S
+    every_s = JUDGE_INTERVAL_S if state.margin.accepted else JUDGE_REFUSED_S
+    return waited_s > every_s or (waited_s > JUDGE_AGAIN_S and look_is_old(state, record))
 
 
 def _choose_update(turn: Turn, rtc: Status) -> None:

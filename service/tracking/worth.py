@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.expected_gain import explained_by_noise
-from service.model.misregistration import BOUNDARY_SCALE
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.tracking.commands import Reject
 from service.tracking.events import Event
 from service.tracking.loop import SAME_DELAY, SAME_LEAK, same_gains
@@ -37,6 +37,9 @@ CALMING_S = 60.0
 
 SIGNIFICANT = 18.5
 """Squared distance, in σ, of a step of four parameters that noise makes once in a thousand."""
+
+NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
+"""A move of α that changes what a new matrix would win (numeric units), if it is more than 1 σ."""
 
 VERDICT_REACH = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 """A verdict of the gate is not for a registration further away than this (numeric units)."""
@@ -122,6 +125,22 @@ def why_worthwhile(
     return _why_gaining(last, in_use, known, policy, now_ns)
 
 
+def look_is_old(state: TrackerState, in_use: ReconstructorRecord) -> bool:
+    """Return whether the last look at the matrix in use says nothing of now.
+
+    Its verdict holds as long as :func:`why_stale` says. What a new one would win counts only where
+    α is known to be elsewhere than where the one in use was made for: there every move counts.
+    """
+    known, last = state.registration, state.assessment
+    gains = () if state.rtc is None else state.rtc.gains[: in_use.n_modes]
+    if why_stale(state, in_use.judged, gains) is not None:
+        return True
+    if known is None or last is None or _step_since(in_use, known.alpha, known) is None:
+        return False
+    noise = np.sqrt(np.diag(known.covariance))
+    return bool(np.any(np.abs(known.alpha.vector - last.alpha.vector) > np.maximum(NOTICED, noise)))
+
+
 def _why_gaining(
     last: Assessment,
     in_use: ReconstructorRecord,
@@ -130,12 +149,10 @@ def _why_gaining(
     now_ns: int,
 ) -> str | None:
     """Return what a new one would win, where that is more than the threshold of now."""
-    covariance = _of_step(in_use, known)
-    if covariance is None or in_use.alpha is None:
+    since = _step_since(in_use, last.alpha, known)
+    if since is None:
         return None
-    step = last.alpha.vector - in_use.alpha.vector
-    if step @ np.linalg.solve(covariance, step) < SIGNIFICANT:
-        return None
+    step, covariance = since
     found, raised = last.expected, _raised(in_use, now_ns)
     win_m = found.loss_m - explained_by_noise(found.loss_m, step, covariance)
     if win_m > policy.update_gain_m * raised:
@@ -161,15 +178,21 @@ def _raised(in_use: ReconstructorRecord, now_ns: int) -> float:
     return 1.0 + max(0.0, 1.0 - since_s / CALMING_S)
 
 
-def _of_step(in_use: ReconstructorRecord, known: Registration) -> NDArray[np.float64] | None:
-    """Return the covariance of what separates two registrations, as both were measured.
+def _step_since(
+    in_use: ReconstructorRecord, alpha: Misregistration, known: Registration
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return the step from what a matrix was made for to ``alpha``, and its covariance.
 
-    They share the model error; what drift may have added since is no error of either.
+    As both were measured: they share the model error; what drift may have added since is no error
+    of either. None: noise explains it, or nobody knows.
     """
-    if in_use.sigma is None:
+    if in_use.alpha is None or in_use.sigma is None:
         return None
+    step = alpha.vector - in_use.alpha.vector
     then = np.maximum(in_use.sigma**2 - known.floor**2, 0.0)
-    return np.asarray(known.covariance + np.diag(then))
+    covariance = known.covariance + np.diag(then)
+    far = step @ np.linalg.solve(covariance, step) >= SIGNIFICANT
+    return (step, covariance) if far else None
 
 
 def moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:

@@ -6,15 +6,13 @@ alone.
 
 from service.worker.optics_worker import OpticsWorker
 from service.worker.process import Done, run_job, start_worker
-from service.worker.records import Compute, Description, InUse, Made, Margin
+from service.worker.records import Compute, Description, Made
 
 __all__ = [
     "Compute",
     "Description",
     "Done",
-    "InUse",
     "Made",
-    "Margin",
     "OpticsWorker",
     "run_job",
     "start_worker",

@@ -34,9 +34,7 @@ from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.worker.records import (
     Compute,
     Description,
-    InUse,
     Made,
-    Margin,
     actuators_of,
     check_controllable,
     outer_of,
@@ -103,7 +101,6 @@ class OpticsWorker:
         self._model = self._sensor.flat
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
         self._start = instrument.start
-        self._margin: tuple[InUse, Margin] | None = None
         self._far: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
 
     def tidy(self) -> None:
@@ -174,7 +171,6 @@ class OpticsWorker:
                 return _unsettled(spectra)
             found = self._against_flat(estimate)
             if self._sensor.follow(found.modes, found.optical_gain):
-                self._margin = None
                 estimate = self._settled_fit(spectra, loop, found.alpha)
         except np.linalg.LinAlgError as error:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
@@ -390,20 +386,24 @@ class OpticsWorker:
         at_work = self._sensor.at_unit_gain(alpha)
         return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
 
-    def margin(self, question: InUse) -> Margin:
-        """Return verdict and worth of a matrix in use; the last ones while nothing has moved."""
-        if self._margin is None or not question.is_about(self._margin[0]):
-            alpha, matrix, loop = question.alpha, question.matrix, question.loop
-            expected = replace(loop, optical_gain=question.optical_gain)
-            found = Margin(
-                verdict=self.judge(matrix, alpha, question.covariance, loop, question.bound),
-                expected=self.assess(matrix, alpha, expected, question.magnitude),
-                alpha=alpha,
-                sigma=question.sigma,
-                gains=tuple(loop.gains.tolist()),
-            )
-            self._margin = question, found
-        return self._margin[1]
+    def margin(
+        self,
+        in_use: NDArray[np.float32],
+        alpha: Misregistration,
+        covariance: NDArray[np.float64],
+        loop: ControlLoop,
+        bound: float,
+        optical_gain: NDArray[np.float64],
+        magnitude: float | None,
+    ) -> tuple[GateVerdict, ExpectedGain | None]:
+        """Return verdict and worth of the matrix in use, ``(n_modes, n_slopes)`` metres per slope.
+
+        ``loop`` and ``bound`` are the gate's; ``optical_gain`` ``(n_basis,)`` and the star's
+        ``magnitude`` the expected gain's.
+        """
+        verdict = self.judge(in_use, alpha, covariance, loop, bound)
+        loop = replace(loop, optical_gain=optical_gain)
+        return verdict, self.assess(in_use, alpha, loop, magnitude)
 
     def watch(
         self, state: passive.Passive, start: Misregistration | None

@@ -29,7 +29,6 @@ from service.tracking.policy import Policy
 from service.tracking.resume import restored, resumed, saved_of
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import new_lines
-from studies.campaign.golden_changes import Renewal
 from studies.campaign.golden_codec import Json, decoded, encoded
 
 FOLDER = Path("tests/data/golden")
@@ -119,29 +118,36 @@ def seen_by_operator(state: TrackerState, now_ns: int) -> dict[str, Json]:
     }
 
 
-def replayed(night: Sequence[Entry], instrument: Entry) -> str | None:
-    """Tell a recorded night to the tracker again; return the first difference, None: there is none.
+def retold(night: Sequence[Entry], instrument: Entry) -> list[Entry]:
+    """Return a recorded night as the tracker would have it: the same events, told to it again.
 
     The first entry of a night says how it began.
     """
     begin, *expected = night
     policy = with_instrument(policy_of(load_settings(None, {}, begin["settings"])), instrument)
     teller = Teller(TrackerState(system=begin["system"], mode=Mode(begin["mode"])), policy)
-    renewal = Renewal()
-    for k, entry in enumerate(map(renewal.entry, expected)):
-        now_ns = entry["t"]
+    for entry in expected:
         if "restart" in entry:
-            teller.restart(Mode(entry["restart"]), now_ns)
+            teller.restart(Mode(entry["restart"]), entry["t"])
         else:
             # the refusal is in the entry
             with suppress(PyrcalError):
-                teller.tell(decoded(Event, entry["event"]), now_ns)
-        found = {name: teller.entries[-1].get(name) for name in COMPARED}
-        told = {name: entry.get(name) for name in COMPARED}
-        difference = first_difference(found, told)
+                teller.tell(decoded(Event, entry["event"]), entry["t"])
+    return [begin, *teller.entries]
+
+
+def replayed(night: Sequence[Entry], instrument: Entry) -> str | None:
+    """Return the first difference between a recorded night and it retold; None: there is none."""
+    begin, *expected = night
+    _, *again = retold(night, instrument)
+    for k, (entry, found) in enumerate(zip(expected, again, strict=True)):
+        difference = first_difference(
+            {name: found.get(name) for name in COMPARED},
+            {name: entry.get(name) for name in COMPARED},
+        )
         if difference is not None:
             what = entry["event"]["is"] if "event" in entry else "restart"
-            since_s = (now_ns - expected[0]["t"]) / 1e9
+            since_s = (entry["t"] - expected[0]["t"]) / 1e9
             return f"{begin['night']}, event {k} after {since_s:.2f} s, {what}: {difference}"
     return None
 

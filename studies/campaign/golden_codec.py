@@ -1,8 +1,8 @@
 """Frozen records as JSON and back, guided by the type hints of their fields.
 
 A record is ``{"is": class name, field: value}`` with the fields that are not at their defaults. Of
-a class only its name is written, so that it may move to another module. What has changed since a
-night was recorded is put right in ``studies.campaign.golden_changes``.
+a class only its name is written, so that it may move to another module. Where a record itself
+changes, nights are retold before: ``python -m studies.campaign.golden_nights --retell``.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Records the golden nights: short nights in which everything happens to the service once.
 
-Run: ``python -m studies.campaign.golden_nights [--only jump,steady]``, then ``git diff``. Recorded
-twice on one machine they are the same but for the names of the RTC's sessions, drawn at random;
-another processor may round otherwise.
+Run: ``python -m studies.campaign.golden_nights [--only jump,steady]``. Recorded twice on one
+machine they are the same but for the names of the RTC's sessions, drawn at random; another
+processor may round otherwise. With ``--retell`` the events stay as they were recorded, and only
+what the tracker makes of them is written anew: the first difference of each night is printed.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.worker import Compute, OpticsWorker
-from studies.campaign.golden import FOLDER, INSTRUMENT, written
+from studies.campaign.golden import FOLDER, INSTRUMENT, read, replayed, retold, written
 from studies.campaign.golden_night import GoldenNight
 from studies.campaign.golden_orders import COMMANDED, MEASURING
 from studies.campaign.golden_skies import ACQUIRING, FAULTS, TRACKING
@@ -32,6 +33,9 @@ def main() -> int:
     with threadpool_limits(1):
         for plan in NIGHTS:
             if plan.name not in names:
+                continue
+            if given.retell:
+                _retell(given.folder, plan.name)
                 continue
             begun = time.process_time()
             # of this night alone: a worker may take up what a matrix tells of the slopes
@@ -49,12 +53,20 @@ def main() -> int:
     return 0
 
 
+def _retell(folder: Path, name: str) -> None:
+    path, (instrument,) = folder / f"{name}.jsonl.xz", read(folder / INSTRUMENT)
+    night = read(path)
+    sys.stdout.write(f"{name}: {replayed(night, instrument) or 'as it was'}\n")
+    written(retold(night, instrument), path)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m studies.campaign.golden_nights",
         description="Records the golden nights, what the tracker is compared with.",
     )
     parser.add_argument("--folder", type=Path, default=FOLDER)
+    parser.add_argument("--retell", action="store_true", help="keep the events")
     parser.add_argument("--only", default="", metavar="NAME,NAME", help="default: all nights")
     return parser
 

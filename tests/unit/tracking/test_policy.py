@@ -9,7 +9,17 @@ from service.tracking.dither_request import lock_in_plan, plan_dither
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest, DitherStop
-from tests.unit.tracking.situations import N_MODES, POLICY, START_NS, Story, moved, of_kind, rtc
+from tests.unit.tracking.situations import (
+    N_MODES,
+    POLICY,
+    START_NS,
+    Story,
+    judged,
+    moved,
+    of_kind,
+    rtc,
+    verdict,
+)
 
 PARALYSING = [
     "second-rtc",
@@ -126,12 +136,32 @@ class TestDither:
 class TestMargin:
     """When the matrix in use is judged."""
 
-    def test_after_two_windows_and_then_every_fifteen_seconds(self):
+    def test_after_two_windows_and_again_where_no_answer_came(self):
         story = Story(Mode.HOLD).meet()
         assert not of_kind(story.see(), ev.JudgeMatrix)
         assert of_kind(story.see(), ev.JudgeMatrix) == [ev.JudgeMatrix(id="initial")]
         assert not of_kind(story.wait(15), ev.JudgeMatrix)
         assert of_kind(story.wait(1), ev.JudgeMatrix)
+
+    @pytest.mark.parametrize(("accepted", "windows"), [(True, 30), (False, 7)])
+    def test_then_seldom_while_the_verdict_holds(self, accepted, windows):
+        story = self.looked_at(accepted=accepted)
+        assert not of_kind(story.see(n_windows=windows), ev.JudgeMatrix)
+        assert of_kind(story.see(), ev.JudgeMatrix)
+
+    def test_at_once_where_alpha_may_be_out_of_its_reach(self):
+        story = self.looked_at()
+        within = 3 * story.state.registration.sigma[0] + 0.04
+        assert not of_kind(story.see(moved(shift_x_subap=0.04)), ev.JudgeMatrix)
+        effects = [e for _ in range(6) for e in story.see(moved(shift_x_subap=within + 0.1))]
+        assert of_kind(effects, ev.JudgeMatrix)
+
+    def looked_at(self, *, accepted=True):
+        story = Story(Mode.HOLD).meet()
+        story.see(n_windows=2)
+        then = judged(story.state.registration, rtc())
+        story.tell(ev.MarginJudged(id="initial", verdict=verdict(accepted=accepted), judged=then))
+        return story
 
     def test_not_while_a_reconstructor_is_being_computed(self):
         story = Story(Mode.HOLD).meet()

@@ -10,6 +10,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Mode
 from service.tracking.worth import CALMING_S
+from tests.unit.tracking import situations
 from tests.unit.tracking.situations import ALPHA, POLICY, Story, moved, of_kind, verdict
 
 FAR_THRESHOLDS = replace(
@@ -42,8 +43,9 @@ def story():
 
 def judged(story, expected, alpha=NEAR, matrix_id="cm-1"):
     """Tell what the worker found; return the reconstructors asked for in the next seconds."""
+    now = situations.judged(story.state.registration, story.state.rtc)
     effects = story.tell(
-        ev.MarginJudged(id=matrix_id, verdict=verdict(), alpha=alpha, expected=expected)
+        ev.MarginJudged(id=matrix_id, verdict=verdict(), alpha=alpha, expected=expected, judged=now)
     )
     return of_kind((*effects, *story.wait(3)), ev.MakeMatrix)
 

@@ -18,13 +18,11 @@ from service import __version__
 from service.keys import KeyFile
 from service.routes import (
     archive,
-    audit,
     commands,
     fits,
-    glance,
     health,
     matrices,
-    orders,
+    numbers,
     page,
     problems,
     reading,
@@ -33,9 +31,7 @@ from service.routes import (
     views,
 )
 from service.routes.admission import OPEN, SCHEMES, Admission, Hosts, needs, scope_of
-from service.routes.connections import server_config
-from service.routes.once import Once
-from service.routes.tracing import Traced
+from service.routes.connections import Once, Traced, server_config
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 
@@ -122,8 +118,7 @@ def create_app(
     page.install(app)
     routers = [
         reading.router,
-        glance.router,
-        audit.router,
+        numbers.router,
         archive.router,
         stream.router,
         page.router,
@@ -163,9 +158,9 @@ class _Application(FastAPI):
             if isinstance(route.original_route, APIRoute)
             for found in route.dependant.dependencies
             for method in route.methods or ()
-            if isinstance(found.call, orders.Body)
+            if isinstance(found.call, commands.Body)
         }
-        bodies, schemas = orders.bodies(read)
+        bodies, schemas = commands.bodies(read)
         for operation, body in bodies.items():
             method, _, path = operation.partition(" ")
             document["paths"][path][method]["requestBody"] = body

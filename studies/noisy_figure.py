@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import MatrixError
-from service.files.drawn import PAPER_MODES, as_maps
-from service.files.figures import check_plots
+from service.files.figures import PAPER_MODES, as_maps, check_plots
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.slopes import to_conventions

@@ -18,8 +18,7 @@ from typing_extensions import override
 from service import __version__
 from service.commands.remote import add, declare, words
 from service.errors import ConfigurationError
-from service.files import kind_of
-from service.files.request import parse_alpha, parse_arms, parse_modes
+from service.files import kind_of, parse_alpha, parse_arms, parse_modes
 
 OTHER_PROGRAMS = {
     "demo": ("studies.demo", "the main job, end to end, on a simulated telescope"),

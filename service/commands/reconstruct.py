@@ -21,6 +21,7 @@ from service.config import load_instrument
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import InversionMethod, Prior, Provenance, Recipe, reconstruct
 from service.errors import ConfigurationError, MatrixError
+from service.files import parse_alpha
 from service.files.container import file_sha256
 from service.files.light import read_light
 from service.files.report import (
@@ -30,7 +31,6 @@ from service.files.report import (
     orientation_words,
     read_fit,
 )
-from service.files.request import parse_alpha
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
 from service.model.modes import modal_basis

@@ -11,8 +11,17 @@ from numpy.typing import NDArray
 
 from service.conformance.articles import ARTICLES, Checked, Moves, skipped, wrong
 from service.conformance.listening import About, listened
-from service.conformance.opening import OPEN_S, STROKE_M, loop, measure, reconnect
-from service.conformance.swaps import MatrixInUse, chunks, commit, rejection
+from service.conformance.moving import (
+    OPEN_S,
+    STROKE_M,
+    MatrixInUse,
+    chunks,
+    commit,
+    loop,
+    measure,
+    reconnect,
+    rejection,
+)
 from service.conformance.talk import TOTAL_M, Talk, dither, dithered_modes, replies
 from service.errors import LinkError, WireError
 from service.fit.dialect import Dialect

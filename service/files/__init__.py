@@ -1,13 +1,27 @@
 """Measured matrices in files, and what was found in them as JSON, text and figures.
 
-The fit itself is ``service.fit``; nothing here decides anything about it. This module says what a
-file cannot be before anything large is imported.
+The fit itself is ``service.fit``; nothing here decides anything about it. This module looks at what
+a user asks of one, in the words of the command line and of REST, and at what a file cannot be,
+before anything large is imported: a mistake is told at once.
 """
 
+from __future__ import annotations
+
+import math
+import re
 from enum import StrEnum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from service.errors import MatrixError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from service.fit.light_rotation import Arms
+    from service.model.misregistration import Misregistration
+
 
 _HDF5_BEGINS = b"\x89HDF\r\n\x1a\n"
 
@@ -55,3 +69,84 @@ def kind_of(path: Path) -> FileKind:
     kind = "something else" if begins else "an empty file"
     kind = next((words for first, words in _OTHERS.items() if begins.startswith(first)), kind)
     raise MatrixError(f"{path}: found {kind}, expected an HDF5, a FITS or a NumPy file")
+
+
+MOST_MODES = 100_000
+
+_PART = re.compile(r"(\d+)(?::(\d+)(?::(\d+))?)?")
+
+
+def parse_modes(text: str) -> NDArray[np.intp]:
+    """Return the basis indices that ``0:400``, ``0:400:2``, ``3,5,9`` or a list of these mean.
+
+    A range ends before its second number, as in Python.
+
+    Raises
+    ------
+    ValueError
+        If the text means something else, nothing, or a mode twice.
+    """
+    expected = "expected first:end, first:end:step, or numbers with commas, like 0:400 or 3,5,9"
+    indices: list[int] = []
+    for part in text.replace(" ", "").split(","):
+        match = _PART.fullmatch(part)
+        if match is None:
+            raise ValueError(f"found {text!r}, {expected}")
+        first, end, step = match.groups()
+        last = int(end) if end is not None else int(first) + 1
+        if last > MOST_MODES or step == "0":
+            raise ValueError(
+                f"found {text!r}, expected modes below {MOST_MODES} and a step above 0"
+            )
+        indices.extend(range(int(first), last, int(step or 1)))
+    if not indices:
+        raise ValueError(f"found {text!r}, which is no mode at all; {expected}")
+    if len(set(indices)) < len(indices):
+        raise ValueError(f"found {text!r}, expected no mode twice")
+    import numpy as np
+
+    return np.array(indices, dtype=np.intp)
+
+
+def parse_alpha(text: str) -> Misregistration:
+    """Return the registration ``X,Y,ROT,MAG``: subapertures, degrees, ratio.
+
+    Raises
+    ------
+    ValueError
+        If it is not four finite numbers, or the magnification is not positive.
+    """
+    values = _numbers(text)
+    if len(values) != 4 or values[3] <= 0.0:
+        expected = "expected X,Y,ROT,MAG: subapertures, degrees, ratio, like 0.3,-0.1,65,0.98"
+        raise ValueError(f"found {text.strip()!r}, {expected}")
+    from service.model.misregistration import PARAMETERS, Misregistration
+
+    return Misregistration.from_boundary(dict(zip(PARAMETERS, values, strict=True)))
+
+
+def parse_arms(text: str) -> Arms:
+    """Return the spider's arms ``WIDTH:DEG,DEG,...``: subapertures, degrees from +x towards +y.
+
+    Raises
+    ------
+    ValueError
+        If it is not a width above 0 and at least one finite angle.
+    """
+    first, _, rest = text.partition(":")
+    width, angles = _numbers(first), _numbers(rest)
+    if not angles or len(width) != 1 or width[0] <= 0.0:
+        expected = "expected WIDTH:DEG,DEG,... of the spider's arms, like 0.9:90,210,330"
+        raise ValueError(f"found {text.strip()!r}, {expected}")
+    from service.fit.light_rotation import Arms
+
+    return Arms(angles_rad=tuple(math.radians(a) for a in angles), width_subap=width[0])
+
+
+def _numbers(text: str) -> list[float]:
+    """Return the finite numbers that a text lists; none where something else is among them."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
+    return values if all(math.isfinite(value) for value in values) else []

@@ -15,7 +15,7 @@ from typing import Any
 
 from service.errors import ConfigurationError, MatrixError, PyrcalError
 from service.files.container import check_sealed
-from service.files.drawn import numbers
+from service.files.figures import numbers
 from service.files.report import document
 from service.files.run import fit_file
 from service.fit.matrix import FitOptions
@@ -228,7 +228,7 @@ class FitJob:
     """What was found, as ``service.files.report.document`` says it."""
 
     figures: bytes | None = None
-    """What its figures are drawn from, JSON of ``service.files.drawn.numbers``."""
+    """What its figures are drawn from, JSON of ``service.files.figures.numbers``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,20 +1,29 @@
-"""The archive: what of each kind lies in it, and what is kept for ever because somebody says so."""
+"""What is kept: the matrices of each kind, which of them for ever, and the audit trail."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import shutil
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from itertools import islice
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Path, Query, Response
 from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+from pydantic import Field
 
-from service.archive import Archive, Pin
+from service.archive import Archive, AuditEntry, Pin, Range
+from service.archive.nights import FOREVER_NS
 from service.archive.retention import Item, items
-from service.routes.commands import AcceptedView, ClientDep
-from service.routes.orders import Said
+from service.routes.commands import AcceptedView, ClientDep, Said
 from service.routes.problems import INVALID, UNKNOWN
-from service.routes.views import ServiceDep, answer, shows, view
+from service.routes.reading import TimeParameters
+from service.routes.views import ServiceDep, answer, clock_of, is_time, picture, shows, view
 from service.runtime.housekeeping import needed
 
 router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
@@ -74,3 +83,117 @@ async def unpin(client: ClientDep, product_id: ProductId, said: Said) -> Accepte
 
 
 _LINKS = {"archive": "/v1/archive"}
+
+
+PAGE = 1000
+"""Entries that are read from the disk at once for an export."""
+
+
+class AuditFormat(StrEnum):
+    """How the audit trail leaves."""
+
+    JSON = "json"
+    JSONL = "jsonl"
+    """One entry on a line, all of the range."""
+
+    CSV = "csv"
+    """The same as a table with a head."""
+
+
+class AuditParameters(TimeParameters):
+    """Which part of the audit trail to return, and how."""
+
+    limit: Annotated[int, Field(ge=1, le=5000)] = 200
+    """At most so many entries; an export has all of them."""
+
+    after: Annotated[int, Field(ge=0, le=FOREVER_NS)] | None = None
+    """``id`` of the last entry of the page before: those that follow; null: the newest ones."""
+
+    format: AuditFormat = AuditFormat.JSON
+    """"json", "jsonl" or "csv"."""
+
+    @property
+    def part(self) -> Range:
+        """The part that is asked for."""
+        first_ns, last_ns = self.between
+        return Range(since_ns=first_ns, until_ns=last_ns, after=self.after, limit=self.limit)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trail:
+    """A part of the audit trail."""
+
+    entries: tuple[AuditEntry, ...]
+    """Oldest first."""
+
+
+ENTRY = view("AuditEntryView", AuditEntry)
+TRAIL = view("AuditView", Trail)
+
+
+@router.get(
+    "/audit",
+    response_class=Response,
+    responses={
+        200: {
+            **shows(TRAIL),
+            "content": {
+                **shows(TRAIL)["content"],
+                "application/jsonl": {"schema": {"type": "string"}},
+                "text/csv": {"schema": {"type": "string"}},
+            },
+        }
+    },
+)
+async def audit(service: ServiceDep, parameters: Annotated[AuditParameters, Query()]) -> Response:
+    """Return the audit trail: the newest entries, those after one, those of a time; or export it.
+
+    ``?after=`` with the ``id`` of the last entry gives the next page; an empty one is the end.
+    """
+    if parameters.format is AuditFormat.JSON:
+        entries = await run_in_threadpool(service.archive.audit_trail, parameters.part)
+        return answer(Trail(entries=entries))
+    kind, lines = {
+        AuditFormat.JSONL: ("application/jsonl", _json_lines),
+        AuditFormat.CSV: ("text/csv", _csv_lines),
+    }[parameters.format]
+    whole = replace(parameters.part, after=parameters.after or 0)
+    name = f"audit.{parameters.format}"
+    return StreamingResponse(
+        lines(_all(service.archive, whole)),
+        media_type=kind,
+        headers={"Content-Disposition": f'attachment; filename="{name}"'},
+    )
+
+
+def _all(archive: Archive, part: Range) -> Iterator[dict[str, Any]]:
+    """Yield all entries of a part as they leave; each page waits for the disk."""
+    page = replace(part, limit=PAGE)
+    while entries := archive.audit_trail(page):
+        yield from map(picture, entries)
+        page = replace(page, after=entries[-1].id)
+
+
+def _json_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
+    for entry in entries:
+        yield json.dumps(entry, ensure_ascii=False) + "\n"
+
+
+def _csv_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
+    """Yield a table; a cell that a spreadsheet would work out is kept from it by an apostrophe."""
+    buffer = io.StringIO()
+    names = (n for name in ENTRY.paths for n in (name, clock_of(name))[: 1 + is_time(name)])
+    table = csv.DictWriter(buffer, list(names))
+    table.writeheader()
+    while True:
+        yield buffer.getvalue()
+        buffer.seek(0)
+        buffer.truncate()
+        rows = list(islice(entries, PAGE))
+        if not rows:
+            return
+        table.writerows({name: _inert(cell) for name, cell in row.items()} for row in rows)
+
+
+def _inert(cell: object) -> object:
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@")) else cell

@@ -1,32 +1,36 @@
 """What an operator asks of the service, and what the observatory tells it.
 
-Each answer is 202 and says in one sentence what was done and, where an RTC answers within some
-seconds, what it said. What takes longer is seen in the state and in the events.
+A body is read straight into the record that the tracker obeys, all faults at once. Each answer is
+202 and says in one sentence what was done and, where an RTC answers within some seconds, what it
+said. What takes longer is seen in the state and in the events.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Depends, Path, Request, Response
-from pydantic import BaseModel, ConfigDict, Discriminator
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict, Discriminator, TypeAdapter, ValidationError
+from pydantic_core import from_json
 
 from service.errors import StaleError, UntaggedError
 from service.routes.admission import caller_of
 from service.routes.numbers import MatrixId
-from service.routes.orders import Said, about, body
 from service.routes.problems import COMMAND, DECISION, INVALID, UNKNOWN
-from service.routes.views import RECONSTRUCTORS, ServiceDep, known, tagged
+from service.routes.views import RECONSTRUCTORS, Schema, ServiceDep, explained, known, tagged
 from service.runtime.recording import Caller
 from service.runtime.supervisor import Supervisor
+from service.tracking import commands as instructions
 from service.tracking.commands import (
     AbortAcquisition,
     AcknowledgeAlarm,
     Acquire,
     Approve,
     Command,
+    Instruction,
     MuteAlarm,
     MuteTime,
     Publish,
@@ -47,6 +51,160 @@ from service.tracking.commands import (
     UnmuteAlarm,
 )
 from service.tracking.state import TrackerState
+
+# --- what is asked: JSON, read into a record
+
+
+JSON = "application/json"
+_SCHEMAS = "#/components/schemas/{model}"
+
+Asked = TypeVar("Asked", bound=Instruction)
+
+
+class Body:
+    """What a request has to say, as a command; a dependency of a route.
+
+    Parameters
+    ----------
+    kind
+        The command, or a union of several told apart by their ``action``.
+    """
+
+    def __init__(self, kind: Any) -> None:  # noqa: ANN401  of the type of a type
+        self.adapter = TypeAdapter[Any](kind)
+        self.required = not self._reads(b"{}")
+
+    async def __call__(self, request: Request) -> Any:  # noqa: ANN401  the command
+        """Return the command; without a body, one that leaves all to the service.
+
+        Raises
+        ------
+        RequestValidationError
+            If it is none: every fault, and where it is.
+        """
+        raw = await request.body()
+        if not raw:
+            if self.required:
+                raise RequestValidationError([{"type": "missing", "loc": ("body",)}])
+            raw = b"{}"
+        elif request.headers.get("content-type", "").partition(";")[0].strip().lower() != JSON:
+            # a page from elsewhere may send anything else without being asked
+            raise RequestValidationError([{"type": "not_json", "loc": ("body",), "input": raw}])
+        try:
+            return self.adapter.validate_json(raw)
+        except ValidationError as error:
+            raise RequestValidationError(_faults(error, raw)) from None
+
+    def _reads(self, raw: bytes) -> bool:
+        try:
+            self.adapter.validate_json(raw)
+        except ValidationError:
+            return False
+        return True
+
+
+def body(kind: Any) -> Any:  # noqa: ANN401  as FastAPI has it
+    """Return what makes a parameter of a route the body of the request."""
+    return Depends(Body(kind))
+
+
+Said = Annotated[Instruction, body(Instruction)]
+"""The body of a request whose path says all the rest."""
+
+
+def about(kind: type[Asked], said: Instruction, **more: str) -> Asked:
+    """Return the command that says the same, and what the path or the service adds."""
+    return kind(**said.said(), **more)
+
+
+Where = tuple[int | str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a fault is in the JSON."""
+
+    path: Where
+    tried: tuple[tuple[Where, int | str], ...]
+    """Alternatives of unions that led there, and where each union is."""
+
+
+def _faults(error: ValidationError, raw: bytes) -> list[dict[str, Any]]:
+    """Return all faults, each where it is in the body.
+
+    Of a union only the alternatives count that fit best; pydantic names them all.
+    """
+    try:
+        whole = from_json(raw)
+    except ValueError:
+        whole = None
+    found = [
+        (_place(fault["loc"], whole, missing=fault["type"] == "missing"), fault)
+        for fault in error.errors(include_url=False)
+    ]
+    depths: dict[Where, dict[int | str, int]] = {}
+    for place, _ in found:
+        for where, branch in place.tried:
+            deepest = depths.setdefault(where, {})
+            deepest[branch] = max(deepest.get(branch, 0), len(place.path))
+    joined: dict[Where, dict[str, Any]] = {}
+    for place, fault in found:
+        if any(depths[where][one] < max(depths[where].values()) for where, one in place.tried):
+            continue
+        before = joined.get(place.path)
+        if before is None or (_is_of_type(before) and not _is_of_type(fault)):
+            joined[place.path] = {**fault, "loc": ("body", *place.path)}
+        elif _is_of_type(before):
+            before["msg"] += f" or {fault['msg'].removeprefix('Input should be ')}"
+    return list(joined.values())
+
+
+def _place(loc: Where, value: Any, *, missing: bool) -> _Place:  # noqa: ANN401  as JSON has it
+    path: Where = ()
+    tried: list[tuple[Where, int | str]] = []
+    for k, part in enumerate(loc):
+        inside = isinstance(value, dict) and part in value
+        if inside or (isinstance(value, list) and isinstance(part, int) and part < len(value)):
+            value = value[part]
+        elif not missing or k < len(loc) - 1:
+            tried.append((path, part))
+            continue
+        path = (*path, part)
+    return _Place(path, tuple(tried))
+
+
+def _is_of_type(fault: Mapping[str, Any]) -> bool:
+    """Return whether a fault is that the value is something else altogether."""
+    kind: str = fault["type"]
+    return kind == "enum" or kind.endswith("_type")
+
+
+def bodies(by_operation: Mapping[str, Body]) -> tuple[dict[str, Schema], dict[str, Schema]]:
+    """Return request bodies by operation, and the schemas of all that they hold by name."""
+    found, document = TypeAdapter.json_schemas(
+        [(name, "validation", body.adapter) for name, body in by_operation.items()],
+        ref_template=_SCHEMAS,
+    )
+    requests = {
+        name: {
+            "content": {JSON: {"schema": found[name, "validation"]}},
+            "required": body.required,
+        }
+        for name, body in by_operation.items()
+    }
+    schemas: dict[str, Schema] = document.get("$defs", {})
+    for name, schema in schemas.items():
+        texts = explained(vars(instructions)[name]) if "properties" in schema else {}
+        if "action" in schema.get("properties", ()):  # what tells alternatives apart
+            schema["required"] = [*schema.get("required", ()), "action"]
+        for field, text in texts.items():
+            if field in schema["properties"]:
+                schema["properties"][field]["description"] = text
+    return requests, schemas
+
+
+# --- who asks, and for what
+
 
 router = APIRouter(
     prefix="/v1",

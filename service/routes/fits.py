@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from starlette.requests import ClientDisconnect
 
 from service.errors import MatrixError
-from service.files.request import parse_alpha, parse_modes
+from service.files import parse_alpha, parse_modes
 from service.files.uploads import FitAsked, FitState
 from service.fit.matrix import FitOptions, Method
 from service.routes import views

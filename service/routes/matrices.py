@@ -14,9 +14,8 @@ from fastapi import APIRouter, Path, Query, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.routes import views
-from service.routes.commands import AcceptedView, ClientDep
+from service.routes.commands import AcceptedView, ClientDep, Said, about, body
 from service.routes.numbers import MatrixParameters, describes_numbers, numbers_of
-from service.routes.orders import Said, about, body
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
 from service.routes.views import ServiceDep, answer, known, shows
 from service.snapshot import Snapshot

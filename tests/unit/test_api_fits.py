@@ -10,7 +10,7 @@ import pytest
 
 from service.api import create_app
 from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
-from service.files.drawn import numbers
+from service.files.figures import numbers
 from service.files.report import document
 from service.files.uploads import FitJob, FitState
 from service.fit.matrix import Method

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from service.files.request import parse_alpha, parse_arms, parse_modes
+from service.files import parse_alpha, parse_arms, parse_modes
 
 
 @pytest.mark.parametrize(

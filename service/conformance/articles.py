@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Final
 
 
@@ -42,7 +43,7 @@ class Moves(StrEnum):
     """It opens the loop for some seconds, and closes it again."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Article:
     """One thing the contract asks."""
 
@@ -56,108 +57,97 @@ class Article:
 
 
 ARTICLES: Final[dict[str, Article]] = {
-    "connection": Article(says="the token alive/rtc is there, and stays", anchor="connection"),
-    "messages": Article(says="every message is as its table says", anchor="messages"),
+    "connection": Article("the token alive/rtc is there, and stays", "connection"),
+    "messages": Article("every message is as its table says", "messages"),
     "frames": Article(
-        says="frames come at the rate that status and dt_ns tell, 10 to 100 messages a second",
-        anchor="frames",
+        "frames come at the rate that status and dt_ns tell, 10 to 100 messages a second", "frames"
     ),
-    "sizes": Article(
-        says="slopes and modes of a frame are those of the status, and stay so", anchor="frames"
-    ),
-    "numbers": Article(says="every number is finite, and slopes are new ones", anchor="frames"),
+    "sizes": Article("slopes and modes of a frame are those of the status, and stay so", "frames"),
+    "numbers": Article("every number is finite, and slopes are new ones", "frames"),
     "sequence": Article(
-        says="each frame comes once, none is lost, seq0 never goes back",
-        anchor="sessions-sequence-time",
+        "each frame comes once, none is lost, seq0 never goes back", "sessions-sequence-time"
     ),
-    "clock": Article(says="t0_ns goes on by dt_ns a frame", anchor="sessions-sequence-time"),
-    "delivery": Article(says="a batch is sent when its last frame is there", anchor="timing"),
+    "clock": Article("t0_ns goes on by dt_ns a frame", "sessions-sequence-time"),
+    "delivery": Article("a batch is sent when its last frame is there", "timing"),
     "session": Article(
-        says="one session, until the RTC or its integrator starts over",
-        anchor="sessions-sequence-time",
+        "one session, until the RTC or its integrator starts over", "sessions-sequence-time"
     ),
-    "status": Article(
-        says="a status 1 to 10 times a second, that agrees with the frames", anchor="status"
-    ),
+    "status": Article("a status 1 to 10 times a second, that agrees with the frames", "status"),
     "ids": Article(
-        says="one basis and one configuration, in frames, status and manifest",
-        anchor="slopes-commands-orientation",
+        "one basis and one configuration, in frames, status and manifest",
+        "slopes-commands-orientation",
     ),
     "matrix": Article(
-        says="rtc/cm/applied answers with manifest and parts of the matrix in use",
-        anchor="reconstructors",
+        "rtc/cm/applied answers with manifest and parts of the matrix in use", "reconstructors"
     ),
-    "law": Article(
-        says="leak, gain and delay of the frames are those of the status", anchor="the-loop"
-    ),
-    "obedience": Article(says="every mode does what the loop asks of it", anchor="the-loop"),
+    "law": Article("leak, gain and delay of the frames are those of the status", "the-loop"),
+    "obedience": Article("every mode does what the loop asks of it", "the-loop"),
     "orientation": Article(
-        says="sign, order, axes and unit are those of the instrument file",
-        anchor="slopes-commands-orientation",
+        "sign, order, axes and unit are those of the instrument file", "slopes-commands-orientation"
     ),
     "late-join": Article(
-        says="cm/current is asked once a session, when alive/service appears",
-        anchor="reconstructors",
+        "cm/current is asked once a session, when alive/service appears", "reconstructors"
     ),
     "replies": Article(
-        says="a reply within 1 s to everything, refusals with their word, once for each id",
-        anchor="commands",
-        moves=Moves.WORDS,
+        "a reply within 1 s to everything, refusals with their word, once for each id",
+        "commands",
+        Moves.WORDS,
     ),
     "dither": Article(
-        says="a dither begins at start_seq as asked for, is told, and stops when told to",
-        anchor="dither",
-        moves=Moves.MIRROR,
+        "a dither begins at start_seq as asked for, is told, and stops when told to",
+        "dither",
+        Moves.MIRROR,
     ),
     "columns": Article(
-        says="row k holds the slopes and the command of one exposure, of the matrix's sign",
-        anchor="frames",
-        moves=Moves.MIRROR,
+        "row k holds the slopes and the command of one exposure, of the matrix's sign",
+        "frames",
+        Moves.MIRROR,
     ),
     "commit": Article(
-        says="a matrix is applied within 2 s of its commit, from the frame acknowledged",
-        anchor="reconstructors",
-        moves=Moves.MATRIX,
+        "a matrix is applied within 2 s of its commit, from the frame acknowledged",
+        "reconstructors",
+        Moves.MATRIX,
     ),
     "chunks": Article(
-        says="a commit may overtake its chunks; what is missing after 2 s is asked for",
-        anchor="reconstructors",
-        moves=Moves.MATRIX,
+        "a commit may overtake its chunks; what is missing after 2 s is asked for",
+        "reconstructors",
+        Moves.MATRIX,
     ),
     "rejection": Article(
-        says="a wrong sum, basis or manifest and a used id are rejected, a repeat answered again",
-        anchor="reconstructors",
-        moves=Moves.MATRIX,
+        "a wrong sum, basis or manifest and a used id are rejected, a repeat answered again",
+        "reconstructors",
+        Moves.MATRIX,
     ),
     "reconnect": Article(
-        says="the RTC comes back after the router was away, in the same session",
-        anchor="connection",
-        moves=Moves.WORDS,
+        "the RTC comes back after the router was away, in the same session",
+        "connection",
+        Moves.WORDS,
     ),
     "loop": Article(
-        says="opening zeroes the integrator in a new session; closing goes on in it; the matrix "
+        "opening zeroes the integrator in a new session; closing goes on in it; the matrix "
         "survives",
-        anchor="loop",
-        moves=Moves.LOOP,
+        "loop",
+        Moves.LOOP,
     ),
     "measure": Article(
-        says="a measured matrix comes in slope per metre; the loop is closed again",
-        anchor="measure",
-        moves=Moves.LOOP,
+        "a measured matrix comes in slope per metre; the loop is closed again",
+        "measure",
+        Moves.LOOP,
     ),
 }
 """By name, in the order in which they are told."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Checked:
     """One check that was made."""
 
+    outcome: Outcome
     name: str
     """Of its article."""
 
-    outcome: Outcome
     found: str
+    """Or why it was not made."""
 
     @property
     def article(self) -> Article:
@@ -165,21 +155,8 @@ class Checked:
         return ARTICLES[self.name]
 
 
-def fine(name: str, found: str) -> Checked:
-    """Return a check that found what the contract says."""
-    return Checked(name=name, outcome=Outcome.OK, found=found)
-
-
-def wrong(name: str, found: str) -> Checked:
-    """Return a check that found something else."""
-    return Checked(name=name, outcome=Outcome.WRONG, found=found)
-
-
-def seen(name: str, found: str) -> Checked:
-    """Return a check that found what is allowed, and worth a look."""
-    return Checked(name=name, outcome=Outcome.SEEN, found=found)
-
-
-def skipped(name: str, why: str) -> Checked:
-    """Return a check that was not made."""
-    return Checked(name=name, outcome=Outcome.SKIPPED, found=why)
+fine = partial(Checked, Outcome.OK)
+wrong = partial(Checked, Outcome.WRONG)
+seen = partial(Checked, Outcome.SEEN)
+skipped = partial(Checked, Outcome.SKIPPED)
+"""A check by its name, and what was found."""

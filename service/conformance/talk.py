@@ -85,16 +85,16 @@ class Talk:
 # --- replies
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class _Question:
     """A command that must be refused."""
 
     kind: CommandKind
     payload: bytes
-    words: tuple[str, ...]
+    what: str
+    words: tuple[str, ...] = ("range", "unsupported", "busy")
     """With one of which the reason may begin."""
 
-    what: str
     optional: bool = False
 
 
@@ -115,46 +115,31 @@ def _questions(talk: Talk, status: Status) -> list[_Question]:
     measure |= dict.fromkeys(("frequency_hz", "duration_s"))
     measure |= {"amplitude_m": [1e-12], "n_average": 1}
     ramp = {"v": 1, "id": new("ramp"), "groups": [[1, 0]], "gains": [0.1], "frames_per_gain": 1}
-    dithering, refused = CommandKind.DITHER, ("range", "unsupported", "busy")
+    dithering = CommandKind.DITHER
+    without = {key: value for key, value in told.items() if key != "modes"}
     return [
-        _Question(kind=dithering, payload=b"\xc1", words=("range",), what="bytes of no message"),
+        _Question(dithering, b"\xc1", "bytes of no message", ("range",)),
         _Question(
-            kind=dithering,
-            payload=msgpack.packb(
-                {k: v for k, v in told.items() if k != "modes"} | {"id": new("missing")}
-            ),
-            words=("missing",),
-            what="a dither without the key modes",
+            dithering,
+            msgpack.packb({**without, "id": new("missing")}),
+            "a dither without the key modes",
+            ("missing",),
         ),
         _Question(
-            kind=dithering,
-            payload=msgpack.packb({**told, "v": 2, "id": new("version")}),
-            words=("v",),
-            what="a dither of version 2",
+            dithering,
+            msgpack.packb({**told, "v": 2, "id": new("version")}),
+            "a dither of version 2",
+            ("v",),
         ),
+        _Question(dithering, msgpack.packb(told), f"a dither of mode {n_modes}"),
+        _Question(CommandKind.LOOP, gains, "one gain more than modes"),
         _Question(
-            kind=dithering,
-            payload=msgpack.packb(told),
-            words=refused,
-            what=f"a dither of mode {n_modes}",
-        ),
-        _Question(
-            kind=CommandKind.LOOP, payload=gains, words=refused, what="one gain more than modes"
-        ),
-        _Question(
-            kind=CommandKind.MEASURE,
-            payload=msgpack.packb(measure),
-            words=refused,
-            what=f"a measurement of mode {n_modes}",
+            CommandKind.MEASURE,
+            msgpack.packb(measure),
+            f"a measurement of mode {n_modes}",
             optional=True,
         ),
-        _Question(
-            kind=CommandKind.RAMP,
-            payload=msgpack.packb(ramp),
-            words=refused,
-            what="a ramp of modes 1 to 0",
-            optional=True,
-        ),
+        _Question(CommandKind.RAMP, msgpack.packb(ramp), "a ramp of modes 1 to 0", optional=True),
     ]
 
 

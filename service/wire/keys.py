@@ -52,21 +52,33 @@ class Encodings(StrEnum):
 class Keys:
     """Key expressions of one system, all below ``ao/v1/{system}``."""
 
-    __slots__ = ("root", "system")
-
     def __init__(self, system: str) -> None:
         self.system = checked_id(system, "the name of the system")
         self.root = f"ao/v1/{system}"
-
-    @property
-    def frames(self) -> str:
+        self.frames = f"{self.root}/tel/frames"
         """Telemetry frames."""
-        return f"{self.root}/tel/frames"
-
-    @property
-    def status(self) -> str:
+        self.status = f"{self.root}/tel/status"
         """Status messages of the RTC."""
-        return f"{self.root}/tel/status"
+        self.all_matrices = f"{self.root}/cm/*"
+        """Every :meth:`matrix`, and :attr:`current`."""
+        self.all_chunks = f"{self.root}/cm/*/chunk/*"
+        """Every :meth:`chunk`."""
+        self.all_commits = f"{self.root}/cm/*/commit"
+        """Every :meth:`commit`."""
+        self.current = f"{self.root}/cm/current"
+        """Queryable: the manifest of the reconstructor the RTC should be using."""
+        self.acknowledgement = f"{self.root}/cm/ack"
+        """Acknowledgements of reconstructors."""
+        self.applied = f"{self.root}/rtc/cm/applied"
+        """Queryable of the RTC: the matrix in use."""
+        self.all_measured = f"{self.root}/im/**"
+        """Every :meth:`measured_chunk` and :meth:`measured_commit`."""
+        self.state = f"{self.root}/state"
+        """What the service knows, for whoever listens."""
+        self.alarm = f"{self.root}/alarm"
+        """Alarms of the service, for whoever listens."""
+        self.all_ranks = f"{self.root}/alive/{Role.SERVICE}/*"
+        """Every :meth:`rank`."""
 
     def chunk(self, matrix_id: str, index: int) -> str:
         """Part ``index`` of a reconstructor."""
@@ -80,36 +92,6 @@ class Keys:
         """Queryable of one reconstructor: its manifest, or with ``?chunk=k`` its bytes."""
         return f"{self.root}/cm/{checked_id(matrix_id, 'a matrix key')}"
 
-    @property
-    def all_matrices(self) -> str:
-        """Every :meth:`matrix`, and :attr:`current`."""
-        return f"{self.root}/cm/*"
-
-    @property
-    def all_chunks(self) -> str:
-        """Every :meth:`chunk`."""
-        return f"{self.root}/cm/*/chunk/*"
-
-    @property
-    def all_commits(self) -> str:
-        """Every :meth:`commit`."""
-        return f"{self.root}/cm/*/commit"
-
-    @property
-    def current(self) -> str:
-        """Queryable: the manifest of the reconstructor the RTC should be using."""
-        return f"{self.root}/cm/current"
-
-    @property
-    def acknowledgement(self) -> str:
-        """Acknowledgements of reconstructors."""
-        return f"{self.root}/cm/ack"
-
-    @property
-    def applied(self) -> str:
-        """Queryable of the RTC: the matrix in use."""
-        return f"{self.root}/rtc/cm/applied"
-
     def command(self, kind: str) -> str:
         """Queryable of the RTC: commands of this :class:`~service.wire.CommandKind`."""
         return f"{self.root}/cmd/rtc/{kind}"
@@ -122,29 +104,9 @@ class Keys:
         """Manifest of a measured interaction matrix."""
         return f"{self.root}/im/{checked_id(matrix_id, 'a matrix key')}/commit"
 
-    @property
-    def all_measured(self) -> str:
-        """Every :meth:`measured_chunk` and :meth:`measured_commit`."""
-        return f"{self.root}/im/**"
-
-    @property
-    def state(self) -> str:
-        """What the service knows, for whoever listens."""
-        return f"{self.root}/state"
-
-    @property
-    def alarm(self) -> str:
-        """Alarms of the service, for whoever listens."""
-        return f"{self.root}/alarm"
-
     def alive(self, role: Role) -> str:
         """Liveliness token of one side."""
         return f"{self.root}/alive/{role}"
-
-    @property
-    def all_ranks(self) -> str:
-        """Every :meth:`rank`."""
-        return f"{self.root}/alive/{Role.SERVICE}/*"
 
     def rank(self, name: str) -> str:
         """Liveliness token of one of several services; its name tells who was first."""

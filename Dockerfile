@@ -12,6 +12,7 @@ WORKDIR /opt/pyrcal
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY service service
 COPY --from=manual /opt/manual service/manual
+COPY check_rtc check_rtc
 COPY sim_rtc sim_rtc
 COPY studies studies
 RUN pip install --no-cache-dir -c constraints.txt . \

@@ -67,12 +67,12 @@ def states() -> str:
 
 
 def house() -> str:
-    """Return docs/house.md: every file of the service and the simulator by its first line."""
+    """Return docs/house.md: every file of service, checker and simulator by its first line."""
     parts = [
         "# Which file has what",
         "Written by `python -m studies.pages` from the first line of each file; change those.",
     ]
-    for top in ("service", "sim_rtc"):
+    for top in ("service", "check_rtc", "sim_rtc"):
         # packages: the built manual holds copies of the examples
         folders = sorted(path.parent for path in (ROOT / top).rglob("__init__.py"))
         for folder in folders:

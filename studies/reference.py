@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from check_rtc.__main__ import check_parser
 from service.commands.arguments import OTHER_PROGRAMS, command_line
 from service.config.instrument_schema import InstrumentFile
 from service.config.settings import Settings
@@ -122,7 +123,10 @@ def commands() -> str:
         "`make` puts `pyrcal` into `.venv/bin`. Each command tells the same with `--help`; "
         "`pyrcal sim --help` and `pyrcal campaign --help` are manuals of their own."
     )
-    parsers = dict(_parsers(command_line())) | {"pyrcal demo": demo_parser()}
+    parsers = dict(_parsers(command_line())) | {
+        "pyrcal demo": demo_parser(),
+        "pyrcal check-rtc": check_parser(),
+    }
     parts = []
     for name, parser in parsers.items():
         rows = list(_options(parser))

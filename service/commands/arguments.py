@@ -23,6 +23,7 @@ from service.files import kind_of, parse_alpha, parse_arms, parse_modes
 OTHER_PROGRAMS = {
     "demo": ("studies.demo", "the main job, end to end, on a simulated telescope"),
     "sim": ("sim_rtc", "the simulated RTC"),
+    "check-rtc": ("check_rtc", "does an RTC keep the contract?"),
     "campaign": ("studies.campaign", "many simulated nights"),
 }
 """Module and purpose of what is run in this program's place, with options of its own."""
@@ -45,7 +46,6 @@ def command_line() -> argparse.ArgumentParser:
     declare(commands)
     _describe_key(commands.add_parser("key", help="who may ask: make, list, revoke API keys"))
     _describe_archive(commands.add_parser("archive", help="what is kept, and is it sound?"))
-    _describe_check(commands.add_parser("check-rtc", help="does an RTC keep the contract?"))
     _describe_fit(commands.add_parser("fit", help="the registration in a measured matrix"))
     _describe_reconstruct(
         commands.add_parser("reconstruct", help="a reconstructor for a known registration")
@@ -114,8 +114,8 @@ def _describe_archive(archive: argparse.ArgumentParser) -> None:
         words("output FILE.fits", type=Path),
         words("--instrument NAME|FILE", "default: that of the settings"),
         words("--recording FILE", "of pyrcal sim --record", type=Path),
-        words("--skip S", "of the recording", type=_seconds, default=0.0),
-        words("--seconds S", "of it, default %(default)g", type=_seconds, default=10.0),
+        words("--skip S", "of the recording", type=seconds, default=0.0),
+        words("--seconds S", "of it, default %(default)g", type=seconds, default=10.0),
         words("--night DATE", "of the evening, UTC; else of the recording"),
     )
     actions = archive.add_subparsers(dest="action", required=True)
@@ -128,42 +128,6 @@ def _describe_archive(archive: argparse.ArgumentParser) -> None:
     ):
         parser = actions.add_parser(action, help=purpose)
         add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
-
-
-_CHECK_EPILOG = """
-One line for each thing that docs/rtc.md asks: what was found, what the contract says, where it
-stands. WRONG breaks the contract, seen is allowed and worth a look, skipped says why. What moves
-anything says so first and asks; where nobody can be asked it is skipped unless --yes. Exit status:
-0 nothing is wrong, 1 something is, 2 nothing could be checked.
-"""
-
-
-def _describe_check(check: argparse.ArgumentParser) -> None:
-    check.description = (
-        "Listen to an RTC in the service's place, ask it things, and say whether it keeps the "
-        "contract of docs/rtc.md. End the service first, or --connect to its router with --passive."
-    )
-    check.epilog = _CHECK_EPILOG
-    add(
-        check,
-        words("--instrument NAME|FILE", "default %(default)s", default="flao-lbt"),
-        words("--system NAME", "of the keys, default the instrument's name"),
-    )
-    add(
-        check.add_mutually_exclusive_group(),
-        words("--listen ENDPOINT", "default tcp/127.0.0.1:7447"),
-        words("--connect ENDPOINT", "a router that is there already"),
-    )
-    add(
-        check,
-        words("--seconds S", "to listen, default %(default)g", type=_seconds, default=8.0),
-        words("--wait S", "for the RTC, default %(default)g", type=_seconds, default=30.0),
-        words("--only CHECK,...", "these checks and no others", type=_names, default=()),
-        words("--passive", "only listen: ask and move nothing"),
-        words("--open-loop", "also what opens the loop: loop, measure"),
-        words("--yes", "move what is said without asking"),
-        words("--json", "print one JSON object at the end"),
-    )
 
 
 _FIT = """
@@ -266,18 +230,21 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def _seconds(text: str) -> float:
+def seconds(text: str) -> float:
+    """Return a time of up to an hour, seconds.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If the text says something else.
+    """
     try:
-        seconds = float(text)
+        found = float(text)
     except ValueError:
-        seconds = math.nan
-    if not 0.0 < seconds <= 3600.0:
+        found = math.nan
+    if not 0.0 < found <= 3600.0:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected seconds above 0 and up to 3600")
-    return seconds
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+    return found
 
 
 def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:

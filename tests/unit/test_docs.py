@@ -11,6 +11,7 @@ from itertools import groupby
 import httpx
 import pytest
 
+from check_rtc.__main__ import check_parser
 from service.api import create_app
 from service.commands.arguments import command_line, with_negative_numbers
 from service.config import load_settings
@@ -58,6 +59,8 @@ def check_pyrcal(words):
         match name:
             case "demo":
                 demo_parser().parse_args(with_negative_numbers(rest))
+            case "check-rtc":
+                check_parser().parse_args(rest)
             case "sim":
                 parse_options([word.replace("bench.toml", "flao-lbt") for word in rest])
             case _:

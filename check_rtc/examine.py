@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.conformance.articles import ARTICLES, Checked, Moves, skipped, wrong
-from service.conformance.listening import About, listened
-from service.conformance.moving import (
+from check_rtc.articles import ARTICLES, Checked, Moves, skipped, wrong
+from check_rtc.listening import About, listened
+from check_rtc.moving import (
     OPEN_S,
     STROKE_M,
     MatrixInUse,
@@ -22,7 +22,7 @@ from service.conformance.moving import (
     reconnect,
     rejection,
 )
-from service.conformance.talk import TOTAL_M, Talk, dither, dithered_modes, replies
+from check_rtc.talk import TOTAL_M, Talk, dither, dithered_modes, replies
 from service.errors import LinkError, WireError
 from service.fit.dialect import Dialect
 from service.wire import Status

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from service.conformance.articles import Checked, fine, seen, skipped, wrong
-from service.conformance.watch import Arrival, Watch, in_order, of_session
+from check_rtc.articles import Checked, fine, seen, skipped, wrong
+from check_rtc.watch import Arrival, Watch, in_order, of_session
 from service.fit.dialect import Dialect
 from service.fit.orientation import setting_written
 from service.runtime.waiting import MOST_STATUSES_HZ

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.conformance.ear import Heard, Topic
-from service.conformance.talk import Talk
-from service.conformance.watch import Watch
+from check_rtc.ear import Heard, Topic
+from check_rtc.talk import Talk
+from check_rtc.watch import Watch
 from service.errors import LinkError, WireError
 from service.link.session import Endpoint
 from service.wire import (

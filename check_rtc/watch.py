@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.conformance.ear import Heard, Topic
+from check_rtc.ear import Heard, Topic
 from service.errors import WireError
 from service.link.intake import Intake
 from service.link.session import Endpoint

@@ -11,9 +11,9 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from service.conformance.articles import Checked, fine, seen, skipped, wrong
-from service.conformance.ear import ANSWER_S, Ear
-from service.conformance.watch import Watch
+from check_rtc.articles import Checked, fine, seen, skipped, wrong
+from check_rtc.ear import ANSWER_S, Ear
+from check_rtc.watch import Watch
 from service.errors import LinkError, WireError
 from service.telemetry.frames import FrameBlock
 from service.telemetry.played import Asked, Finding, Meter, measured

@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.conformance.articles import Checked, fine, seen, skipped, wrong
-from service.conformance.talk import Talk
+from check_rtc.articles import Checked, fine, seen, skipped, wrong
+from check_rtc.talk import Talk
 from service.errors import LinkError, WireError
 from service.link.matrices import MeasuredIntake, MeasuredMatrix
 from service.wire import (

@@ -1,11 +1,10 @@
-"""``pyrcal check-rtc``: does an RTC keep the contract? One line for each thing that it asks."""
+"""The check of an RTC: one line for each thing that the contract asks."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import os
-import signal
 import sys
 import time
 from dataclasses import replace
@@ -14,13 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from check_rtc.articles import ARTICLES, Checked, Outcome
+from check_rtc.ear import Ear
+from check_rtc.examine import Examination, examine
+from check_rtc.talk import Talk
+from check_rtc.watch import Watch
 from service.commands.terminal import say
 from service.config import load_instrument
-from service.conformance.articles import ARTICLES, Checked, Outcome
-from service.conformance.ear import Ear
-from service.conformance.examine import Examination, examine
-from service.conformance.talk import Talk
-from service.conformance.watch import Watch
 from service.errors import ConfigurationError, ModelError, shown
 from service.fit.dialect import Dialect, of_reconstructor
 from service.link.session import Endpoint
@@ -34,7 +33,7 @@ KEPT, BROKEN = 0, 1
 PAGE = "docs/rtc.md"
 
 
-def main(options: argparse.Namespace) -> int:
+def check(options: argparse.Namespace) -> int:
     """Check, tell, and return the exit status: 0 nothing is wrong, 1 something is.
 
     Raises
@@ -42,8 +41,6 @@ def main(options: argparse.Namespace) -> int:
     PyrcalError
         If nothing could be checked: no RTC, no link, or options that make no sense.
     """
-    if options.own_process:  # told to end, it first stops its dither and closes the loop again
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
     unknown = [name for name in options.only if name not in ARTICLES]
     if unknown:
         raise ConfigurationError(
@@ -68,33 +65,33 @@ def main(options: argparse.Namespace) -> int:
     )
     checks = []
     with Ear(endpoint, as_service=not options.passive) as ear:
-        for check in examine(Talk(ear, Watch(endpoint, time.monotonic)), wish):
-            checks.append(check)
+        for one in examine(Talk(ear, Watch(endpoint, time.monotonic)), wish):
+            checks.append(one)
             if not options.json:
-                print(shown(line(check)), flush=True)
+                print(shown(line(one)), flush=True)
     if options.json:
-        print(json.dumps({"checks": [told(check) for check in checks]}, indent=2))
-    broken = [check.name for check in checks if check.outcome is Outcome.WRONG]
+        print(json.dumps({"checks": [told(one) for one in checks]}, indent=2))
+    broken = [one.name for one in checks if one.outcome is Outcome.WRONG]
     say(f"{len(checks)} checks, {len(broken)} wrong{': ' if broken else ''}{', '.join(broken)}")
     return BROKEN if broken else KEPT
 
 
-def line(check: Checked) -> str:
+def line(one: Checked) -> str:
     """Return a check on one line: what was found, what the contract says, where."""
-    article = check.article
+    article = one.article
     return (
-        f"{check.outcome:8}{check.name:12} {check.found} "
+        f"{one.outcome:8}{one.name:12} {one.found} "
         f"[contract: {article.says}; {PAGE}#{article.anchor}]"
     )
 
 
-def told(check: Checked) -> dict[str, str]:
+def told(one: Checked) -> dict[str, str]:
     """Return a check as JSON has it."""
-    article = check.article
+    article = one.article
     return {
-        "check": check.name,
-        "outcome": check.outcome.lower(),
-        "found": check.found,
+        "check": one.name,
+        "outcome": one.outcome.lower(),
+        "found": one.found,
         "contract": article.says,
         "where": f"{PAGE}#{article.anchor}",
         "moves": article.moves.value,

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.conformance.articles import ARTICLES, Outcome
-from service.conformance.ear import Heard, Topic
-from service.conformance.examine import Examination, examine
+from check_rtc.articles import ARTICLES, Outcome
+from check_rtc.ear import Heard, Topic
+from check_rtc.examine import Examination, examine
 from service.errors import LinkError, WireError
 from service.fit.dialect import Dialect
 from service.model.kinds import SlopeOrder
 from service.model.slopes import Orientation
-from tests.unit.conformance.pretend import Pretend
+from tests.unit.check_rtc.pretend import Pretend
 from tests.vectors import PAGE, anchors_of
 
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.conformance.articles import ARTICLES, Moves, Outcome
-from service.conformance.examine import Examination, examine
+from check_rtc.articles import ARTICLES, Moves, Outcome
+from check_rtc.examine import Examination, examine
 from service.wire import AckState, CommandKind
-from tests.unit.conformance.pretend import Pretend
+from tests.unit.check_rtc.pretend import Pretend
 
 ASKING = frozenset(name for name, of in ARTICLES.items() if of.moves is not Moves.NOTHING)
 

@@ -1,0 +1,77 @@
+"""``pyrcal check-rtc``: what it understands. Nothing here takes long to import."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Sequence
+
+from service.commands.arguments import OneLineParser, seconds
+from service.commands.remote import add, words
+from service.errors import PyrcalError, shown
+
+_EPILOG = """
+One line for each thing that docs/rtc.md asks: what was found, what the contract says, where it
+stands. WRONG breaks the contract, seen is allowed and worth a look, skipped says why. What moves
+anything says so first and asks; where nobody can be asked it is skipped unless --yes. Exit status:
+0 nothing is wrong, 1 something is, 2 nothing could be checked.
+"""
+
+
+def check_parser() -> argparse.ArgumentParser:
+    """Return what reads the command line."""
+    check = OneLineParser(prog="pyrcal check-rtc")
+    check.description = (
+        "Listen to an RTC in the service's place, ask it things, and say whether it keeps the "
+        "contract of docs/rtc.md. End the service first, or --connect to its router with --passive."
+    )
+    check.epilog = _EPILOG
+    add(
+        check,
+        words("--instrument NAME|FILE", "default %(default)s", default="flao-lbt"),
+        words("--system NAME", "of the keys, default the instrument's name"),
+    )
+    add(
+        check.add_mutually_exclusive_group(),
+        words("--listen ENDPOINT", "default tcp/127.0.0.1:7447"),
+        words("--connect ENDPOINT", "a router that is there already"),
+    )
+    add(
+        check,
+        words("--seconds S", "to listen, default %(default)g", type=seconds, default=8.0),
+        words("--wait S", "for the RTC, default %(default)g", type=seconds, default=30.0),
+        words("--only CHECK,...", "these checks and no others", type=_names, default=()),
+        words("--passive", "only listen: ask and move nothing"),
+        words("--open-loop", "also what opens the loop: loop, measure"),
+        words("--yes", "move what is said without asking"),
+        words("--json", "print one JSON object at the end"),
+    )
+    return check
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Check; return the exit status: 0 nothing is wrong, 1 something is, 2 nothing was checked."""
+    options = check_parser().parse_args(arguments)
+    if arguments is None:  # nothing has begun that an interrupt could cut in two
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from check_rtc.check import check
+
+    if arguments is None:  # told to end, it first stops its dither and closes the loop again
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
+    try:
+        return check(options)
+    except PyrcalError as error:
+        sys.stderr.write(f"pyrcal: {shown(str(error))}\n")
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -42,6 +42,18 @@ SHARED = (
 """Their tests share a service; every other system test has its own, and may run anywhere."""
 
 
+@pytest.fixture
+async def client(service):
+    """Give whoever asks REST of a test's own service, in this process."""
+    import httpx  # most tests need neither
+
+    from service.api import create_app
+
+    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+        yield client
+
+
 @pytest.fixture(autouse=True)
 def log_of_its_own():
     """Leave no log behind that writes where the test before has looked."""

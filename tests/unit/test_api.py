@@ -7,7 +7,6 @@ import re
 import threading
 from dataclasses import dataclass, field, replace
 
-import httpx
 import numpy as np
 import pytest
 from prometheus_client.openmetrics.parser import (
@@ -16,7 +15,6 @@ from prometheus_client.openmetrics.parser import (
 from prometheus_client.parser import text_string_to_metric_families
 
 from service import __version__
-from service.api import create_app
 from service.archive import Archive
 from service.control.gate import GateVerdict
 from service.errors import (
@@ -270,13 +268,6 @@ def service(archive):
             archive_waiting=2,
         ),
     )
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 async def body_of(client, path, **parameters):

@@ -2,10 +2,8 @@
 
 from dataclasses import replace
 
-import httpx
 import pytest
 
-from service.api import create_app
 from service.errors import CommandError
 from service.routes.views import picture
 from service.tracking.commands import AbortAcquisition, Acquire
@@ -30,13 +28,6 @@ class FakeService:
 @pytest.fixture
 def service():
     return FakeService()
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from tests.unit.test_api import (  # noqa: F401
     SECOND,
     archive,
     body_of,
-    client,
     metrics_of,
     service,
 )
@@ -66,7 +65,7 @@ async def test_alarms_are_those_that_last_went_unseen_or_are_muted(client, servi
     ],
 )
 async def test_what_operators_do_about_an_alarm_is_an_order(
-    client,  # noqa: F811
+    client,
     service,  # noqa: F811
     path,
     body,

@@ -5,10 +5,8 @@ import io
 import json
 from types import SimpleNamespace
 
-import httpx
 import pytest
 
-from service.api import create_app
 from service.archive import Archive, AuditEntry
 from service.routes import archive as kept
 
@@ -49,13 +47,6 @@ def service(tmp_path):
         )
         archive.record((), entries)
         yield FakeService(archive)
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 async def names(client, query=""):

@@ -15,6 +15,7 @@ from service.files.report import document
 from service.files.uploads import FitJob, FitState
 from service.fit.matrix import Method
 from tests.unit.files.made import a_fit, a_report
+from tests.unit.test_api import assert_problem
 
 JOB = FitJob(id="fit-1", state=FitState.WAITING, asked_ns_utc=7, n_bytes=4, sha256="ab")
 
@@ -72,14 +73,6 @@ async def client(desk):
     transport = httpx.ASGITransport(create_app(SERVICE, desk), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
         yield client
-
-
-def assert_problem(response, status, kind, *words):
-    assert response.status_code == status, response.text
-    assert response.headers["content-type"] == "application/problem+json"
-    assert response.json()["type"] == f"urn:pyrcal:problem:{kind}"
-    for word in words:
-        assert word in response.json()["detail"]
 
 
 async def test_the_body_is_the_file_and_the_parameters_are_those_of_the_command(client, desk):

@@ -3,10 +3,8 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import httpx
 import pytest
 
-from service.api import create_app
 from service.tracking.commands import SetLoop
 from service.tracking.registration import ModeGain
 from service.tracking.state import TrackerState
@@ -42,13 +40,6 @@ class FakeService:
 @pytest.fixture
 def service():
     return FakeService()
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 async def test_the_present_table_is_of_every_mode_of_the_basis(client):

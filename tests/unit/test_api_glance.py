@@ -2,11 +2,9 @@
 
 from types import SimpleNamespace
 
-import httpx
 import numpy as np
 import pytest
 
-from service.api import create_app
 from service.config import packaged_instrument
 from service.control.reconstructor import invert
 from service.errors import UnknownIdError
@@ -33,13 +31,6 @@ class FakeService:
 @pytest.fixture
 def service():
     return FakeService()
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 async def test_singular_values_are_those_of_the_matrix_it_inverts(client, service):

@@ -1,9 +1,7 @@
 """Changing the loop over real HTTP messages, with a hand-written service behind it."""
 
-import httpx
 import pytest
 
-from service.api import create_app
 from service.errors import CommandError, LinkError
 from service.tracking.commands import GainGroup, ModeGroup, Ramp, SetLoop
 
@@ -25,13 +23,6 @@ class FakeService:
 @pytest.fixture
 def service():
     return FakeService()
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,9 @@ import io
 from dataclasses import replace
 from types import SimpleNamespace
 
-import httpx
 import numpy as np
 import pytest
 
-from service.api import create_app
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.snapshot import Snapshot
 from service.tracking.commands import GiveUp, Measure
@@ -88,13 +86,6 @@ class FakeMatrices:
 @pytest.fixture
 def service():
     return FakeService()
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 async def test_a_bare_request_measures_push_pull_modal(client, service):

@@ -3,11 +3,9 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import httpx
 import numpy as np
 import pytest
 
-from service.api import create_app
 from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.routes.views import GATHERING, picture
@@ -84,13 +82,6 @@ class FakeMatrices:
 @pytest.fixture
 def service():
     return FakeService()
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 async def test_a_bare_request_takes_the_controlled_modes(client, service):

@@ -6,11 +6,9 @@ import sys
 from types import SimpleNamespace
 
 import h5py
-import httpx
 import numpy as np
 import pytest
 
-from service.api import create_app
 from service.archive import Archive
 from service.snapshot import Snapshot
 from service.tracking.products import MatrixState, ReconstructorRecord
@@ -61,13 +59,6 @@ def service(tmp_path):
         for one in RECORDS:
             archive.reconstructors.store(one, MATRIX, None, {})
         yield FakeService(archive)
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 @pytest.mark.parametrize(

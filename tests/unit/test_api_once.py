@@ -3,10 +3,8 @@
 import asyncio
 from dataclasses import replace
 
-import httpx
 import pytest
 
-from service.api import create_app
 from service.errors import CommandError, StorageError
 from service.routes import connections
 from service.snapshot import Snapshot
@@ -41,13 +39,6 @@ class FakeService:
 @pytest.fixture
 def service():
     return FakeService()
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 def keyed(client, key="k-1", path="/v1/rollback", **body):

@@ -4,11 +4,9 @@ import gzip
 import re
 from dataclasses import replace
 
-import httpx
 import numpy as np
 import pytest
 
-from service.api import create_app
 from service.config import packaged_instrument
 from service.model.instrument import TabulatedModes
 from service.model.misregistration import PARAMETERS
@@ -41,13 +39,6 @@ def service(archive):  # noqa: F811
     service.instrument = packaged_instrument("flao-lbt")
     service.policy = POLICY
     return service
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 # --- its files

@@ -1,9 +1,7 @@
 """Random dithers asked for over real HTTP messages, with a hand-written service behind."""
 
-import httpx
 import pytest
 
-from service.api import create_app
 from service.snapshot import Snapshot
 from service.tracking.commands import StartDither
 from service.tracking.products import ModeSet
@@ -33,13 +31,6 @@ class FakeService:
 @pytest.fixture
 def service():
     return FakeService()
-
-
-@pytest.fixture
-async def client(service):
-    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
-    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
-        yield client
 
 
 @pytest.mark.parametrize(

@@ -19,9 +19,9 @@ from service.tracking import (
     operator,
     probation,
     reconstructors,
+    resume,
     rtc,
     rules,
-    stopping,
     validity,
 )
 from service.tracking import commands as cmd
@@ -79,7 +79,7 @@ def _go_on(turn: Turn) -> None:
         return
     fetch_in_use(turn)
     if turn.state.stopped_because:
-        stopping.keep_stopped(turn)
+        resume.keep_stopped(turn)
         return
     acquisition.acquire(turn)
     if turn.acquisition.under_way:
@@ -184,8 +184,8 @@ REACTIONS: Final[dict[type, Callable[[Turn, Any], object]]] = {
     cmd.SetValue: rules.tell,
     cmd.SetLoop: operator.set_loop,
     cmd.Ramp: operator.ramp,
-    cmd.StopEverything: stopping.stop,
-    cmd.Resume: stopping.resume,
+    cmd.StopEverything: resume.stop,
+    cmd.Resume: resume.resume,
     cmd.Acquire: acquisition.acquire_on_command,
     cmd.AbortAcquisition: acquisition.abort_on_command,
     cmd.StartDither: operator.start_dither,

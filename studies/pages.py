@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any, get_args
 
 from service.api import create_app
-from service.tracking.activity import ALLOWS
+from service.tracking.activity import ALLOWS, OCCUPIES, Occupation, Operation
 from service.tracking.alarms import Act, Attention, Severity
 from service.tracking.commands import Command
-from service.tracking.operation import OCCUPIES, Occupation, Operation
 from service.tracking.products import MatrixState, MeasureState, ProbationState
 from service.tracking.registration import Validity
 from service.tracking.state import AcquisitionStage, Mode

@@ -21,9 +21,9 @@ from service.routes.admission import OPEN
 from service.routes.problems import problem, problem_response
 from service.routes.views import ServiceDep
 from service.snapshot import Pace, Snapshot
+from service.tracking.activity import Occupation, Operation
 from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND, Attention, Party, Severity
 from service.tracking.dither_request import DitherPhase
-from service.tracking.operation import Occupation, Operation
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
 from service.tracking.state import Mode, TrackerState

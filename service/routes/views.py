@@ -38,11 +38,11 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistr
 from service.runtime.supervisor import Supervisor
 from service.snapshot import AlarmShown, Alpha, GainTableShown, Pace, Rtc, Snapshot
 from service.telemetry.probation import ProbationFinding
+from service.tracking.activity import Operating
 from service.tracking.alarms import Alarm, Note, Remark
 from service.tracking.commands import GainGroup
 from service.tracking.dither_request import Dither, Dithering, DitherPlan
 from service.tracking.loop import LoopCommand
-from service.tracking.operation import Operating
 from service.tracking.products import (
     Assessment,
     MeasurementRecord,

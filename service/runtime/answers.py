@@ -141,8 +141,9 @@ class Given:
         name = "" if asked is None else asked.id
         dither = now.dither
         if dither is None or dither.id != name:
-            told = (alarm.text for alarm in now.alarms if alarm.name == NO_DITHER)
-            raise CommandError(next(told, f"{name} is not followed any more: see the events"))
+            told = now.alarm(NO_DITHER)
+            gone = f"{name} is not followed any more: see the events"
+            raise CommandError(gone if told is None else told.text)
         cost = f"{1e9 * total_m(dither.request):.3g} nm RMS in all"
         cost = f"{cost}, budget {1e9 * now.dithering.budget_m:.3g} nm"
         if dither.start_seq is None:

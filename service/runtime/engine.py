@@ -125,9 +125,8 @@ class Engine:
         """Take in what came over the link besides frames."""
         self.post(event)
         if self.streams is not None:
-            mismatch = shape_news(self.streams, self.state)
-            if mismatch is not None:
-                self.post(mismatch)
+            for news in shape_news(self.streams, self.state):
+                self.post(news)
 
     def feed(self, blocks: Iterable[FrameBlock]) -> None:
         """Take in frames; windows that end in them are handed on to be fitted."""
@@ -202,10 +201,7 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
     if streams.vibrations is not None and lines != state.vibrations_hz:
         found.append(ev.Vibrations(lines_hz=lines))
     for name, trouble, over in troubles(streams):
-        known = any(alarm.name == name for alarm in state.alarms)
-        if (trouble is not None) is not known:
-            text, t_ns = trouble or over, streams.heard_ns_utc
-            found.append(ev.Trouble(name=name, text=text, over=known, t_ns_utc=t_ns))
+        found += ev.Trouble.news(state, name, trouble, over, streams.heard_ns_utc)
     judged, trial = streams.comparison.found, state.probation
     if judged is not None and trial is not None and trial.awaits(judged.before, judged.after):
         found.append(ev.Compared(finding=judged))
@@ -215,7 +211,7 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
 def _misplayed(dither_id: str, played: Finding, state: TrackerState) -> list[Event]:
     """Return what the frames hold of the dither, where it is told for the first time or is over."""
     told = state.dithering
-    raised = any(alarm.name in {alarms.NOT_AS_ASKED, alarms.OVER_BUDGET} for alarm in state.alarms)
+    raised = state.alarm(alarms.NOT_AS_ASKED) or state.alarm(alarms.OVER_BUDGET)
     louder = played.found_m > LOUDER * told.amiss_m
     news = told.amiss_id != dither_id or louder if played.text else raised
     if not news:
@@ -233,7 +229,7 @@ def _answered(streams: Streams, state: TrackerState) -> list[Event]:
     Of an open loop, and of one that is being closed, the optical gain may be next to nothing.
     """
     found = None if streams.played is None else streams.played.unanswered
-    raised = any(alarm.name == alarms.MIRROR_SILENT for alarm in state.alarms)
+    raised = state.alarm(alarms.MIRROR_SILENT) is not None
     closed = len(streams.in_loop) > 0 and not state.acquisition.under_way
     if found is None or not closed or not (found or raised):
         return []
@@ -242,16 +238,13 @@ def _answered(streams: Streams, state: TrackerState) -> list[Event]:
     return [ev.Trouble(name=alarms.MIRROR_SILENT, text=text, over=not found, t_ns_utc=t_ns)]
 
 
-def shape_news(streams: Streams, state: TrackerState) -> Event | None:
-    """Return whether it has changed that the RTC's telemetry fits the instrument file, or None."""
+def shape_news(streams: Streams, state: TrackerState) -> list[ev.Trouble]:
+    """Return whether it has changed that the RTC's telemetry fits the instrument file."""
     if state.rtc is None:
-        return None
-    reason = shape_mismatch(streams.description, state.rtc)
-    known = any(alarm.name == alarms.OTHER_INSTRUMENT for alarm in state.alarms)
-    if (reason is not None) is known:
-        return None
-    text = reason or "the RTC's telemetry fits the instrument file again"
-    return ev.Trouble(name=alarms.OTHER_INSTRUMENT, text=text, over=known)
+        return []
+    wrong = shape_mismatch(streams.description, state.rtc)
+    over = "the RTC's telemetry fits the instrument file again"
+    return ev.Trouble.news(state, alarms.OTHER_INSTRUMENT, wrong, over)
 
 
 def shape_mismatch(description: Description, rtc: Status) -> str | None:

@@ -204,8 +204,7 @@ async def listened(
         workers.first = partial(run_job, OpticsWorker.adopt, dialect.found)
         text = f'orientation "auto": found {setting_written(dialect.found)} by {record.id}'
         events.append(ev.Noted(name="slopes.adopted", text=text))
-    raised = any(alarm.name == WRONG_MATRIX for alarm in state.alarms)
-    if dialect.wrong or raised:
+    if dialect.wrong or state.alarm(WRONG_MATRIX) is not None:
         text = f"{record.id}: {dialect.wrong}" if dialect.wrong else f"{record.id} is as told"
         events.append(ev.Trouble(name=WRONG_MATRIX, text=text, over=not dialect.wrong))
     return events

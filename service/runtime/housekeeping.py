@@ -49,7 +49,7 @@ async def keep_house(
     """
     log, next_s = structlog.get_logger(), time.monotonic() + LOOK_S
     while True:
-        low = any(alarm.name == DISK_LOW for alarm in state().alarms)
+        low = state().alarm(DISK_LOW) is not None
         try:
             text = await asyncio.to_thread(low_on_space, archive.directory, keeping, low=low)
             if text is not None or low:

@@ -20,11 +20,10 @@ from service.tracking import events as ev
 from service.tracking.alarms import ARCHIVE_FAILED
 from service.tracking.commands import Command
 from service.tracking.events import Effect
-from service.tracking.operator import orders_of
 from service.tracking.policy import Policy
 from service.tracking.products import ReconstructorRecord
 from service.tracking.registration import HistoryEntry
-from service.tracking.resume import resumed, saved_of, with_orders
+from service.tracking.resume import orders_of, resumed, saved_of, with_orders
 from service.tracking.state import Level, LogEntry, TrackerState
 from service.tracking.turn import logged
 from service.wire import DitherRequest, MeasureRequest, RampRequest

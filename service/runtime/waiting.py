@@ -12,8 +12,8 @@ from service.link.statistics import MALFORMED, RECENT_S, USED, Fate, LinkStatist
 from service.model.misregistration import at_boundary
 from service.tracking import alarms
 from service.tracking import events as ev
+from service.tracking.activity import operating
 from service.tracking.alarms import Act, Alarm, Party, forbids
-from service.tracking.operation import operating
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
 from service.tracking.reconstructors import why_unread

@@ -8,10 +8,9 @@ import heapq
 import itertools
 import resource
 import time
-from collections import Counter, defaultdict, deque
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections import defaultdict, deque
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
@@ -263,18 +262,8 @@ STARVED = 0.6
 """Processor time of the worker over the time it is at work: with less the machine is loaded."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Mark:
-    """All counters at one moment, seconds."""
-
-    clock: float
-    service: float = 0.0
-    busy: float = 0.0
-    telemetry: float = 0.0
-    jobs: Mapping[str, float] = field(default_factory=dict)
-    late: int = 0
-    fitted: int = 0
-    fitted_s: float = 0.0
+JOB = "job "
+"""Before the name of a job, among what is counted."""
 
 
 class PaceMeter:
@@ -282,49 +271,46 @@ class PaceMeter:
 
     def __init__(self, workers: WorkerPool) -> None:
         self._workers = workers
-        self._telemetry_s = 0.0
-        self._late = self._fitted = 0
-        self._fitted_s = 0.0
-        self._marks: deque[_Mark] = deque([self._mark()])
+        self._counted: defaultdict[str, float] = defaultdict(float)
+        self._marks = deque([self._mark()])
         self._behind = False
 
     def heard(self, seconds: float) -> None:
         """Count telemetry that was taken in."""
-        self._telemetry_s += seconds
+        self._counted["telemetry_s"] += seconds
 
     def was_late(self) -> None:
         """Count a window that came while another one still waited."""
-        self._late += 1
+        self._counted["late"] += 1
 
     def fitted(self, window_s: float) -> None:
         """Count a window that the worker has begun with."""
-        self._fitted += 1
-        self._fitted_s += window_s
+        self._counted["fitted"] += 1
+        self._counted["fitted_s"] += window_s
 
     def look(self) -> Pace:
         """Take note of where everything stands, and return how it goes."""
         now = self._mark()
         self._marks.append(now)
-        while len(self._marks) > 2 and now.clock - self._marks[1].clock >= MEMORY_S:
+        while len(self._marks) > 2 and now["clock_s"] - self._marks[1]["clock_s"] >= MEMORY_S:
             self._marks.popleft()
         return self.pace
 
     @property
     def pace(self) -> Pace:
         """What the work of the last minute cost."""
-        first, last = self._marks[0], self._marks[-1]
-        lasted_s = max(last.clock - first.clock, 1e-9)
-        telemetry_s, fitted = last.telemetry - first.telemetry, last.fitted - first.fitted
-        jobs = Counter(last.jobs)
-        jobs.subtract(first.jobs)
+        spent = self._spent()
+        lasted_s, telemetry_s = max(spent["clock_s"], 1e-9), spent["telemetry_s"]
+        fitted = spent["fitted"]
+        jobs = {key.removeprefix(JOB): s for key, s in spent.items() if key.startswith(JOB)}
         per_s = {name: s / telemetry_s for name, s in jobs.items() if s > 0} if telemetry_s else {}
         return Pace(
             worker_per_s=sum(per_s.values()) if telemetry_s else None,
             by_job=dict(sorted(per_s.items(), key=lambda item: -item[1])),
-            service_per_s=(last.service - first.service) / lasted_s,
-            busy_ratio=(last.busy - first.busy) / lasted_s,
-            window_s=(last.fitted_s - first.fitted_s) / fitted if fitted else None,
-            windows_late=last.late - first.late,
+            service_per_s=spent["service_s"] / lasted_s,
+            busy_ratio=spent["busy_s"] / lasted_s,
+            window_s=spent["fitted_s"] / fitted if fitted else None,
+            windows_late=round(spent["late"]),
         )
 
     def news(self, state: TrackerState) -> list[ev.Trouble]:
@@ -333,20 +319,15 @@ class PaceMeter:
         if lost:
             lost = f"{lost}; another one takes over, what it was at is lost. If it comes again: is "
             lost += "there memory enough, and does the machine get to run it?"
-        said = [
-            (WORKER_LOST, lost, "the worker does its work again"),
-            (WORKER_BEHIND, self._why_behind(), "the worker keeps up with the telemetry again"),
-        ]
-        known = {alarm.name for alarm in state.alarms}
+        keeps_up = "the worker keeps up with the telemetry again"
         return [
-            ev.Trouble(name=name, text=text or over, over=name in known)
-            for name, text, over in said
-            if bool(text) is not (name in known)
+            *ev.Trouble.news(state, WORKER_LOST, lost, "the worker does its work again"),
+            *ev.Trouble.news(state, WORKER_BEHIND, self._why_behind(), keeps_up),
         ]
 
     def _why_behind(self) -> str:
-        pace, first, last = self.pace, self._marks[0], self._marks[-1]
-        if last.clock - first.clock < ENOUGH_S or pace.busy_ratio is None:
+        pace, spent = self.pace, self._spent()
+        if spent["clock_s"] < ENOUGH_S or pace.busy_ratio is None:
             return ""
         if self._behind:
             self._behind = pace.busy_ratio > AT_EASE and pace.windows_late > 0
@@ -355,8 +336,8 @@ class PaceMeter:
         if not self._behind:
             return ""
         most = ", ".join(f"{name} {share:.2f}" for name, share in list(pace.by_job.items())[:3])
-        got = sum(last.jobs.values()) - sum(first.jobs.values())
-        share = got / max(last.busy - first.busy, 1e-9)
+        got = sum(s for key, s in spent.items() if key.startswith(JOB))
+        share = got / max(spent["busy_s"], 1e-9)
         cause = (
             f"the machine is loaded: of a second at work it gets {share:.1f} s of a processor"
             if share < STARVED
@@ -369,14 +350,14 @@ class PaceMeter:
             "s long and α comes as much later; end other work there, or control and dither less"
         )
 
-    def _mark(self) -> _Mark:
-        return _Mark(
-            clock=time.monotonic(),
-            service=time.process_time(),
-            busy=self._workers.busy_s,
-            telemetry=self._telemetry_s,
-            jobs=dict(self._workers.cpu_s),
-            late=self._late,
-            fitted=self._fitted,
-            fitted_s=self._fitted_s,
-        )
+    def _mark(self) -> defaultdict[str, float]:
+        """Return all counters as they are now."""
+        jobs = {f"{JOB}{name}": s for name, s in self._workers.cpu_s.items()}
+        clocks = {"clock_s": time.monotonic(), "service_s": time.process_time()}
+        busy = {"busy_s": self._workers.busy_s}
+        return defaultdict(float, self._counted | jobs | clocks | busy)
+
+    def _spent(self) -> defaultdict[str, float]:
+        """Return what every counter has come to in the time that is remembered."""
+        first, last = self._marks[0], self._marks[-1]
+        return defaultdict(float, {key: n - first[key] for key, n in last.items()})

@@ -19,7 +19,7 @@ from service.tracking.products import (
     MeasurementRecord,
     ReconstructorRecord,
 )
-from service.tracking.state import Level
+from service.tracking.state import Level, TrackerState
 from service.wire import Acknowledgement, Reply, Status
 from service.wire import Command as Request
 
@@ -151,6 +151,16 @@ class Trouble:
 
     t_ns_utc: int = 0
     """End of the telemetry that told, the RTC's clock; 0: it was not telemetry."""
+
+    @classmethod
+    def news(
+        cls, state: TrackerState, name: str, text: str | None, over: str, t_ns_utc: int = 0
+    ) -> list[Trouble]:
+        """Return the trouble that has come or gone, if it has; no text: there is none now."""
+        known = state.alarm(name) is not None
+        if bool(text) is known:
+            return []
+        return [cls(name=name, text=text or over, over=known, t_ns_utc=t_ns_utc)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

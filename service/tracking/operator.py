@@ -31,7 +31,7 @@ from service.tracking.reconstructors import (
     send_once_judged,
 )
 from service.tracking.registration import table_of
-from service.tracking.state import Level, Mode, Orders, TrackerState
+from service.tracking.state import Level, Mode
 from service.tracking.turn import Turn
 from service.tracking.worth import outdated
 from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
@@ -41,47 +41,9 @@ def set_mode(turn: Turn, command: cmd.SetMode) -> None:
     """Go on in the mode an operator orders; that of the settings is remembered."""
     mode = command.mode
     of_settings = turn.state.settings_mode or turn.state.mode
-    _order(turn, mode, None if mode is of_settings else of_settings)
+    order(turn, mode, None if mode is of_settings else of_settings)
     turn.calm(PROBATION)
     turn.log("mode", f"mode is {mode}")
-
-
-def orders_of(state: TrackerState) -> Orders:
-    """Return what the next service has to obey; the default is nothing."""
-    return Orders(
-        mode=None if state.settings_mode is None else state.mode,
-        settings_mode=state.settings_mode,
-        dither_stopped=state.dither_stopped,
-        stopped=state.stopped_because,
-        seen=state.notes,
-    )
-
-
-def obey(turn: Turn, orders: Orders) -> None:
-    """Take over what was ordered before a restart, the mode being the settings' so far.
-
-    What was said last counts: an order outlives the service, and ends with the next one, or when
-    the settings say something else than they did when it was given.
-    """
-    if orders.dither_stopped:
-        allow(turn, allowed=False)
-        text = "by an operator before the restart; start the dither to let it dither again"
-        turn.warn("dither.stopped", text)
-    of_settings, ordered = turn.state.mode, orders.mode
-    if ordered is None or ordered is of_settings:
-        return
-    if of_settings is not orders.settings_mode:
-        text = (
-            f"mode is {of_settings}: the settings, which said {orders.settings_mode} when an "
-            f"operator set {ordered}, have been changed since"
-        )
-    else:
-        text = (
-            f"mode is {ordered}, as an operator set it before the restart, and not {of_settings} "
-            "as the settings say; set the mode to change it"
-        )
-        _order(turn, ordered, of_settings)
-    turn.warn("mode", text)
 
 
 def approve(turn: Turn, command: cmd.Approve) -> None:
@@ -239,11 +201,12 @@ def _copy(turn: Turn, source: str, why: str) -> None:
 def hold(turn: Turn, why: str) -> None:
     """Do nothing unasked until an operator sets another mode."""
     of_settings = turn.state.settings_mode or turn.state.mode
-    _order(turn, Mode.HOLD, None if of_settings is Mode.HOLD else of_settings)
+    order(turn, Mode.HOLD, None if of_settings is Mode.HOLD else of_settings)
     turn.log("mode", f"hold: {why}")
 
 
-def _order(turn: Turn, mode: Mode, of_settings: Mode | None) -> None:
+def order(turn: Turn, mode: Mode, of_settings: Mode | None) -> None:
+    """Go on in a mode; ``of_settings`` is that of the settings, None: the same."""
     turn.state = replace(turn.state, mode=mode, settings_mode=of_settings)
 
 

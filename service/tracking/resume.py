@@ -1,18 +1,24 @@
-"""Taking up a night where the service before this one left it: α, an acquisition, orders."""
+"""What outlasts a moment: the order to stop everything, and what the next service takes up."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from service.errors import CommandError
+from service.tracking import commands as cmd
+from service.tracking import dither
 from service.tracking.acquisition import inherit, left_behind
+from service.tracking.acquisition_stages import abort
+from service.tracking.activity import ramping
+from service.tracking.alarms import STOPPED, Act
 from service.tracking.attention import take_over
 from service.tracking.events import Tick
-from service.tracking.operator import obey, orders_of
+from service.tracking.measuring import give_up
+from service.tracking.operator import order
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import thinned
 from service.tracking.state import Orders, Saved, TrackerState
-from service.tracking.stopping import stay_stopped
 from service.tracking.turn import Turn
 from service.tracking.validity import age, restore
 
@@ -24,6 +30,92 @@ _RESTARTED = {
     MatrixState.STAGED: MatrixState.FAILED,
     MatrixState.PROPOSED: MatrixState.DISCARDED,
 }
+
+
+def stop(turn: Turn, command: cmd.StopEverything) -> None:
+    """End what runs as its own command would; from then on ask only for dithers to end.
+
+    An acquisition gives back the loop as it was found, now. One that a measurement has opened is
+    closed again when all is released: the RTC is busy until then. A gain ramp is the RTC's, and
+    ends by itself; only opening the loop would end it sooner.
+    """
+    if not turn.state.stopped_because:
+        ramp = ramping(turn.state, turn.now_ns)
+        left = "" if ramp is None else f"; {ramp.id} is the RTC's and ends by itself"
+        _stay(turn, f"everything was stopped {command.signed}{left}")
+    if turn.acquisition.under_way:
+        abort(turn, "by the operator", held_off=True)
+    for record in (turn.state.measuring, turn.state.gathering):
+        if record is not None:
+            give_up(turn, record.id)
+    if turn.rtc is None or turn.forbidden(Act.ASK) is not None:
+        dither.drop(turn)
+    else:
+        dither.make_way(turn)
+
+
+def resume(turn: Turn, command: cmd.Resume) -> None:
+    """Go on in the mode and with the dither that were ordered before, or meanwhile.
+
+    Raises
+    ------
+    CommandError
+        If nothing is stopped.
+    """
+    if not turn.state.stopped_because:
+        raise CommandError("resume: nothing is stopped")
+    turn.state = replace(turn.state, stopped_because="")
+    turn.calm(STOPPED)
+    turn.log("resumed", command.signed)
+
+
+def keep_stopped(turn: Turn) -> None:
+    """Have no dither of the service's own on the mirror while everything is stopped."""
+    if turn.rtc is not None and turn.forbidden(Act.ASK) is None:
+        dither.stop_unwanted(turn, turn.rtc)
+
+
+def _stay(turn: Turn, text: str) -> None:
+    turn.state = replace(turn.state, stopped_because=text)
+    turn.alarm(STOPPED, f"{text}: nothing is dithered, made or sent until the stop is released")
+
+
+def orders_of(state: TrackerState) -> Orders:
+    """Return what the next service has to obey; the default is nothing."""
+    return Orders(
+        mode=None if state.settings_mode is None else state.mode,
+        settings_mode=state.settings_mode,
+        dither_stopped=state.dither_stopped,
+        stopped=state.stopped_because,
+        seen=state.notes,
+    )
+
+
+def obey(turn: Turn, orders: Orders) -> None:
+    """Take over what was ordered before a restart, the mode being the settings' so far.
+
+    What was said last counts: an order outlives the service, and ends with the next one, or when
+    the settings say something else than they did when it was given.
+    """
+    if orders.dither_stopped:
+        dither.allow(turn, allowed=False)
+        text = "by an operator before the restart; start the dither to let it dither again"
+        turn.warn("dither.stopped", text)
+    of_settings, ordered = turn.state.mode, orders.mode
+    if ordered is None or ordered is of_settings:
+        return
+    if of_settings is not orders.settings_mode:
+        text = (
+            f"mode is {of_settings}: the settings, which said {orders.settings_mode} when an "
+            f"operator set {ordered}, have been changed since"
+        )
+    else:
+        text = (
+            f"mode is {ordered}, as an operator set it before the restart, and not {of_settings} "
+            "as the settings say; set the mode to change it"
+        )
+        order(turn, ordered, of_settings)
+    turn.warn("mode", text)
 
 
 def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRecord, ...]:
@@ -81,7 +173,8 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
     turn = Turn(state, Tick(), policy, now_ns)
     if saved.orders is not None and saved.system == state.system:
         obey(turn, saved.orders)
-        stay_stopped(turn, saved.orders)
+        if saved.orders.stopped:
+            _stay(turn, saved.orders.stopped)
         take_over(turn, saved.orders)
     reason = _why_not(state, saved, now_ns)
     if reason is not None:

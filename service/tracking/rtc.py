@@ -149,7 +149,7 @@ def on_vanished(turn: Turn, _: ev.RtcVanished) -> None:
 def on_services(turn: Turn, event: ev.ServicesMet) -> None:
     """Stand by while another service drives the RTC, or say that one stands by."""
     who = " and ".join(event.others)
-    stood_by = any(alarm.name == alarms.STANDING_BY for alarm in turn.state.alarms)
+    stood_by = turn.state.alarm(alarms.STANDING_BY) is not None
     if not event.others:
         turn.calm(alarms.SECOND_SERVICE)
     else:

@@ -389,6 +389,10 @@ class TrackerState:
         """Return the record of this id, or None."""
         return next((r for r in reversed(self.reconstructors) if r.id == matrix_id), None)
 
+    def alarm(self, name: str) -> Alarm | None:
+        """Return the alarm of this name that lasts, or None."""
+        return next((alarm for alarm in self.alarms if alarm.name == name), None)
+
     @property
     def on_probation(self) -> bool:
         """Whether nothing is sent unasked: a matrix is on probation, or being rolled back."""

@@ -142,7 +142,7 @@ class Turn:
         """
         if critical:
             own = replace(ALARMS[name], severity=Severity.CRITICAL)
-        before = next((alarm for alarm in self.state.alarms if alarm.name == name), None)
+        before = self.state.alarm(name)
         t_ns = 0 if self.rtc is None else self.rtc.t_ns
         first = before or Alarm(name=name, since_ns_utc=self.now_ns, text=text, t_ns_utc=t_ns)
         others = tuple(alarm for alarm in self.state.alarms if alarm.name != name)

@@ -90,7 +90,7 @@ def void(turn: Turn, because: str, t_ns_utc: int = 0) -> None:
 
 def end_alarm(turn: Turn, name: str, t_ns_utc: int = 0) -> None:
     """End an alarm; telemetry that it was of stays what it was."""
-    alarm = next((alarm for alarm in turn.state.alarms if alarm.name == name), None)
+    alarm = turn.state.alarm(name)
     turn.calm(name)
     if alarm is not None and forbids(alarm, Act.MEASURE):
         void(turn, alarm.kind.because, t_ns_utc)
@@ -98,7 +98,7 @@ def end_alarm(turn: Turn, name: str, t_ns_utc: int = 0) -> None:
 
 def tells_of(state: TrackerState, name: str, when: Taken) -> bool:
     """Return whether telemetry was taken since this alarm was raised, or there is no such alarm."""
-    alarm = next((alarm for alarm in state.alarms if alarm.name == name), None)
+    alarm = state.alarm(name)
     return alarm is None or not precedes(state, when, alarm.t_ns_utc)
 
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
+from service.tracking.activity import Operation
 from service.tracking.alarms import Alarm, Note, Remark, Severity
 from service.tracking.commands import AcknowledgeAlarm, MuteAlarm, UnmuteAlarm
-from service.tracking.operation import Operation
 from tests.unit.test_api import (  # noqa: F401
     SECOND,
     archive,

@@ -6,8 +6,8 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.activity import Occupation, Operation, operating
 from service.tracking.alarms import Alarm
-from service.tracking.operation import Occupation, Operation, operating
 from service.tracking.state import Acquisition, AcquisitionStage, Mode
 from service.wire import Loop
 from tests.unit.tracking.situations import Story, rtc

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.control.expected_gain import noise_of_counts
 from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
@@ -36,6 +35,7 @@ from studies.registered import (
     registered,
     telescope_of,
 )
+from studies.slope_noise import noise_of_counts
 
 Array32 = NDArray[np.float32]
 

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.control.expected_gain import noise_of_counts
 from service.fit.light import CannotTell, find_pupil, measured_illumination
 from service.model.interaction import InteractionModel, valid_subapertures
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import Illumination
 from studies.registered import PASSES, STROKE_M, Array, measured_by_day, registered
+from studies.slope_noise import noise_of_counts
 
 N_FRAMES = 100
 """Averaged in the flux map."""

@@ -121,7 +121,7 @@ def predicted(
         variance_m2=model.basis.variance_m2 * stronger,
         beyond_m2=beyond_m2(model.basis.variance_m2) * stronger,
         crossing_hz=given.wind / instrument.diameter_m,
-        slope_noise=float(noise[0]),
+        slope_noise=noise,
     )
     timing = ControlLoop(
         frame_rate_hz=1000.0,

@@ -341,13 +341,12 @@ class OpticsWorker:
         fresh = reconstruct(flat, self._recipe(n_modes)).matrix
         noise, kind = self._compute.slope_noise, model.instrument.slopes.kind
         if magnitude is not None:
-            of_star = noise_of_star(
+            noise = noise_of_star(
                 model.instrument,
                 magnitude=magnitude,
                 frame_rate_hz=loop.frame_rate_hz,
                 n_valid=int(model.valid.sum()),
             )
-            noise = float(of_star[0])
         sky = Sky(
             variance_m2=model.basis.variance_m2,
             beyond_m2=beyond_m2(model.basis.variance_m2),

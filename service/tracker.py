@@ -21,7 +21,6 @@ from service.tracking import (
     reconstructors,
     resume,
     rtc,
-    rules,
     validity,
 )
 from service.tracking import commands as cmd
@@ -62,11 +61,11 @@ def step(
     """
     refuse_if_occupied(state, event, now_ns)
     turn = Turn(state, event, policy, now_ns)
-    rules.judge(turn)
+    attention.judge(turn)
     measuring.watch_measurement(turn)
     REACTIONS[type(event)](turn, event)
     probation.follow(turn)
-    rules.judge(turn)
+    attention.judge(turn)
     note_declined(turn)
     _go_on(turn)
     attention.follow(turn)
@@ -181,7 +180,7 @@ REACTIONS: Final[dict[type, Callable[[Turn, Any], object]]] = {
     ev.JobFailed: _on_failure,
     cmd.SetMode: operator.set_mode,
     cmd.SetPointing: lambda turn, command: validity.point(turn, command.pointing),
-    cmd.SetValue: rules.tell,
+    cmd.SetValue: attention.tell,
     cmd.SetLoop: operator.set_loop,
     cmd.Ramp: operator.ramp,
     cmd.StopEverything: resume.stop,

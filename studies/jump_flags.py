@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from service.config.policy import policy_of
 from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.tracking.estimate import Measured
 from service.tracking.events import Tick
 from service.tracking.evidence import enter
+from service.tracking.filtering import Measured
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Source
 from service.tracking.state import TrackerState

@@ -24,7 +24,7 @@ from service.routes.commands import AcceptedView, ClientDep, Said
 from service.routes.problems import INVALID, UNKNOWN
 from service.routes.reading import TimeParameters
 from service.routes.views import ServiceDep, answer, clock_of, is_time, picture, shows, view
-from service.runtime.housekeeping import needed
+from service.runtime.recording import needed
 
 router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from service.errors import CommandError, LinkError
 from service.tracking import commands as cmd
 from service.tracking.alarms import NO_DITHER, Note
-from service.tracking.attention import muted
+from service.tracking.attention import muted, said
 from service.tracking.commands import Command
 from service.tracking.dither_request import total_m
 from service.tracking.loop import CommandState
 from service.tracking.products import MatrixState, MeasureState, ReconstructorRecord
 from service.tracking.reconstructors import why_unsendable
-from service.tracking.rules import said
 from service.tracking.state import TrackerState
 from service.tracking.turn import new_lines
 

@@ -1,4 +1,8 @@
-"""Keeping the archive in step with the state: written before it counts, kept until it is."""
+"""The archive kept in step with the state, and its disk in order.
+
+What counts is written before it does, and waits until it is; what is old goes, a little at a time,
+and a disk that is almost full is told.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +19,10 @@ import msgspec
 import structlog
 
 from service.archive import Archive, AuditEntry
+from service.archive.retention import Keeping, due, items, low_on_space, remove
 from service.errors import ArchiveError, StorageError
 from service.tracking import events as ev
-from service.tracking.alarms import ARCHIVE_FAILED
+from service.tracking.alarms import ARCHIVE_FAILED, DISK_LOW
 from service.tracking.commands import Command
 from service.tracking.events import Effect
 from service.tracking.policy import Policy
@@ -30,6 +35,15 @@ from service.wire import DitherRequest, MeasureRequest, RampRequest
 
 RETRY_S = 2.0
 """Between two attempts while the disk refuses."""
+
+LOOK_S = 30.0
+"""Between two looks at the free space."""
+
+PRUNE_S = 3600.0
+"""Between two looks for what is old."""
+
+REST_S = 0.5
+"""Between two products that are removed: others want the disk, too."""
 
 MOST_WAITING = 10_000
 """Lines of the audit trail, and estimates, that wait for a disk; newer ones are counted and
@@ -252,6 +266,36 @@ class Recorder:
             except ArchiveError as error:  # it has been put aside: the next attempt finds none
                 self._log.error("archive.failed", text=str(error))
 
+    async def keep_house(self, keeping: Keeping) -> None:
+        """Look after the disk until cancelled, as the user has decided; in threads."""
+        next_s = time.monotonic() + LOOK_S
+        while True:
+            low = self._state().alarm(DISK_LOW) is not None
+            try:
+                folder = self._archive.directory
+                text = await asyncio.to_thread(low_on_space, folder, keeping, low=low)
+                if text is not None or low:
+                    self._post(ev.Trouble(name=DISK_LOW, text=text or "", over=text is None))
+                if time.monotonic() >= next_s:
+                    next_s = time.monotonic() + PRUNE_S
+                    await self._prune(keeping)
+            except (OSError, ArchiveError) as error:  # a disk that refuses is told of elsewhere
+                self._log.warning("archive.not-looked-after", text=str(error))
+            except Exception:  # noqa: BLE001 - a bug must not end the service
+                self._log.exception("archive.not-looked-after")
+            await asyncio.sleep(LOOK_S)
+
+    async def _prune(self, keeping: Keeping) -> None:
+        """Remove what is old or too much, one by one; what has come into use meanwhile stays."""
+        every = await asyncio.to_thread(items, self._archive, needed(self._state()))
+        for item, why in tuple(due(every, keeping, time.time_ns())):
+            if item.id in needed(self._state()):
+                continue
+            entry = await asyncio.to_thread(remove, self._archive, item, why)
+            if entry is not None:
+                self.add(entry)
+            await asyncio.sleep(REST_S)
+
     async def keep_orders(self) -> None:
         """Keep what was ordered for the service after this one now, if the disk lets it."""
         try:
@@ -390,3 +434,9 @@ def _course(state: TrackerState) -> tuple[object, ...]:
         return (acquisition.stage,)
     session = None if rtc is None else rtc.session
     return acquisition.stage, acquisition.attempt, acquisition.matrix, session
+
+
+def needed(state: TrackerState) -> frozenset[str]:
+    """Return the ids of matrices that somebody may ask for at any moment."""
+    ids = (state.in_use, state.previous, state.acquisition.matrix, state.acquisition.applied)
+    return frozenset(one for one in ids if one is not None)

@@ -23,7 +23,6 @@ from service.runtime.actions import Actions
 from service.runtime.answers import Given
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
-from service.runtime.housekeeping import keep_house
 from service.runtime.recording import Caller, Recorder, ids_of
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
@@ -33,11 +32,11 @@ from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.attention import is_news
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.products import MeasureState
-from service.tracking.rules import is_news
 from service.tracking.state import Level, TrackerState, Waiting
 from service.tracking.turn import new_lines
 from service.wire import TEXT_LIMIT, AlarmMessage
@@ -210,15 +209,7 @@ class Supervisor:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._recorder.run())
             group.create_task(self._recorder.save())
-            group.create_task(
-                keep_house(
-                    self.archive,
-                    self._keeping,
-                    lambda: self._engine.state,
-                    self._post,
-                    self._recorder.add,
-                )
-            )
+            group.create_task(self._recorder.keep_house(self._keeping))
             description = await self._described()
             self._engine.prepared(description)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"

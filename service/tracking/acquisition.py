@@ -19,25 +19,10 @@ from dataclasses import replace
 from service.control.gate import FORGIVING_LEAK
 from service.errors import CommandError
 from service.telemetry.openloop import NOT_FOUND
+from service.tracking import acquisition_stages as stages
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors, worth
-from service.tracking.acquisition_stages import (
-    abort,
-    begin,
-    enter_stage,
-    far_stage,
-    gains_for,
-    give_up,
-    go_on,
-    left_open,
-    on_far,
-    on_missed,
-    request_loop,
-    restart,
-    why_needed,
-    why_not_now,
-)
 from service.tracking.activity import ramping
 from service.tracking.alarms import ACQUISITION, Act
 from service.tracking.dither import allow, choose_dither, make_way
@@ -70,7 +55,7 @@ def acquire_on_command(turn: Turn, _: cmd.Acquire) -> None:
     CommandError
         If none can begin now.
     """
-    reason = why_not_now(turn.state, turn.policy)
+    reason = stages.why_not_now(turn.state, turn.policy)
     if turn.rtc is None or reason is not None:
         raise CommandError(f"acquisition: {reason}")
     allow(turn)
@@ -89,7 +74,7 @@ def abort_on_command(turn: Turn, _: cmd.AbortAcquisition) -> None:
     if not turn.acquisition.under_way and not interrupted:
         raise CommandError("acquisition: none is under way")
     turn.calm(ACQUISITION)
-    abort(turn, "by the operator", held_off=True)
+    stages.abort(turn, "by the operator", held_off=True)
 
 
 def acquire(turn: Turn) -> None:
@@ -99,14 +84,14 @@ def acquire(turn: Turn) -> None:
         _take_up(turn)
     elif not acquisition.under_way:
         if turn.state.windows_accepted > turn.before.windows_accepted:
-            go_on(turn, replace(acquisition, misses=0))
+            stages.go_on(turn, replace(acquisition, misses=0))
         _forget_when_over(turn)
-        why = why_needed(turn.state, turn.policy, turn.now_ns)
+        why = stages.why_needed(turn.state, turn.policy, turn.now_ns)
         if why is not None and turn.rtc and ramping(turn.state, turn.now_ns) is None:
             _begin(turn, turn.rtc, why, commanded=False)
     elif isinstance(turn.event, ev.RtcVanished):
         # the state before still knows in which session that was
-        go_on(turn, _cut_off(turn.before, "the RTC vanished"))
+        stages.go_on(turn, _cut_off(turn.before, "the RTC vanished"))
         _wait(turn, NO_RTC)
     else:
         _advance(turn)
@@ -128,7 +113,7 @@ def left_behind(state: TrackerState) -> Acquisition | None:
 
 def inherit(turn: Turn, left: Acquisition) -> None:
     """Take over the acquisition that the service before this one has left."""
-    go_on(turn, left)
+    stages.go_on(turn, left)
     if left.stage is AcquisitionStage.FAILED:
         turn.alarm(ACQUISITION, left.text)
     elif left.stage is not AcquisitionStage.ABORTED:
@@ -140,14 +125,14 @@ def _begin(turn: Turn, rtc: Status, why: str, *, commanded: bool) -> None:
     make_way(turn)
     cut_off(turn, "an acquisition has begun")
     lost = _own_loop_lost(turn)
-    begin(turn, rtc, why=why, commanded=commanded)
+    stages.begin(turn, rtc, why=why, commanded=commanded)
     turn.log("acquisition.begun", why)
     if lost is not None:
         most = worth.half_of(rtc.n_controlled)
         first = min(turn.acquisition.n_modes, most)
-        go_on(turn, replace(turn.acquisition, most_modes=most, n_modes=first))
+        stages.go_on(turn, replace(turn.acquisition, most_modes=most, n_modes=first))
         worth.limit_modes(turn, most, f"{lost} with {rtc.n_controlled} modes")
-    far_stage(turn, rtc)
+    stages.far_stage(turn, rtc)
 
 
 def _own_loop_lost(turn: Turn) -> str | None:
@@ -174,7 +159,7 @@ def _advance(turn: Turn) -> None:
     if turn.acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
         _closed_stage(turn, turn.rtc)
     else:
-        far_stage(turn, turn.rtc)
+        stages.far_stage(turn, turn.rtc)
 
 
 def _end_by_event(turn: Turn) -> bool:
@@ -183,17 +168,17 @@ def _end_by_event(turn: Turn) -> bool:
     late = turn.now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
     match turn.event:
         case cmd.StopDither():
-            abort(turn, "because the dither was stopped")
+            stages.abort(turn, "because the dither was stopped")
         case cmd.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
-            abort(turn, f"because the mode is {mode}")
+            stages.abort(turn, f"because the mode is {mode}")
         case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
-            restart(turn, "the RTC began a new session")
+            stages.restart(turn, "the RTC began a new session")
         case ev.DitherMeasured(id=loud, text=text) if loud == state.dithering.loud_id and text:
-            give_up(turn, text)
+            stages.give_up(turn, text)
         case ev.Noted(name="dither.unusable", text=text):
-            give_up(turn, f"its dither cannot be read: {text}")
+            stages.give_up(turn, f"its dither cannot be read: {text}")
         case ev.Tick() if late:
-            restart(turn, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s")
+            stages.restart(turn, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s")
         case _:
             return _end_by_answer(turn)
     return True
@@ -205,9 +190,9 @@ def _end_by_answer(turn: Turn) -> bool:
         case ev.Answered(
             request=LoopRequest(id=acquisition.command), reply=Reply(accepted=False, reason=reason)
         ):
-            give_up(turn, f"the RTC will not change its loop: {reason}")
+            stages.give_up(turn, f"the RTC will not change its loop: {reason}")
         case ev.JobFailed(effect=ev.Ask(request=LoopRequest(id=acquisition.command)), text=text):
-            restart(turn, text)
+            stages.restart(turn, text)
         case _:
             return False
     return True
@@ -216,11 +201,11 @@ def _end_by_answer(turn: Turn) -> bool:
 def _take_in(turn: Turn) -> None:
     match turn.event:
         case ev.FarFitted():
-            on_far(turn, turn.event)
+            stages.on_far(turn, turn.event)
         case ev.WindowLost(refused=refused) if refused.reason.startswith(NOT_FOUND):
-            on_missed(turn, refused.reason)
+            stages.on_missed(turn, refused.reason)
         case ev.Answered(request=DitherRequest(), reply=Reply(accepted=False, reason=reason)):
-            on_missed(turn, f"the RTC refused the dither: {reason}")
+            stages.on_missed(turn, f"the RTC refused the dither: {reason}")
         case ev.MatrixMade():
             _on_made(turn, turn.event)
         case _:
@@ -232,7 +217,7 @@ def _closed_stage(turn: Turn, rtc: Status) -> None:
     acquisition = turn.acquisition
     record = turn.state.reconstructor(acquisition.matrix) if acquisition.matrix else None
     if record is not None and record.state in _LOST:
-        restart(turn, f"{record.id} was not applied: {record.reason}")
+        stages.restart(turn, f"{record.id} was not applied: {record.reason}")
     elif acquisition.stage is AcquisitionStage.WIDENING:
         _widen(turn, rtc, record)
     elif record is None:
@@ -242,12 +227,12 @@ def _closed_stage(turn: Turn, rtc: Status) -> None:
         return
     elif rtc.loop == "open":
         if acquisition.command is None:
-            request_loop(turn, cmd.SetLoop(loop="closed"))
+            stages.request_loop(turn, cmd.SetLoop(loop="closed"))
     else:
         n_windows = turn.state.windows_accepted
-        go_on(turn, replace(acquisition, applied=record.id, windows=n_windows))
+        stages.go_on(turn, replace(acquisition, applied=record.id, windows=n_windows))
         text = f"closed on {record.n_modes} modes: sharpening the registration"
-        enter_stage(turn, AcquisitionStage.WIDENING, text)
+        stages.enter_stage(turn, AcquisitionStage.WIDENING, text)
 
 
 def _on_made(turn: Turn, made: ev.MatrixMade) -> None:
@@ -260,9 +245,9 @@ def _on_made(turn: Turn, made: ev.MatrixMade) -> None:
         return
     found = acquisition.found
     if rtc is None or found is None:
-        restart(turn, f"{record.id} cannot be sent: no RTC is there")
+        stages.restart(turn, f"{record.id} cannot be sent: no RTC is there")
         return
-    gains = gains_for(found, record.n_modes, rtc.n_modes)
+    gains = stages.gains_for(found, record.n_modes, rtc.n_modes)
     stale = worth.why_worthless(turn.state, record.judged, gains[: record.n_modes])
     if stale is not None:
         reconstructors.change_state(
@@ -272,14 +257,14 @@ def _on_made(turn: Turn, made: ev.MatrixMade) -> None:
         return
     reason = reconstructors.why_unsendable(turn.state, record)
     if reason is not None:
-        restart(turn, f"{record.id} cannot be sent: {reason}")
+        stages.restart(turn, f"{record.id} cannot be sent: {reason}")
         return
     reconstructors.send_with(turn, record.id, gains)
     most = acquisition.most_modes
     if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
         most = record.n_modes
     sent = replace(acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None)
-    go_on(turn, replace(sent, most_modes=most))
+    stages.go_on(turn, replace(sent, most_modes=most))
 
 
 def _on_refused(turn: Turn, record: ReconstructorRecord) -> None:
@@ -287,24 +272,24 @@ def _on_refused(turn: Turn, record: ReconstructorRecord) -> None:
     acquisition, gate, rtc = turn.acquisition, record.gate, turn.rtc
     slippery = gate is not None and gate.edge_motion_m is not None
     if acquisition.stage is AcquisitionStage.WIDENING:
-        go_on(turn, replace(acquisition, most_modes=acquisition.n_modes))
+        stages.go_on(turn, replace(acquisition, most_modes=acquisition.n_modes))
     elif slippery and rtc is not None and rtc.leak > FORGIVING_LEAK:
         text = f"a leak of {FORGIVING_LEAK} is to keep the outer ring in place"
         turn.log("acquisition.leak", text)
-        request_loop(turn, cmd.SetLoop(leak=FORGIVING_LEAK))
+        stages.request_loop(turn, cmd.SetLoop(leak=FORGIVING_LEAK))
     else:
         reason = gate.reason if gate is not None else record.reason
-        give_up(turn, f"no number of modes passes the gate: {reason}")
+        stages.give_up(turn, f"no number of modes passes the gate: {reason}")
 
 
 def _widen(turn: Turn, rtc: Status, record: ReconstructorRecord | None) -> None:
     acquisition, known = turn.acquisition, turn.known
     slipped = turn.forbidden(Act.HOLD)
     if slipped is not None:
-        restart(turn, f"{slipped.name} with {acquisition.n_modes} modes", slipped=True)
+        stages.restart(turn, f"{slipped.name} with {acquisition.n_modes} modes", slipped=True)
         return
     if rtc.loop == "open":
-        restart(turn, "somebody opened the loop")
+        stages.restart(turn, "somebody opened the loop")
         return
     doubted = known is not None and bool(known.doubt)
     waiting = doubted or turn.state.making_since_ns_utc is not None
@@ -312,7 +297,7 @@ def _widen(turn: Turn, rtc: Status, record: ReconstructorRecord | None) -> None:
         if record.applied_frame_seq is not None and acquisition.applied != record.id:
             n_windows = turn.state.windows_accepted
             acquisition = replace(acquisition, applied=record.id, windows=n_windows)
-            go_on(turn, acquisition)
+            stages.go_on(turn, acquisition)
         seen, goal = turn.state.windows_accepted - acquisition.windows, _goal(acquisition)
         if seen >= 1 and (record.n_modes < goal or worth.moved(turn.state, record, turn.policy)):
             _make(turn, goal, rtc, at_least=record.n_modes)
@@ -332,7 +317,7 @@ def _make(turn: Turn, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:
         effect = ev.MakeMatrix(
             n_modes=n_modes,
             why=f"acquisition: {n_modes} modes",
-            gains=gains_for(found, n_modes, rtc.n_modes),
+            gains=stages.gains_for(found, n_modes, rtc.n_modes),
             fewer=tuple(rung for rung in worth.fewer_than(n_modes) if rung > at_least),
         )
         reconstructors.make(turn, effect)
@@ -349,7 +334,7 @@ def _finish(turn: Turn, record: ReconstructorRecord) -> None:
     took_s = (turn.now_ns - acquisition.started_ns_utc) / SECOND_NS
     of_goal = "" if record.n_modes >= goal else f" of {goal}"
     text = f"tracking after {took_s:.0f} s, {record.n_modes}{of_goal} modes controlled"
-    enter_stage(turn, AcquisitionStage.TRACKING, text)
+    stages.enter_stage(turn, AcquisitionStage.TRACKING, text)
     turn.calm(ACQUISITION)
 
 
@@ -369,7 +354,7 @@ def _forget_when_over(turn: Turn) -> None:
         text = f"{ENOUGH_WINDOWS} windows agree in the closed loop: none is needed any more"
     else:
         return
-    go_on(turn, Acquisition(text=text, since_ns_utc=turn.now_ns))
+    stages.go_on(turn, Acquisition(text=text, since_ns_utc=turn.now_ns))
     turn.calm(ACQUISITION)
     turn.log("acquisition.idle", text)
 
@@ -413,14 +398,14 @@ def _take_up(turn: Turn) -> None:
         _wait(turn, f"it does not begin anew by itself: {why_not}", do)
         return
     cause = _cause(turn.acquisition)
-    go_on(turn, replace(turn.acquisition, interruption=None))
+    stages.go_on(turn, replace(turn.acquisition, interruption=None))
     turn.calm(ACQUISITION)
-    restart(turn, cause)
+    stages.restart(turn, cause)
 
 
 def _why_not_by_itself(turn: Turn, rtc: Status) -> str | None:
     state = turn.state
-    if left_open(state, rtc) is None:
+    if stages.left_open(state, rtc) is None:
         return "the RTC has begun another session since, and who left its loop open is not known"
     if state.mode is not Mode.AUTO:
         return f"the mode is {state.mode}"
@@ -428,7 +413,7 @@ def _why_not_by_itself(turn: Turn, rtc: Status) -> str | None:
         return "the settings forbid that"
     if state.dither_stopped:
         return "the dither was stopped"
-    return why_not_now(state, turn.policy)
+    return stages.why_not_now(state, turn.policy)
 
 
 def _wait(turn: Turn, what: str, do: str = "") -> None:
@@ -437,7 +422,7 @@ def _wait(turn: Turn, what: str, do: str = "") -> None:
     if any((alarm.name, alarm.text) == (ACQUISITION, text) for alarm in turn.state.alarms):
         return
     stage = AcquisitionStage.INTERRUPTED
-    go_on(turn, replace(turn.acquisition, stage=stage, text=text, since_ns_utc=turn.now_ns))
+    stages.go_on(turn, replace(turn.acquisition, stage=stage, text=text, since_ns_utc=turn.now_ns))
     turn.warn("acquisition.interrupted", what)
     turn.alarm(ACQUISITION, text)
 
@@ -449,7 +434,7 @@ def _note_closed(turn: Turn, rtc: Status) -> None:
         told = "which had passed the gate: the registration is followed from there"
     text = f"{_said(turn.acquisition)}; the loop is closed on {matrix}, {told}"
     turn.calm(ACQUISITION)
-    enter_stage(turn, AcquisitionStage.ABORTED, text)
+    stages.enter_stage(turn, AcquisitionStage.ABORTED, text)
 
 
 def _said(acquisition: Acquisition) -> str:

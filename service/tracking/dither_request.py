@@ -337,15 +337,41 @@ def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:
     )
 
 
+def check_modes(what: str, modes: tuple[int, ...], rtc: Status) -> None:
+    """Refuse modes that the RTC's basis does not have, or none.
+
+    Raises
+    ------
+    CommandError
+        If so.
+    """
+    if not modes or max(modes) >= rtc.n_modes:
+        found = max(modes, default=None)
+        raise CommandError(f"{what}: found mode {found}; expected 0 to {rtc.n_modes - 1}")
+
+
+def cost_of(what: str, total_m: float, policy: Policy, *, over_budget: bool) -> str:
+    """Return in words what a dither costs, of the budget; beyond it only if that is meant.
+
+    Raises
+    ------
+    CommandError
+        If it is not.
+    """
+    cost = f"{1e9 * total_m:.3g} nm RMS in all, budget {1e9 * policy.dither_budget_m:.3g} nm"
+    if total_m <= policy.dither_budget_m * (1.0 + 1e-9):
+        return cost
+    if not over_budget:
+        raise CommandError(f"{what}: {cost}; say over_budget if that is meant")
+    return f"{cost}: over budget, as asked"
+
+
 def _modes(asked: tuple[int, ...] | ModeSet, rtc: Status) -> tuple[int, ...]:
     if isinstance(asked, ModeSet):
         modes = tuple(range(rtc.n_modes if asked is ModeSet.ALL else rtc.n_controlled))
     else:
         modes = asked
-    if not modes or max(modes) >= rtc.n_modes:
-        raise CommandError(
-            f"dither: found mode {max(modes, default=None)}; expected 0 to {rtc.n_modes - 1}"
-        )
+    check_modes("dither", modes, rtc)
     if len(modes) > rtc.max_dither_modes:
         raise CommandError(
             f"dither: found {len(modes)} modes; the RTC dithers at most {rtc.max_dither_modes}"

@@ -18,27 +18,11 @@ from service.telemetry import kalman
 from service.telemetry.kalman import JUMP_THRESHOLD, Joint
 from service.telemetry.passive import PassiveEstimate
 from service.telemetry.random_dither import RandomEstimate
-from service.tracking import alarms, jumps, validity
+from service.tracking import alarms, filtering, jumps, validity
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import count_miss
 from service.tracking.dither import found_again
-from service.tracking.estimate import (
-    CAPTURE_RANGE,
-    Folded,
-    Measured,
-    accept,
-    bias_of,
-    brought_forward,
-    counted,
-    entry_of,
-    followed_gains,
-    gains_of,
-    joint_of,
-    model_error_of,
-    remember,
-    why_no_measurement,
-    why_no_window,
-)
+from service.tracking.filtering import Folded, Measured
 from service.tracking.jumps import Distance, Reading
 from service.tracking.loop import loop_numbers, same_numbers
 from service.tracking.policy import SECOND_NS
@@ -68,7 +52,7 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
     when = validity.taken(event.began_ns_utc, estimate.t_ns_utc)
-    reason = why_no_window(turn.state, estimate, when, turn.policy)
+    reason = filtering.why_no_window(turn.state, estimate, when, turn.policy)
     if reason is not None:
         refuse_window(turn, reason)
         return
@@ -79,21 +63,21 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
         if validity.tells_of(turn.state, name, when):
             turn.calm(name)
     known = turn.known
-    modes, gains, gain_sigma = gains_of(estimate)
+    modes, gains, gain_sigma = filtering.gains_of(estimate)
     measured = Measured(
         alpha=estimate.alpha,
         covariance=estimate.covariance,
         when=when,
         source=Source.RANDOM if random else Source.LOCK_IN,
         optical_gain=float(gains.mean()),
-        optical_gains=followed_gains(
+        optical_gains=filtering.followed_gains(
             () if known is None else known.optical_gains,
             modes,
             gains[: len(modes)],
             gain_sigma,
             estimate.t_ns_utc,
         ),
-        floor=model_error_of(known, estimate, turn.policy),
+        floor=filtering.model_error_of(known, estimate, turn.policy),
         misfit=estimate.misfit,
     )
     enter(turn, measured)
@@ -124,7 +108,7 @@ def enter(turn: Turn, measured: Measured) -> None:
     known = turn.known
     if known is None:
         joint = kalman.begin_joint(measured.alpha.vector, measured.covariance)
-        accept(turn, Folded(joint=joint, n_windows=1, innovation=0.0), measured)
+        filtering.accept(turn, Folded(joint=joint, n_windows=1, innovation=0.0), measured)
         return
     reading = _reading(measured, turn.state)
     first = jumps.window_before(known)
@@ -151,13 +135,15 @@ def enter(turn: Turn, measured: Measured) -> None:
     if far.far:
         _put_aside(turn, known, measured, far)
         return
-    prior = brought_forward(turn.state, known, measured.t_ns_utc, turn.policy, turn.now_ns)
+    prior = filtering.brought_forward(
+        turn.state, known, measured.t_ns_utc, turn.policy, turn.now_ns
+    )
     folded = Folded(
         joint=kalman.with_dithered(prior, measured.alpha.vector, measured.covariance),
-        n_windows=counted(turn.state, known, prior, turn.policy),
+        n_windows=filtering.counted(turn.state, known, prior, turn.policy),
         innovation=_innovation(prior, measured),
     )
-    accept(turn, folded, measured)
+    filtering.accept(turn, folded, measured)
 
 
 def _put_aside(turn: Turn, known: Registration, measured: Measured, far: Distance) -> None:
@@ -177,7 +163,7 @@ def _put_aside(turn: Turn, known: Registration, measured: Measured, far: Distanc
     )
     doubt = "a jump is suspected"
     validity.hold(turn, replace(_doubted(known, doubt, measured.t_ns_utc), candidate=candidate))
-    remember(turn, entry_of(measured, known, innovation, entered=False))
+    filtering.remember(turn, filtering.entry_of(measured, known, innovation, entered=False))
     turn.warn("registration.jump-suspected", text)
     turn.alarm(alarms.SUSPECTED, text)
     validity.want_window(turn, doubt)
@@ -190,7 +176,7 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
     The first of them is used if it is wholly of the new place.
     """
     policy = turn.policy
-    prior = brought_forward(turn.state, known, measured.t_ns_utc, policy, turn.now_ns)
+    prior = filtering.brought_forward(turn.state, known, measured.t_ns_utc, policy, turn.now_ns)
     noise = measured.covariance
     whole = jumps.wholly_after(first, _reading(measured, turn.state), known.alpha.vector, policy)
     if whole:
@@ -207,7 +193,7 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
     )
     validity.hold(turn, replace(known, passive_after_ns_utc=first.t_ns_utc))
     both = whole and known.candidate is not None
-    accept(turn, folded, measured, n_accepted=2 if both else 1)
+    filtering.accept(turn, folded, measured, n_accepted=2 if both else 1)
     turn.warn("registration.jump", f"jumped by {_step(measured, known)}, as two windows have seen")
 
 
@@ -251,12 +237,14 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         return
     known = _expecting(known, estimate.bias_excess)
     prior = kalman.allowing(
-        brought_forward(turn.state, known, event.t_ns_utc, turn.policy, turn.now_ns),
+        filtering.brought_forward(turn.state, known, event.t_ns_utc, turn.policy, turn.now_ns),
         estimate.bias_excess,
     )
     if _mixed(known):
         text = "not used: its telemetry may be from both sides of a jump"
-        bias = bias_of(joint_of(known), event.t_ns_utc, _loop(turn.state, known))
+        bias = filtering.bias_of(
+            filtering.joint_of(known), event.t_ns_utc, _loop(turn.state, known)
+        )
         validity.hold(turn, replace(known, bias=bias))
         _show(turn, event, _reading_sigma(estimate, prior), prior.bias, text)
         return
@@ -267,7 +255,7 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         t_ns_utc=event.t_ns_utc,
         pointing=validity.pointing_at(turn.state, event.t_ns_utc),
     )
-    far = jumps.look_surprise(known, joint_of(known), reading, turn.policy)
+    far = jumps.look_surprise(known, filtering.joint_of(known), reading, turn.policy)
     if far > JUMP_THRESHOLD:
         _doubt_by_look(turn, known, event, prior, far)
         return
@@ -286,7 +274,7 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         misfit=estimate.misfit,
         source=Source.PASSIVE,
     )
-    remember(turn, entry)
+    filtering.remember(turn, entry)
     _show(turn, event, sigma, joint.bias, "agrees with α and with what is known of its own bias")
 
 
@@ -308,7 +296,7 @@ def _why_no_look(state: TrackerState, event: ev.Watched) -> str | None:
     of_loop = loop_numbers(state.rtc)
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
-    return why_no_measurement(state, validity.taken(event.began_ns_utc, event.t_ns_utc))
+    return filtering.why_no_measurement(state, validity.taken(event.began_ns_utc, event.t_ns_utc))
 
 
 def _why_known_already(state: TrackerState, event: ev.Watched) -> str | None:
@@ -325,7 +313,7 @@ def _why_known_already(state: TrackerState, event: ev.Watched) -> str | None:
 def _show_alone(turn: Turn, event: ev.Watched) -> None:
     """Show a look while α is not known: it is all there is, and no more than it says it is."""
     step = event.estimate.alpha.vector - turn.policy.start.vector
-    if np.any(np.abs(step) > CAPTURE_RANGE):
+    if np.any(np.abs(step) > filtering.CAPTURE_RANGE):
         text = (
             f"it cannot tell: {event.estimate.alpha.to_boundary()} is too far from where its fit "
             "begins, the nominal rotation; let the service acquire, or dither"
@@ -344,7 +332,9 @@ def _expecting(known: Registration, excess: Array) -> Registration:
     """
     if known.bias is not None and known.bias.looked_ns_utc:
         return known
-    return replace(known, bias=bias_of(kalman.forgotten(joint_of(known), excess), 0, ()))
+    return replace(
+        known, bias=filtering.bias_of(kalman.forgotten(filtering.joint_of(known), excess), 0, ())
+    )
 
 
 def _loop(state: TrackerState, known: Registration) -> tuple[float, ...]:
@@ -375,7 +365,7 @@ def _doubt_by_look(
     known = turn.known or known
     gone = kalman.forgotten(prior, event.estimate.bias_excess)
     after = _after_look(turn, known, gone, event)
-    bias = bias_of(gone, event.t_ns_utc, _loop(turn.state, known))
+    bias = filtering.bias_of(gone, event.t_ns_utc, _loop(turn.state, known))
     validity.hold(turn, replace(_doubted(after, text, event.t_ns_utc), bias=bias))
     turn.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
     turn.alarm(alarms.DISAGREES, text)
@@ -393,7 +383,9 @@ def _after_look(turn: Turn, known: Registration, joint: Joint, event: ev.Watched
         covariance=joint.alpha_covariance,
         t_ns_utc=max(event.t_ns_utc, known.t_ns_utc),
         arrived_ns_utc=turn.now_ns,
-        bias=bias_of(joint, event.t_ns_utc, loop, jumps.sum_of(known, joint_of(known))),
+        bias=filtering.bias_of(
+            joint, event.t_ns_utc, loop, jumps.sum_of(known, filtering.joint_of(known))
+        ),
         pointing=validity.pointing_at(turn.state, event.t_ns_utc),
     )
 

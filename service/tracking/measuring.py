@@ -13,7 +13,7 @@ from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither import ask_for, ask_to_stop, drop, make_way_for_noisy
-from service.tracking.dither_request import RANDOM_TOTAL_M, plan_random
+from service.tracking.dither_request import RANDOM_TOTAL_M, check_modes, cost_of, plan_random
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MeasurementRecord, MeasureState
@@ -70,10 +70,7 @@ def measure(turn: Turn, command: cmd.Measure) -> None:
     if turn.state.measurement(command.id) is not None:
         raise CommandError(f"measure: {command.id} was measured before; ids are never reused")
     record = _planned(command, rtc, turn.policy, turn.now_ns)
-    if max(record.modes) >= rtc.n_modes:
-        raise CommandError(
-            f"measure: found mode {max(record.modes)}; expected 0 to {rtc.n_modes - 1}"
-        )
+    check_modes("measure", record.modes, rtc)
     _keep(turn, record)
     turn.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
     turn.ask(
@@ -265,13 +262,9 @@ def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
     if turn.state.measurement(command.id) is not None:
         text = f"{command.id} was measured before; ids are never reused"
         raise CommandError(f"noisy matrix: {text}")
-    duration_s, budget_m = command.duration_s or DURATION_S, turn.policy.dither_budget_m
-    total = command.total_amplitude_m or min(RANDOM_TOTAL_M, budget_m)
-    if total > budget_m * (1.0 + 1e-9) and not command.over_budget:
-        raise CommandError(
-            f"noisy matrix: {1e9 * total:.3g} nm RMS in all, budget {1e9 * budget_m:.3g} nm; say "
-            "over_budget if that is meant"
-        )
+    duration_s = command.duration_s or DURATION_S
+    total = command.total_amplitude_m or min(RANDOM_TOTAL_M, turn.policy.dither_budget_m)
+    cost_of("noisy matrix", total, turn.policy, over_budget=command.over_budget)
     dither = plan_random(
         rtc,
         turn.policy,

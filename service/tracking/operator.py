@@ -7,6 +7,7 @@ from dataclasses import replace
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking import reconstructors
 from service.tracking.alarms import PROBATION
 from service.tracking.commands import GainGroup, ModeGroup
 from service.tracking.dither import allow, ask_for
@@ -16,6 +17,8 @@ from service.tracking.dither_request import (
     RANDOM_TOTAL_M,
     Choice,
     Dither,
+    check_modes,
+    cost_of,
     plan_dither,
     plan_random,
     total_m,
@@ -24,12 +27,6 @@ from service.tracking.dither_request import (
 from service.tracking.loop import CommandState, LoopCommand, extended_gains
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
-from service.tracking.reconstructors import (
-    change_state,
-    known_record,
-    make,
-    send_once_judged,
-)
 from service.tracking.registration import table_of
 from service.tracking.state import Level, Mode
 from service.tracking.turn import Turn
@@ -59,7 +56,7 @@ def approve(turn: Turn, command: cmd.Approve) -> None:
         raise CommandError(f"{record.id} cannot be judged: α is invalid ({known.standing.reason})")
     if outdated(turn.state, record):
         raise CommandError(f"{record.id} was made for another α than the present one: refit")
-    send_once_judged(turn, record.id)
+    reconstructors.send_once_judged(turn, record.id)
 
 
 def reject(turn: Turn, command: cmd.Reject) -> None:
@@ -71,7 +68,9 @@ def reject(turn: Turn, command: cmd.Reject) -> None:
         If it is none.
     """
     record = _proposed(turn, command.id)
-    change_state(turn, record.id, MatrixState.DISCARDED, command.reason or "by the operator")
+    reconstructors.change_state(
+        turn, record.id, MatrixState.DISCARDED, command.reason or "by the operator"
+    )
     turn.log("reconstructor.discarded", record.id)
 
 
@@ -83,7 +82,7 @@ def publish(turn: Turn, command: cmd.Publish) -> None:
     CommandError
         If it cannot, or no RTC is there.
     """
-    record = known_record(turn.state, command.id)
+    record = reconstructors.known_record(turn.state, command.id)
     if not record.was_used and turn.known is None:
         raise CommandError(
             f"{record.id} cannot be judged: α is not known yet; start a dither, wait for a window"
@@ -121,7 +120,7 @@ def refit(turn: Turn, command: cmd.Refit) -> None:
     asked = command.n_modes or rtc.n_controlled
     if not 0 < asked <= rtc.n_modes:
         raise CommandError(f"refit: found {asked} modes; expected 1 to {rtc.n_modes}")
-    make(turn, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
+    reconstructors.make(turn, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
 
 
 def start_dither(turn: Turn, command: cmd.StartDither) -> None:
@@ -137,16 +136,12 @@ def start_dither(turn: Turn, command: cmd.StartDither) -> None:
         raise CommandError("a dither needs an RTC with its loop closed")
     choice = by_hand(turn.state, rtc, turn.policy)
     dither = _planned(command, choice, rtc, turn.policy, turn.now_ns)
-    found_nm, budget_nm = 1e9 * total_m(dither.request), 1e9 * turn.policy.dither_budget_m
-    cost = f"{found_nm:.3g} nm RMS in all, budget {budget_nm:.3g} nm"
-    over = found_nm > budget_nm * (1.0 + 1e-9)
-    if over and not command.over_budget:
-        raise CommandError(f"dither: {cost}; say over_budget if that is meant")
+    total, meant = total_m(dither.request), command.over_budget
+    cost = cost_of("dither", total, turn.policy, over_budget=meant)
     allow(turn)
     modes = dither.request.modes
     which = f"modes {modes}" if len(modes) < 10 else f"{len(modes)} modes"
-    text = f"{dither.request.kind}, {which}, {cost}" + (": over budget, as asked" if over else "")
-    turn.log("dither.asked", text)
+    turn.log("dither.asked", f"{dither.request.kind}, {which}, {cost}")
     ask_for(turn, dither)
 
 
@@ -180,10 +175,7 @@ def _planned(
         frequency_hz=command.frequency_hz,
         duration_s=command.duration_s,
     )
-    if max(dither.request.modes) >= rtc.n_modes:
-        raise CommandError(
-            f"dither: found mode {max(dither.request.modes)}; expected 0 to {rtc.n_modes - 1}"
-        )
+    check_modes("dither", dither.request.modes, rtc)
     reason = why_unusable(dither, rtc, policy)
     if reason is not None:
         raise CommandError(f"dither: {reason}")
@@ -194,7 +186,7 @@ def _copy(turn: Turn, source: str, why: str) -> None:
     """Offer an earlier matrix again; hold, or the service would replace it at once."""
     if turn.rtc is None:
         raise CommandError("no RTC is there")
-    make(turn, ev.CopyMatrix(source=source, why=why))
+    reconstructors.make(turn, ev.CopyMatrix(source=source, why=why))
     hold(turn, why)
 
 
@@ -211,7 +203,7 @@ def order(turn: Turn, mode: Mode, of_settings: Mode | None) -> None:
 
 
 def _proposed(turn: Turn, matrix_id: str) -> ReconstructorRecord:
-    record = known_record(turn.state, matrix_id)
+    record = reconstructors.known_record(turn.state, matrix_id)
     if record.state is not MatrixState.PROPOSED:
         raise CommandError(f"{matrix_id} is {record.state}, not proposed")
     return record

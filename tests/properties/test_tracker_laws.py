@@ -12,7 +12,7 @@ from service.tracker import step
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import total_m
-from service.tracking.estimate import HISTORY_LENGTH
+from service.tracking.filtering import HISTORY_LENGTH
 from service.tracking.measuring import MEASUREMENTS_KEPT
 from service.tracking.products import MatrixState, MeasurementRecord, MeasureState
 from service.tracking.reconstructors import RECONSTRUCTORS_KEPT

@@ -19,7 +19,7 @@ from service.archive import Archive, Pin, retention
 from service.archive.nights import DAY_NS
 from service.archive.retention import Keeping, due, items
 from service.errors import UnknownIdError
-from service.runtime import housekeeping
+from service.runtime import recording
 from service.tracking.products import MatrixState
 from service.tracking.state import Alarm, TrackerState
 from tests.unit.test_archive import product, record_of
@@ -118,16 +118,16 @@ def test_one_killed_between_index_and_disk_has_lost_nothing(archive):
 @pytest.fixture
 def quick(monkeypatch):
     for name in ("LOOK_S", "REST_S"):
-        monkeypatch.setattr(housekeeping, name, 0.0)
-    monkeypatch.setattr(housekeeping.time, "time_ns", lambda: NOW)
+        monkeypatch.setattr(recording, name, 0.0)
+    monkeypatch.setattr(recording.time, "time_ns", lambda: NOW)
 
 
 async def kept_for_a_moment(archive, keeping, state):
-    told, lines = [], []
-    work = housekeeping.keep_house(archive, keeping, lambda: state, told.append, lines.append)
+    told = []
+    recorder = recording.Recorder(archive, lambda: state, told.append)
     with suppress(TimeoutError):
-        await asyncio.wait_for(work, 0.4)
-    return told, lines
+        await asyncio.wait_for(recorder.keep_house(keeping), 0.4)
+    return told, recorder._entries
 
 
 async def test_a_running_service_removes_what_is_old_and_says_so(archive, quick):

@@ -8,7 +8,7 @@ from service.model.misregistration import Misregistration
 from service.telemetry.estimate import MODEL_ERROR
 from service.telemetry.windows import WindowRefused
 from service.tracking import events as ev
-from service.tracking.estimate import HISTORY_LENGTH
+from service.tracking.filtering import HISTORY_LENGTH
 from service.tracking.state import Level, Mode
 from tests.unit.tracking.situations import (
     ALPHA,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.tracking import events as ev
-from service.tracking.estimate import FIRST_SCATTER, GAIN_RATE, MODES_KEPT, followed_gains
+from service.tracking.filtering import FIRST_SCATTER, GAIN_RATE, MODES_KEPT, followed_gains
 from service.tracking.state import Mode
 from tests.unit.tracking.situations import SECOND, START_NS, Story, estimate
 

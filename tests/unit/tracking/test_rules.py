@@ -12,7 +12,7 @@ from service.tracker import step
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import Act, Severity, forbidding
-from service.tracking.rules import FIELDS, is_news
+from service.tracking.attention import FIELDS, is_news
 from service.tracking.state import Mode, TrackerState
 
 SHUTTER = """

@@ -144,7 +144,7 @@ def _on_answer(turn: Turn, answered: ev.Answered) -> None:
 def _on_failure(turn: Turn, failed: ev.JobFailed) -> None:
     match failed.effect:
         case ev.Ask(request=MeasureRequest(id=name)):
-            measuring.fail_by_id(turn, name, failed.text)
+            measuring.fail(turn, turn.state.measurement(name), failed.text)
         case ev.FinishNoisy(record=noisy):
             measuring.fail(turn, noisy, failed.text)
         case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):

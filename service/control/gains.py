@@ -145,9 +145,6 @@ class GainTable:
     relative_sigma: Array
     """``(n_modes,)`` 1 σ of it, as a share of it."""
 
-    measured_modes: tuple[int, ...]
-    """Those it was found from; empty: only what is expected at 1" of seeing."""
-
     @property
     def factors(self) -> Array:
         """``(n_modes,)`` by which to multiply one loop gain for all: mean 1, bounded."""
@@ -202,7 +199,6 @@ def gain_table(
     return GainTable(
         optical_gain=np.exp(expected),
         relative_sigma=np.sqrt(np.maximum(variance, 0.0)),
-        measured_modes=tuple(int(mode) for mode in modes),
     )
 
 

@@ -243,9 +243,6 @@ class NoisyMatrix:
     noise: NDArray[np.float64]
     """``(n_slopes, n_dithered)`` 1 σ of each element, from the slopes' own scatter."""
 
-    slope_memory: float
-    """Lag-1 correlation of the slopes that was taken out before correlating, -1..1."""
-
     @property
     def snr_of_modes(self) -> NDArray[np.float64]:
         """``(n_dithered,)`` RMS signal of a column's elements over their noise; 0: none seen."""
@@ -297,7 +294,6 @@ def noisy_matrix(window: Correlated) -> NoisyMatrix:
         modes=window.plan.modes,
         matrix=sums.response.sum(axis=0, dtype=float) @ power,
         noise=noise,
-        slope_memory=sums.memory,
     )
 
 

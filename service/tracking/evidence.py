@@ -23,12 +23,13 @@ from service.tracking import events as ev
 from service.tracking.acquisition_stages import count_miss
 from service.tracking.dither import found_again
 from service.tracking.filtering import Folded, Measured
-from service.tracking.jumps import Distance, Reading
+from service.tracking.jumps import Distance
 from service.tracking.loop import loop_numbers, same_numbers
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import (
     Candidate,
     HistoryEntry,
+    Reading,
     Registration,
     Seen,
     Source,
@@ -178,7 +179,7 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
     policy = turn.policy
     prior = filtering.brought_forward(turn.state, known, measured.t_ns_utc, policy, turn.now_ns)
     noise = measured.covariance
-    whole = jumps.wholly_after(first, _reading(measured, turn.state), known.alpha.vector, policy)
+    whole = jumps.wholly_after(first, _reading(measured, turn.state), known.alpha, policy)
     if whole:
         elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
         noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
@@ -209,8 +210,8 @@ def _doubted(known: Registration, doubt: str, since_ns_utc: int) -> Registration
 
 def _reading(measured: Measured, state: TrackerState) -> Reading:
     return Reading(
-        value=measured.alpha.vector,
-        noise=measured.covariance,
+        alpha=measured.alpha,
+        covariance=measured.covariance,
         t_ns_utc=measured.t_ns_utc,
         pointing=validity.pointing_at(state, measured.t_ns_utc),
     )
@@ -250,8 +251,8 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         return
     measured = estimate.alpha.vector
     reading = Reading(
-        value=measured,
-        noise=prior.scatter * estimate.covariance,
+        alpha=estimate.alpha,
+        covariance=prior.scatter * estimate.covariance,
         t_ns_utc=event.t_ns_utc,
         pointing=validity.pointing_at(turn.state, event.t_ns_utc),
     )

@@ -15,9 +15,8 @@ from service.model.misregistration import Misregistration
 from service.telemetry.kalman import JUMP_THRESHOLD, Joint
 from service.telemetry.passive import BIAS_FLOOR
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import Earlier, Registration, Seen
+from service.tracking.registration import Earlier, Reading, Registration, Seen
 from service.tracking.validity import CLOCK_SET_BACK_S, flexure
-from service.wire import Pointing
 
 STEADY_S = 60.0
 """The drift of a minute is what the settings tell: over less it is that share of it."""
@@ -40,20 +39,6 @@ LITTLE = 0.3
 _ROTATION = 2
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reading:
-    """What was measured, when, and where the telescope looked."""
-
-    value: Array
-    """``(4,)`` numeric units."""
-
-    noise: Array
-    """``(4, 4)`` its covariance."""
-
-    t_ns_utc: int
-    pointing: Pointing | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,10 +101,10 @@ def pair_surprise(known: Registration, reading: Reading, policy: Policy) -> Dist
     if known.candidate is None and before is not None:
         seen_from = (before, before.earlier)
     alone = replace(
-        reading, value=first.alpha.vector, noise=first.covariance, t_ns_utc=first.t_ns_utc
+        reading, alpha=first.alpha, covariance=first.covariance, t_ns_utc=first.t_ns_utc
     )
     nearest = min(_farthest(seen_from, one, policy).innovation for one in (alone, reading))
-    if distance_apart(first, reading, policy) >= min(nearest, JUMP_THRESHOLD):
+    if _apart(first.alpha, first, reading, policy) >= min(nearest, JUMP_THRESHOLD):
         return NEAR
     found = _farthest(seen_from, _together(first, reading), policy)
     return replace(found, rotation_limit=ROTATION_LIMIT_OF_TWO)
@@ -132,19 +117,14 @@ def window_before(known: Registration) -> Seen | None:
     return None if known.earlier is None else known.earlier.then
 
 
-def distance_apart(first: Seen, reading: Reading, policy: Policy) -> float:
-    """Return how far two windows lie apart: squared, normalised, expected 4."""
-    return _apart(reading.value - first.alpha.vector, first, reading, policy)
-
-
-def wholly_after(first: Seen, reading: Reading, old: Array, policy: Policy) -> bool:
+def wholly_after(first: Seen, reading: Reading, old: Misregistration, policy: Policy) -> bool:
     """Return whether a window is of the new place ``reading`` tells, and not partly of the ``old``.
 
     The first window after a jump began before it. What it may lack of the way (2 σ of the
     difference allowed for) must be little.
     """
-    lacks = np.sqrt(_apart(reading.value - first.alpha.vector, first, reading, policy)) + 2.0
-    return bool(lacks <= LITTLE * np.sqrt(_apart(reading.value - old, first, reading, policy)))
+    lacks = np.sqrt(_apart(first.alpha, first, reading, policy)) + 2.0
+    return bool(lacks <= LITTLE * np.sqrt(_apart(old, first, reading, policy)))
 
 
 def look_surprise(known: Registration, joint: Joint, reading: Reading, policy: Policy) -> float:
@@ -183,16 +163,18 @@ def sum_of(known: Registration, joint: Joint) -> Earlier:
 
 def _together(first: Seen, reading: Reading) -> Reading:
     """Return the mean of two windows, each by its precision, at the time of the second."""
-    weights = [np.linalg.inv(noise) for noise in (first.covariance, reading.noise)]
+    weights = [np.linalg.inv(noise) for noise in (first.covariance, reading.covariance)]
     noise = np.linalg.inv(weights[0] + weights[1])
-    value = noise @ (weights[0] @ first.alpha.vector + weights[1] @ reading.value)
-    return replace(reading, value=value, noise=noise)
+    value = noise @ (weights[0] @ first.alpha.vector + weights[1] @ reading.alpha.vector)
+    return replace(reading, alpha=Misregistration.from_vector(value), covariance=noise)
 
 
-def _apart(difference: Array, first: Seen, reading: Reading, policy: Policy) -> float:
+def _apart(place: Misregistration, first: Seen, reading: Reading, policy: Policy) -> float:
+    """Return how far a window lies from a place by the noise of two: squared, 4 is expected."""
     elapsed_s = max(reading.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
     added = _drifted(elapsed_s, policy) + 2.0 * (VARYING * policy.floor) ** 2
-    total = first.covariance + reading.noise + np.diag(added)
+    total = first.covariance + reading.covariance + np.diag(added)
+    difference = reading.alpha.vector - place.vector
     return float(difference @ np.linalg.solve(total, difference))
 
 
@@ -213,5 +195,5 @@ def _surprise(earlier: Earlier, reading: Reading, policy: Policy, forgot: Array)
     elapsed_s = max(elapsed_s, 0.0)
     bent = flexure(earlier.pointing, reading.pointing, policy)
     added = _drifted(elapsed_s, policy) + bent**2 + (VARYING * policy.floor) ** 2 + forgot
-    total = earlier.covariance + reading.noise + np.diag(added)
-    return distance(reading.value - earlier.alpha.vector, total)
+    total = earlier.covariance + reading.covariance + np.diag(added)
+    return distance(reading.alpha.vector - earlier.alpha.vector, total)

@@ -181,17 +181,10 @@ def on_measured(turn: Turn, record: MeasurementRecord) -> None:
             turn.log(name, record.id)
 
 
-def fail_by_id(turn: Turn, measurement_id: str, text: str) -> None:
+def fail(turn: Turn, record: MeasurementRecord | None, text: str) -> None:
     """Note why there is no matrix, unless nobody waits for it any more."""
-    record = turn.state.measurement(measurement_id)
-    if record is not None:
-        fail(turn, record, text)
-
-
-def fail(turn: Turn, record: MeasurementRecord, text: str) -> None:
-    """Note why there is no matrix, unless nobody waits for it any more."""
-    known = turn.state.measurement(record.id)
-    if known is None or known.state is not MeasureState.GIVEN_UP:
+    known = None if record is None else turn.state.measurement(record.id)
+    if record is not None and (known is None or known.state is not MeasureState.GIVEN_UP):
         _keep(turn, replace(record, state=MeasureState.FAILED, reason=text))
         turn.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")
 

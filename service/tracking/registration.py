@@ -90,11 +90,16 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Earlier(Seen):
-    """What was known before the last measurement: a jump inside that one is seen from here."""
+class Reading(Seen):
+    """What was measured, or known, and where the telescope looked."""
 
     pointing: Pointing | None
     """Of the telescope then; None: not known."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Earlier(Reading):
+    """What was known before the last measurement: a jump inside that one is seen from here."""
 
     then: Seen | None = None
     """The window that entered next; None: it is not kept."""

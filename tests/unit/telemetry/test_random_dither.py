@@ -78,9 +78,9 @@ def test_a_noise_free_sensor_gives_back_its_own_columns():
     window = only_window(RandomDither(plan=plan()), quiet_block(FREE, 2001))
     noisy = noisy_matrix(window)
     expected = 0.6 * small_model().interaction_matrix(SOMEWHERE)[:, list(FREE)]
-    assert abs(noisy.slope_memory) < 0.1
+    assert abs(window.sums.memory) < 0.1
     # whitening by a ρ that is not zero leaves -ρ s[k-1], as random as the signs themselves
-    bound = 3.0 * abs(noisy.slope_memory) + 1e-5
+    bound = 3.0 * abs(window.sums.memory) + 1e-5
     assert np.linalg.norm(noisy.matrix - expected) < bound * np.linalg.norm(expected)
 
 

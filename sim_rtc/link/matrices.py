@@ -27,12 +27,11 @@ from service.wire import (
 )
 from sim_rtc.computer.feed import Background
 from sim_rtc.computer.measure import Measurement, product
-from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.reconstructors import Outcome, Staging
 from sim_rtc.computer.telemetry import Reconstructor
 from sim_rtc.faults import Fault, FaultKind, FaultPlan
 from sim_rtc.link.record import Recorder
-from sim_rtc.link.replies import acknowledge
+from sim_rtc.link.replies import Computer, acknowledge
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -56,7 +55,7 @@ class Matrices(Background):
         self,
         session: zenoh.Session,
         keys: Keys,
-        computer: RealTimeComputer,
+        computer: Computer,
         *,
         plan: FaultPlan | None = None,
         recorder: Recorder | None = None,

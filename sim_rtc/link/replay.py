@@ -31,8 +31,8 @@ from service.wire import (
     decode,
     encode,
 )
-from sim_rtc.link.link import Token, frames_publisher, open_session, status_publisher
 from sim_rtc.link.replies import acknowledge, answer_applied, answer_commands
+from sim_rtc.link.session import Token, frames_publisher, open_session, status_publisher
 
 _log = structlog.get_logger("sim_rtc")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import structlog
 import zenoh
@@ -25,15 +25,51 @@ from service.wire import (
     encode,
     split,
 )
-from sim_rtc.computer.real_time_computer import RealTimeComputer
+from sim_rtc.computer.measure import Measurement
+from sim_rtc.computer.reconstructors import Terms
+from sim_rtc.computer.telemetry import Identity, Reconstructor
 
 _log = structlog.get_logger("sim_rtc")
+
+
+class Computer(Protocol):
+    """What the link asks of an RTC, be it simulated or another program."""
+
+    identity: Identity
+    """Names the telemetry carries."""
+
+    @property
+    def session(self) -> str:
+        """Of the frames to come."""
+
+    @property
+    def reconstructor(self) -> Reconstructor:
+        """What multiplies the slopes now."""
+
+    @property
+    def largest_matrix_bytes(self) -> int:
+        """Bytes of a matrix for all modes."""
+
+    def terms(self) -> Terms:
+        """Return what a new reconstructor must fit at present."""
+
+    def stage(self, reconstructor: Reconstructor) -> None:
+        """Take a checked matrix, to be swapped in."""
+
+    def take_swaps(self) -> list[tuple[str, int]]:
+        """Return ids and first frames of the matrices swapped in since the last call."""
+
+    def take_measured(self) -> list[Measurement]:
+        """Return the measurements that have ended since the last call."""
+
+    def execute(self, command: Command) -> Reply:
+        """Carry out a command, or say why not."""
 
 
 class Replies:
     """The RTC's queryables; they answer on the network's threads."""
 
-    def __init__(self, keys: Keys, computer: RealTimeComputer) -> None:
+    def __init__(self, keys: Keys, computer: Computer) -> None:
         self._keys = keys
         self._computer = computer
         self._cache = ReplyCache(computer.execute)

@@ -36,7 +36,7 @@ from service.wire import (
     layout_of,
     split,
 )
-from sim_rtc.link.link import client_config
+from sim_rtc.link.session import client_config
 from tests.system.cable import Cable, free_port
 from tests.system.night import Process, wait_for
 from tests.system.pace import patience, slowness

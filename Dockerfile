@@ -14,6 +14,7 @@ COPY service service
 COPY --from=manual /opt/manual service/manual
 COPY check_rtc check_rtc
 COPY sim_rtc sim_rtc
+COPY cacao_bridge cacao_bridge
 COPY studies studies
 RUN pip install --no-cache-dir -c constraints.txt . \
     && useradd --system --create-home --home-dir /var/lib/pyrcal pyrcal

@@ -66,12 +66,12 @@ def states() -> str:
 
 
 def house() -> str:
-    """Return docs/house.md: every file of service, checker and simulator by its first line."""
+    """Return docs/house.md: every file of every program by its first line."""
     parts = [
         "# Which file has what",
         "Written by `python -m studies.pages` from the first line of each file; change those.",
     ]
-    for top in ("service", "check_rtc", "sim_rtc"):
+    for top in ("service", "check_rtc", "sim_rtc", "cacao_bridge"):
         # packages: the built manual holds copies of the examples
         folders = sorted(path.parent for path in (ROOT / top).rglob("__init__.py"))
         for folder in folders:

@@ -24,6 +24,7 @@ OTHER_PROGRAMS = {
     "demo": ("studies.demo", "the main job, end to end, on a simulated telescope"),
     "sim": ("sim_rtc", "the simulated RTC"),
     "check-rtc": ("check_rtc", "does an RTC keep the contract?"),
+    "cacao": ("cacao_bridge", "the bridge to a loop of cacao's"),
     "campaign": ("studies.campaign", "many simulated nights"),
 }
 """Module and purpose of what is run in this program's place, with options of its own."""

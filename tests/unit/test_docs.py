@@ -11,6 +11,7 @@ from itertools import groupby
 import httpx
 import pytest
 
+from cacao_bridge.__main__ import arguments_parser
 from check_rtc.__main__ import check_parser
 from service.api import create_app
 from service.commands.arguments import command_line, with_negative_numbers
@@ -61,6 +62,8 @@ def check_pyrcal(words):
                 demo_parser().parse_args(with_negative_numbers(rest))
             case "check-rtc":
                 check_parser().parse_args(rest)
+            case "cacao":
+                arguments_parser().parse_args(rest)
             case "sim":
                 parse_options([word.replace("bench.toml", "flao-lbt") for word in rest])
             case _:

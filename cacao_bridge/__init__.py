@@ -1,0 +1,1 @@
+"""The bridge to cacao: its streams in shared memory on one side, pyrcal's contract on the other."""

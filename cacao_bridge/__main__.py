@@ -1,0 +1,163 @@
+"""``pyrcal cacao``: the bridge as a process of its own, an RTC to the service."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+import structlog
+import zenoh
+
+from cacao_bridge.calibration import consent
+from cacao_bridge.computer import Cacao
+from cacao_bridge.settings import Settings, load
+from service.errors import PyrcalError
+from service.wire import Keys, encode
+from service.wire.frames import encode_frames
+from sim_rtc.link.matrices import Matrices
+from sim_rtc.link.replies import Replies
+from sim_rtc.link.session import (
+    Lifeline,
+    Token,
+    frames_publisher,
+    open_session,
+    status_publisher,
+)
+
+_STATUS_PERIOD_S: Final = 0.2
+_REPORT_PERIOD_S: Final = 10.0
+_UNLINKED_PAUSE_S: Final = 0.2
+_LEAST_BATCH_S: Final = 0.01
+_log = structlog.get_logger("cacao")
+
+
+def arguments_parser() -> argparse.ArgumentParser:
+    """Return what reads the command line."""
+    parser = argparse.ArgumentParser(prog="pyrcal cacao", description=__doc__)
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="settings, TOML")
+    parser.add_argument(
+        "--apply",
+        nargs="?",
+        const="waiting",
+        metavar="ID",
+        help="let the matrix that waits be written into cacao's streams, and end",
+    )
+    parser.add_argument("--seconds", type=float, help="end after so long")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the bridge until it is told to stop; return the exit status."""
+    options = arguments_parser().parse_args(arguments)
+    _configure_log()
+    stopped = threading.Event()
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        stopped.set()
+
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, stop)
+    try:
+        settings = load(options.config)
+        if options.apply is not None:
+            print(f"{consent(settings, options.apply)}: the bridge writes it; restart cacao's loop")
+            return 0
+        bridge = Bridge(settings)
+    except PyrcalError as error:
+        print(f"pyrcal cacao: {error}", file=sys.stderr)
+        return 2
+    if options.seconds is not None:
+        threading.Timer(options.seconds, stopped.set).start()
+    bridge.run(stopped)
+    return 0
+
+
+class Bridge:
+    """Streams on one side, the contract on the other, in one thread."""
+
+    def __init__(self, settings: Settings) -> None:
+        """Raise ``ConfigurationError`` if a file of the settings is not what it should be."""
+        self._settings = settings
+        self._cacao = Cacao(settings)
+        self._n_sent = 0
+
+    def run(self, stopped: threading.Event) -> None:
+        """Bridge until ``stopped``; the service may come and go."""
+        keys = Keys(self._settings.wire.system)
+        try:
+            while not self._cacao.known and not stopped.is_set():
+                self._cacao.poll()  # which matrix cacao has, before anybody may ask
+                stopped.wait(_UNLINKED_PAUSE_S)
+            replies = Replies(keys, self._cacao)
+            while (session := open_session(self._settings.wire.connect, stopped)) is not None:
+                with session:
+                    replies.declare(session)
+                    with (
+                        Matrices(session, keys, self._cacao) as matrices,
+                        Token(session, keys, None),
+                    ):
+                        self._speak(session, keys, matrices, stopped)
+        finally:
+            self._cacao.close()
+
+    def _speak(
+        self, session: zenoh.Session, keys: Keys, matrices: Matrices, stopped: threading.Event
+    ) -> None:
+        """Send what comes until ``stopped`` or cut off."""
+        frames = frames_publisher(session, keys, 1.0 / _LEAST_BATCH_S)
+        status = status_publisher(session, keys)
+        lifeline, next_status_s, next_report_s = Lifeline(time.monotonic()), 0.0, 0.0
+        said = ""
+        while not stopped.is_set():
+            for header, rows in self._cacao.poll():
+                payload, attachment = encode_frames(header, rows)
+                frames.put(payload, attachment=attachment)
+                self._n_sent += header.n
+            if self._cacao.has_news:
+                matrices.look()
+            now_s = time.monotonic()
+            if now_s >= next_status_s or self._cacao.session != said:
+                status.put(encode(self._cacao.status()))
+                said, next_status_s = self._cacao.session, now_s + _STATUS_PERIOD_S
+                if lifeline.cut(session, now_s):
+                    _log.warning("link.cut-off", text=lifeline.text)
+                    return
+            if now_s >= next_report_s:
+                self._report()
+                next_report_s = now_s + _REPORT_PERIOD_S
+            stopped.wait(_UNLINKED_PAUSE_S if self._cacao.unlinked else self._cacao.pause_s)
+
+    def _report(self) -> None:
+        _log.info(
+            "bridge.report",
+            frames=self._n_sent,
+            lost=self._cacao.n_lost,
+            unpaired=self._cacao.n_unpaired,
+            cm_id=self._cacao.reconstructor.manifest.id,
+            cpu_s=round(time.process_time(), 2),
+            wrong=self._cacao.complaint,
+        )
+
+
+def _configure_log() -> None:
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.KeyValueRenderer(key_order=["timestamp", "level", "event"]),
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

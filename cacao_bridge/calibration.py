@@ -1,0 +1,201 @@
+"""Matrices on their way to cacao: kept, written into its streams, taken up when it restarts.
+
+cacao copies its modes when the process that multiplies them starts, and looks at the streams no
+more. So a matrix is in use when that process is another one than it was when the streams were
+written, and not before. Which it is lies in a folder, and outlives this program.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import msgpack
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from cacao_bridge.settings import Settings, load_index, load_modes
+from cacao_bridge.streams import Stream, StreamError, create, path_of
+from service.errors import ConfigurationError
+from service.wire import CHUNK_LIMIT, Manifest, checksum, decode, encode, layout_of
+from sim_rtc.computer.telemetry import Identity, Reconstructor
+
+Array32 = NDArray[np.float32]
+_log = structlog.get_logger("cacao")
+
+_STATE: Final = "state.json"
+_CONSENT: Final = "apply"
+_KEYWORD: Final = "PYRCAL"
+
+
+class Calibration:
+    """The matrix in use, the one that waits, and the streams that cacao reads at its start."""
+
+    def __init__(self, settings: Settings, identity: Identity) -> None:
+        """Raise ``ConfigurationError`` if a file of the settings is not what it should be."""
+        self._settings, self._identity = settings, identity
+        self._unit = np.float32(settings.loop.metre_per_unit)
+        self.index, self.dm_modes = load_index(settings), load_modes(settings)
+        self._folder = Path(settings.calibration.folder)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._known: dict[str, Any] = json.loads((self._folder / _STATE).read_text("utf-8"))
+        except FileNotFoundError:
+            self._known = {"in_use": None, "waiting": None, "written": False, "process": None}
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(f"calibration.folder: {self._folder}: {error}") from error
+        self.in_use: Reconstructor | None = None
+
+    @property
+    def waiting(self) -> str | None:
+        """The matrix that has come and is not in use."""
+        found: str | None = self._known["waiting"]
+        return found
+
+    def stage(self, matrix: Reconstructor) -> None:
+        """Keep a matrix that fits; it takes the place of one that waits."""
+        name = matrix.manifest.id
+        if self.waiting not in {None, name}:
+            _log.warning("matrix.superseded", id=self.waiting, by=name)
+        self._keep(matrix)
+        self._know(waiting=name, written=False)
+        if self._settings.calibration.interlock == "operator":
+            _log.warning("matrix.waits", id=name, text=f"pyrcal cacao --config FILE --apply {name}")
+
+    def look(self, process: int, shape: tuple[int, ...]) -> str | None:
+        """Write what may be written; return the id of a matrix just taken up, None: none was.
+
+        Parameters
+        ----------
+        process
+            The one that multiplies now.
+        shape
+            Of a frame of slopes.
+
+        Raises
+        ------
+        StreamError
+            If the streams of cacao's modes cannot be read or written.
+        """
+        restarted = process != self._known["process"]
+        if restarted or self.in_use is None:
+            before = self._known["in_use"]
+            self.in_use = self._found(restarted=restarted)
+            name = self.in_use.manifest.id
+            done = name == self.waiting
+            self._know(process=process, in_use=name, **({"waiting": None} if done else {}))
+            if name != before:
+                _log.warning("matrix.taken-up", id=name, before=before, process=process)
+                return name
+        if self.waiting is not None and not self._known["written"] and self._may():
+            self._write(self._kept(self.waiting), shape)
+            self._know(written=True)
+            _log.warning("matrix.written", id=self.waiting, text="restart cacao's loop to use it")
+        return None
+
+    def _may(self) -> bool:
+        if self._settings.calibration.interlock == "restart":
+            return True
+        consent = self._folder / _CONSENT
+        if not consent.exists():
+            return False
+        name = consent.read_text("utf-8").strip()
+        consent.unlink()
+        if name != self.waiting:
+            _log.error("matrix.not-that-one", found=name, expected=self.waiting)
+        return name == self.waiting
+
+    def _found(self, *, restarted: bool) -> Reconstructor:
+        """Return what the process that multiplies has copied."""
+        recorded = self._known["in_use"]
+        if recorded is not None and not restarted:
+            return self._kept(recorded)
+        stream = Stream(self._path(self._settings.streams.modes_wfs))
+        cube = stream.latest().reshape(stream.shape[0], -1)
+        if self.index.max() >= cube.shape[1]:
+            found = f"{self._settings.streams.modes_wfs}: {cube.shape[1]} values a slice"
+            raise StreamError(f"{found}, expected at least {self.index.max() + 1}")
+        for name in (self.waiting, recorded):
+            if name is not None:
+                kept = self._kept(name)
+                if np.array_equal(self._slices(kept, cube.shape[1]), cube):
+                    return kept
+        return self._foreign(cube)
+
+    def _foreign(self, cube: Array32) -> Reconstructor:
+        """Return what somebody else has written, under a name of its own."""
+        matrix = np.ascontiguousarray(cube[:, self.index] * self._unit)
+        manifest = Manifest(
+            id=f"own-{checksum(matrix)[:12]}",
+            layout=layout_of(matrix, CHUNK_LIMIT),
+            alpha=None,
+            sigma=None,
+            im_id=None,
+            parent=None,
+            basis_id=self._identity.basis_id,
+            config_id=self._identity.config_id,
+            system=self._identity.system,
+            created_ns=0,
+        )
+        own = Reconstructor(manifest=manifest, matrix=matrix)
+        self._keep(own)
+        return own
+
+    def _slices(self, of: Reconstructor, n_values: int) -> Array32:
+        """Return a matrix as cacao has it: one slice a mode, 0 where there is no slope."""
+        cube = np.zeros((len(of.matrix), n_values), dtype=np.float32)
+        cube[:, self.index] = of.matrix / self._unit
+        return cube
+
+    def _write(self, of: Reconstructor, shape: tuple[int, ...]) -> None:
+        name, streams = of.manifest.id, self._settings.streams
+        cube = self._slices(of, int(np.prod(shape)))
+        keywords = {_KEYWORD: (checksum(of.matrix)[:15], name)}
+        modes = self.dm_modes[: len(of.matrix)]
+        create(self._path(streams.modes_dm), modes, keywords)
+        create(self._path(streams.modes_wfs), cube.reshape(-1, *shape), keywords)
+
+    def _path(self, name: str) -> Path:
+        return path_of(name, self._settings.streams.directory)
+
+    def _keep(self, matrix: Reconstructor) -> None:
+        """Lay down the numbers, and beside them where they come from."""
+        data = encode(matrix.manifest)
+        name = self._folder / matrix.manifest.id
+        np.save(f"{name}.npy", matrix.matrix, allow_pickle=False)
+        Path(f"{name}.json").write_text(json.dumps(msgpack.unpackb(data), indent=1), "utf-8")
+
+    def _kept(self, name: str) -> Reconstructor:
+        try:
+            told = json.loads((self._folder / f"{name}.json").read_text("utf-8"))
+            matrix = np.load(self._folder / f"{name}.npy", allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise StreamError(f"{self._folder}: matrix {name} cannot be read: {error}") from error
+        return Reconstructor(manifest=decode(Manifest, msgpack.packb(told)), matrix=matrix)
+
+    def _know(self, **what: Any) -> None:  # noqa: ANN401  as JSON has them
+        self._known |= what
+        fresh = self._folder / f"{_STATE}.new"
+        fresh.write_text(json.dumps(self._known), "utf-8")
+        fresh.replace(self._folder / _STATE)
+
+
+def consent(settings: Settings, name: str) -> str:
+    """Let the matrix that waits be written into cacao's streams; return its id.
+
+    Raises
+    ------
+    ConfigurationError
+        If none waits, or another.
+    """
+    folder = Path(settings.calibration.folder)
+    try:
+        waiting = json.loads((folder / _STATE).read_text("utf-8"))["waiting"]
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigurationError(f"calibration.folder: {folder}: {error}") from error
+    if waiting is None or name not in {"waiting", waiting}:
+        raise ConfigurationError(f"--apply: found {name}, expected {waiting or 'none: none waits'}")
+    (folder / _CONSENT).write_text(waiting, "utf-8")
+    return str(waiting)

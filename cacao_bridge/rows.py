@@ -1,0 +1,142 @@
+"""Rows of telemetry: slopes, and the command that was on the mirror while they were exposed.
+
+cacao counts each stream by itself. A command answers a frame of slopes; which one its trace tells.
+It is on the mirror ``delay_frames`` exposures later, so row k holds slopes k and the command that
+answers k - delay: of a delay of 1.7 frames seven tenths of the older of two commands. Both count by
+the frame of slopes that they answer, and a row leaves when all of it is there.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.wire.frames import FRAMES_PER_BATCH
+
+Array32 = NDArray[np.float32]
+
+PATIENCE_FRAMES: Final = 64
+"""A row whose command has not come so many frames later is left out, and counted."""
+
+_KEPT: Final = 512
+_NEVER: Final = -(2**62)
+
+
+class Rows:
+    """The last frames of both streams, put together.
+
+    Parameters
+    ----------
+    n_slopes, n_modes
+        Columns.
+    delay_frames
+        From an exposure to the one that the answer to it is on the mirror for; 1 or more.
+    dither
+        Whether rows end with the dither's share of the command.
+    """
+
+    def __init__(self, n_slopes: int, n_modes: int, delay_frames: float, *, dither: bool) -> None:
+        self._delay = int(delay_frames)
+        self._older = np.float32(delay_frames - self._delay)
+        self._slopes = np.zeros((_KEPT, n_slopes), dtype=np.float32)
+        self._commands_m = np.zeros((_KEPT, n_modes), dtype=np.float32)
+        self._dither_m = np.zeros((_KEPT, n_modes if dither else 0), dtype=np.float32)
+        self.n_unpaired = 0
+        """Frames that were left out because their command never came."""
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew: what comes has nothing to do with what came."""
+        self._of_slopes, self._of_commands = np.full((2, _KEPT), _NEVER)
+        self._dither_m[:] = 0.0
+        self.next = self._newest = -1
+        """The first frame that has not left; -1: there is none."""
+
+    def take_slopes(self, first: int, values: Array32) -> None:
+        """Take ``(n, n_slopes)`` of frames from ``first`` on."""
+        self._put(self._slopes, self._of_slopes, first, values)
+        self.take_dither(first, first + len(values) - 1, 0.0)
+        if self.next < 0:
+            self.next = first
+        self._newest = max(self._newest, first + len(values) - 1)
+
+    def take_commands(self, first: int, values: Array32) -> None:
+        """Take ``(n, n_modes)`` metres: the loop's answers to frames from ``first`` on."""
+        self._put(self._commands_m, self._of_commands, first, values)
+
+    def take_dither(self, first: int, last: int, values: Array32 | float) -> None:
+        """Take ``(n_modes,)`` metres, played in answer to all frames from ``first`` to ``last``.
+
+        Where nothing is said after the slopes have come, nothing was played.
+        """
+        self._dither_m[np.arange(max(first, last - _KEPT + 1), last + 1) % _KEPT] = values
+
+    def _put(self, kept: Array32, counters: NDArray[np.int64], first: int, values: Array32) -> None:
+        values = values[-_KEPT:]
+        frames = np.arange(len(values)) + first
+        kept[frames % _KEPT], counters[frames % _KEPT] = values, frames
+
+    def ready(self, answers_to: int | None = None) -> list[tuple[int, Array32]]:
+        """Return the rows that are complete, as runs of consecutive frames with their first.
+
+        At most as many rows in each as a message may have. ``answers_to`` is the last frame of
+        which it is known what was played in answer to it; None: nothing plays.
+        """
+        runs: list[tuple[int, Array32]] = []
+        if self.next < 0:
+            return runs
+        self.skip(self._newest - _KEPT + self._delay + 2)
+        newest = self._newest if answers_to is None else min(self._newest, answers_to + self._delay)
+        frames = np.arange(self.next, newest + 1)
+        whole = self._complete(frames)
+        for first, last in _runs(whole):
+            if self.next < frames[first]:
+                if self._newest - self.next < PATIENCE_FRAMES:
+                    break
+                self.skip(int(frames[first]))
+            for start in range(first, last, FRAMES_PER_BATCH):
+                part = frames[start : min(start + FRAMES_PER_BATCH, last)]
+                runs.append((int(part[0]), self._rows(part)))
+            self.next = int(frames[last - 1]) + 1
+        self.skip(self._newest - PATIENCE_FRAMES)
+        return runs
+
+    def _complete(self, frames: NDArray[Any]) -> NDArray[np.bool_]:
+        whole: NDArray[np.bool_] = self._of_slopes[frames % _KEPT] == frames
+        for answered in (frames - self._delay, frames - self._delay - 1)[: 1 + bool(self._older)]:
+            whole &= self._of_commands[answered % _KEPT] == answered
+        return whole
+
+    @property
+    def newest(self) -> int:
+        """The last frame of slopes that was taken; -1: none was."""
+        return self._newest
+
+    def skip(self, to: int) -> None:
+        """Leave out rows before ``to`` that have not left yet."""
+        if to > self.next:
+            self.n_unpaired += to - self.next
+            self.next = to
+
+    def _rows(self, frames: NDArray[Any]) -> Array32:
+        dither_m = self._on_mirror(self._dither_m, frames)
+        commands_m = self._on_mirror(self._commands_m, frames)
+        if dither_m.shape[1]:
+            commands_m += dither_m
+        return np.hstack([self._slopes[frames % _KEPT], commands_m, dither_m])
+
+    def _on_mirror(self, answers: Array32, frames: NDArray[Any]) -> Array32:
+        """Return the mean over each exposure of answers that came a part of a frame late."""
+        newer: Array32 = answers[(frames - self._delay) % _KEPT]
+        if not self._older:
+            return newer
+        older = answers[(frames - self._delay - 1) % _KEPT]
+        return np.asarray(self._older * older + (1 - self._older) * newer)
+
+
+def _runs(whole: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and end of each run of trues."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -51,6 +51,9 @@ MOST_LAG: Final = 0.2
 NOISY: Final = 0.3
 """Noise over answer from which on a line tells nothing."""
 
+SILENT: Final = 0.1
+"""Least answer over command, noise included, of a mirror that moves."""
+
 _SIDES: Final = (-4.0, -3.0, 3.0, 4.0)
 """Bins beside a line, where its noise is."""
 
@@ -349,6 +352,8 @@ def _columns(ledger: _Ledger, modes: tuple[int, ...], status: Status) -> Checked
     answer, noise = _transfer(
         seq, np.concatenate(ledger.seen_m), np.concatenate(ledger.moved_m), turns
     )
+    if (np.abs(answer) + noise < SILENT).all():
+        return wrong("columns", "no slope answers what the commands hold: the mirror stands still")
     if (noise > NOISY * np.abs(answer)).any():
         return skipped("columns", f"too noisy: {np.max(noise / np.abs(answer)):.2f} of the answer")
     unit, weight = answer / np.abs(answer), np.abs(answer) / np.maximum(noise, 1e-9)

@@ -35,6 +35,7 @@ LINES = {
     "late-swap@0:4,100": {"commit"},
     "dither-lost@0:100": {"dither"},
     "dither-late@0:0.3,100": {"dither"},
+    "mirror-silent@0:100": {"columns"},
 }
 """Each fault, and the lines that name it."""
 
@@ -80,7 +81,7 @@ def test_a_healthy_rtc_keeps_the_contract_and_is_told_what_was_moved(tmp_path):
     [pytest.param(one, marks=[] if one in ALWAYS else pytest.mark.slow) for one in LINES],
 )
 def test_each_fault_is_named_by_its_line_and_by_no_other(tmp_path, fault):
-    asking = LINES[fault] & {"commit", "dither"}
+    asking = LINES[fault] & {"columns", "commit", "dither"}
     options = ["--yes", "--seconds", "1", "--only", *asking] if asking else ["--passive"]
     status, checks, text = checked(tmp_path, *options, faults=(fault,))
     assert {name for name, one in checks.items() if one["outcome"] in FLAGGED} == LINES[fault], text

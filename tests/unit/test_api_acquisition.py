@@ -8,26 +8,13 @@ from service.errors import CommandError
 from service.routes.views import picture
 from service.tracking.commands import AbortAcquisition, Acquire
 from service.tracking.state import Acquisition, AcquisitionStage
+from tests.unit.obedient import Obedient
 from tests.unit.tracking.situations import ALPHA
-
-
-class FakeService:
-    """Remembers what it was asked."""
-
-    def __init__(self):
-        self.commands = []
-        self.refusal = None
-
-    async def submit(self, command, caller):
-        if self.refusal is not None:
-            raise self.refusal
-        self.commands.append(command)
-        return "1 action(s) under way"
 
 
 @pytest.fixture
 def service():
-    return FakeService()
+    return Obedient()
 
 
 @pytest.mark.parametrize(

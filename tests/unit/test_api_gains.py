@@ -1,13 +1,13 @@
 """The table of loop gains over real HTTP messages, with a hand-written service behind it."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 
 from service.tracking.commands import SetLoop
 from service.tracking.registration import ModeGain
 from service.tracking.state import TrackerState
+from tests.unit.obedient import Obedient
 from tests.unit.runtime.handmade import REGISTRATION
 from tests.unit.tracking.situations import START_NS, record, rtc
 
@@ -17,29 +17,16 @@ MEASURED = (
 )
 
 
-class FakeService:
-    """Shows a state, remembers what it was asked."""
-
-    def __init__(self):
-        self.commands = []
-        self.state = TrackerState(
+@pytest.fixture
+def service():
+    return Obedient(
+        TrackerState(
             system="flao",
             rtc=rtc(),
             registration=replace(REGISTRATION, optical_gains=MEASURED),
             reconstructors=(record("cm-1", optical_gains=MEASURED[:1]), record("cm-2")),
         )
-
-    def snapshot(self):
-        return SimpleNamespace(tracker=self.state)
-
-    async def submit(self, command, caller):
-        self.commands.append(command)
-        return "1 action(s) under way"
-
-
-@pytest.fixture
-def service():
-    return FakeService()
+    )
 
 
 async def test_the_present_table_is_of_every_mode_of_the_basis(client):
@@ -66,7 +53,7 @@ async def test_where_nothing_was_measured_the_table_says_so(client):
 
 async def test_a_table_of_nothing_is_a_problem(client, service):
     assert (await client.get("/v1/reconstructors/cm-9/gains")).status_code == 404
-    service.state = replace(service.state, rtc=None)
+    service.tracker = replace(service.tracker, rtc=None)
     answer = await client.get("/v1/gains")
     assert (answer.status_code, "no RTC is there" in answer.text) == (409, True)
 

@@ -4,25 +4,12 @@ import pytest
 
 from service.errors import CommandError, LinkError
 from service.tracking.commands import GainGroup, ModeGroup, Ramp, SetLoop
-
-
-class FakeService:
-    """Remembers what it was asked."""
-
-    def __init__(self):
-        self.commands = []
-        self.refusal = None
-
-    async def submit(self, command, caller):
-        if self.refusal is not None:
-            raise self.refusal
-        self.commands.append(command)
-        return "1 action(s) under way"
+from tests.unit.obedient import Obedient
 
 
 @pytest.fixture
 def service():
-    return FakeService()
+    return Obedient()
 
 
 @pytest.mark.parametrize(

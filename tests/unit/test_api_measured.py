@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError, LinkError, UnknownIdError
-from service.snapshot import Snapshot
 from service.tracking.commands import GiveUp, Measure
 from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import TrackerState
 from service.wire import Pattern
+from tests.unit.obedient import Obedient
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3)
 FILE = b"\x89HDF the product"
@@ -45,31 +45,6 @@ RUNNING = replace(
 )
 
 
-class FakeService:
-    """Holds a real state and remembers what it was asked."""
-
-    def __init__(self):
-        self.commands = []
-        self.refusal = None
-        self.archive = SimpleNamespace(measured=FakeMatrices())
-
-    def snapshot(self):
-        return Snapshot(
-            tracker=TrackerState(system="flao-lbt", measurements=(STORED, RUNNING)),
-            link=None,
-            now_ns=1_763_696_400_250_000_000,
-            started_ns=0,
-            ready=True,
-            ready_reason="ready",
-        )
-
-    async def submit(self, command, caller):
-        if self.refusal is not None:
-            raise self.refusal
-        self.commands.append(command)
-        return "Measure: 1 action(s) under way"
-
-
 class FakeMatrices:
     """The archive's measured matrices."""
 
@@ -85,7 +60,11 @@ class FakeMatrices:
 
 @pytest.fixture
 def service():
-    return FakeService()
+    return Obedient(
+        TrackerState(system="flao-lbt", measurements=(STORED, RUNNING)),
+        now_ns=1_763_696_400_250_000_000,
+        archive=SimpleNamespace(measured=FakeMatrices()),
+    )
 
 
 async def test_a_bare_request_measures_push_pull_modal(client, service):

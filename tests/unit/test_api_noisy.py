@@ -9,10 +9,10 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.routes.views import GATHERING, picture
-from service.snapshot import Snapshot
 from service.tracking.commands import GiveUp, MeasureNoisy
 from service.tracking.products import MeasurementRecord, MeasureState, ModeSet, NoisyFinding
 from service.tracking.state import TrackerState
+from tests.unit.obedient import Obedient
 
 FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"
 STORED = MeasurementRecord(
@@ -45,31 +45,6 @@ STORED = MeasurementRecord(
 RUNNING = replace(STORED, id="noisy-2", state=MeasureState.RUNNING, finding=None)
 
 
-class FakeService:
-    """Holds a real state and remembers what it was asked."""
-
-    def __init__(self):
-        self.commands = []
-        self.refusal = None
-        self.archive = SimpleNamespace(noisy=FakeMatrices())
-
-    def snapshot(self):
-        return Snapshot(
-            tracker=TrackerState(system="flao-lbt", measurements=(STORED, RUNNING)),
-            link=None,
-            now_ns=1_763_696_400_250_000_000,
-            started_ns=0,
-            ready=True,
-            ready_reason="ready",
-        )
-
-    async def submit(self, command, caller):
-        if self.refusal is not None:
-            raise self.refusal
-        self.commands.append(command)
-        return "MeasureNoisy: 1 action(s) under way"
-
-
 class FakeMatrices:
     """The archive's noisy matrices."""
 
@@ -81,7 +56,11 @@ class FakeMatrices:
 
 @pytest.fixture
 def service():
-    return FakeService()
+    return Obedient(
+        TrackerState(system="flao-lbt", measurements=(STORED, RUNNING)),
+        now_ns=1_763_696_400_250_000_000,
+        archive=SimpleNamespace(noisy=FakeMatrices()),
+    )
 
 
 async def test_a_bare_request_takes_the_controlled_modes(client, service):

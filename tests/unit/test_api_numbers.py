@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from service.archive import Archive
-from service.snapshot import Snapshot
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import TrackerState
 from service.wire import checksum
+from tests.unit.obedient import Obedient
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4) / 7
 
@@ -32,23 +32,11 @@ RECORDS = (
 )
 
 
-class FakeService:
-    """Holds a real state and a real archive."""
+class FakeService(Obedient):
+    """Has the matrices of a real archive."""
 
-    def __init__(self, archive):
-        self.archive = archive
-        self.matrix = archive.reconstructors.matrix
-        self.tracker = TrackerState(system="flao-lbt", reconstructors=RECORDS, in_use="cm-3")
-        self.commands = []
-
-    def snapshot(self):
-        return Snapshot(
-            tracker=self.tracker, link=None, now_ns=0, started_ns=0, ready=True, ready_reason=""
-        )
-
-    async def submit(self, command, caller):
-        self.commands.append(command)
-        return "so it is"
+    def matrix(self, matrix_id):
+        return self.archive.reconstructors.matrix(matrix_id)
 
 
 @pytest.fixture
@@ -58,7 +46,8 @@ def service(tmp_path):
     with archive:
         for one in RECORDS:
             archive.reconstructors.store(one, MATRIX, None, {})
-        yield FakeService(archive)
+        state = TrackerState(system="flao-lbt", reconstructors=RECORDS, in_use="cm-3")
+        yield FakeService(state, archive=archive)
 
 
 @pytest.mark.parametrize(

@@ -2,35 +2,15 @@
 
 import pytest
 
-from service.snapshot import Snapshot
 from service.tracking.commands import StartDither
 from service.tracking.products import ModeSet
-from service.tracking.state import TrackerState
 from service.wire import DitherKind
-
-
-class FakeService:
-    def __init__(self):
-        self.commands = []
-
-    def snapshot(self):
-        return Snapshot(
-            tracker=TrackerState(system="flao-lbt"),
-            link=None,
-            now_ns=0,
-            started_ns=0,
-            ready=True,
-            ready_reason="ready",
-        )
-
-    async def submit(self, command, caller):
-        self.commands.append(command)
-        return "StartDither: 1 action(s) under way"
+from tests.unit.obedient import Obedient
 
 
 @pytest.fixture
 def service():
-    return FakeService()
+    return Obedient()
 
 
 @pytest.mark.parametrize(

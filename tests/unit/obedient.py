@@ -1,0 +1,33 @@
+"""A service that does whatever it is asked: REST is tried with it where no other is needed."""
+
+from dataclasses import dataclass, field
+
+from service.snapshot import Snapshot
+from service.tracking.state import TrackerState
+
+
+@dataclass
+class Obedient:
+    """Holds a real state and remembers what it was asked."""
+
+    tracker: TrackerState = field(default_factory=lambda: TrackerState(system="flao-lbt"))
+    now_ns: int = 0
+    archive: object = None
+    refusal: Exception | None = None
+    commands: list = field(default_factory=list)
+
+    def snapshot(self):
+        return Snapshot(
+            tracker=self.tracker,
+            link=None,
+            now_ns=self.now_ns,
+            started_ns=0,
+            ready=True,
+            ready_reason="ready",
+        )
+
+    async def submit(self, command, caller):
+        if self.refusal is not None:
+            raise self.refusal
+        self.commands.append(command)
+        return f"{type(command).__name__}: 1 action(s) under way"

@@ -23,7 +23,7 @@ from service.files import kind_of, parse_alpha, parse_arms, parse_modes
 OTHER_PROGRAMS = {
     "demo": ("studies.demo", "the main job, end to end, on a simulated telescope"),
     "sim": ("sim_rtc", "the simulated RTC"),
-    "check-rtc": ("check_rtc", "does an RTC keep the contract?"),
+    "check-rtc": ("check_rtc", "whether an RTC keeps the contract"),
     "cacao": ("cacao_bridge", "the bridge to a loop of cacao's"),
     "campaign": ("studies.campaign", "many simulated nights"),
 }

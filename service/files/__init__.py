@@ -71,6 +71,9 @@ def kind_of(path: Path) -> FileKind:
     raise MatrixError(f"{path}: found {kind}, expected an HDF5, a FITS or a NumPy file")
 
 
+# --- what is asked of a fit
+
+
 MOST_MODES = 100_000
 
 _PART = re.compile(r"(\d+)(?::(\d+)(?::(\d+))?)?")

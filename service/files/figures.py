@@ -247,6 +247,9 @@ def _scan(axes: Axes, scan: ScanStep, number: int) -> None:
     axes.tick_params(labelsize="x-small")
 
 
+# --- as numbers: what the figures are drawn from, few enough for a browser
+
+
 PAPER_MODES = (1, 5, 10, 50, 100, 200, 300, 350, 400)
 """Modes the paper shows, counted from 1 as it does."""
 

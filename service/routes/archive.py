@@ -85,6 +85,9 @@ async def unpin(client: ClientDep, product_id: ProductId, said: Said) -> Accepte
 _LINKS = {"archive": "/v1/archive"}
 
 
+# --- the audit trail: who ordered what, when, why and from where, and what it was answered
+
+
 PAGE = 1000
 """Entries that are read from the disk at once for an export."""
 

@@ -237,7 +237,11 @@ class _Connection(H11Protocol):
         self.transport.close()
 
 
-KEY = "idempotency-key"
+# --- the same POST is carried out once
+
+
+ONCE = "idempotency-key"
+"""Header of whoever may send a request again."""
 
 LONGEST_KEY = 200
 MOST_KEPT = 1000
@@ -248,7 +252,6 @@ LARGEST_KEPT = 100_000
 
 _NOT_DONE = {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.INSUFFICIENT_STORAGE}
 """Answers that say that nothing was done: the next time may do it."""
-
 
 _Name = tuple[object, str]
 """Who may act, and the key of that one."""
@@ -286,7 +289,7 @@ class Once:
         if scope["type"] != "http" or scope["method"] != "POST":
             return await self._app(scope, receive, send)
         request = Request(scope, receive)
-        key = request.headers.get(KEY)
+        key = request.headers.get(ONCE)
         if key is None:
             return await self._app(scope, receive, send)
         return await self._answer(request, key, send)
@@ -350,13 +353,13 @@ def _lasts(heard: list[Message]) -> bool:
     return heard[0]["status"] not in _NOT_DONE and size <= LARGEST_KEPT
 
 
-HEADER = "x-request-id"
+# --- which request has led to what: an id in its answer and in every line of the log
+
+
+REQUEST_ID = "x-request-id"
 
 _USABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 """An id of the client's own that is harmless in a log."""
-
-
-# --- which request has led to what: an id in its answer and in every line of the log
 
 
 class Traced:
@@ -377,12 +380,12 @@ class Traced:
         """Answer a request, with its id."""
         if scope["type"] != "http":
             return await self._app(scope, receive, send)
-        told = Headers(scope=scope).get(HEADER, "")
+        told = Headers(scope=scope).get(REQUEST_ID, "")
         name = told if _USABLE.fullmatch(told) else uuid4().hex
 
         async def named(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message)[HEADER] = name
+                MutableHeaders(scope=message)[REQUEST_ID] = name
             await send(message)
 
         with bound_contextvars(request_id=name):

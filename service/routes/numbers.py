@@ -161,6 +161,9 @@ def describes_numbers(description: str, rows_and_columns: str, example: str) -> 
     }
 
 
+# --- what the small figures of the page are drawn from
+
+
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
 

@@ -43,6 +43,17 @@ SHARED = (
 
 
 @pytest.fixture
+def archive(tmp_path):
+    """Give an archive that is open, in a folder of the test's own."""
+    from service.archive import Archive
+
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        yield archive
+
+
+@pytest.fixture
 async def client(service):
     """Give whoever asks REST of a test's own service, in this process."""
     import httpx  # most tests need neither

@@ -246,14 +246,6 @@ class FakeService:
 
 
 @pytest.fixture
-def archive(tmp_path):
-    archive = Archive(tmp_path)
-    archive.open()
-    with archive:
-        yield archive
-
-
-@pytest.fixture
 def service(archive):
     return FakeService(
         archive=archive,

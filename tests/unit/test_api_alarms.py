@@ -9,7 +9,6 @@ from service.tracking.alarms import Alarm, Note, Remark, Severity
 from service.tracking.commands import AcknowledgeAlarm, MuteAlarm, UnmuteAlarm
 from tests.unit.test_api import (  # noqa: F401
     SECOND,
-    archive,
     body_of,
     metrics_of,
     service,

@@ -35,14 +35,6 @@ def record_of(name="im-1", matrix=MATRIX, **changes):
     return replace(record, **changes)
 
 
-@pytest.fixture
-def archive(tmp_path):
-    archive = Archive(tmp_path)
-    archive.open()
-    with archive:
-        yield archive
-
-
 def product(tmp_path, name="im-1"):
     return tmp_path / "interaction_matrices" / f"{name}.h5"
 

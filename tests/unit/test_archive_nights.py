@@ -43,14 +43,6 @@ def line(t_ns, name, text="so it was", who="service"):
     return AuditEntry(t_ns_utc=t_ns, who=who, name=name, text=text)
 
 
-@pytest.fixture
-def archive(tmp_path):
-    archive = Archive(tmp_path)
-    archive.open()
-    with archive:
-        yield archive
-
-
 def assert_same(found, expected):
     for field in fields(HistoryEntry):
         ours, theirs = getattr(found, field.name), getattr(expected, field.name)

@@ -59,14 +59,6 @@ def record_of(name="noisy-1", matrix=MATRIX, **changes):
     return replace(record, **changes)
 
 
-@pytest.fixture
-def archive(tmp_path):
-    archive = Archive(tmp_path)
-    archive.open()
-    with archive:
-        yield archive
-
-
 def product(tmp_path, name="noisy-1"):
     return tmp_path / "noisy_matrices" / f"{name}.h5"
 

@@ -21,10 +21,10 @@ from service.routes import page
 from service.tracking.alarms import ALARMS
 from sim_rtc.options import parse_options
 from studies.demo.arguments import demo_parser
-from tests.unit.test_api import archive, assert_problem, service
+from tests.unit.test_api import assert_problem, service
 from tests.unit.test_house import ROOT
 
-__all__ = ["archive", "service"]  # fixtures
+__all__ = ["service"]  # fixtures
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SHELL_ALONE = {"cd", "docker", "export", "git", "grep", "zip"}

@@ -14,10 +14,10 @@ from service.runtime.recording import ids_of
 from service.tracking.alarms import ALARMS, ARCHIVE_FAILED, WORKER_BEHIND
 from service.tracking.registration import Validity
 from service.tracking.state import Alarm, Party, Waiting
-from tests.unit.test_api import LINK, SECOND, STATE, archive, assert_problem, service
+from tests.unit.test_api import LINK, SECOND, STATE, assert_problem, service
 from tests.unit.test_house import ROOT
 
-__all__ = ["archive", "service"]  # fixtures
+__all__ = ["service"]  # fixtures
 
 SCRAPED = (ROOT / "deploy" / "prometheus.yml").read_text(encoding="utf-8")
 RULES = yaml.safe_load((ROOT / "deploy" / "alerts.yml").read_text(encoding="utf-8"))

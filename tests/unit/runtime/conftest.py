@@ -2,7 +2,6 @@
 
 import pytest
 
-from service.archive import Archive
 from service.runtime.actions import Actions, Publishing
 from service.runtime.workers import WorkerPool
 from service.worker import start_worker
@@ -15,14 +14,6 @@ def workers():
     workers = WorkerPool(lambda: start_worker(small_instrument(), COMPUTE))
     yield workers
     workers.close()
-
-
-@pytest.fixture
-def archive(tmp_path):
-    archive = Archive(tmp_path)
-    archive.open()
-    with archive:
-        yield archive
 
 
 @pytest.fixture

@@ -75,7 +75,7 @@ def choose_dither(turn: Turn, rtc: Status) -> None:
     if forbidden is not None:
         _show(turn, DitherPhase.OFF, forbidden)
         return
-    wish, plan = dither_plan.wanted(turn.state, rtc, turn.policy, turn.now_ns)
+    wish, plan = dither_plan.wanted(turn, rtc)
     turn.dithering = replace(
         turn.dithering,
         plan=plan,
@@ -320,9 +320,7 @@ def _begin(turn: Turn, rtc: Status, wish: Wish) -> None:
         turn.put_off(dither_s=2.0)
         _note_stop(turn, rtc.dither_id)
         ask_to_stop(turn)
-    elif turn.now_ns >= wish.next_ns_utc and not dither_plan.awaits_a_result(
-        turn.state, wish, turn.now_ns
-    ):
+    elif turn.now_ns >= wish.next_ns_utc and not dither_plan.awaits_a_result(turn, wish):
         _ask(turn, rtc, wish)
 
 

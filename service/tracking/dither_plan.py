@@ -31,6 +31,7 @@ from service.tracking.loop import why_open
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
+from service.tracking.turn import Turn
 from service.wire import Status
 
 MIN_WINDOWS = 3
@@ -89,16 +90,14 @@ class Wish:
     """When; now or earlier: at once."""
 
 
-def wanted(
-    state: TrackerState, rtc: Status, policy: Policy, now_ns: int
-) -> tuple[Wish, DitherPlan]:
+def wanted(turn: Turn, rtc: Status) -> tuple[Wish, DitherPlan]:
     """Return the dither that is wanted in this state, and the plan behind it."""
-    kappa = precision(state, rtc)
-    demand = _demand(kappa, state, rtc, policy, now_ns)
+    state, policy, kappa = turn.state, turn.policy, precision(turn.state, rtc)
+    demand = _demand(turn, rtc, kappa)
     window_s = demand.window_s
     sittings = tuple(n * window_s for n in SITTING_LADDER)
     sparse = replace(demand, window_s=dither.burst_s(kappa, demand, sittings))
-    phase, reason, next_ns = _paced(state, sparse, policy, now_ns)
+    phase, reason, next_ns = _paced(turn, sparse)
     demand = sparse if phase is DitherPhase.SPARSE else demand
     found = schedule(kappa, demand)
     plan = _plan(state, found, demand, window_s, phase)
@@ -166,12 +165,11 @@ def window_lengths_s(policy: Policy) -> tuple[float, ...]:
     return tuple(s for s in lengths if s <= policy.longest_window_s) or (policy.window_s,)
 
 
-def _demand(
-    kappa: NDArray[np.float64], state: TrackerState, rtc: Status, policy: Policy, now_ns: int
-) -> Demand:
+def _demand(turn: Turn, rtc: Status, kappa: NDArray[np.float64]) -> Demand:
+    policy = turn.policy
     demand = Demand(
         sigma=policy.dither_sigma,
-        drift_rate=np.sqrt(np.maximum(_walk_rate(state, policy, now_ns), _SLOWEST**2)),
+        drift_rate=np.sqrt(np.maximum(_walk_rate(turn), _SLOWEST**2)),
         budget_m=budget_m(rtc, policy),
         window_s=policy.window_s,
         settling_s=SETTLING_S,
@@ -189,20 +187,18 @@ def _lasting_s(phase: DitherPhase) -> float:
     return 0.0 if phase is DitherPhase.SPARSE else LASTING_S - SETTLING_S - SPARE_S
 
 
-def _walk_rate(state: TrackerState, policy: Policy, now_ns: int) -> NDArray[np.float64]:
+def _walk_rate(turn: Turn) -> NDArray[np.float64]:
     """Return ``(4,)`` variance that α gains in a second: the drift, or the flexure of a slew."""
-    known, base = state.registration, policy.drift_rate**2
+    known, base = turn.known, turn.policy.drift_rate**2
     if known is None:
         return base
-    age_s = (now_ns - known.arrived_ns_utc) / SECOND_NS
+    age_s = (turn.now_ns - known.arrived_ns_utc) / SECOND_NS
     return np.maximum(base, known.grown / age_s) if age_s >= 1.0 else base
 
 
-def _paced(
-    state: TrackerState, demand: Demand, policy: Policy, now_ns: int
-) -> tuple[DitherPhase, str, int]:
+def _paced(turn: Turn, demand: Demand) -> tuple[DitherPhase, str, int]:
     """Return how to dither, why, and when the next window is due."""
-    known = state.registration
+    state, known, policy, now_ns = turn.state, turn.known, turn.policy, turn.now_ns
     if known is None:
         return DitherPhase.ACQUIRE, "α is not known", now_ns
     if state.dither_due_since_ns_utc is not None:
@@ -277,13 +273,13 @@ def why_none(state: TrackerState, rtc: Status, policy: Policy) -> str | None:
     return None if alarm is None else f"nothing would be measured under {alarm.name}"
 
 
-def awaits_a_result(state: TrackerState, wish: Wish, now_ns: int) -> bool:
+def awaits_a_result(turn: Turn, wish: Wish) -> bool:
     """Return whether the window of the dither that ended last may still be on its way."""
-    dithering = state.dithering
+    dithering = turn.dithering
     if wish.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
         return False
-    late = now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
-    return not late and state.windows_accepted < dithering.results_due
+    late = turn.now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
+    return not late and turn.state.windows_accepted < dithering.results_due
 
 
 def too_strong(state: TrackerState, rtc: Status, policy: Policy) -> str | None:

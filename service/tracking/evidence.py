@@ -53,7 +53,7 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
     when = validity.taken(event.began_ns_utc, estimate.t_ns_utc)
-    reason = filtering.why_no_window(turn.state, estimate, when, turn.policy)
+    reason = filtering.why_no_window(turn, estimate, when)
     if reason is not None:
         refuse_window(turn, reason)
         return
@@ -136,12 +136,10 @@ def enter(turn: Turn, measured: Measured) -> None:
     if far.far:
         _put_aside(turn, known, measured, far)
         return
-    prior = filtering.brought_forward(
-        turn.state, known, measured.t_ns_utc, turn.policy, turn.now_ns
-    )
+    prior = filtering.brought_forward(turn, known, measured.t_ns_utc)
     folded = Folded(
         joint=kalman.with_dithered(prior, measured.alpha.vector, measured.covariance),
-        n_windows=filtering.counted(turn.state, known, prior, turn.policy),
+        n_windows=filtering.counted(turn, known, prior),
         innovation=_innovation(prior, measured),
     )
     filtering.accept(turn, folded, measured)
@@ -177,7 +175,7 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
     The first of them is used if it is wholly of the new place.
     """
     policy = turn.policy
-    prior = filtering.brought_forward(turn.state, known, measured.t_ns_utc, policy, turn.now_ns)
+    prior = filtering.brought_forward(turn, known, measured.t_ns_utc)
     noise = measured.covariance
     whole = jumps.wholly_after(first, _reading(measured, turn.state), known.alpha, policy)
     if whole:
@@ -237,10 +235,8 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         _show_alone(turn, event)
         return
     known = _expecting(known, estimate.bias_excess)
-    prior = kalman.allowing(
-        filtering.brought_forward(turn.state, known, event.t_ns_utc, turn.policy, turn.now_ns),
-        estimate.bias_excess,
-    )
+    forward = filtering.brought_forward(turn, known, event.t_ns_utc)
+    prior = kalman.allowing(forward, estimate.bias_excess)
     if _mixed(known):
         text = "not used: its telemetry may be from both sides of a jump"
         bias = filtering.bias_of(

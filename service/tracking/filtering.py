@@ -158,16 +158,15 @@ class Folded:
     """Whether it is of a new place, to which what was known before says nothing."""
 
 
-def brought_forward(
-    state: TrackerState, known: Registration, t_ns_utc: int, policy: Policy, now_ns: int
-) -> Joint:
+def brought_forward(turn: Turn, known: Registration, t_ns_utc: int) -> Joint:
     """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
     elapsed_ns = t_ns_utc - known.t_ns_utc
     if elapsed_ns < -validity.CLOCK_SET_BACK_S * SECOND_NS:
         # a clock that was set back, or another night played again: the service's own must do
-        elapsed_ns = now_ns - known.arrived_ns_utc
+        elapsed_ns = turn.now_ns - known.arrived_ns_utc
+    policy = turn.policy
     drift = Drift(alpha_rate=policy.drift_rate, bias_memory_s=policy.bias_memory_s)
-    bent = validity.flexure(known.pointing, state.pointing, policy)
+    bent = validity.flexure(known.pointing, turn.state.pointing, policy)
     return predicted(joint_of(known), drift, elapsed_ns / SECOND_NS, bent)
 
 
@@ -210,13 +209,12 @@ def remember(turn: Turn, entry: HistoryEntry) -> None:
     turn.state = replace(turn.state, history=history)
 
 
-def counted(state: TrackerState, known: Registration, prior: Joint, policy: Policy) -> int:
+def counted(turn: Turn, known: Registration, prior: Joint) -> int:
     """Return how many windows agree after this one: it stands alone where α had gone stale."""
+    policy = turn.policy
     sigma = np.sqrt(np.diag(prior.alpha_covariance) + known.floor**2)
-    alone = validity.slewed_deg(state, known) > policy.slew_limit_deg or np.any(
-        sigma > policy.stale_sigma
-    )
-    return 1 if alone else known.n_windows + 1
+    slewed = validity.slewed_deg(turn.state, known) > policy.slew_limit_deg
+    return 1 if slewed or np.any(sigma > policy.stale_sigma) else known.n_windows + 1
 
 
 def accept(turn: Turn, folded: Folded, measured: Measured, *, n_accepted: int = 1) -> None:
@@ -333,13 +331,11 @@ def gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
     return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
 
 
-def why_no_window(
-    state: TrackerState, estimate: DitheredEstimate, when: Taken, policy: Policy
-) -> str | None:
+def why_no_window(turn: Turn, estimate: DitheredEstimate, when: Taken) -> str | None:
     """Return why a window's estimate must not be used, or None."""
-    if state.rtc is None or estimate.session != state.rtc.session:
+    if turn.rtc is None or estimate.session != turn.rtc.session:
         return "the RTC has restarted since"
-    reason = why_no_measurement(state, when)
+    reason = why_no_measurement(turn.state, when)
     if reason is not None:
         return reason
     lag = float(np.median(estimate.lag_frames))
@@ -354,8 +350,7 @@ def why_no_window(
     sigma = np.sqrt(np.diag(estimate.covariance))
     if np.any(sigma > validity.USELESS_SIGMA):
         return "too uncertain: raise the dither's amplitude or the window's length"
-    known = state.registration
-    near = policy.start if known is None else known.alpha
+    near = turn.policy.start if turn.known is None else turn.known.alpha
     distance = np.abs(estimate.alpha.vector - near.vector)
     if np.any(distance > CAPTURE_RANGE):
         return (

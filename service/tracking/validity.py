@@ -153,9 +153,10 @@ def age(turn: Turn) -> None:
     known = turn.known
     if known is not None:
         known = _without_old_candidate(known, turn.now_ns)
-        grown = _growth(turn.state, known, turn.policy, turn.now_ns)
-        known = replace(known, grown=grown)
-        standing = _standing(turn.state, known, turn.policy, turn.now_ns)
+        walked = turn.policy.drift_rate**2 * elapsed_s(turn.state, known, turn.now_ns)
+        bent = flexure(known.pointing, turn.state.pointing, turn.policy)
+        known = replace(known, grown=walked + bent**2)
+        standing = _standing(turn, known)
         if standing.validity in _WORTHLESS:
             want_window(turn, standing.reason)
         turn.known = replace(known, standing=standing)
@@ -203,14 +204,8 @@ def elapsed_s(state: TrackerState, known: Registration, now_ns: int) -> float:
     return max(now_ns - known.arrived_ns_utc, 0) / SECOND_NS
 
 
-def _growth(state: TrackerState, known: Registration, policy: Policy, now_ns: int) -> Array:
-    """Return ``(4,)`` variance that drift and flexure have added since the last measurement."""
-    walked = policy.drift_rate**2 * elapsed_s(state, known, now_ns)
-    return np.asarray(walked + flexure(known.pointing, state.pointing, policy) ** 2)
-
-
-def _standing(state: TrackerState, known: Registration, policy: Policy, now_ns: int) -> Standing:
-    reason = _why_invalid(state, known, policy)
+def _standing(turn: Turn, known: Registration) -> Standing:
+    policy, reason = turn.policy, _why_invalid(turn.state, known, turn.policy)
     if reason is not None:
         return Standing(validity=Validity.INVALID, reason=reason)
     sigma, limit = known.sigma, policy.stale_sigma
@@ -221,7 +216,7 @@ def _standing(state: TrackerState, known: Registration, policy: Policy, now_ns: 
     rate = np.maximum(policy.drift_rate**2, np.finfo(float).tiny)
     left_s = float(np.min((limit**2 - sigma**2) / rate))
     # a rate of zero never ends it; a century is beyond any night
-    until_ns = now_ns + round(left_s * SECOND_NS) if left_s < 3e9 else None
+    until_ns = turn.now_ns + round(left_s * SECOND_NS) if left_s < 3e9 else None
     if np.any(sigma > AGEING_SHARE * limit):
         reason = _worst(sigma, AGEING_SHARE * limit)
         return Standing(validity=Validity.AGEING, reason=reason, until_ns_utc=until_ns)

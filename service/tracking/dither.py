@@ -71,7 +71,7 @@ def choose_dither(turn: Turn, rtc: Status) -> None:
     if dither is not None and not own_sine(dither.request):
         _show(turn, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
-    forbidden = dither_plan.why_none(turn.state, rtc, turn.policy)
+    forbidden = dither_plan.why_none(turn, rtc)
     if forbidden is not None:
         _show(turn, DitherPhase.OFF, forbidden)
         return
@@ -280,8 +280,8 @@ def stop_unanswered(turn: Turn, text: str) -> None:
 
 def stop_unwanted(turn: Turn, rtc: Status) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
-    running, loud = rtc.dither_id, dither_plan.too_strong(turn.state, rtc, turn.policy)
-    why = loud or dither_plan.why_unwanted(turn.state, rtc, turn.policy)
+    running, loud = rtc.dither_id, dither_plan.too_strong(turn, rtc)
+    why = loud or dither_plan.why_unwanted(turn, rtc)
     if running is None or why is None:
         forget_unwanted(turn)
         _forgive(turn, rtc)

@@ -14,7 +14,7 @@ from service.control.dither import (
     schedule,
     tabulated,
 )
-from service.tracking.alarms import Act, forbidding
+from service.tracking.alarms import Act
 from service.tracking.dither_request import (
     OUR_DITHERS,
     OWN_DITHER,
@@ -112,8 +112,9 @@ def wanted(turn: Turn, rtc: Status) -> tuple[Wish, DitherPlan]:
     return Wish(phase=phase, reason=reason, choice=choice, next_ns_utc=next_ns), plan
 
 
-def by_hand(state: TrackerState, rtc: Status, policy: Policy) -> Choice:
+def by_hand(turn: Turn, rtc: Status) -> Choice:
     """Return what an operator's dither is like where the operator does not say."""
+    state, policy = turn.state, turn.policy
     plan = state.dithering.plan
     window_s = policy.window_s if plan is None else plan.window_s
     lasting_s = policy.dither_duration_s - SETTLING_S - SPARE_S
@@ -256,20 +257,21 @@ def _steady(state: TrackerState, found: Schedule, demand: Demand) -> float:
     return before.total_m if 1.0 / CHANGE <= ratio <= CHANGE else found.total_m
 
 
-def why_none(state: TrackerState, rtc: Status, policy: Policy) -> str | None:
+def why_none(turn: Turn, rtc: Status) -> str | None:
     """Return why the service asks for no dither of its own, or None."""
+    state = turn.state
     still = state.dithering.unwanted_id
     left = "" if still is None else f"; the RTC still plays {still}"
     if state.dither_stopped:
         return f"stopped by the operator{left}"
-    if not policy.dither_enabled and state.dither is None:
+    if not turn.policy.dither_enabled and state.dither is None:
         return f"the settings forbid it{left}"
     if not rtc.in_loop:
         return why_open(rtc)
     unnamed = rtc.cm_id is None or state.unfetched
     if state.in_use is None and not unnamed and state.dither is None and rtc.dither is None:
         return "the reconstructor in use is not known yet"
-    alarm = forbidding(state, Act.MEASURE)
+    alarm = turn.forbidden(Act.MEASURE)
     return None if alarm is None else f"nothing would be measured under {alarm.name}"
 
 
@@ -282,15 +284,15 @@ def awaits_a_result(turn: Turn, wish: Wish) -> bool:
     return not late and turn.state.windows_accepted < dithering.results_due
 
 
-def too_strong(state: TrackerState, rtc: Status, policy: Policy) -> str | None:
+def too_strong(turn: Turn, rtc: Status) -> str | None:
     """Return why a dither that is played costs more than it may, or None.
 
     An operator's own may cost more than the budget, but not more than was asked for.
     """
     if rtc.dither is None:
         return None
-    running, dithering = rtc.dither.request, state.dithering
-    found_m, most_m = total_m(running), budget_m(rtc, policy)
+    running, dithering = rtc.dither.request, turn.dithering
+    found_m, most_m = total_m(running), budget_m(rtc, turn.policy)
     over = own_sine(running) and found_m > ROUNDING * most_m
     if not over and running.id != dithering.loud_id:
         return None
@@ -302,9 +304,9 @@ def too_strong(state: TrackerState, rtc: Status, policy: Policy) -> str | None:
     )
 
 
-def why_unwanted(state: TrackerState, rtc: Status, policy: Policy) -> str | None:
+def why_unwanted(turn: Turn, rtc: Status) -> str | None:
     """Return why the dither that the RTC plays must go though it is not too strong, or None."""
-    running = rtc.dither_id
+    state, running = turn.state, rtc.dither_id
     if running is None or not running.startswith(OUR_DITHERS):
         return None
     if state.stopped_because:
@@ -312,6 +314,7 @@ def why_unwanted(state: TrackerState, rtc: Status, policy: Policy) -> str | None
     followed = state.dither is not None and state.dither.id == running
     if state.dither_stopped and not followed:
         return "the operator wants no dither"
-    if not policy.dither_enabled and state.dither is None and running.startswith(OWN_DITHER):
+    forbidden = not turn.policy.dither_enabled
+    if forbidden and state.dither is None and running.startswith(OWN_DITHER):
         return "the settings forbid a dither"
     return None

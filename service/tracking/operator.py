@@ -15,7 +15,6 @@ from service.tracking.dither_plan import by_hand
 from service.tracking.dither_request import (
     ASKED_DITHER,
     RANDOM_TOTAL_M,
-    Choice,
     Dither,
     check_modes,
     cost_of,
@@ -25,7 +24,7 @@ from service.tracking.dither_request import (
     why_unusable,
 )
 from service.tracking.loop import CommandState, LoopCommand, extended_gains
-from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
 from service.tracking.registration import table_of
 from service.tracking.state import Level, Mode
@@ -134,10 +133,9 @@ def start_dither(turn: Turn, command: cmd.StartDither) -> None:
     rtc = turn.rtc
     if rtc is None or rtc.loop == "open":
         raise CommandError("a dither needs an RTC with its loop closed")
-    choice = by_hand(turn.state, rtc, turn.policy)
-    dither = _planned(command, choice, rtc, turn.policy, turn.now_ns)
-    total, meant = total_m(dither.request), command.over_budget
-    cost = cost_of("dither", total, turn.policy, over_budget=meant)
+    dither = _planned(turn, rtc, command)
+    total, over_budget = total_m(dither.request), command.over_budget
+    cost = cost_of("dither", total, turn.policy, over_budget=over_budget)
     allow(turn)
     modes = dither.request.modes
     which = f"modes {modes}" if len(modes) < 10 else f"{len(modes)} modes"
@@ -145,9 +143,7 @@ def start_dither(turn: Turn, command: cmd.StartDither) -> None:
     ask_for(turn, dither)
 
 
-def _planned(
-    command: cmd.StartDither, choice: Choice, rtc: Status, policy: Policy, now_ns: int
-) -> Dither:
+def _planned(turn: Turn, rtc: Status, command: cmd.StartDither) -> Dither:
     """Return the dither to ask for.
 
     Raises
@@ -155,6 +151,7 @@ def _planned(
     CommandError
         If it could not be played, or not be read.
     """
+    policy, now_ns = turn.policy, turn.now_ns
     if command.kind is DitherKind.BINARY or isinstance(command.modes, ModeSet):
         return plan_random(
             rtc,
@@ -169,7 +166,7 @@ def _planned(
         rtc,
         policy,
         now_ns,
-        choice=choice,
+        choice=by_hand(turn, rtc),
         modes=command.modes,
         amplitude_m=command.amplitude_m,
         frequency_hz=command.frequency_hz,

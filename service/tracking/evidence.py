@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.telemetry import kalman
-from service.telemetry.kalman import JUMP_THRESHOLD, Joint
+from service.telemetry.kalman import Joint
 from service.telemetry.passive import PassiveEstimate
 from service.telemetry.random_dither import RandomEstimate
 from service.tracking import alarms, filtering, jumps, validity
@@ -253,7 +253,7 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         pointing=validity.pointing_at(turn.state, event.t_ns_utc),
     )
     far = jumps.look_surprise(known, filtering.joint_of(known), reading, turn.policy)
-    if far > JUMP_THRESHOLD:
+    if far > jumps.LOOK_LIMIT:
         _doubt_by_look(turn, known, event, prior, far)
         return
     joint = kalman.scattered(kalman.with_passive(prior, measured, estimate.covariance), far)

@@ -33,6 +33,11 @@ tenth of a subaperture is 20 σ and needs no such help."""
 ROTATION_LIMIT_OF_TWO = 12.2
 """The same for two windows together, once in 2000: they must also agree."""
 
+LOOK_LIMIT = 26.9
+"""What a passive look's innovation exceeds once in 10 000: it is the larger of two, and the scatter
+that both are normalised by is itself learnt, from some forty looks (four times F of 4 and 156, at
+half of that)."""
+
 LITTLE = 0.3
 """Share of a jump by which a window may fall short of it and still be of the new place."""
 

@@ -18,7 +18,6 @@ from tests.unit.test_api import (
     STATE,
     FakeService,
     Snapshot,
-    archive,  # noqa: F401  a fixture
     assert_problem,
     body_of,
     entry,
@@ -29,7 +28,7 @@ LIMIT_BYTES = 300_000
 
 
 @pytest.fixture
-def service(archive):  # noqa: F811
+def service(archive):
     service = FakeService(
         archive=archive,
         now=Snapshot(

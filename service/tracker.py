@@ -16,6 +16,7 @@ from service.tracking import (
     dither,
     evidence,
     measuring,
+    offload,
     operator,
     probation,
     reconstructors,
@@ -40,6 +41,7 @@ from service.wire import (
     DitherStop,
     LoopRequest,
     MeasureRequest,
+    OffloadRequest,
     RampRequest,
     Status,
 )
@@ -86,6 +88,7 @@ def _go_on(turn: Turn) -> None:
     measuring.follow_noisy(turn)
     if not measuring.awaits_its_dither(turn.state):
         decide(turn)
+        offload.demand(turn)
 
 
 def _on_tick(turn: Turn, _: ev.Tick) -> None:
@@ -136,6 +139,8 @@ def _on_answer(turn: Turn, answered: ev.Answered) -> None:
             dither.on_stop_answer(turn, reply)
         case MeasureRequest() as request:
             measuring.on_answer(turn, request, reply)
+        case OffloadRequest() as request:
+            offload.on_answer(turn, request, reply)
         case LoopRequest() | RampRequest() as request:
             outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
             operator.on_loop_answer(turn, request.id, outcome, reply.reason)
@@ -145,6 +150,8 @@ def _on_failure(turn: Turn, failed: ev.JobFailed) -> None:
     match failed.effect:
         case ev.Ask(request=MeasureRequest(id=name)):
             measuring.fail(turn, turn.state.measurement(name), failed.text)
+        case ev.Ask(request=OffloadRequest(id=name)):
+            offload.on_failure(turn, name, failed.text)
         case ev.FinishNoisy(record=noisy):
             measuring.fail(turn, noisy, failed.text)
         case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):

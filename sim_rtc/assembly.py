@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -64,6 +64,9 @@ class Telescope:
     drive: MirrorDrive | None
     """Limits and lag of the mirror; None: it obeys at once."""
 
+    move: Callable[[NDArray[np.float64]], None] | None
+    """Moves the mirror's image by ``(4,)``, numeric units; None: nothing can."""
+
     def computer(self, blocks: Iterator[Block]) -> RealTimeComputer:
         """Return a computer that runs on these blocks of the feed."""
         return RealTimeComputer(
@@ -75,6 +78,7 @@ class Telescope:
             stroke_m=STROKE_M,
             mode_to_actuator=self.mode_to_actuator,
             drive=self.drive,
+            move=self.move,
         )
 
 
@@ -153,7 +157,18 @@ def build_telescope(
         weights=plant.weights,
         mode_to_actuator=basis.mode_to_actuator,
         drive=build_drive(options, instrument, basis),
+        move=build_stage(options, optics),
     )
+
+
+def build_stage(
+    options: Options, optics: MovingOptics
+) -> Callable[[NDArray[np.float64]], None] | None:
+    """Return what moves the mirror's image when it is asked to, as well as it obeys."""
+    obedience = options.stage
+    if obedience is None:
+        return None
+    return lambda vector: optics.move(obedience * vector)
 
 
 def build_plant(

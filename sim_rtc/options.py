@@ -193,6 +193,11 @@ class Options:
         "dead pixels: dark, and their subapertures read slopes of 0",
         count(0, 100),
     )
+    stage: float | None = option(
+        "--stage RATIO",
+        "a stage moves the mirror's image on request, by so much of what it is asked",
+        within(0.1, 2.0),
+    )
     frame_rate_hz: float = option(
         "--rate HZ", "frame rate", within(10.0, 4000.0), default=1000.0, chapter="loop"
     )

@@ -32,6 +32,7 @@ from service.wire import (
     MatrixLayout,
     MeasuredManifest,
     MeasureRequest,
+    OffloadRequest,
     Pointing,
     RampRequest,
     Reply,
@@ -54,6 +55,7 @@ MESSAGES: Final[dict[str, type]] = {
     "loop": LoopRequest,
     "measure": MeasureRequest,
     "ramp": RampRequest,
+    "offload": OffloadRequest,
     "reply": Reply,
     "commit": Manifest,
     "ack": Acknowledgement,
@@ -135,7 +137,8 @@ def rows_of(name: str) -> list[Row]:
 
 
 def _rows(name: str, record: type) -> Iterator[Row]:
-    texts = described_fields(record)
+    bases = reversed(record.__mro__[:-1])
+    texts = {key: text for base in bases for key, text in described_fields(base).items()}
     known = {field.name: field.type for field in _info(record)}
     for field in fields(record):
         kind = known[field.name]

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.archive.retention import Keeping
-from service.config.settings import Settings
+from service.config.settings import OffloadTable, Settings
 from service.control.reconstructor import InversionMethod
 from service.model.misregistration import BOUNDARY_SCALE
 from service.prepared import usual_folder
 from service.tracking.alarms import Act, Severity
-from service.tracking.policy import Policy, Rule
+from service.tracking.policy import Offloading, Policy, Rule
 from service.worker import Compute
 
 FLAT = (0.004, 0.01, 0.001)
@@ -96,6 +96,19 @@ def policy_of(settings: Settings) -> Policy:
             )
             for rule in settings.rules
         ),
+        offloading=_offloading(settings.offload),
+    )
+
+
+def _offloading(table: OffloadTable) -> Offloading | None:
+    if not table.enabled:
+        return None
+    return Offloading(
+        share=table.gain,
+        near=np.array(table.dead_band) / BOUNDARY_SCALE,
+        most_step=np.array(table.most_step) / BOUNDARY_SCALE,
+        reach=np.array(table.reach) / BOUNDARY_SCALE,
+        settle_s=table.settle_s,
     )
 
 

@@ -232,6 +232,36 @@ class ControlTable(Table):
     """Least time between two reconstructors, seconds."""
 
 
+Size = Annotated[float, Field(ge=0.0)]
+FourAxes = Annotated[tuple[Size, Size, Size, Size], Field(strict=False)]
+"""Shift x and y in subapertures, rotation in degrees, magnification."""
+
+
+class OffloadTable(Table):
+    """``[offload]``: correction by moving the mirror's image, with a lens or a stage, in mode auto.
+
+    Four values are shift x, shift y (subapertures), rotation (degrees), magnification.
+    """
+
+    enabled: bool = False
+    """Whether moves are asked for at all."""
+
+    gain: float = Field(default=0.8, gt=0.0, le=1.0)
+    """Share of the way back to the nominal registration that is asked for at once."""
+
+    dead_band: FourAxes = (0.015, 0.015, 0.015, 0.002)
+    """Nearer to the nominal registration than this nothing is asked for."""
+
+    most_step: FourAxes = (0.1, 0.1, 0.2, 0.005)
+    """Of one move."""
+
+    reach: FourAxes = (1.0, 1.0, 1.0, 0.02)
+    """Of all moves together since the service began, either way; 0: what cannot be moved."""
+
+    settle_s: float = Field(default=3.0, ge=0.0, le=50.0)
+    """From the reply until the image stands still, where the reply does not say, seconds."""
+
+
 class ComputeTable(Table):
     """``[compute]``: what the heavy work may use, and how finely it samples the optics."""
 
@@ -346,6 +376,7 @@ class Settings(Table):
     tracking: TrackingTable = TrackingTable()
     acquisition: AcquisitionTable = AcquisitionTable()
     control: ControlTable = ControlTable()
+    offload: OffloadTable = OffloadTable()
     compute: ComputeTable = ComputeTable()
     fits: FitsTable = FitsTable()
     archive: ArchiveTable = ArchiveTable()

@@ -97,7 +97,7 @@ def judge(
     stable = _verdict(worst, aligned, bound, 1 + 2 * len(steps))
     if loop.outer is None or not stable.accepted:
         return stable
-    motion_m = edge_motion_m(
+    motion_m = loop.noise * edge_motion_m(
         reconstructor,
         centre,
         gains.astype(float),

@@ -33,6 +33,9 @@ class ControlLoop:
     """``(n_outer, n_modes)`` position of each actuator of the mirror's outermost ring, metres, for
     a unit command of each mode; None: the modes are measured, it is not known."""
 
+    noise: float = 1.0
+    """1 σ of what the reconstructor multiplies where that of a slope is 1: half of it of pixels."""
+
     def of(self, modes: slice | NDArray[np.intp]) -> ControlLoop:
         """Return the same loop with only these modes controlled."""
         gain, outer = self.optical_gain, self.outer

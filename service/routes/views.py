@@ -51,7 +51,7 @@ from service.tracking.products import (
     Probation,
     ReconstructorRecord,
 )
-from service.tracking.registration import HistoryEntry, ModeGain, Watchdog
+from service.tracking.registration import HistoryEntry, ModeGain, Move, Watchdog
 from service.tracking.state import Acquisition, LogEntry, ObservatoryValue, TrackerState, Waiting
 from service.wire import Pointing
 
@@ -396,6 +396,7 @@ view(
     "n_modes",
 )
 
+view("MoveView", Move, "id state text step total n_moves asked_ns_utc")
 RECONSTRUCTOR = view(
     "ReconstructorView",
     ReconstructorRecord,
@@ -483,7 +484,7 @@ STATE = view(
     "registration=alpha tracker.in_use tracker.margin tracker.assessment tracker.mode_limit "
     "tracker.probation rtc tracker.pointing tracker.basis_id tracker.config_id tracker.dither "
     "tracker.dithering tracker.vibrations_hz tracker.measuring tracker.gathering "
-    "tracker.acquisition tracker.loop_command tracker.dither_due_since_ns_utc "
+    "tracker.acquisition tracker.move tracker.loop_command tracker.dither_due_since_ns_utc "
     "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating "
     "tracker.told alarms stale_alarms muted_alarms worst_severity tracker.windows_accepted "
     "tracker.windows_refused tracker.windows_outlying pace link",

@@ -37,6 +37,26 @@ class Rule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Offloading:
+    """How α is corrected by moving the mirror's image; all arrays ``(4,)``, numeric units."""
+
+    share: float
+    """Of the way back to the nominal registration that is asked for at once."""
+
+    near: NDArray[np.float64]
+    """Nearer than this nothing is asked for."""
+
+    most_step: NDArray[np.float64]
+    """Of one demand."""
+
+    reach: NDArray[np.float64]
+    """Of all demands together, either way; 0: what cannot be moved."""
+
+    settle_s: float
+    """From the reply until the image stands still, where the reply does not say."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Policy:
     """The settings of the tracker."""
 
@@ -122,6 +142,9 @@ class Policy:
 
     rules: tuple[Rule, ...] = ()
     """Operators' own."""
+
+    offloading: Offloading | None = None
+    """None: α is corrected by the matrix alone."""
 
     refused_interval_s: float = 30.0
     """The same after one was refused, rejected or not acknowledged."""

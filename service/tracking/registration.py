@@ -279,6 +279,40 @@ class HistoryEntry:
     """Id of the matrix in use when it was looked at; None: unknown."""
 
 
+class MoveState(StrEnum):
+    """What became of a demand to move the mirror's image."""
+
+    ASKED = "asked"
+    """No reply yet."""
+
+    MOVED = "moved"
+    """The device has taken it; α is expected where it should be, and measured again."""
+
+    REFUSED = "refused"
+    FAILED = "failed"
+    """No reply: it may have moved or not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Move:
+    """The last demand to move the mirror's image, with a lens or a stage."""
+
+    id: str
+    state: MoveState = MoveState.ASKED
+    text: str = ""
+    """The device's reason, or what it is waited for."""
+
+    step: Array
+    """``(4,)`` by how much α was to change, numeric units."""
+
+    total: Array
+    """``(4,)`` of all demands that were carried out since the service began, numeric units."""
+
+    asked_ns_utc: int
+    n_moves: int = 0
+    """Demands that were carried out."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Watchdog:
     """The passive estimate, from ordinary telemetry, beside the dithered one."""

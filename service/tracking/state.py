@@ -21,7 +21,7 @@ from service.tracking.products import (
     Probation,
     ReconstructorRecord,
 )
-from service.tracking.registration import HistoryEntry, Registration, Watchdog
+from service.tracking.registration import HistoryEntry, Move, Registration, Watchdog
 from service.wire import Pointing, Status
 
 
@@ -360,6 +360,9 @@ class TrackerState:
 
     void_because: str = ""
     """What was the matter with it."""
+
+    move: Move | None = None
+    """The last one asked for; None: none was, or α is corrected by the matrix alone."""
 
     watchdog: Watchdog | None = None
     unwatched: str = ""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.tracking.alarms import STALE, Act, forbids
 from service.tracking.loop import separation_deg
 from service.tracking.policy import SECOND_NS, Policy
@@ -124,6 +124,37 @@ def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
 def hold(turn: Turn, registration: Registration) -> None:
     """Take something for what is known of α."""
     turn.known = registration
+
+
+def displace(turn: Turn, step: Array, spread: Array, because: str, until_ns_utc: int) -> None:
+    """Expect α elsewhere, for the mirror's image was moved; windows must confirm it.
+
+    Parameters
+    ----------
+    turn
+        The event being worked out.
+    step, spread
+        ``(4,)`` by how much, and 1 σ of it, numeric units.
+    because, until_ns_utc
+        What moved it; telemetry that began before that time of the RTC's clock measures nothing.
+    """
+    void(turn, because, until_ns_utc)
+    known = turn.known
+    if known is None:
+        return
+    bias = None if known.bias is None else replace(known.bias, earlier=None)
+    turn.known = replace(
+        known,
+        alpha=Misregistration.from_vector(known.alpha.vector + step),
+        covariance=known.covariance + np.diag(spread**2),
+        n_windows=0,
+        earlier=None,
+        candidate=None,
+        bias=bias,
+        passive_after_ns_utc=max(known.passive_after_ns_utc, until_ns_utc),
+    )
+    want_window(turn, because)
+    age(turn)
 
 
 def forget(turn: Turn) -> None:

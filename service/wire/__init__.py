@@ -16,6 +16,7 @@ from service.wire.commands import (
     Loop,
     LoopRequest,
     MeasureRequest,
+    OffloadRequest,
     Pattern,
     RampRequest,
     Reply,

@@ -13,6 +13,7 @@ from service.errors import WireError
 from service.wire.codec import (
     Count,
     Form,
+    FourNumbers,
     Id,
     Map,
     Positive,
@@ -45,6 +46,7 @@ class CommandKind(StrEnum):
     LOOP = "loop"
     MEASURE = "measure"
     RAMP = "ramp"
+    OFFLOAD = "offload"
 
 
 class Loop(StrEnum):
@@ -187,7 +189,15 @@ class RampRequest:
     """Frames each gain is tried for, settling included."""
 
 
-Command = DitherRequest | DitherStop | LoopRequest | MeasureRequest | RampRequest
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OffloadRequest(FourNumbers):
+    """Move the mirror's image on the sensor, with a lens or a stage: so much α is to change."""
+
+    id: Id
+    """Of the command: repeated with the same id it is carried out once."""
+
+
+Command = DitherRequest | DitherStop | LoopRequest | MeasureRequest | RampRequest | OffloadRequest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,6 +223,7 @@ _KINDS: dict[type[Command], CommandKind] = {
     LoopRequest: CommandKind.LOOP,
     MeasureRequest: CommandKind.MEASURE,
     RampRequest: CommandKind.RAMP,
+    OffloadRequest: CommandKind.OFFLOAD,
 }
 _START, _STOP = "start", "stop"
 
@@ -250,6 +261,8 @@ def decode_command(kind: CommandKind, data: bytes) -> Command:
             return decode(MeasureRequest, data)
         case CommandKind.RAMP:
             return decode(RampRequest, data)
+        case CommandKind.OFFLOAD:
+            return decode(OffloadRequest, data)
 
 
 def _starts(values: Map, where: str) -> Map:
@@ -304,4 +317,5 @@ travels(Form(DitherStop, "a dither command", keys=lambda keys: {**keys, "action"
 travels(Form(LoopRequest, "a loop command"))
 travels(Form(MeasureRequest, "a measure command", check=_check_measurement))
 travels(Form(RampRequest, "a ramp command", check=_check_ramp))
+travels(Form(OffloadRequest, "an offload command"))
 travels(Form(Reply, "a reply", fields=reason_or_none))

@@ -381,7 +381,8 @@ class OpticsWorker:
         bound: float,
     ) -> GateVerdict:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
-        loop = replace(loop, outer=outer_of(self._model))
+        noise = self._model.instrument.slopes.kind.noise
+        loop = replace(loop, outer=outer_of(self._model), noise=noise)
         at_work = self._sensor.at_unit_gain(alpha)
         return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
 

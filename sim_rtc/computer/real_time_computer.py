@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.wire import (
     Command,
     DitherRequest,
@@ -21,6 +22,7 @@ from service.wire import (
     Loop,
     LoopRequest,
     MeasureRequest,
+    OffloadRequest,
     RampRequest,
     Reply,
     Status,
@@ -71,8 +73,10 @@ class RealTimeComputer:
         stroke_m: float,
         drive: MirrorDrive | None = None,
         mode_to_actuator: NDArray[np.float64] | None = None,
+        move: Callable[[NDArray[np.float64]], None] | None = None,
     ) -> None:
         self._blocks = blocks
+        self._move = move
         self.identity = identity
         self._settings = settings
         self._n_slopes, self._n_modes = optics.n_slopes, optics.opd_per_command.shape[1]
@@ -262,6 +266,8 @@ class RealTimeComputer:
                 return self._start_measurement(command)
             case RampRequest():
                 return self._start_ramp(command)
+            case OffloadRequest():
+                return self._offload(command)
 
     def ramp_up(self, step_s: float) -> None:
         """Try gains around those of the start, once the loop has been closed for a moment."""
@@ -375,6 +381,13 @@ class RealTimeComputer:
             ramp = GainRamp(settings.gains, plan)
             self._set(self._activities.begin_ramp(ramp, settings))
             return accepted(request.id, self._seq)
+
+    def _offload(self, request: OffloadRequest) -> Reply:
+        if self._move is None:
+            return refused(request.id, "unsupported: nothing moves the mirror's image (--stage)")
+        asked = [getattr(request, name) for name in PARAMETERS]
+        self._move(np.array(asked) / BOUNDARY_SCALE)
+        return Reply(id=request.id, accepted=True, reason="", start_seq=None)
 
     def _change_loop(self, request: LoopRequest) -> Reply:
         reason = loop_refusal(request, self._n_modes)

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from queue import SimpleQueue
 from typing import Self
 
 import numpy as np
@@ -207,6 +208,11 @@ class MovingOptics:
         self._segment: _Segment | None = None
         self._next: Future[_Segment] | None = None
         self._current: tuple[int, Optics] | None = None
+        self._demands: SimpleQueue[Array] = SimpleQueue()
+
+    def move(self, vector: Array) -> None:
+        """Move the mirror's image by ``(4,)``, numeric units, once the optics there are ready."""
+        self._demands.put(vector)
 
     def start(self) -> Optics:
         """Compute the optics at time 0; takes seconds."""
@@ -220,6 +226,11 @@ class MovingOptics:
         segment = self._segment
         if segment is None:
             return self.start()
+        if not self._demands.empty():
+            there = self._schedule.start.vector + self._demands.get()
+            start = Misregistration.from_vector(there)
+            self._schedule = replace(self._schedule, start=start)
+            self._next = self._executor.submit(self._compute, time_s, None)
         if segment.first is segment.last:
             return segment.first
         share = min(1.0, (time_s - segment.start_s) / (segment.stop_s - segment.start_s))

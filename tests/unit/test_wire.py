@@ -24,6 +24,7 @@ from service.wire import (
     Manifest,
     MeasuredManifest,
     MeasureRequest,
+    OffloadRequest,
     Pattern,
     Pointing,
     RampRequest,
@@ -370,6 +371,9 @@ def test_a_reply_may_lack_the_id_it_could_not_read():
         RampRequest(
             id="r-1", groups=((0, 1), (2, 99), (100, 399)), gains=(0.2, 0.4), frames_per_gain=500
         ),
+        OffloadRequest(
+            id="o-1", shift_x_subap=-0.1, shift_y_subap=0.0, rotation_deg=0.2, magnification=1e-3
+        ),
     ],
 )
 def test_commands_arrive_as_they_were_meant(command):
@@ -419,6 +423,22 @@ def test_a_ramp_that_tries_nothing_or_one_mode_twice_is_refused(changes, words):
     ramp = RampRequest(id="r-1", groups=((0, 1),), gains=(0.2,), frames_per_gain=5)
     with pytest.raises(WireError, match=words):
         decode_command(CommandKind.RAMP, changed(encode(ramp), **changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rotation_deg": float("nan")}, "^range: rotation_deg"),
+        ({"magnification": "1"}, "^range: magnification"),
+        ({"shift_y_subap": ...}, "^missing: key 'shift_y_subap'"),
+    ],
+)
+def test_a_move_by_no_number_is_refused(changes, words):
+    move = OffloadRequest(
+        id="o-1", shift_x_subap=0.1, shift_y_subap=0.0, rotation_deg=0.0, magnification=0.0
+    )
+    with pytest.raises(WireError, match=words):
+        decode_command(CommandKind.OFFLOAD, changed(encode(move), **changes))
 
 
 def test_the_id_of_an_otherwise_useless_command_can_still_be_read():

@@ -10,6 +10,7 @@ from service.wire import (
     Loop,
     LoopRequest,
     Manifest,
+    OffloadRequest,
     layout_of,
 )
 from sim_rtc.computer.feed import OpenLoopBlock
@@ -192,3 +193,16 @@ def test_a_command_is_carried_out_once_for_ten_minutes(computer):
     other = desk.handle(loop_request("d", leak=0.5), 600.0)
     assert other.reason.startswith("id: d was used for another command")
     assert desk.handle(dither_request("d"), 601.0).reason.startswith("busy")
+
+
+def test_the_image_is_moved_by_who_can_and_refused_by_who_cannot(computer):
+    request = OffloadRequest(
+        id="o-1", shift_x_subap=-0.1, shift_y_subap=0.0, rotation_deg=90.0, magnification=0.002
+    )
+    refused = computer.execute(request)
+    assert not refused.accepted
+    assert refused.reason.startswith("unsupported: ")
+    moved = []
+    computer._move = moved.append
+    assert computer.execute(request).accepted
+    np.testing.assert_allclose(moved, [[-0.1, 0.0, np.pi / 2, 0.002]])

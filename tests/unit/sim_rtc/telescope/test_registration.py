@@ -1,8 +1,19 @@
+from concurrent.futures import Executor, Future
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from service.model.misregistration import Misregistration
-from sim_rtc.telescope.registration import Drift, Flexure, Jump, Schedule, Walk, random_registration
+from sim_rtc.telescope.registration import (
+    Drift,
+    Flexure,
+    Jump,
+    MovingOptics,
+    Schedule,
+    Walk,
+    random_registration,
+)
 
 START = Misregistration(shift_x_subap=0.1)
 
@@ -75,3 +86,25 @@ def test_nothing_asked_for_is_nothing_moved():
     still = Schedule(start=START)
     assert not still.drifts
     assert still.alpha_at(1e4) == START
+
+
+def test_a_stage_moves_what_drifts_and_jumps_by_themselves_as_well():
+    class Plant:
+        def optics(self, alpha):
+            return SimpleNamespace(alpha=alpha)
+
+    class AtOnce(Executor):
+        def submit(self, function, /, *args):
+            future = Future()
+            future.set_result(function(*args))
+            return future
+
+    schedule = Schedule(start=START, jumps=(Jump(time_s=10.0, shift_y_subap=0.2),))
+    optics = MovingOptics(Plant(), schedule, AtOnce())
+    assert optics.start().alpha.shift_x_subap == pytest.approx(0.1)
+    optics.move(np.array([-0.1, 0.0, 0.01, 0.0]))
+    seen = {time_s: optics.at(time_s).alpha for time_s in (2.0, 2.5, 9.0, 10.0, 10.5)}
+    assert seen[2.5].shift_x_subap == pytest.approx(0.0)
+    assert seen[2.5].rotation_rad == pytest.approx(START.rotation_rad + 0.01)
+    assert seen[10.5].shift_y_subap == pytest.approx(START.shift_y_subap + 0.2)
+    assert seen[10.5].shift_x_subap == pytest.approx(0.0)

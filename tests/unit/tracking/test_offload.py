@@ -1,0 +1,178 @@
+"""When a move of the mirror's image is asked for, by how much, and what becomes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.tracking import commands as cmd
+from service.tracking import events as ev
+from service.tracking.policy import Offloading
+from service.tracking.registration import MoveState, Validity
+from service.tracking.state import Mode
+from service.wire import OffloadRequest, Reply
+from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, moved, rtc
+
+LIMITS = Offloading(
+    share=0.5,
+    near=np.array([0.02, 0.02, 0.02, 0.002]) / BOUNDARY_SCALE,
+    most_step=np.array([0.1, 0.03, 0.2, 0.005]) / BOUNDARY_SCALE,
+    reach=np.array([1.0, 1.0, 1.0, 0.0]) / BOUNDARY_SCALE,
+    settle_s=3.0,
+)
+"""The magnification of this device cannot be moved."""
+
+STAYS = replace(POLICY, n_modes_target=400, update_threshold=np.full(4, 9.0))
+MOVES = replace(STAYS, offloading=LIMITS)
+AFTER = Misregistration.from_vector(
+    ALPHA.vector + np.array([-0.06, 0.03, -0.1, 0.0]) / BOUNDARY_SCALE
+)
+
+
+def a_story(mode=Mode.AUTO, policy=MOVES, n_windows=3, alpha=ALPHA):
+    """α is known, and the loop runs on a matrix that was made for it."""
+    story = Story(Mode.AUTO, STAYS)
+    story.meet()
+    story.see(alpha, n_windows=3)
+    story.use("cm-1")
+    story.wait(40.0)
+    story.tell(cmd.SetMode(mode=mode))
+    story.policy = policy
+    story.see(alpha, n_windows=n_windows)
+    return story
+
+
+def answer(story, *, accepted=True, reason="", start_seq=None):
+    (asked,) = story.asked(OffloadRequest)
+    reply = Reply(id=asked.id, accepted=accepted, reason=reason, start_seq=start_seq)
+    return story.tell(ev.Answered(request=asked, reply=reply))
+
+
+def test_a_share_of_the_way_home_is_asked_for_within_the_limits():
+    (asked,) = a_story().asked(OffloadRequest)
+    # ALPHA is 0.12, -0.08 subap, 0.2 deg, 1.003: half of it, 0.03 at most along y
+    assert asked.shift_x_subap == pytest.approx(-0.06, abs=2e-3)
+    assert asked.shift_y_subap == pytest.approx(0.03)
+    assert asked.rotation_deg == pytest.approx(-0.1, abs=5e-3)
+    assert asked.magnification == 0.0
+
+
+@pytest.mark.parametrize("mode", [Mode.PROPOSE, Mode.HOLD])
+def test_nothing_moves_unless_the_service_may_act_by_itself(mode):
+    assert a_story(mode).asked(OffloadRequest) == []
+
+
+def test_nothing_moves_where_nobody_asked_for_it():
+    assert a_story(policy=STAYS).asked(OffloadRequest) == []
+
+
+def test_nothing_moves_while_a_jump_is_suspected():
+    story = a_story(n_windows=0)
+    story.see(moved(shift_x_subap=0.4))
+    assert story.state.registration.doubt
+    story.wait(3.0)
+    assert story.asked(OffloadRequest) == []
+
+
+def test_nothing_moves_while_everything_is_stopped_and_it_does_after():
+    story = a_story(policy=STAYS)
+    story.tell(cmd.StopEverything())
+    story.policy = MOVES
+    story.wait(3.0)
+    assert story.asked(OffloadRequest) == []
+    story.tell(cmd.Resume())
+    story.wait(2.0)
+    assert len(story.asked(OffloadRequest)) == 1
+
+
+def test_where_it_was_drawn_nothing_is_asked_for():
+    near = Misregistration(shift_x_subap=0.015, rotation_rad=2e-4)
+    assert a_story(alpha=near).asked(OffloadRequest) == []
+
+
+def test_the_filter_is_told_and_a_window_there_is_no_jump():
+    story = a_story()
+    answer(story)
+    known = story.state.registration
+    np.testing.assert_allclose(known.alpha.vector, AFTER.vector, atol=3e-3)
+    assert known.n_windows == 0
+    assert known.standing.validity is Validity.STALE
+    assert story.state.move.state is MoveState.MOVED
+    story.wait(4.0)
+    story.see(AFTER, n_windows=2)
+    assert story.state.registration.n_windows == 2
+    assert not [name for name in story.logged if "jump" in name]
+    # and the rest of the way is asked for
+    assert len(story.asked(OffloadRequest)) == 2
+    assert story.state.move.n_moves == 1
+
+
+def test_telemetry_of_the_move_itself_measures_nothing():
+    story = a_story()
+    story.tell(rtc(cm_id="cm-1", t_ns=story.now_ns))
+    answer(story)
+    story.see(AFTER)
+    assert story.state.windows_refused == 1
+    assert story.state.registration.n_windows == 0
+    story.wait(3.0)
+    story.see(AFTER)
+    assert story.state.registration.n_windows == 1
+
+
+def test_without_a_reply_it_may_have_moved_or_not():
+    story = a_story()
+    before = story.state.registration
+    (asked,) = story.asked(OffloadRequest)
+    story.tell(ev.JobFailed(effect=ev.Ask(request=asked), text="nobody answered"))
+    known = story.state.registration
+    np.testing.assert_array_equal(known.alpha.vector, before.alpha.vector)
+    assert np.sqrt(known.covariance[0, 0]) >= 0.06
+    assert story.state.move.state is MoveState.FAILED
+    assert story.state.move.n_moves == 0
+    assert "offload.failed" in story.logged
+
+
+def test_a_device_that_refuses_is_asked_again_later_and_alpha_stands():
+    story = a_story()
+    before = story.state.registration
+    answer(story, accepted=False, reason="busy: the stage is parked")
+    np.testing.assert_array_equal(story.state.registration.alpha.vector, before.alpha.vector)
+    assert story.state.move.text == "busy: the stage is parked"
+    story.see(n_windows=4)
+    assert len(story.asked(OffloadRequest)) == 1
+    story.see(n_windows=14)
+    assert len(story.asked(OffloadRequest)) == 2
+
+
+def test_the_reach_of_the_device_is_never_left():
+    short = replace(LIMITS, reach=np.array([0.04, 0.03, 0.0, 0.0]) / BOUNDARY_SCALE)
+    story = a_story(policy=replace(MOVES, offloading=short))
+    (asked,) = story.asked(OffloadRequest)
+    assert asked.shift_x_subap == pytest.approx(-0.04)
+    assert asked.rotation_deg == 0.0
+    answer(story)
+    story.wait(4.0)
+    story.see(moved(shift_x_subap=-0.04, shift_y_subap=0.03), n_windows=6)
+    assert len(story.asked(OffloadRequest)) == 1
+
+
+def test_the_image_is_not_led_away_from_the_matrix_in_use():
+    """It was made for where the mirror is: a second step waits for the next matrix."""
+    small = replace(LIMITS, most_step=np.array([0.03, 0.03, 0.2, 0.005]) / BOUNDARY_SCALE)
+    story = a_story(policy=replace(MOVES, offloading=small))
+    assert len(story.asked(OffloadRequest)) == 1
+    answer(story)
+    story.wait(4.0)
+    story.see(moved(shift_x_subap=-0.03, shift_y_subap=0.03, rotation_rad=-0.0017), n_windows=6)
+    assert {one.shift_x_subap for one in story.asked(OffloadRequest)[1:]} == {0.0}
+
+
+def test_the_reply_may_say_from_which_frame_on_the_image_stands_still():
+    story = a_story()
+    story.meet(seq=10_000)
+    now_ns = story.state.rtc.t_ns
+    answer(story, start_seq=17_000)
+    assert story.state.void_before_ns_utc == pytest.approx(now_ns + 8 * SECOND, abs=SECOND / 10)

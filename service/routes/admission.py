@@ -21,11 +21,12 @@ import structlog
 from fastapi import Request
 from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from typing_extensions import override
 
 from service.archive import AuditEntry
 from service.errors import ConfigurationError
 from service.keys import Key, KeyFile, KeyScope, is_loopback
-from service.routes.connections import RETRY_S, bounded, to_its_end
+from service.routes.connections import RETRY_S, Middleware, bounded, to_its_end
 from service.routes.problems import problem
 from service.runtime.recording import Caller, Whence
 
@@ -238,7 +239,7 @@ def whence_of(request: Request) -> Whence:
     return Whence.CLI if sent.get("user-agent", "").startswith("pyrcal") else Whence.REST
 
 
-class Admission:
+class Admission(Middleware):
     """Lets requests through to the application that may be made, each with its whole body.
 
     ``request.user`` is then the key it was made with; None: there are no keys, or none is needed.
@@ -264,7 +265,7 @@ class Admission:
         keys: KeyFile | None,
         audit: Callable[[AuditEntry], object],
     ) -> None:
-        self._app = app
+        super().__init__(app)
         self._hosts = hosts
         self._keys = keys
         self._failures = Failures()
@@ -272,11 +273,9 @@ class Admission:
         self._routes: tuple[RouteContext, ...] = ()
         self._trouble = ""
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request that may not be made; hand on every other."""
-        if scope["type"] != "http":
-            return await self._app(scope, receive, send)
-        return await to_its_end(self._admit, scope, receive, send)
+    @override
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await to_its_end(self._admit, scope, receive, send)
 
     async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
         request, scope["user"] = Request(scope), None

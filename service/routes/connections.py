@@ -46,6 +46,27 @@ STREAMED = ("POST", "/v1/fits")
 """The route that reads its body itself: it goes to the disk, with its own limits."""
 
 
+class Middleware:
+    """Stands before the application; what is no request over HTTP passes by it.
+
+    Parameters
+    ----------
+    app
+        The application.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or hand it on."""
+        over_http = scope["type"] == "http"
+        await (self._answer if over_http else self._app)(scope, receive, send)
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        raise NotImplementedError
+
+
 async def bounded(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
     """Run a request with its whole body, if that comes in time and is not too large."""
     request = Request(scope)
@@ -268,33 +289,26 @@ class _Given:
     done: asyncio.Event = field(default_factory=asyncio.Event)
 
 
-class Once:
+class Once(Middleware):
     """Answers a POST with an ``Idempotency-Key`` that has been answered as it was answered then.
 
     One that comes while the first is at work waits for its answer. What is remembered is lost
     with the service, and bounded.
-
-    Parameters
-    ----------
-    app
-        The application.
     """
 
     def __init__(self, app: ASGIApp) -> None:
-        self._app = app
+        super().__init__(app)
         self._given: OrderedDict[_Name, _Given] = OrderedDict()
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or hand it on."""
-        if scope["type"] != "http" or scope["method"] != "POST":
-            return await self._app(scope, receive, send)
+    @override
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         request = Request(scope, receive)
         key = request.headers.get(ONCE)
-        if key is None:
+        if request.method != "POST" or key is None:
             return await self._app(scope, receive, send)
-        return await self._answer(request, key, send)
+        return await self._once(request, key, send)
 
-    async def _answer(self, request: Request, key: str, send: Send) -> None:
+    async def _once(self, request: Request, key: str, send: Send) -> None:
         if (request.method, request.url.path) == STREAMED:
             # it goes to the disk as it comes: nobody has its bytes to compare
             return await self._refuse(request, send, "found a key, expected none with an upload")
@@ -362,24 +376,14 @@ _USABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 """An id of the client's own that is harmless in a log."""
 
 
-class Traced:
+class Traced(Middleware):
     """Gives each request an id, the client's own where that can be used.
 
     What is logged while it is at work has the id as ``request_id``, in the tasks it starts, too.
-
-    Parameters
-    ----------
-    app
-        The application.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, with its id."""
-        if scope["type"] != "http":
-            return await self._app(scope, receive, send)
+    @override
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         told = Headers(scope=scope).get(REQUEST_ID, "")
         name = told if _USABLE.fullmatch(told) else uuid4().hex
 
@@ -389,4 +393,4 @@ class Traced:
             await send(message)
 
         with bound_contextvars(request_id=name):
-            return await self._app(scope, receive, named)
+            await self._app(scope, receive, named)

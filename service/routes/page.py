@@ -25,6 +25,7 @@ from service.model.instrument import Instrument, Mirror
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.routes.admission import OPEN
+from service.routes.connections import Middleware
 from service.routes.views import ServiceDep, answer, shows, view
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"])
@@ -98,24 +99,19 @@ class _Manual(StaticFiles):
         await super().__call__(scope, receive, send)
 
 
-class Packed:
+class Packed(Middleware):
     """Compresses what the page is made of, and the long lists it reads.
 
     Not what is compressed already or cannot be, as noise in a matrix, nor a stream.
-
-    Parameters
-    ----------
-    app
-        The application.
     """
 
     def __init__(self, app: ASGIApp) -> None:
-        self._app = app
+        super().__init__(app)
         self._packing = GZipMiddleware(app, minimum_size=1000, compresslevel=4)
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
-        packs = scope["type"] == "http" and _PACKED.fullmatch(scope["path"])
+    @override
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        packs = _PACKED.fullmatch(scope["path"])
         await (self._packing if packs else self._app)(scope, receive, send)
 
 

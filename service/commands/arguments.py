@@ -268,6 +268,10 @@ def check_files(options: argparse.Namespace) -> None:
     PyrcalError
         One line that names the file.
     """
+    if getattr(options, "instrument", None) is not None:
+        from service.config import instrument_path
+
+        instrument_path(options.instrument)  # a wrong name is told without the schema
     if options.command in {"fit", "reconstruct"}:
         from service.config.instrument_schema import read_instrument_file
 

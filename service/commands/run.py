@@ -7,7 +7,6 @@ import os
 from functools import partial
 
 from service.config import Settings, load_settings
-from service.config.instrument_schema import read_instrument_file
 from service.errors import ConfigurationError
 from service.keys import KeyFile, KeyScope, is_loopback
 
@@ -35,6 +34,8 @@ def main(options: argparse.Namespace) -> int:
         if key in given:
             given[key] = [given[key]]
     settings = load_settings(options.config, os.environ, given)
+    from service.config.instrument_schema import read_instrument_file
+
     read_instrument_file(settings.service.instrument)
     _check_keys(settings)
     # from here on each import takes its time: the worker's first, so that it imports beside them

@@ -5,13 +5,49 @@ Both are TOML, read strictly: an unknown key, a wrong type or a number out of ra
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from service.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from service.config.instrument import load_instrument, packaged_instrument
     from service.config.settings import Settings, load_settings
 
 __all__ = ["Settings", "load_instrument", "load_settings", "packaged_instrument"]
+
+
+_PACKAGED = Path(__file__).parents[1] / "instruments"
+
+
+def instrument_path(name_or_path: str | Path) -> Path:
+    """Return the file of a packaged instrument, or the path as it is; nothing is read yet.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is a name, and no packaged one.
+    """
+    path = Path(name_or_path)
+    is_name = path.suffix != ".toml" and path.name == str(name_or_path)
+    return packaged_file(path.name) if is_name else path
+
+
+def packaged_file(name: str) -> Path:
+    """Return where the file of a packaged instrument is.
+
+    Raises
+    ------
+    ConfigurationError
+        If none has this name.
+    """
+    known = {path.stem: path for path in _PACKAGED.glob("*.toml")}
+    if name not in known:
+        raise ConfigurationError(
+            f"instrument {name}: neither a packaged name ({', '.join(sorted(known))}) "
+            "nor the path of a .toml file"
+        )
+    return known[name]
 
 
 def __getattr__(name: str) -> object:

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from service.config import packaged_file
 from service.config.instrument_schema import (
     Centres,
     InstrumentFile,
     LoopTable,
     ModesTable,
     WfsTable,
-    packaged_file,
     read_instrument_file,
 )
 from service.config.mirrors import MirrorFile, own_modes, read_mirror

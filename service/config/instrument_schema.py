@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
+from service.config import instrument_path
 from service.config.sources import Id, Named, Table, in_file, read_toml, validated
-from service.errors import ConfigurationError
 from service.model.kinds import BasisKind, Influence, Normalisation, SignalKind, SlopeOrder, Stop
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -210,12 +210,9 @@ class InstrumentFile(Table):
     instrument: AboutTable
     wfs: WfsTable
     mirror: MirrorTable
-    modes: ModesTable = ModesTable()
-    slopes: SlopesTable = SlopesTable()
-    loop: LoopTable = LoopTable()
-
-
-_PACKAGED = Path(__file__).parents[1] / "instruments"
+    modes: ModesTable = Field(default_factory=ModesTable)
+    slopes: SlopesTable = Field(default_factory=SlopesTable)
+    loop: LoopTable = Field(default_factory=LoopTable)
 
 
 def read_instrument_file(name_or_path: str | Path) -> tuple[InstrumentFile, Path]:
@@ -226,24 +223,5 @@ def read_instrument_file(name_or_path: str | Path) -> tuple[InstrumentFile, Path
     ConfigurationError
         If there is no such file, or one line with the key that cannot be used.
     """
-    path = Path(name_or_path)
-    if path.suffix != ".toml" and path.name == str(name_or_path):
-        path = packaged_file(str(name_or_path))
+    path = instrument_path(name_or_path)
     return validated(InstrumentFile, read_toml(path), in_file(path)), path
-
-
-def packaged_file(name: str) -> Path:
-    """Return where the file of a packaged instrument is.
-
-    Raises
-    ------
-    ConfigurationError
-        If none has this name.
-    """
-    known = {path.stem: path for path in _PACKAGED.glob("*.toml")}
-    if name not in known:
-        raise ConfigurationError(
-            f"instrument {name}: neither a packaged name ({', '.join(sorted(known))}) "
-            "nor the path of a .toml file"
-        )
-    return known[name]

@@ -369,17 +369,17 @@ _WORD = {str: "text", float: "number"}
 class Settings(Table):
     """Everything the user may decide about the service."""
 
-    service: ServiceTable = ServiceTable()
-    zenoh: ZenohTable = ZenohTable()
-    api: ApiTable = ApiTable()
-    dither: DitherTable = DitherTable()
-    tracking: TrackingTable = TrackingTable()
-    acquisition: AcquisitionTable = AcquisitionTable()
-    control: ControlTable = ControlTable()
-    offload: OffloadTable = OffloadTable()
-    compute: ComputeTable = ComputeTable()
-    fits: FitsTable = FitsTable()
-    archive: ArchiveTable = ArchiveTable()
+    service: ServiceTable = Field(default_factory=ServiceTable)
+    zenoh: ZenohTable = Field(default_factory=ZenohTable)
+    api: ApiTable = Field(default_factory=ApiTable)
+    dither: DitherTable = Field(default_factory=DitherTable)
+    tracking: TrackingTable = Field(default_factory=TrackingTable)
+    acquisition: AcquisitionTable = Field(default_factory=AcquisitionTable)
+    control: ControlTable = Field(default_factory=ControlTable)
+    offload: OffloadTable = Field(default_factory=OffloadTable)
+    compute: ComputeTable = Field(default_factory=ComputeTable)
+    fits: FitsTable = Field(default_factory=FitsTable)
+    archive: ArchiveTable = Field(default_factory=ArchiveTable)
     rules: Tuple[RuleTable] = ()
 
     @model_validator(mode="after")

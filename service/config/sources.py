@@ -44,6 +44,7 @@ class Table(BaseModel):
         strict=True,
         allow_inf_nan=False,
         use_attribute_docstrings=True,
+        defer_build=True,  # of what is asked for: to build them all takes longer than an answer
     )
 
 

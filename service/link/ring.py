@@ -221,17 +221,19 @@ class FrameRing:
 
     def _fill(self, batch: FrameBatch, rows: NDArray[np.intp], slots: NDArray[np.int64]) -> None:
         header = batch.header
-        finite = np.isfinite(batch.rows[rows]).all(axis=1)
+        whole = len(rows) == header.n  # as nearly always: views instead of copies
+        chosen: slice | NDArray[np.intp] = slice(None) if whole else rows
+        finite = np.isfinite(batch.rows[chosen]).all(axis=1)
         self._state[slots] = np.where(finite, HELD, VOID)
         self._counts.lost -= len(rows)
         self._counts.nonfinite += int(np.count_nonzero(~finite))
         self._counts.received += int(np.count_nonzero(finite))
         places = (header.seq0 + rows) % self._room
-        self._slopes[places] = batch.slopes[rows]
-        self._commands[places] = batch.commands_m[rows]
+        self._slopes[places] = batch.slopes[chosen]
+        self._commands[places] = batch.commands_m[chosen]
         dither = batch.dither_m
         if dither is not None:
-            self._dither[places] = dither[rows]
+            self._dither[places] = dither[chosen]
         self._has_dither[slots] = header.dither
         self._t_ns[slots] = header.t0_ns + rows * header.dt_ns
         self._dt_ns[slots] = header.dt_ns

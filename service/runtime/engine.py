@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.slopes import likely_kind
 from service.runtime.streams import (
+    REST_S,
     VERDICTS,
     Streams,
     fed,
@@ -39,6 +40,9 @@ from service.tracking.policy import Policy
 from service.tracking.state import Level, TrackerState
 from service.wire import Status
 from service.worker import Description
+
+WATCH_INTERVAL_S = 4.0
+"""Between two looks of the passive watchdog: a jump is to be seen within 5 s."""
 
 Step = Callable[[TrackerState, Event, Policy, int], tuple[TrackerState, tuple[Effect, ...]]]
 
@@ -142,6 +146,15 @@ class Engine:
                     self._driver.fit(window)
         for event in news(was_silent_s, self.streams, self.state):
             self.post(event)
+
+    @property
+    def look_interval_s(self) -> float:
+        """Seconds between two looks of the passive watchdog.
+
+        Windows of a dither show a jump themselves: every other stretch of telemetry is enough then.
+        """
+        dithered = self.streams is not None and self.streams.cutter is not None
+        return WATCH_INTERVAL_S + (REST_S if dithered else 0.0)
 
     def take_sums(self) -> Passive | str:
         """Return the sums of ordinary telemetry and begin new ones, or why there are none yet."""

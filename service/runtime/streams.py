@@ -39,6 +39,9 @@ from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0
 
+REST_S = 4.0
+"""After a look, before ordinary telemetry is summed again while windows of a dither come."""
+
 WINDOW_SAMPLES = 5
 """Frames of a window that must have been looked at before it can be said to be off the loop."""
 
@@ -385,6 +388,14 @@ def taken(streams: Streams) -> tuple[Streams, Passive | str]:
         n_effective=0.0,
         since_ns_utc=streams.heard_ns_utc - waiting_ns,
     )
+    if streams.cutter is not None and sums.tail is not None:
+        begun = replace(
+            begun,
+            waiting=(),
+            begun=False,
+            from_seq=sums.tail.next_seq + round(REST_S * rtc.frame_rate_hz),
+            since_ns_utc=streams.heard_ns_utc + round(REST_S * 1e9),
+        )
     # a window that is under way is of the gains with which it began
     loop = rtc if streams.cutter is None else streams.loop
     return replace(streams, passive=begun, loop=loop), sums

@@ -45,11 +45,8 @@ from service.worker import Description, OpticsWorker
 POLL_S = 0.1
 """Longest time telemetry waits to be taken in: frames held for a hole ring no bell."""
 
-GATHER_S = 0.08
+GATHER_S = 0.16
 """Between two visits to the link: each costs two milliseconds, whatever there is."""
-
-WATCH_INTERVAL_S = 4.0
-"""Between two looks of the passive watchdog: a jump is to be seen within 5 s."""
 
 DESCRIBE_ATTEMPTS = 3
 """Workers that may die while the model is prepared before the service gives up."""
@@ -349,7 +346,7 @@ class Supervisor:
 
     async def _watch(self) -> None:
         while True:
-            await asyncio.sleep(WATCH_INTERVAL_S)
+            await asyncio.sleep(self._engine.look_interval_s)
             async with self._workers.turn("watch"):
                 sums = self._engine.take_sums()
                 event = await watched(sums, self._engine.state, self._workers)

@@ -213,6 +213,9 @@ class Passive:
     begun: bool = False
     """Whether frames of this run have been multiplied."""
 
+    from_seq: int = 0
+    """Frames before this one are left out."""
+
     since_ns_utc: int = 0
     """No frame in the sums is older, by the RTC's clock; 0: not known."""
 
@@ -238,7 +241,7 @@ def accumulate(state: Passive, block: FrameBlock) -> Passive:
     A dither of controlled modes is as good as their own motion. What moves outside the loop is
     taken out of the instrument, where its response would pass for that of controlled modes.
     """
-    if state.why_unusable is not None:
+    if state.why_unusable is not None or block.first_seq < state.from_seq:
         return state
     block = replace(block, dither_m=None)
     if state.tail is not None and not block.follows(state.tail):

@@ -65,7 +65,7 @@ def test_the_gate_judges_the_modes_that_move_by_the_bound_it_was_given(night):
 
 def test_ordinary_telemetry_is_looked_at_and_agrees(night):
     looks = [entry for entry in night.state.history if entry.source is Source.PASSIVE]
-    assert len(looks) >= 2
+    assert looks
     assert night.state.watchdog.consistent
 
 

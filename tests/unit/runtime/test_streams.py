@@ -441,7 +441,8 @@ class TestLooks:
     def test_no_two_looks_share_telemetry(self, streams):
         """Nothing is forgotten here: two looks hold together what one of all telemetry would."""
         sums = replace(streams.passive, memory_frames=1e12)
-        one, _ = play(replace(streams, passive=sums), 0, 20)
+        quiet = with_dither(replace(streams, passive=sums), None, WINDOW_S)
+        one, _ = play(quiet, 0, 20)
         all_of_it, _ = play(one, 2000, 20)
         rest, first = taken(one)
         rest, _ = play(rest, 2000, 20)
@@ -449,6 +450,16 @@ class TestLooks:
         _, both = taken(all_of_it)
         assert both.n_effective == pytest.approx(first.n_effective + second.n_effective)
         np.testing.assert_allclose(both.power, first.power + second.power, rtol=1e-5, atol=1e-20)
+
+    def test_beside_windows_of_a_dither_every_other_stretch_is_left_out(self, streams):
+        """And a look says of which time it is."""
+        one, _ = play(streams, 0, 20)
+        rest, first = taken(one)
+        resting, _ = play(rest, 2000, 40)
+        assert isinstance(taken(resting)[1], str)
+        _, second = taken(play(resting, 6000, 20)[0])
+        assert second.n_effective == pytest.approx(first.n_effective, rel=0.02)
+        assert second.since_ns_utc == first.tail.next_t_ns - 1_000_000 + 4_000_000_000
 
     def test_what_is_taken_is_gone_at_once(self, streams):
         one, _ = play(streams, 0, 20)

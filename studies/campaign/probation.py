@@ -15,6 +15,7 @@ import argparse
 import json
 import sys
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -243,10 +244,16 @@ class Night:
 
 
 def nights(plant: str, n_marginal: int, n_good: int, first_seed: int, output: Path) -> None:
-    """Run trials, night after night, and write what came of each at once."""
-    left = {"marginal": n_marginal, "good": n_good}
-    seed = first_seed
-    while any(left.values()):
+    """Run trials, night after night, and write what came of each at once.
+
+    Those that are in the file count: it goes on with the night after the last of them.
+    """
+    lines = output.read_text(encoding="utf-8").splitlines() if output.exists() else []
+    done = [row for row in map(json.loads, lines) if row["plant"] == plant]
+    n_done = Counter(row["kind"] for row in done)
+    left = {"marginal": n_marginal - n_done["marginal"], "good": n_good - n_done["good"]}
+    seed = max([first_seed, *(row["seed"] + 1 for row in done)])
+    while any(n > 0 for n in left.values()):
         night, rng = Night(plant, seed), np.random.default_rng(1000 + seed)
         for k in range(TRIALS_A_NIGHT):
             kinds = [kind for kind, n in left.items() if n > 0]

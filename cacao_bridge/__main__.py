@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import queue
 import signal
 import sys
 import threading
@@ -13,15 +14,20 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+import numpy as np
 import structlog
 import zenoh
+import zenoh.ext
+from numpy.typing import NDArray
+from typing_extensions import override
 
 from cacao_bridge.calibration import consent
 from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
 from service.errors import PyrcalError
-from service.wire import Keys, encode
+from service.wire import FrameHeader, Keys, encode
 from service.wire.frames import encode_frames
+from sim_rtc.computer.feed import Background
 from sim_rtc.link.matrices import Matrices
 from sim_rtc.link.replies import Replies
 from sim_rtc.link.session import (
@@ -35,7 +41,9 @@ from sim_rtc.link.session import (
 _STATUS_PERIOD_S: Final = 0.2
 _REPORT_PERIOD_S: Final = 10.0
 _UNLINKED_PAUSE_S: Final = 0.2
-_LEAST_BATCH_S: Final = 0.01
+_LEAST_BATCH_S: Final = 0.02
+_BACKLOG: Final = 64
+"""Messages that wait to be sent; beyond it they are dropped, with a line in the log."""
 _log = structlog.get_logger("cacao")
 
 
@@ -80,8 +88,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+class Sender(Background):
+    """Sends rows in a thread of its own while a ``with`` block lasts: a put may wait."""
+
+    def __init__(self, frames: zenoh.ext.AdvancedPublisher) -> None:
+        super().__init__("sender")
+        self._frames = frames
+        self._waiting: queue.Queue[tuple[FrameHeader, NDArray[np.float32]]] = queue.Queue(_BACKLOG)
+
+    def offer(self, header: FrameHeader, rows: NDArray[np.float32]) -> None:
+        """Queue rows; never waits."""
+        try:
+            self._waiting.put_nowait((header, rows))
+        except queue.Full:
+            _log.warning("frames.dropped", n=header.n, first=header.seq0, waiting=_BACKLOG)
+
+    @override
+    def _work(self) -> None:
+        while not self._stopped.is_set():
+            try:
+                header, rows = self._waiting.get(timeout=_UNLINKED_PAUSE_S)
+            except queue.Empty:
+                continue
+            payload, attachment = encode_frames(header, rows)
+            self._frames.put(payload, attachment=attachment)
+
+
 class Bridge:
-    """Streams on one side, the contract on the other, in one thread."""
+    """Streams on one side, the contract on the other."""
 
     def __init__(self, settings: Settings) -> None:
         """Raise ``ConfigurationError`` if a file of the settings is not what it should be."""
@@ -102,24 +136,28 @@ class Bridge:
                     replies.declare(session)
                     with (
                         Matrices(session, keys, self._cacao) as matrices,
+                        Sender(frames_publisher(session, keys, 1.0 / _LEAST_BATCH_S)) as sender,
                         Token(session, keys, None),
                     ):
-                        self._speak(session, keys, matrices, stopped)
+                        self._speak(session, keys, matrices, sender, stopped)
         finally:
             self._cacao.close()
 
     def _speak(
-        self, session: zenoh.Session, keys: Keys, matrices: Matrices, stopped: threading.Event
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        matrices: Matrices,
+        sender: Sender,
+        stopped: threading.Event,
     ) -> None:
         """Send what comes until ``stopped`` or cut off."""
-        frames = frames_publisher(session, keys, 1.0 / _LEAST_BATCH_S)
         status = status_publisher(session, keys)
         lifeline, next_status_s, next_report_s = Lifeline(time.monotonic()), 0.0, 0.0
         said = ""
         while not stopped.is_set():
             for header, rows in self._cacao.poll():
-                payload, attachment = encode_frames(header, rows)
-                frames.put(payload, attachment=attachment)
+                sender.offer(header, rows)
                 self._n_sent += header.n
             if self._cacao.has_news:
                 matrices.look()

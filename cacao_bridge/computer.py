@@ -26,6 +26,7 @@ from service.wire import (
     Reply,
     Status,
 )
+from service.wire.codec import TEXT_LIMIT
 from service.wire.status import DitherStatus
 from sim_rtc.computer.measure import Measurement
 from sim_rtc.computer.reconstructors import Terms
@@ -33,6 +34,9 @@ from sim_rtc.computer.telemetry import Identity, Reconstructor, new_session
 
 Array32 = NDArray[np.float32]
 _log = structlog.get_logger("cacao")
+
+_PAUSE_S: Final = 0.02
+"""Between two looks where rings are long: 50 messages a second."""
 
 _STANDS_S: Final = 1.0
 """Without a frame, until a counter is said to stand."""
@@ -57,6 +61,9 @@ class Cacao:
             system=wire.system, basis_id=wire.basis_id, config_id=wire.config_id
         )
         self._calibration = Calibration(settings, self.identity)
+        n_slopes = len(self._calibration.index)
+        self._whole = np.array_equal(self._calibration.index, np.arange(n_slopes))
+        """Whether all of a frame is slopes."""
         self._projection = np.linalg.pinv(
             self._calibration.dm_modes.reshape(self._loop.n_modes, -1).astype(np.float64)
         ).astype(np.float32)
@@ -71,6 +78,7 @@ class Cacao:
         self._played: deque[tuple[int, int, Array32]] = deque(maxlen=100_000)
         self._player: Player | None = None
         self._law: tuple[tuple[float, ...], float] | None = None
+        self._law_trouble = ""
         self._n_next: int | None = None
         self._streams: dict[str, Stream] = {}
         self.complaint = ""
@@ -107,7 +115,7 @@ class Cacao:
         """How long may be slept between two looks without a frame being lost."""
         streams = [self._streams.get(name) for name in ("slopes", "commands")]
         n_kept = min((stream.n_kept for stream in streams if stream is not None), default=64)
-        return min(max(n_kept / 4, 0.25) / self._loop.frame_rate_hz, 0.01)
+        return min(max(n_kept / 4, 0.25) / self._loop.frame_rate_hz, _PAUSE_S)
 
     def poll(self) -> list[tuple[FrameHeader, Array32]]:
         """Return what is new, fit to be sent; what is wrong is in :attr:`complaint`."""
@@ -116,8 +124,8 @@ class Cacao:
             self._read_slopes()
             self._read_commands()
             self._look_after_matrices()
-            self._complain(self._standing() or self._off_rate())
-        except StreamError as error:
+            self._complain(self._standing() or self._off_rate() or self._law_trouble)
+        except (StreamError, OSError) as error:
             self._complain(str(error))
             self._unlink()
             return []
@@ -141,8 +149,7 @@ class Cacao:
         slopes, commands = self._open(self._names.slopes), self._open(self._names.commands)
         multiplied = self._open(self._names.multiplied)
         needed = int(self._calibration.index.max()) + 1
-        whole = len(self._calibration.index) == needed  # no index: all of it is slopes
-        if slopes.n_values < needed or (whole and slopes.n_values != needed):
+        if slopes.n_values < needed or (self._whole and slopes.n_values != needed):
             raise StreamError(f"{slopes.name}: found {slopes.n_values} values, expected {needed}")
         n_modes, n_actuators = self._loop.n_modes, self._projection.shape[0]
         modal = self._loop.commands_are == "modes"
@@ -151,10 +158,20 @@ class Cacao:
             expected = f"at most {n_modes} modes" if modal else f"{n_actuators} actuators"
             found = f"{commands.n_values} values {commands.shape}"
             raise StreamError(f"{commands.name}: found {found}, expected {expected}")
+        if self._names.dither:
+            self._channel().write(np.zeros(n_actuators, dtype=np.float32))
         self._streams = {"slopes": slopes, "commands": commands, "multiplied": multiplied}
         self._commands_writer = commands.writer
         for name, stream in self._streams.items():
             _log.info("stream.linked", role=name, name=stream.name, keeps=stream.n_kept)
+
+    def _channel(self) -> Stream:
+        """Return the mirror's channel that is the bridge's own."""
+        channel, n_actuators = self._open(self._names.dither, writable=True), len(self._projection)
+        if channel.n_values != n_actuators:
+            found = f"{channel.n_values} values, expected {n_actuators}"
+            raise StreamError(f"{channel.name}: found {found}")
+        return channel
 
     def _read_slopes(self) -> None:
         slopes = self._streams["slopes"]
@@ -165,7 +182,8 @@ class Cacao:
             self.n_lost += frames.n_lost
             _log.warning("frames.lost", n=frames.n_lost, before=frames.first, keeps=slopes.n_kept)
         self._slopes_at = frames.first + len(frames.values) - 1
-        self._rows.take_slopes(frames.first, frames.values[:, self._calibration.index])
+        values = frames.values if self._whole else frames.values[:, self._calibration.index]
+        self._rows.take_slopes(frames.first, values)
         self._moved_s["slopes"] = time.monotonic()
         self._follow_clock(self._slopes_at, slopes.written_ns or time.time_ns())
 
@@ -187,8 +205,9 @@ class Cacao:
                 told = f"its trace names no frame of {slopes.name}"
                 raise StreamError(f"{commands.name}: {told}; set loop.counter_offset")
             return
-        if before not in {None, self._offset}:
-            # Some of these frames answer one that is not known: the loop left slopes out.
+        if before != self._offset:
+            # Which slopes some of these answer is not known: the first ones, or the loop left
+            # slopes out.
             _log.warning("commands.unpaired", n=len(frames.values), before=before, now=self._offset)
             return
         self._rows.take_commands(frames.first + self._offset, self._in_modes(frames.values))
@@ -297,8 +316,11 @@ class Cacao:
 
     def stage(self, reconstructor: Reconstructor) -> None:
         """Keep a checked matrix until cacao may have it."""
-        with self._lock:
-            self._calibration.stage(reconstructor)
+        try:
+            with self._lock:
+                self._calibration.stage(reconstructor)
+        except OSError as error:
+            _log.error("matrix.not-kept", id=reconstructor.manifest.id, reason=str(error))
 
     @property
     def has_news(self) -> bool:
@@ -341,6 +363,7 @@ class Cacao:
             max_dither_m=self._loop.max_dither_m if self._names.dither else 0.0,
             max_dither_modes=self._loop.n_modes if self._names.dither else 0,
             magnitude=None,
+            trouble=self.complaint[:TEXT_LIMIT] or None,
         )
 
     def _gains_and_leak(self) -> tuple[tuple[float, ...], float]:
@@ -356,16 +379,17 @@ class Cacao:
                     values = self._open(name).latest().ravel()[:n_modes]
                     row[:], row[: len(values)] = 0.0, values
         except StreamError as error:
-            self._complain(str(error))
-            if self._law is not None:
-                return self._law
+            self._law_trouble = str(error)
+            return self._law or (tuple(both[0].tolist()), self._loop.leak)
         gains, factors = both
         n_controlled = len(self.reconstructor.matrix)
         in_loop = factors[:n_controlled][gains[:n_controlled] > 0]
-        leak = float(np.median(in_loop)) if len(in_loop) else self._loop.leak
+        leak, self._law_trouble = float(np.median(in_loop)) if len(in_loop) else self._loop.leak, ""
         if len(in_loop) and np.ptp(in_loop) > _LEAK_SPREAD:
             span = f"{in_loop.min():.4f} to {in_loop.max():.4f}"
-            self._complain(f"{self._names.factors}: found {span}, expected the same for all modes")
+            self._law_trouble = (
+                f"{self._names.factors}: found {span}, expected the same for all modes"
+            )
         product = np.clip(gains * factors if self._names.gains else gains, 0.0, None)
         self._law = tuple(product.tolist()), min(max(leak, 0.0), 1.0)
         return self._law
@@ -398,13 +422,10 @@ class Cacao:
         if reason:
             return reason, None
         try:
-            channel = self._open(self._names.dither, writable=True)
+            channel = self._channel()
         except StreamError as error:
             return f"busy: {error}"[:1000], None
         per_metre = self._calibration.dm_modes.reshape(loop.n_modes, -1)
-        if channel.n_values != per_metre.shape[1]:
-            found = f"{channel.n_values} values, expected {per_metre.shape[1]}"
-            return f"range: {channel.name}: found {found}", None
         start_seq = slopes.counter + round(_LEAD_S * loop.frame_rate_hz) + 1
         mirror = Mirror(
             channel=channel,

@@ -28,6 +28,8 @@ Array32 = NDArray[np.float32]
 _log = structlog.get_logger("cacao")
 
 _LOOKS_PER_FRAME: Final = 8.0
+_STANDS_S: Final = 0.5
+"""Without a frame of slopes, until the dither is taken off the mirror and ended."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,14 +79,18 @@ class Player(Background):
         last = self.status.start_seq + round(request.duration_s * self._mirror.frame_rate_hz)
         pause_s = 1.0 / (_LOOKS_PER_FRAME * self._mirror.frame_rate_hz)
         before, value_m = self._slopes.counter, self._value_m(0)
+        moved_s = time.monotonic()
         while True:
             now = self._slopes.counter
-            if now == before and not self._stopped.is_set():
+            stands = time.monotonic() - moved_s > _STANDS_S
+            if now == before and not stands and not self._stopped.is_set():
                 time.sleep(pause_s)
                 continue
+            moved_s = time.monotonic()
             if now > before + 1:
                 self._played(before + 1, now - 1, value_m)
-            over = self._stopped.is_set() or now + self._mirror.lead >= last or now < before
+            over = stands or now + self._mirror.lead >= last or now < before
+            over = over or self._stopped.is_set()
             value_m = np.zeros_like(value_m) if over else self._value_m(now + self._mirror.lead)
             self._mirror.channel.write(value_m @ self._mirror.per_metre)
             self._played(now, now, value_m)

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.wire.frames import FRAMES_PER_BATCH
+from service.wire.frames import BATCH_LIMIT, FRAMES_PER_BATCH
 
 Array32 = NDArray[np.float32]
 
@@ -43,6 +43,8 @@ class Rows:
         self._slopes = np.zeros((_KEPT, n_slopes), dtype=np.float32)
         self._commands_m = np.zeros((_KEPT, n_modes), dtype=np.float32)
         self._dither_m = np.zeros((_KEPT, n_modes if dither else 0), dtype=np.float32)
+        n_bytes = 4 * (n_slopes + n_modes * (1 + dither))
+        self._per_message = max(1, min(FRAMES_PER_BATCH, BATCH_LIMIT // n_bytes))
         self.n_unpaired = 0
         """Frames that were left out because their command never came."""
         self.forget()
@@ -96,8 +98,8 @@ class Rows:
                 if self._newest - self.next < PATIENCE_FRAMES:
                     break
                 self.skip(int(frames[first]))
-            for start in range(first, last, FRAMES_PER_BATCH):
-                part = frames[start : min(start + FRAMES_PER_BATCH, last)]
+            for start in range(first, last, self._per_message):
+                part = frames[start : min(start + self._per_message, last)]
                 runs.append((int(part[0]), self._rows(part)))
             self.next = int(frames[last - 1]) + 1
         self.skip(self._newest - PATIENCE_FRAMES)

@@ -74,6 +74,7 @@ PARTS: Final[dict[str, type]] = {
 
 MAY_BE_ABSENT: Final = {
     ("status", "pointing"),
+    ("status", "trouble"),
     ("im-commit", "reason"),
     ("state", "validity"),
     ("state", "waiting_for"),

@@ -186,7 +186,9 @@ def _for_the_worker(facts: Facts) -> Iterator[Waiting]:
 
 def _for_messages(facts: Facts) -> Iterator[Waiting]:
     """Yield what of the RTC's telemetry does not come."""
-    link, where = facts.link, f"ao/v1/{facts.state.system}"
+    link, where, rtc = facts.link, f"ao/v1/{facts.state.system}", facts.state.rtc
+    if rtc is not None and rtc.trouble and link.rtc_alive:
+        yield Waiting(name="rtc-trouble", party=Party.RTC, text=rtc.trouble, hinders=True)
     no_status = facts.status_silent_s >= SILENT_S
     if facts.frames_come:
         if no_status:

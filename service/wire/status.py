@@ -142,6 +142,9 @@ class Status:
     pointing: Pointing | None = None
     """An extension: an RTC that does not know it may leave the key out."""
 
+    trouble: Text | None = None
+    """An extension: what is wrong on the RTC's side, for people; None or no such key: nothing."""
+
     @property
     def dither_id(self) -> str | None:
         """The dither now running; None: none."""
@@ -278,6 +281,8 @@ def _opened(data: bytes, where: str) -> Map:
 
 def _status_keys(keys: Map) -> Map:
     playing = keys["dither"]
+    if keys["trouble"] is None:
+        del keys["trouble"]
     if playing is None:
         return keys
     action = {"action": "start", "start_seq": playing.start_seq}
@@ -321,7 +326,7 @@ travels(
     Form(
         Status,
         WHERE,
-        extensions=("pointing",),
+        extensions=("pointing", "trouble"),
         opened=_opened,
         keys=_status_keys,
         fields=_status_fields,

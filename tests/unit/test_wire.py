@@ -251,6 +251,13 @@ def test_an_rtc_may_say_where_the_telescope_looks_or_know_nothing_of_it():
         assert decode(Status, changed(encode(looking), pointing=unknown)) == STATUS
 
 
+def test_an_rtc_may_say_what_is_wrong_on_its_side():
+    troubled = replace(STATUS, trouble="aol1_imWFS2: its counter stands at 7")
+    assert decode(Status, encode(troubled)) == troubled
+    assert b"trouble" not in encode(STATUS), "who has none says what was said before there was one"
+    assert decode(Status, changed(encode(troubled), trouble=None)) == STATUS
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -101,3 +101,13 @@ def test_the_dither_is_a_part_of_the_command_as_late_as_it(delay):
     rows.take_commands(500, np.zeros((60, 2), dtype=np.float32))
     later = rows_of(rows.ready())
     assert all(not row[3:].any() for row in later.values()), "the ring has come around"
+
+
+def test_a_message_holds_as_many_rows_as_it_may():
+    for n_slopes, most in ((10, 50), (24_998, 40)):
+        rows = Rows(n_slopes, 2, 1.0, dither=False)
+        rows.take_slopes(0, np.zeros((70, n_slopes), dtype=np.float32))
+        rows.take_commands(0, np.zeros((70, 2), dtype=np.float32))
+        runs = rows.ready()
+        assert max(len(part) for _, part in runs) == most
+        assert [seq for seq, _ in runs] == list(range(1, 70, most))

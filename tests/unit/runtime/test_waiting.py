@@ -181,6 +181,14 @@ def test_what_the_rtc_does_not_send_is_waited_for(found, name, party, hinders):
     assert len(wait.text) > 20
 
 
+def test_what_the_rtc_says_of_itself_is_waited_for_in_its_words_while_it_is_there():
+    state = TrackerState(system="small", rtc=rtc(trouble="aol1_imWFS2: its counter stands at 7"))
+    wait = waits(link(*WELL), state)["rtc-trouble"]
+    assert (wait.party, wait.hinders) == ("rtc", True)
+    assert wait.text == "aol1_imWFS2: its counter stands at 7"
+    assert "rtc-trouble" not in waits(link(*WELL, rtc_alive=False), state)
+
+
 def test_a_first_status_is_given_three_seconds():
     assert waits(link(*WELL[:1], status_age_s=None, session_age_s=2.9)) == {}
 

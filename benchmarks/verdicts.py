@@ -32,7 +32,7 @@ from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan, Spectra, fit_w
 from service.telemetry.windows import ClosedLoop
 from service.tracking.state import Mode
 from service.tracking.updates import JUDGE_INTERVAL_S
-from service.worker import Compute, OpticsWorker
+from service.worker import Compute, Conditions, OpticsWorker
 from studies.campaign.observatory import Observatory
 
 N_MODES = 594
@@ -79,7 +79,7 @@ def main() -> None:
         near, aligned = model.linearise(ALPHA), model.interaction_matrix(IN_USE)
         # the workbench has its own, once
         few = reconstruct(aligned, Recipe(n_modes=30)).matrix
-        bench.judge(few, ALPHA, np.diag(SIGMA**2), _settings(30), BOUND)
+        bench.judge(few, _conditions(np.diag(SIGMA**2), _settings(30)))
         sys.stdout.write(
             "| modes | job | s | fits | inversions | busy |\n|---|---|---|---|---|---|\n"
         )
@@ -143,7 +143,7 @@ def _jobs(
     yield Job(name="inversion", work=lambda: reconstruct(aligned, recipe))
     yield Job(
         name="gate",
-        work=lambda: bench.judge(matrix, ALPHA, covariance, settings, BOUND),
+        work=lambda: bench.judge(matrix, _conditions(covariance, settings)),
         every_s=JUDGE_INTERVAL_S,
     )
     yield Job(
@@ -153,8 +153,12 @@ def _jobs(
     )
     yield Job(
         name="new reconstructor, judged",
-        work=lambda: bench.make(ALPHA, covariance, settings, BOUND),
+        work=lambda: bench.make(_conditions(covariance, settings)),
     )
+
+
+def _conditions(covariance: NDArray[np.float64], loop: ControlLoop) -> Conditions:
+    return Conditions(alpha=ALPHA, covariance=covariance, loop=loop, bound=BOUND)
 
 
 def _settings(n_modes: int) -> ControlLoop:

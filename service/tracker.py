@@ -63,11 +63,11 @@ def step(
     """
     refuse_if_occupied(state, event, now_ns)
     turn = Turn(state, event, policy, now_ns)
-    attention.judge(turn)
+    attention.judge_rules(turn)
     measuring.watch_measurement(turn)
     REACTIONS[type(event)](turn, event)
     probation.follow(turn)
-    attention.judge(turn)
+    attention.judge_rules(turn)
     note_declined(turn)
     _go_on(turn)
     attention.follow(turn)
@@ -187,11 +187,11 @@ REACTIONS: Final[dict[type, Callable[[Turn, Any], object]]] = {
     ev.JobFailed: _on_failure,
     cmd.SetMode: operator.set_mode,
     cmd.SetPointing: lambda turn, command: validity.point(turn, command.pointing),
-    cmd.SetValue: attention.tell,
+    cmd.SetValue: attention.tell_value,
     cmd.SetLoop: operator.set_loop,
     cmd.Ramp: operator.ramp,
     cmd.StopEverything: resume.stop,
-    cmd.Resume: resume.resume,
+    cmd.Resume: resume.release,
     cmd.Acquire: acquisition.acquire_on_command,
     cmd.AbortAcquisition: acquisition.abort_on_command,
     cmd.StartDither: operator.start_dither,

@@ -31,7 +31,7 @@ from service.tracking.products import (
 )
 from service.tracking.registration import Registration, table_of
 from service.tracking.state import TrackerState
-from service.worker import OpticsWorker
+from service.worker import Conditions, OpticsWorker
 
 UNKNOWN_PARENT = "unknown"
 """Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""
@@ -161,14 +161,8 @@ class Actions:
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
         gains = (effect.gains or extended_gains(rtc, effect.n_modes))[: effect.n_modes]
-        made = await self._workers.call(
-            OpticsWorker.make,
-            registration.alpha,
-            registration.total_covariance,
-            loop_to_judge(state, gains),
-            self._publishing.pole_radius_bound,
-            effect.fewer,
-        )
+        conditions = self._conditions(state, gains)
+        made = await self._workers.call(OpticsWorker.make, conditions, effect.fewer)
         accepted = made.gate.accepted
         parent = state.in_use or UNKNOWN_PARENT
         record = self._record(len(made.matrix), effect.why, registration, parent)
@@ -235,10 +229,7 @@ class Actions:
             verdict, expected = await self._workers.call(
                 OpticsWorker.margin,
                 matrix,
-                registration.alpha,
-                registration.total_covariance,
-                loop_to_judge(state, gains),
-                self._publishing.pole_radius_bound,
+                self._conditions(state, gains),
                 expected_gains(registration, rtc.n_modes),
                 rtc.magnitude,
             )
@@ -255,14 +246,17 @@ class Actions:
     async def _verdict(
         self, matrix: NDArray[np.float32], gains: tuple[float, ...], state: TrackerState
     ) -> GateVerdict:
+        conditions = self._conditions(state, gains)
+        return await self._workers.call(OpticsWorker.judge, matrix, conditions)
+
+    def _conditions(self, state: TrackerState, gains: tuple[float, ...]) -> Conditions:
+        """Return what a reconstructor has to hold in now, with these gains."""
         registration = _registered(state)
-        return await self._workers.call(
-            OpticsWorker.judge,
-            matrix,
-            registration.alpha,
-            registration.total_covariance,
-            loop_to_judge(state, gains),
-            self._publishing.pole_radius_bound,
+        return Conditions(
+            alpha=registration.alpha,
+            covariance=registration.total_covariance,
+            loop=loop_to_judge(state, gains),
+            bound=self._publishing.pole_radius_bound,
         )
 
     async def _ask_judged(self, request: wire.LoopRequest, state: TrackerState) -> Event | None:

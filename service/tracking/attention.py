@@ -230,7 +230,7 @@ FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
 """What a condition may ask of the state; nothing where it is not known."""
 
 
-def judge(turn: Turn) -> None:
+def judge_rules(turn: Turn) -> None:
     """Raise the alarms of the rules that hold, and end those of the others."""
     raised = {alarm.name: alarm.text for alarm in turn.state.alarms}
     for rule in turn.policy.rules:
@@ -243,7 +243,7 @@ def judge(turn: Turn) -> None:
             end_alarm(turn, name)
 
 
-def tell(turn: Turn, command: cmd.SetValue) -> None:
+def tell_value(turn: Turn, command: cmd.SetValue) -> None:
     """Take a value that a rule asks for; it counts for as long as was said.
 
     Raises

@@ -54,7 +54,7 @@ def stop(turn: Turn, command: cmd.StopEverything) -> None:
         dither.make_way(turn)
 
 
-def resume(turn: Turn, command: cmd.Resume) -> None:
+def release(turn: Turn, command: cmd.Resume) -> None:
     """Go on in the mode and with the dither that were ordered before, or meanwhile.
 
     Raises

@@ -6,10 +6,11 @@ alone.
 
 from service.worker.optics_worker import OpticsWorker
 from service.worker.process import Done, run_job, start_worker
-from service.worker.records import Compute, Description, Made
+from service.worker.records import Compute, Conditions, Description, Made
 
 __all__ = [
     "Compute",
+    "Conditions",
     "Description",
     "Done",
     "Made",

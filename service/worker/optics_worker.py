@@ -33,6 +33,7 @@ from service.telemetry.random_dither import Correlated, RandomEstimate, fit_rand
 from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.worker.records import (
     Compute,
+    Conditions,
     Description,
     Made,
     actuators_of,
@@ -298,26 +299,18 @@ class OpticsWorker:
                 return None
         return None
 
-    def make(
-        self,
-        alpha: Misregistration,
-        covariance: NDArray[np.float64],
-        loop: ControlLoop,
-        bound: float,
-        fewer: tuple[int, ...] = (),
-    ) -> Made:
+    def make(self, conditions: Conditions, fewer: tuple[int, ...] = ()) -> Made:
         """Compute the reconstructor for α, as many modes as the loop has gains, and judge it.
 
         Where the gate refuses it, the most of ``fewer`` modes, largest first, that pass; none
         passes: the one asked for.
         """
-        matrix = self._model.interaction_matrix(alpha)
+        matrix, loop = self._model.interaction_matrix(conditions.alpha), conditions.loop
 
         def judged(n_modes: int) -> Made:
             inversion = reconstruct(matrix, self._recipe(n_modes))
-            verdict = self.judge(
-                inversion.matrix, alpha, covariance, loop.of(slice(n_modes)), bound
-            )
+            of_these = replace(conditions, loop=loop.of(slice(n_modes)))
+            verdict = self.judge(inversion.matrix, of_these)
             return Made(
                 matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
             )
@@ -372,38 +365,28 @@ class OpticsWorker:
             prior=prior,
         )
 
-    def judge(
-        self,
-        reconstructor: NDArray[np.float32],
-        alpha: Misregistration,
-        covariance: NDArray[np.float64],
-        loop: ControlLoop,
-        bound: float,
-    ) -> GateVerdict:
+    def judge(self, reconstructor: NDArray[np.float32], conditions: Conditions) -> GateVerdict:
         """Return whether a reconstructor would hold the loop within α ± 3σ."""
-        noise = self._model.instrument.slopes.kind.noise
-        loop = replace(loop, outer=outer_of(self._model), noise=noise)
+        alpha, noise = conditions.alpha, self._model.instrument.slopes.kind.noise
+        loop = replace(conditions.loop, outer=outer_of(self._model), noise=noise)
         at_work = self._sensor.at_unit_gain(alpha)
+        covariance, bound = conditions.covariance, conditions.bound
         return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
 
     def margin(
         self,
         in_use: NDArray[np.float32],
-        alpha: Misregistration,
-        covariance: NDArray[np.float64],
-        loop: ControlLoop,
-        bound: float,
+        conditions: Conditions,
         optical_gain: NDArray[np.float64],
         magnitude: float | None,
     ) -> tuple[GateVerdict, ExpectedGain | None]:
         """Return verdict and worth of the matrix in use, ``(n_modes, n_slopes)`` metres per slope.
 
-        ``loop`` and ``bound`` are the gate's; ``optical_gain`` ``(n_basis,)`` and the star's
-        ``magnitude`` the expected gain's.
+        ``optical_gain`` ``(n_basis,)`` and the star's ``magnitude`` are the expected gain's.
         """
-        verdict = self.judge(in_use, alpha, covariance, loop, bound)
-        loop = replace(loop, optical_gain=optical_gain)
-        return verdict, self.assess(in_use, alpha, loop, magnitude)
+        verdict = self.judge(in_use, conditions)
+        loop = replace(conditions.loop, optical_gain=optical_gain)
+        return verdict, self.assess(in_use, conditions.alpha, loop, magnitude)
 
     def watch(
         self, state: passive.Passive, start: Misregistration | None

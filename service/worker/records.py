@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.gate import GateVerdict
+from service.control.loop import ControlLoop
 from service.control.reconstructor import MAX_CONDITION, InversionMethod
 from service.errors import ModelError
 from service.model.instrument import Instrument, Mirror
@@ -73,6 +74,21 @@ class Description:
 
     start: Misregistration = field(default_factory=Misregistration)
     """Where a fit starts while nothing is known of α: the mirror's nominal rotation."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Conditions:
+    """What a reconstructor has to hold in."""
+
+    alpha: Misregistration
+    covariance: NDArray[np.float64]
+    """``(4, 4)`` of α, numeric units, model error included."""
+
+    loop: ControlLoop
+    """As the gate is to see it."""
+
+    bound: float
+    """Largest pole radius that is accepted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 from service.config import load_instrument
 from service.control.loop import ControlLoop
 from service.prepared import usual_folder
-from service.worker import Compute
+from service.worker import Compute, Conditions
 
 INSTRUMENT = Path(__file__).with_name("small.toml")
 COMPUTE = Compute(threads=1, nice=0, cache=usual_folder(os.environ))
@@ -26,3 +26,8 @@ def loop_settings(n_modes=N_CONTROLLED, gain=0.4):
     return ControlLoop(
         frame_rate_hz=1000.0, gains=np.full(n_modes, gain), leak=0.999, delay_frames=2.0
     )
+
+
+def conditions(alpha, covariance, loop, bound):
+    """What a reconstructor has to hold in."""
+    return Conditions(alpha=alpha, covariance=covariance, loop=loop, bound=bound)

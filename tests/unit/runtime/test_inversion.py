@@ -10,14 +10,21 @@ from service.config.settings import load_settings
 from service.control.reconstructor import InversionMethod, Prior, invert, invert_with_prior
 from service.model.misregistration import Misregistration
 from service.worker import OpticsWorker
-from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, loop_settings, small_instrument
+from tests.unit.runtime.small import (
+    COMPUTE,
+    N_CONTROLLED,
+    SIGMA,
+    conditions,
+    loop_settings,
+    small_instrument,
+)
 
 NOISE = 0.2
 
 
 def made_with(**settings):
     bench = OpticsWorker(small_instrument(), replace(COMPUTE, **settings))
-    made = bench.make(Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95)
+    made = bench.make(conditions(Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95))
     return bench._model, made
 
 

@@ -17,6 +17,7 @@ from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,
     SIGMA,
+    conditions,
     loop_settings,
     small_instrument,
 )
@@ -117,13 +118,15 @@ def test_a_flat_response_follows_nothing():
 def test_gains_are_counted_once_when_a_loop_is_judged(bench):
     """The gate sees the response at work, whether told so by the model or by the gains."""
     still_bench = OpticsWorker(small_instrument(), COMPUTE)
-    made = still_bench.make(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95)
+    made = still_bench.make(conditions(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95))
     near = bench._sensor.near(ALPHA)
     at_work = replace(loop_settings(), optical_gain=bench._sensor.ratio()[:N_CONTROLLED])
-    verdict = bench.judge(made.matrix, ALPHA, np.diag(SIGMA**2), at_work, 0.95)
+    verdict = bench.judge(made.matrix, conditions(ALPHA, np.diag(SIGMA**2), at_work, 0.95))
     itself = judge(made.matrix, near, ALPHA, np.diag(SIGMA**2), loop_settings(), bound=0.95)
     assert verdict.worst_pole_radius == pytest.approx(itself.worst_pole_radius, abs=1e-5)
-    told = still_bench.judge(made.matrix, ALPHA, np.diag(SIGMA**2), at_work, 0.95)
+    told = still_bench.judge(made.matrix, conditions(ALPHA, np.diag(SIGMA**2), at_work, 0.95))
     assert verdict.aligned_pole_radius == told.aligned_pole_radius
-    flat = bench.judge(made.matrix, Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95)
+    flat = bench.judge(
+        made.matrix, conditions(Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95)
+    )
     assert flat.worst_pole_radius != pytest.approx(verdict.worst_pole_radius, abs=1e-3)

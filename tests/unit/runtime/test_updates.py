@@ -25,7 +25,7 @@ from service.tracking.worth import fewer_than
 from service.wire import LoopRequest
 from service.worker import OpticsWorker
 from tests.unit.runtime.handmade import N_MODES, REGISTRATION, STATE
-from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, small_instrument
+from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, conditions, small_instrument
 from tests.unit.tracking.situations import START_NS, rtc
 
 pytestmark = pytest.mark.timeout(60)
@@ -54,7 +54,7 @@ async def make(actions, state, n_modes=N_CONTROLLED, fewer=()):
 
 
 def make_in(bench, loop, fewer=()):
-    return bench.make(Misregistration(), np.diag(SIGMA**2), loop, 0.95, fewer)
+    return bench.make(conditions(Misregistration(), np.diag(SIGMA**2), loop, 0.95), fewer)
 
 
 def slip_alarm():

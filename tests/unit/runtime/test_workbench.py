@@ -16,6 +16,7 @@ from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,
     SIGMA,
+    conditions,
     loop_settings,
     small_instrument,
 )
@@ -35,7 +36,9 @@ def bench():
 
 @pytest.fixture(scope="module")
 def aligned(bench):
-    return bench.make(Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95).matrix
+    return bench.make(
+        conditions(Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95)
+    ).matrix
 
 
 def dithered_window(bench, alpha, *, gain=1.0, noise=1e-4, seed=1):
@@ -164,7 +167,7 @@ def test_noise_without_a_signal_is_refused_in_words(bench, aligned):
 
 
 def test_a_reconstructor_inverts_the_interaction_matrix_of_its_registration(bench):
-    made = bench.make(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95)
+    made = bench.make(conditions(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95))
     product = made.matrix @ bench._model.interaction_matrix(ALPHA)[:, :N_CONTROLLED]
     np.testing.assert_allclose(product, np.eye(N_CONTROLLED), atol=1e-3)
     assert made.gate.accepted
@@ -173,15 +176,17 @@ def test_a_reconstructor_inverts_the_interaction_matrix_of_its_registration(benc
 
 def test_the_gate_sees_through_a_reconstructor_for_another_place(bench, aligned):
     far = replace(ALPHA, rotation_rad=np.deg2rad(25.0))
-    verdict = bench.judge(aligned, far, np.diag(SIGMA**2), loop_settings(), 0.95)
+    verdict = bench.judge(aligned, conditions(far, np.diag(SIGMA**2), loop_settings(), 0.95))
     assert not verdict.accepted
     assert verdict.worst_pole_radius > 1.0
-    near = bench.judge(aligned, Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95)
+    near = bench.judge(
+        aligned, conditions(Misregistration(), np.diag(SIGMA**2), loop_settings(), 0.95)
+    )
     assert near.accepted
 
 
 def test_a_gain_beyond_stability_is_refused_however_good_the_matrix(bench):
-    made = bench.make(ALPHA, np.diag(SIGMA**2), loop_settings(gain=1.2), 0.95)
+    made = bench.make(conditions(ALPHA, np.diag(SIGMA**2), loop_settings(gain=1.2), 0.95))
     assert not made.gate.accepted
     assert "unstable" in made.gate.reason
 

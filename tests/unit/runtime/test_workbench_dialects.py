@@ -15,7 +15,14 @@ from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
 from service.worker import OpticsWorker
-from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, loop_settings, small_instrument
+from tests.unit.runtime.small import (
+    COMPUTE,
+    N_CONTROLLED,
+    SIGMA,
+    conditions,
+    loop_settings,
+    small_instrument,
+)
 from tests.unit.runtime.test_workbench import dithered_window, open_loop
 
 NOMINAL_RAD = np.deg2rad(64.5)
@@ -65,7 +72,7 @@ class Sensor:
 
 
 def test_its_telemetry_gives_the_registration_from_the_nominal_rotation(bench, seen):
-    reconstructor = bench.make(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95).matrix
+    reconstructor = bench.make(conditions(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95)).matrix
     bench.describe()
     estimate = bench.fit(dithered_window(Sensor(seen), ALPHA), open_loop(reconstructor), None)
     error = estimate.alpha.vector - ALPHA.vector
@@ -74,7 +81,7 @@ def test_its_telemetry_gives_the_registration_from_the_nominal_rotation(bench, s
 
 
 def test_its_reconstructor_takes_slopes_as_it_lists_them(bench, seen):
-    made = bench.make(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95)
+    made = bench.make(conditions(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95))
     product = made.matrix @ seen[:, :N_CONTROLLED]
     np.testing.assert_allclose(product, np.eye(N_CONTROLLED), atol=1e-3)
     assert made.gate.accepted
@@ -157,7 +164,7 @@ def test_an_orientation_left_open_is_found_in_the_rtcs_own_matrix_and_taken_over
     dialect = rtc.auto.listen(rtc.own, None)
     assert dialect.adopted
     assert dialect.found == rtc.setting
-    made = rtc.auto.make(ALPHA_SMALL, np.diag(SIGMA**2), loop_settings(), 0.95)
+    made = rtc.auto.make(conditions(ALPHA_SMALL, np.diag(SIGMA**2), loop_settings(), 0.95))
     product = made.matrix @ rtc.seen[:, :N_CONTROLLED]
     np.testing.assert_allclose(product, np.eye(N_CONTROLLED), atol=1e-3)
 

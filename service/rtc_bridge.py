@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from service import wire
 from service.errors import LinkError, UnknownIdError, WireError
+from service.files.recorder import RecordingWriter
+from service.files.recording import RecordedKind
 from service.link import session as link
 from service.link.intake import Intake
 from service.link.matrices import LinkEvent, MeasuredIntake, Offer, Outbox
@@ -50,6 +52,7 @@ class Bridge:
         self._outbox = Outbox(endpoint.offer_s)
         self._session: zenoh.Session | None = None
         self._closed = False
+        self._recorder: RecordingWriter | None = None
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._held: list[object] = []
         self._standby = Standby(self._keys, drive=self._drive, report=self._intake.event)
@@ -149,6 +152,26 @@ class Bridge:
         """Return all counters of the link."""
         return self._intake.statistics()
 
+    def keep(self, recorder: RecordingWriter | None) -> None:
+        """Have all that the RTC sends put into a recorder from now on; None: no more.
+
+        It begins with the reconstructor in use, as far as this service has it.
+        """
+        self._recorder = recorder
+        if self._intake.statistics().rtc_alive:
+            self._record(RecordedKind.LIVELINESS, b"\x01")
+        self._record_matrix()
+
+    def _record_matrix(self) -> None:
+        offer = self._outbox.current
+        if offer is not None:
+            self._record(RecordedKind.MATRIX, b"".join(offer.parts), offer.commit)
+
+    def _record(self, kind: RecordedKind, payload: bytes, attachment: bytes = b"") -> None:
+        recorder = self._recorder
+        if recorder is not None:
+            recorder.put(kind, payload, attachment)
+
     def offer(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> None:
         """Let an RTC ask for a reconstructor without sending it.
 
@@ -170,6 +193,7 @@ class Bridge:
             If it is not on offer.
         """
         self._outbox.set_current(matrix_id)
+        self._record_matrix()
 
     async def publish(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> None:
         """Send a reconstructor: its parts, then the commit that orders staging and swap.
@@ -263,20 +287,26 @@ class Bridge:
         session, attachment = self._session, sample.attachment
         if session is None:
             return
+        payload = link.bytes_of(sample.payload, wire.BATCH_LIMIT, "a frame batch")
+        header = None
+        if attachment is not None:
+            header = link.bytes_of(attachment, wire.ATTACHMENT_LIMIT, "an attachment")
+        self._record(RecordedKind.FRAMES, payload, header or b"")
         self._intake.frames(
-            link.bytes_of(sample.payload, wire.BATCH_LIMIT, "a frame batch"),
-            None
-            if attachment is None
-            else link.bytes_of(attachment, wire.ATTACHMENT_LIMIT, "an attachment"),
+            payload,
+            header,
             recoverable=sample.source_info is not None,
             latency_s=link.latency_s(session, sample, time.time_ns()),
         )
 
     def _on_status(self, sample: zenoh.Sample) -> None:
-        self._intake.status(link.bytes_of(sample.payload, wire.STATUS_LIMIT, "a status"))
+        data = link.bytes_of(sample.payload, wire.STATUS_LIMIT, "a status")
+        self._record(RecordedKind.STATUS, data)
+        self._intake.status(data)
 
     def _on_ack(self, sample: zenoh.Sample) -> None:
         data = link.bytes_of(sample.payload, wire.MESSAGE_LIMIT, "an acknowledgement")
+        self._record(RecordedKind.ACKNOWLEDGEMENT, data)
         acknowledgement = wire.decode(wire.Acknowledgement, data)
         matrix_id = acknowledgement.id
         known = matrix_id is None or self._outbox.knows(matrix_id)
@@ -290,6 +320,7 @@ class Bridge:
             self._intake.event(event)
 
     def _on_alive(self, token: tuple[str, bool]) -> None:
+        self._record(RecordedKind.LIVELINESS, bytes([token[1]]))
         self._intake.liveliness(alive=token[1])
 
     def _answer(self, query: zenoh.Query) -> None:

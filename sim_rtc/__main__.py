@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.errors import ConfigurationError, PyrcalError
+from service.files.recorder import RecordingWriter
 from service.files.recording import Recording
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import Ahead, message_frames
@@ -24,7 +25,6 @@ from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch, FrameClock, Pace
 from sim_rtc.faults import ComputerFaults, FaultPlan
 from sim_rtc.link.link import Link
-from sim_rtc.link.record import Recorder
 from sim_rtc.link.replay import Replay
 from sim_rtc.options import Options, parse_options
 from sim_rtc.truth import TruthRecorder, write_snapshot
@@ -78,7 +78,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         plan, recorder = FaultPlan(options.faults), None
         if options.record is not None:
             system = computer.identity.system
-            recorder = stack.enter_context(Recorder(options.record, system=system))
+            recorder = stack.enter_context(RecordingWriter(options.record, system=system))
         link = stack.enter_context(
             Link(computer, options, telescope.detector, clock=clock, plan=plan, recorder=recorder)
         )

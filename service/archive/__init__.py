@@ -6,6 +6,7 @@
       reconstructors/<id>.h5        one reconstructor each, written once, complete or absent
       interaction_matrices/<id>.h5  one measured interaction matrix each, likewise
       noisy_matrices/<id>.h5        one noisy interaction matrix each, likewise
+      recordings/<id>.h5            telemetry that somebody has asked for, whole up to its end
       tracking.json                 the registration, for the service after this one
       index.sqlite                  where each is on its way, who did what, when, and α over time
       lock                          held while a service uses the directory

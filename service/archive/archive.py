@@ -6,12 +6,14 @@ import fcntl
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Self
+from typing import IO, Any, Self
 
 from service.archive.index import AuditEntry, Index, Pin, Range, begun_ns_utc
 from service.archive.nights import Nights
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
+from service.archive.recordings import Recordings
 from service.archive.records import TrackingFile
+from service.archive.store import Store
 from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.tracking.registration import HistoryEntry
@@ -42,7 +44,14 @@ class Archive:
         """Interaction matrices the RTC has measured."""
         self.noisy = NoisyArchive(directory / "noisy_matrices", self._index)
         """Noisy interaction matrices of random dithers."""
-        self.stores = (self.reconstructors, self.measured, self.noisy)
+        self.recordings = Recordings(directory / "recordings")
+        """Telemetry that somebody has asked for."""
+        self.stores: tuple[Store[Any] | Recordings, ...] = (
+            self.reconstructors,
+            self.measured,
+            self.noisy,
+            self.recordings,
+        )
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
         self.nights = Nights(self._index.reading, noon_utc_h)

@@ -7,10 +7,12 @@ import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from service.archive.archive import Archive
-from service.archive.index import AuditEntry, Product
+from service.archive.index import AuditEntry
 from service.archive.nights import DAY_NS
+from service.archive.recordings import Recordings
 from service.errors import ArchiveError
 from service.tracking.products import MatrixState, ReconstructorRecord
 
@@ -48,7 +50,7 @@ class Item:
 
     id: str
     kind: str
-    """"reconstructor", "measurement" or "noisy matrix"."""
+    """"reconstructor", "measurement", "noisy matrix" or "recording"."""
 
     state: str
     """What has become of it."""
@@ -102,13 +104,15 @@ def items(archive: Archive, in_use: Collection[str] = ()) -> tuple[Item, ...]:
             if alive or item.id in in_use:
                 kept[item.id] = alive or "in use"
         kept |= {pin.id: f"pinned by {pin.who}: {pin.why}" for pin in pins}
+        if isinstance(store, Recordings):
+            kept |= store.kept()
         found += [
             replace(item, kept_because=item.kept_because or kept.get(item.id, "")) for item in there
         ]
     return tuple(sorted(found, key=lambda item: item.stored_ns_utc))
 
 
-def _item(kind: str, path: Path, product_id: str, records: Mapping[str, Product]) -> Item:
+def _item(kind: str, path: Path, product_id: str, records: Mapping[str, Any]) -> Item:
     """Return a product; one that somebody has to look at is kept until then."""
     record = records.get(product_id)
     try:
@@ -126,8 +130,11 @@ def _item(kind: str, path: Path, product_id: str, records: Mapping[str, Product]
 
 
 def due(every: Collection[Item], keeping: Keeping, now_ns: int) -> Iterator[tuple[Item, str]]:
-    """Yield what is to go, and why: what is too old, then as much as is too much, oldest first."""
-    n_bytes = sum(item.n_bytes for item in every)
+    """Yield what is to go, and why: what is too old, then as much as is too much, oldest first.
+
+    Recordings are large, and stay until somebody removes them: no matrix goes because of one.
+    """
+    n_bytes = sum(item.n_bytes for item in every if item.kind != Recordings.noun)
     for item in sorted(every, key=lambda item: item.stored_ns_utc):
         age_days = (now_ns - item.stored_ns_utc) / DAY_NS
         if item.kept_because:
@@ -179,6 +186,8 @@ def _damage(item: Item, path: Path, found: str) -> Damage:
         means = "the RTC has it, and goes on; it could not be sent again to one that restarts"
     elif item.kind == "reconstructor":
         means = "it cannot be sent, nor gone back to; what is known of it is in the index"
+    elif item.kind == Recordings.noun:
+        means = "it cannot be replayed, nor exported"
     else:
         means = "it cannot be fitted or compared any more; what is known of it is in the index"
     return Damage(

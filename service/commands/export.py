@@ -24,6 +24,7 @@ _SOURCES = {
     "reconstructor": ("/v1/reconstructors/{id}/matrix", _MATRIX),
     "measurement": ("/v1/measurements/{id}/matrix", _MATRIX),
     "noisy-matrix": ("/v1/noisy-matrix/{id}/file", ("hdf5",)),
+    "recording": ("/v1/recordings/{id}/file", ("hdf5",)),
 }
 """Path of REST, and formats, the usual one first."""
 

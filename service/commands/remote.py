@@ -122,6 +122,7 @@ _ID = words("id ID", "a reconstructor, or in-use, previous, candidate")
 _ALARM = words("id ALARM", "its name: pyrcal alarms")
 _CANDIDATE = words("id ID", "default: the one proposed last", nargs="?", default="candidate")
 _MODES = words("--modes N,...|controlled|all", "of the basis", type=_numbers(int))
+_RECORDING = words("id ID", "of a recording: pyrcal archive list")
 _LASTS = words("--duration-s S", "how long", type=float)
 _EACH = words("--amplitude-m M", "RMS of each mode, metres OPD", type=float)
 _LINES = words("--frequency-hz HZ,...", "a line for each", type=_numbers(float))
@@ -159,7 +160,7 @@ REQUESTS = (
         words(
             "what",
             "alpha: what the service remembers of it; the others: from its archive",
-            choices=("alpha", "audit", "reconstructor", "measurement", "noisy-matrix"),
+            choices=("alpha", "audit", "reconstructor", "measurement", "noisy-matrix", "recording"),
         ),
         words("id ID", "of a matrix; or in-use, previous", nargs="?"),
         words("--format F", "alpha, audit: csv, jsonl; matrices: npy, hdf5..."),
@@ -290,6 +291,27 @@ REQUESTS = (
         *(_MODES, _TOTAL, _LASTS, _OVER, _NO_WAIT),
         body="modes total_amplitude_m duration_s over_budget",
         follows="/v1/noisy-matrix/{id}",
+    ),
+    _orders(
+        "record",
+        "keep the telemetry that comes from now on, byte for byte; a minute if not told otherwise",
+        "POST /v1/recordings",
+        *(_LASTS, _NO_WAIT),
+        body="duration_s",
+        follows="/v1/recordings/{id}",
+    ),
+    _orders(
+        "end-recording",
+        "keep no more of it; what there is stays",
+        "POST /v1/recordings/{id}/end",
+        _RECORDING,
+    ),
+    _orders(
+        "remove-recording",
+        "remove telemetry that was kept, for good",
+        "DELETE /v1/recordings/{id}",
+        _RECORDING,
+        asks="remove it for good",
     ),
     _orders(
         "give-up",

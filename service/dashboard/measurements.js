@@ -28,6 +28,7 @@ export class Measurements {
     const zone = root.querySelector("#fit");
     for (const name of ["dragover", "dragleave", "drop"]) zone.addEventListener(name, (event) => this.#drag(zone, event));
     this.form.addEventListener("input", () => this.#offer());
+    document.querySelector("#order").addEventListener("close", () => this.root.hidden || this.look());
     for (const name of ["state", "lost"]) service.addEventListener(name, () => this.#onState());
     this.#offer();
   }
@@ -36,9 +37,9 @@ export class Measurements {
   async look() {
     clearTimeout(this.#looking);
     try {
-      const [measured, noisy, fits] = await Promise.all(
-        ["v1/measurements", "v1/noisy-matrix", "v1/fits"].map((path) => this.#service.get(path)));
-      this.#matrices = [...measured.measurements, ...noisy.noisy_matrices].sort((a, b) => born(b) - born(a));
+      const [measured, noisy, kept, fits] = await Promise.all(
+        ["v1/measurements", "v1/noisy-matrix", "v1/recordings", "v1/fits"].map((path) => this.#service.get(path)));
+      this.#matrices = [...measured.measurements, ...noisy.noisy_matrices, ...kept.recordings].sort((a, b) => born(b) - born(a));
       this.#fits = fits.fits.reverse();
       this.#show();
     } catch {
@@ -62,8 +63,8 @@ export class Measurements {
   #show() {
     const { now } = this.#service;
     const n = this.#matrices.length;
-    put(this.root.querySelector(".read"), n ? `${n} ${n === 1 ? "matrix" : "matrices"}, newest first` : "none has been measured for this service yet");
-    fill(this.root.querySelector("#matrices tbody"), this.#matrices.map((m) => this.#matrixRow(m, now)), 6, "none");
+    put(this.root.querySelector(".read"), n ? `${n}, newest first` : "none has been measured for this service yet");
+    fill(this.root.querySelector("#matrices tbody"), this.#matrices.map((m) => ("who" in m ? recordingRow(m, now) : this.#matrixRow(m, now))), 6, "none");
     fill(this.root.querySelector("#fits tbody"), this.#fits.map((f) => this.#fitRow(f, now)), 4, "none since the service started");
   }
 
@@ -267,6 +268,21 @@ export class Measurements {
     fill(root.querySelector(".by-mode tbody"), drawn.modes.map((mode, k) => make("tr", {}, make("th", { scope: "row", text: String(mode) }),
       make("td", { text: number(found.gains[k], 3) }), make("td", { text: number(100 * drawn.residual_by_mode[k], 1) }))));
   }
+}
+
+function recordingRow(recording, now) {
+  const { id, state, who, why, reason, n_bytes: size, n_dropped: dropped } = recording;
+  const acts = make("td", { className: "acts" });
+  acts.append(state === "stored" ? download(`v1/recordings/${encodeURIComponent(id)}/file`, "HDF5", `${id}.h5`) : "ends by itself");
+  const at = born(recording);
+  const lacks = [dropped && `${dropped} messages dropped`, reason].filter(Boolean).join("; ");
+  return make("tr", {},
+    make("th", { scope: "row", text: id }),
+    make("td", { text: "telemetry" }),
+    make("td", { text: state }),
+    make("td", { text: `${day(at)} ${clock(at)}, ${ago(at, now)}` }),
+    make("td", { text: `${number(size / 1e6, 0)} MB, for ${who}: ${why || DASH}${lacks && `; ${lacks}`}` }),
+    acts);
 }
 
 function born(matrix) {

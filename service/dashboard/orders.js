@@ -230,7 +230,7 @@ function alarmOf(state, name) {
 const TITLES = {
   approve: "Approve", reject: "Reject", rollback: "Roll back", hold: "Hold", mode: "Mode", acquire: "Acquire",
   abort: "Abort the acquisition", "give-up": "Give up", "dither-start": "Start the dither", "dither-stop": "Stop the dither",
-  stop: "Stop everything", resume: "Release", measure: "Measure", noisy: "Noisy matrix", "open-loop": "End the gain ramp",
+  stop: "Stop everything", resume: "Release", measure: "Measure", noisy: "Noisy matrix", record: "Keep telemetry", "open-loop": "End the gain ramp",
   acknowledge: "Acknowledge", mute: "Mute", unmute: "Unmute",
 };
 
@@ -486,6 +486,20 @@ const ORDERS = {
         ...(modes && { modes: [...Array(modes).keys()] }),
         ...(n && pattern !== "sine" && { n_average: n }),
       }),
+    };
+  },
+  record() {
+    return {
+      title: "Keep telemetry",
+      fields: [{ name: "duration_s", label: "Seconds", min: 1, max: 3600, step: "any", value: 60 }],
+      facts: ({ duration_s: seconds }) => [
+        `All that the RTC sends in the next ${number(seconds, 0)} s goes to the archive, byte for byte; what came before is gone.`,
+        "It stays until somebody removes it; it ends before its time where the disk becomes full.",
+      ],
+      button: "Begin",
+      asked: true,
+      method: "POST",
+      path: "v1/recordings",
     };
   },
   noisy(orders) {

@@ -115,6 +115,12 @@ class Outbox:
             if matrix_id in self._offers and self._sums.get(matrix_id) == sha256:
                 self._current = matrix_id
 
+    @property
+    def current(self) -> Offer | None:
+        """The offer that answers ``cm/current``; None: there is none."""
+        with self._lock:
+            return None if self._current is None else self._offers.get(self._current)
+
     def current_commit(self) -> bytes:
         """Return the manifest that answers ``cm/current``.
 

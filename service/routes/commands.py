@@ -21,6 +21,7 @@ from service.routes.admission import caller_of
 from service.routes.numbers import MatrixId
 from service.routes.problems import COMMAND, DECISION, INVALID, UNKNOWN
 from service.routes.views import RECONSTRUCTORS, Schema, ServiceDep, explained, known, tagged
+from service.runtime import keeping
 from service.runtime.recording import Caller
 from service.runtime.supervisor import Supervisor
 from service.tracking import commands as instructions
@@ -193,8 +194,9 @@ def bodies(by_operation: Mapping[str, Body]) -> tuple[dict[str, Schema], dict[st
         for name, body in by_operation.items()
     }
     schemas: dict[str, Schema] = document.get("$defs", {})
+    records = vars(instructions) | vars(keeping)
     for name, schema in schemas.items():
-        texts = explained(vars(instructions)[name]) if "properties" in schema else {}
+        texts = explained(records[name]) if "properties" in schema else {}
         if "action" in schema.get("properties", ()):  # what tells alternatives apart
             schema["required"] = [*schema.get("required", ()), "action"]
         for field, text in texts.items():

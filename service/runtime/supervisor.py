@@ -23,6 +23,7 @@ from service.runtime.actions import Actions
 from service.runtime.answers import Given
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
+from service.runtime.keeping import TelemetryKeeper
 from service.runtime.recording import Caller, Recorder, ids_of
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
@@ -87,6 +88,14 @@ class Supervisor:
         self._recorder = Recorder(archive, lambda: self._engine.state, self._post)
         self._actions = actions
         self._keeping = keeping
+        self.recordings = TelemetryKeeper(
+            archive=archive,
+            keeping=keeping,
+            system=state.system,
+            tap=bridge.keep,
+            audit=self._recorder.add,
+        )
+        """Telemetry kept on request."""
         self._backlog = Backlog()
         self._meter = PaceMeter(workers)
         self._running: set[asyncio.Task[None]] = set()
@@ -206,6 +215,7 @@ class Supervisor:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._recorder.run())
             group.create_task(self._recorder.save())
+            group.create_task(self.recordings.run())
             group.create_task(self._recorder.keep_house(self._keeping))
             description = await self._described()
             self._engine.prepared(description)

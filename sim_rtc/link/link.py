@@ -18,6 +18,7 @@ import structlog
 import zenoh
 from typing_extensions import override
 
+from service.files.recorder import RecordingWriter
 from service.files.recording import RecordedKind
 from service.wire import Keys, encode, split
 from sim_rtc.computer.feed import Background
@@ -25,7 +26,6 @@ from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of
 from sim_rtc.faults import FaultPlan, WireFaults
 from sim_rtc.link.matrices import Matrices
-from sim_rtc.link.record import Recorder
 from sim_rtc.link.replies import Replies
 from sim_rtc.link.session import (
     Lifeline,
@@ -55,7 +55,7 @@ class Link(Background):
         *,
         clock: FrameClock,
         plan: FaultPlan,
-        recorder: Recorder | None = None,
+        recorder: RecordingWriter | None = None,
     ) -> None:
         """Take the plan of the faults, and where everything that is sent is written, too."""
         super().__init__("link")

@@ -12,6 +12,7 @@ import zenoh
 from typing_extensions import override
 
 from service.errors import WireError
+from service.files.recorder import RecordingWriter
 from service.files.recording import RecordedKind
 from service.wire import (
     CHUNK_LIMIT,
@@ -30,7 +31,6 @@ from sim_rtc.computer.measure import Measurement, product
 from sim_rtc.computer.reconstructors import Outcome, Staging
 from sim_rtc.computer.telemetry import Reconstructor
 from sim_rtc.faults import Fault, FaultKind, FaultPlan
-from sim_rtc.link.record import Recorder
 from sim_rtc.link.replies import Computer, acknowledge
 
 _log = structlog.get_logger("sim_rtc")
@@ -58,7 +58,7 @@ class Matrices(Background):
         computer: Computer,
         *,
         plan: FaultPlan | None = None,
-        recorder: Recorder | None = None,
+        recorder: RecordingWriter | None = None,
     ) -> None:
         super().__init__("matrices")
         self._session = session

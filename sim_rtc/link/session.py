@@ -10,9 +10,9 @@ import structlog
 import zenoh
 import zenoh.ext
 
+from service.files.recorder import RecordingWriter
 from service.files.recording import RecordedKind
 from service.wire import Encodings, Keys, Role
-from sim_rtc.link.record import Recorder
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -121,7 +121,9 @@ class Lifeline:
 class Token:
     """The RTC's liveliness token, which may go and come back while the ``with`` block lasts."""
 
-    def __init__(self, session: zenoh.Session, keys: Keys, recorder: Recorder | None) -> None:
+    def __init__(
+        self, session: zenoh.Session, keys: Keys, recorder: RecordingWriter | None
+    ) -> None:
         self._session = session
         self._key = keys.alive(Role.RTC)
         self._recorder = recorder

@@ -16,6 +16,7 @@ import uvicorn
 from service.__main__ import main
 from service.api import create_app
 from service.archive import AuditEntry
+from service.archive.recordings import RecordingRecord
 from service.commands import orders
 from service.commands.remote import REQUESTS
 from service.errors import CommandError
@@ -131,7 +132,7 @@ ORDERS = [
 
 
 def test_every_order_of_the_table_is_tried_below():
-    tried = {words[0] for words, _, _ in ORDERS}
+    tried = {words[0] for words, _, _ in ORDERS} | {"record", "end-recording", "remove-recording"}
     assert tried == {one.name for one in REQUESTS if one.module == "orders"}
 
 
@@ -199,6 +200,46 @@ def test_an_approval_is_done_when_the_rtc_has_applied_it(capsys, service, monkey
     at_the_next_look(monkeypatch, lambda: becomes(service, "cm-1", end))
     assert main(["approve", "cm-1", "--yes"]) == status
     assert capsys.readouterr().out.splitlines()[-1].startswith(f"cm-1 is {end}")
+
+
+class Keeping:
+    """Keeps telemetry as long as it is looked at twice."""
+
+    def __init__(self):
+        self.told, self.looks = [], 0
+
+    async def begin(self, *said):
+        self.told.append(said)
+        return self.all()[0]
+
+    async def end(self, *said):
+        self.told.append(said)
+        return self.all()[0]
+
+    async def remove(self, *said):
+        self.told.append(said)
+
+    def all(self):
+        self.looks += 1
+        state = "running" if self.looks < 3 else "stored"
+        record = RecordingRecord(
+            id="tm-1", state=state, created_ns_utc=1, duration_s=5, who="", why=""
+        )
+        return (record,)
+
+
+def test_telemetry_is_kept_and_followed_ended_and_removed(capsys, service):
+    kept = service.recordings = Keeping()
+    who = ["--why", "odd edge", "--who", "Ada"]
+    assert main(["record", "--duration-s", "5", *who]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "tm-1 keeps telemetry for 5 s",
+        "tm-1 is stored",
+    ]
+    assert main(["end-recording", "tm-1", *who]) == 0
+    assert main(["remove-recording", "tm-1", "--yes", *who]) == 0
+    assert kept.told == [(5.0, "Ada", "odd edge"), ("Ada has ended it", "tm-1"), ("tm-1",)]
+    assert capsys.readouterr().out.splitlines() == ["tm-1 has ended: 0 MB", "tm-1 is removed"]
 
 
 @pytest.mark.parametrize("words", [["rollback", "--why", "so"], ["publish", "cm-0"]])

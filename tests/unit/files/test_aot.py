@@ -10,6 +10,7 @@ from service.__main__ import main
 from service.archive import Archive
 from service.errors import ConfigurationError
 from service.files.aot import affine
+from service.files.recorder import RecordingWriter
 from service.files.recording import RecordedKind, Recording
 from service.model.interaction import rtc_valid_subapertures
 from service.model.misregistration import Misregistration
@@ -24,7 +25,6 @@ from service.wire import (
     encode,
     encode_frames,
 )
-from sim_rtc.link.record import Recorder
 from tests.unit.runtime.small import small_instrument
 from tests.unit.test_archive_nights import NOON, SECOND, entry
 
@@ -92,7 +92,7 @@ MANIFEST = Manifest(
 @pytest.fixture
 def night(tmp_path):
     """A recording of 0.2 s, and an archive that knows α of that night."""
-    with Recorder(tmp_path / "night.h5", system="small") as recorder:
+    with RecordingWriter(tmp_path / "night.h5", system="small") as recorder:
         recorder.put(RecordedKind.MATRIX, MATRIX.tobytes(), encode(MANIFEST))
         recorder.put(RecordedKind.STATUS, encode(STATUS))
         for k in range(0, N_FRAMES, 20):

@@ -66,6 +66,9 @@ class HandmadeBridge:
     def set_current(self, matrix_id):
         self.current = matrix_id
 
+    def keep(self, recorder):
+        self.recorder = recorder
+
 
 class Clock:
     def __init__(self):

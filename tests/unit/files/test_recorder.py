@@ -7,16 +7,16 @@ import h5py
 import pytest
 
 from service.errors import ConfigurationError
+from service.files.recorder import RecordingWriter
 from service.files.recording import RecordedKind, Recording
-from sim_rtc.link.record import Recorder
 from tests.system.pace import in_time
 
 WRITER = """
 import sys, time
 from pathlib import Path
 from service.files.recording import RecordedKind
-from sim_rtc.link.record import Recorder
-with Recorder(Path(sys.argv[1]), system="small") as recorder:
+from service.files.recorder import RecordingWriter
+with RecordingWriter(Path(sys.argv[1]), system="small") as recorder:
     for number in range(10**6):
         recorder.put(RecordedKind.FRAMES, number.to_bytes(8, "little") * 1000, b"header")
         if number % 100 == 0:
@@ -38,7 +38,7 @@ def test_messages_come_back_byte_for_byte_in_order(tmp_path):
         *[(RecordedKind.FRAMES, bytes([k % 256]) * k, b"attachment") for k in range(1000)],
         (RecordedKind.STATUS, b"status", b""),
     ]
-    with Recorder(path, system="small") as recorder:
+    with RecordingWriter(path, system="small") as recorder:
         for message in given:
             recorder.put(*message)
     with Recording(path) as recording:
@@ -52,7 +52,7 @@ def test_messages_come_back_byte_for_byte_in_order(tmp_path):
 
 def test_what_waits_is_bounded_and_what_is_dropped_is_counted(tmp_path):
     path = tmp_path / "night.h5"
-    with Recorder(path, system="small", backlog_bytes=1000) as recorder:
+    with RecordingWriter(path, system="small", backlog_bytes=1000) as recorder:
         began = time.monotonic()
         for _ in range(100):
             recorder.put(RecordedKind.FRAMES, bytes(100))
@@ -88,7 +88,7 @@ def test_a_killed_writer_leaves_a_file_that_lacks_at_most_two_seconds(tmp_path):
 
 def test_a_file_that_is_still_being_written_can_be_read(tmp_path):
     path = tmp_path / "night.h5"
-    with Recorder(path, system="small") as recorder:
+    with RecordingWriter(path, system="small") as recorder:
         recorder.put(RecordedKind.STATUS, b"one")
         deadline = time.monotonic() + 10.0
         while not read(path) and time.monotonic() < deadline:
@@ -101,7 +101,7 @@ def test_a_recording_is_never_overwritten(tmp_path):
     path.write_bytes(b"last night")
     with (
         pytest.raises(ConfigurationError, match="it exists already"),
-        Recorder(path, system="small"),
+        RecordingWriter(path, system="small"),
     ):
         pass
     assert path.read_bytes() == b"last night"

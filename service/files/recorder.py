@@ -1,4 +1,4 @@
-"""A night on file: what the RTC sent, byte for byte, in HDF5 that survives a ``kill -9``.
+"""Telemetry onto the disk: what the RTC sent, byte for byte, in HDF5 that survives a ``kill -9``.
 
 The layout is :mod:`service.files.recording`'s, which reads it. Everything grows by appending; the
 file is written in HDF5's single-writer mode and flushed twice a second.
@@ -15,13 +15,11 @@ from typing import Any, Final, Self
 import h5py
 import numpy as np
 import structlog
-from typing_extensions import override
 
 from service.errors import ConfigurationError
 from service.files.recording import FORMAT, VERSION, Message, RecordedKind
-from sim_rtc.computer.feed import Background
 
-_log = structlog.get_logger("sim_rtc")
+_log = structlog.get_logger()
 
 FLUSH_S: Final = 0.5
 """Most that a killed process loses, beside the time the disk needs."""
@@ -43,23 +41,28 @@ _ROW: Final = np.dtype(
 )
 
 
-class Recorder(Background):
-    """Writes messages while its ``with`` block lasts; ``put`` never waits."""
+class RecordingWriter:
+    """Writes messages in a thread while its ``with`` block lasts; ``put`` never waits."""
 
     def __init__(self, path: Path, *, system: str, backlog_bytes: int = BACKLOG_BYTES) -> None:
-        super().__init__("recorder")
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._path = path
         self._system = system
         self._backlog_bytes = backlog_bytes
         self._waiting: deque[Message] = deque()
         self._waiting_bytes = 0
         self._lock = threading.Lock()
-        self._broken = False
         self._start_s = time.monotonic()
         self.n_dropped = 0
         """Messages that were not written."""
 
-    @override
+        self.n_bytes = 0
+        """Taken so far."""
+
+        self.trouble = ""
+        """Why nothing is written any more; empty: all is."""
+
     def __enter__(self) -> Self:
         """Create the file.
 
@@ -72,7 +75,7 @@ class Recorder(Background):
             self._file = h5py.File(self._path, "x", libver="latest")
         except OSError as error:
             reason = "it exists already" if self._path.exists() else str(error)
-            raise ConfigurationError(f"--record: cannot create {self._path}: {reason}") from error
+            raise ConfigurationError(f"{self._path}: cannot be created: {reason}") from error
         self._file.attrs.update(
             format=FORMAT, version=VERSION, system=self._system, created_ns=time.time_ns()
         )
@@ -80,12 +83,13 @@ class Recorder(Background):
         self._rows = _growing(self._file, "messages", _ROW, _ROWS_CHUNK)
         self._dropped = self._file.create_dataset("dropped", data=np.zeros(1, np.int64))
         self._file.swmr_mode = True
-        return super().__enter__()
+        self._thread.start()
+        return self
 
-    @override
     def __exit__(self, *_: object) -> None:
         """Write what waits and close the file."""
-        super().__exit__()
+        self._stopped.set()
+        self._thread.join()
         self._file.close()
         _log.info("record.end", file=str(self._path), dropped=self.n_dropped)
 
@@ -95,13 +99,13 @@ class Recorder(Background):
         message = Message(time_s=time_s, kind=kind, payload=payload, attachment=attachment)
         size = len(payload) + len(attachment)
         with self._lock:
-            if self._broken or self._waiting_bytes + size > self._backlog_bytes:
+            if self.trouble or self._waiting_bytes + size > self._backlog_bytes:
                 self.n_dropped += 1
                 return
             self._waiting.append(message)
             self._waiting_bytes += size
+            self.n_bytes += size
 
-    @override
     def _work(self) -> None:
         try:
             while not self._stopped.wait(FLUSH_S):
@@ -112,7 +116,7 @@ class Recorder(Background):
             with self._lock:
                 self.n_dropped += len(self._waiting)
                 self._waiting.clear()
-                self._broken = True
+                self.trouble = str(error)
 
     def _write(self) -> None:
         """Append what waits: bytes before the rows that point to them, and both to the disk."""

@@ -1,0 +1,240 @@
+"""Telemetry kept on request: what comes from now on is recorded into the archive, for a time."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import structlog
+from annotated_types import Gt, Le
+
+from service.archive import Archive, AuditEntry
+from service.archive.recordings import RUNNING, STORED, RecordingRecord
+from service.archive.retention import GIGABYTE, Keeping, low_on_space
+from service.errors import (
+    CommandError,
+    ConfigurationError,
+    StorageError,
+    UnknownIdError,
+)
+from service.files.recorder import RecordingWriter
+from service.tracking.commands import Instruction
+
+LONGEST_S = 3600.0
+
+LARGEST_GB = 20.0
+"""Of one recording, in units of 1e9 bytes: half an hour of 1400 slopes and 600 modes at 1 kHz."""
+
+LOOK_S = 0.5
+"""Between two looks at how far it is."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingChoice(Instruction):
+    """For how long telemetry is to be kept."""
+
+    duration_s: Annotated[float, Gt(0.0), Le(LONGEST_S)] = 60.0
+    """From now on; what came before is gone."""
+
+
+class TelemetryKeeper:
+    """Writes one recording at a time; belongs to the event loop, the disk is waited for in threads.
+
+    Parameters
+    ----------
+    archive
+        Open.
+    keeping
+        Says how much of the disk is to stay free.
+    system
+        Whose telemetry it is.
+    tap
+        Has everything that the RTC sends put into a recorder; None: no more.
+    audit
+        Takes a line when one has ended.
+    """
+
+    def __init__(
+        self,
+        *,
+        archive: Archive,
+        keeping: Keeping,
+        system: str,
+        tap: Callable[[RecordingWriter | None], None],
+        audit: Callable[[AuditEntry], None],
+    ) -> None:
+        self._archive = archive
+        self._keeping = keeping
+        self._system = system
+        self._tap = tap
+        self._audit = audit
+        self._guard = asyncio.Lock()
+        self._recorder: RecordingWriter | None = None
+        self._record: RecordingRecord | None = None
+        self._ends_s = 0.0
+
+    async def begin(self, duration_s: float, who: str, why: str) -> RecordingRecord:
+        """Begin a recording.
+
+        Raises
+        ------
+        CommandError
+            If one is under way, or the disk is almost full.
+        StorageError
+            If the disk refuses.
+        """
+        async with self._guard:
+            if self._record is not None:
+                raise CommandError(f"{self._record.id} is under way; end it first")
+            full = await asyncio.to_thread(self._full)
+            if full is not None:
+                raise CommandError(f"nothing is recorded: {full}")
+            now_ns = time.time_ns()
+            now = datetime.fromtimestamp(now_ns / 1e9, UTC)
+            record = RecordingRecord(
+                id=f"tm-{now:%Y%m%dT%H%M%S.%f}",
+                state=RUNNING,
+                created_ns_utc=now_ns,
+                duration_s=duration_s,
+                who=who,
+                why=why,
+            )
+            recorder = RecordingWriter(
+                self._archive.recordings.path_of(record.id), system=self._system
+            )
+            await asyncio.to_thread(self._open, recorder, record)
+            self._tap(recorder)
+            self._recorder, self._record = recorder, record
+            self._ends_s = time.monotonic() + duration_s
+            return record
+
+    def _open(self, recorder: RecordingWriter, record: RecordingRecord) -> None:
+        """Begin to write; what cannot be noted is not begun.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses.
+        """
+        try:
+            recorder.__enter__()
+        except ConfigurationError as error:
+            raise StorageError(str(error)) from error
+        try:
+            self._archive.recordings.write(record)
+        except StorageError:
+            recorder.__exit__()
+            raise
+
+    async def end(self, reason: str, recording_id: str | None = None) -> RecordingRecord:
+        """End the recording under way; what is in it is kept.
+
+        Raises
+        ------
+        CommandError
+            If there is none, or not that one.
+        """
+        async with self._guard:
+            recorder, record = self._recorder, self._record
+            if recorder is None or record is None or recording_id not in {None, record.id}:
+                raise CommandError(f"{recording_id or 'no recording'} is not under way")
+            self._recorder = self._record = None
+            self._tap(None)
+            await asyncio.to_thread(recorder.__exit__)
+            record = replace(
+                record,
+                state=STORED,
+                reason=recorder.trouble or reason,
+                n_bytes=recorder.n_bytes,
+                n_dropped=recorder.n_dropped,
+            )
+            text = f"{record.id}: {record.n_bytes / 1e6:.0f} MB, {record.n_dropped} dropped"
+            why = f": {record.reason}" if record.reason else ""
+            self._audit(
+                AuditEntry(
+                    t_ns_utc=time.time_ns(),
+                    who="service",
+                    name="recording.ended",
+                    text=f"{text}{why}",
+                )
+            )
+            try:
+                await asyncio.to_thread(self._archive.recordings.write, record)
+            except StorageError as error:
+                structlog.get_logger().warning("recording.not-noted", text=str(error))
+            return record
+
+    def all(self) -> tuple[RecordingRecord, ...]:
+        """Return what is known of each, oldest first; reads the disk."""
+        recorder, running = self._recorder, self._record
+        return tuple(
+            replace(one, n_bytes=recorder.n_bytes, n_dropped=recorder.n_dropped)
+            if recorder is not None and running is not None and one.id == running.id
+            else one
+            for one in self._archive.recordings.records()
+        )
+
+    async def remove(self, recording_id: str) -> None:
+        """Remove one that has ended.
+
+        Raises
+        ------
+        CommandError
+            If it is under way.
+        UnknownIdError
+            If there is none of this id.
+        StorageError
+            If the disk refuses.
+        """
+        async with self._guard:
+            await asyncio.to_thread(self.file, recording_id)
+            await asyncio.to_thread(self._archive.recordings.remove, recording_id)
+
+    def file(self, recording_id: str) -> Path:
+        """Return the file of one that has ended.
+
+        Raises
+        ------
+        CommandError, UnknownIdError
+            As :meth:`remove`.
+        """
+        if self._record is not None and self._record.id == recording_id:
+            raise CommandError(f"{recording_id} is under way; end it first")
+        if recording_id not in self._archive.recordings.stored():
+            raise UnknownIdError(f"recording {recording_id}: no such recording")
+        return self._archive.recordings.path_of(recording_id)
+
+    async def run(self) -> None:
+        """End recordings in their time until cancelled, and the last one then."""
+        try:
+            while True:
+                await asyncio.sleep(LOOK_S)
+                if self._recorder is not None:
+                    reason = await asyncio.to_thread(self._why_end, self._recorder)
+                    if reason is not None and self._recorder is not None:
+                        await self.end(reason)
+        finally:
+            if self._recorder is not None:
+                await self.end("the service was ended")
+
+    def _full(self) -> str | None:
+        """Return what to tell of a disk with little room, None where there is enough."""
+        try:
+            return low_on_space(self._archive.directory, self._keeping, low=False)
+        except OSError as error:
+            return str(error)
+
+    def _why_end(self, recorder: RecordingWriter) -> str | None:
+        """Return why a recording ends now, None: it goes on; empty: its time is up."""
+        if time.monotonic() >= self._ends_s:
+            return ""
+        if recorder.trouble:
+            return recorder.trouble
+        if recorder.n_bytes > LARGEST_GB * GIGABYTE:
+            return f"it holds {LARGEST_GB:g} GB, the most there may be"
+        return self._full()

@@ -1,12 +1,14 @@
 """``pyrcal check-rtc`` on the simulated RTC: healthy, and with each of its faults."""
 
 import json
+import re
 
 import pytest
 
 from sim_rtc.faults import FaultKind
 from tests.system.cable import free_port
 from tests.system.night import INSTRUMENT, Process
+from tests.system.pace import slowness
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
@@ -65,6 +67,13 @@ def checked_beside(folder, rtc_words, *options):
     return status, {one["check"]: one for one in told["checks"]}, check.log
 
 
+def late_with_the_machine(checks):
+    """Whether a busy machine is why frames came late: the RTC runs on it, too."""
+    late_ms = re.search(r"at most (\d+) ms", checks["delivery"]["found"])
+    slower = slowness(again=True)
+    return late_ms is not None and slower > 1.2 and int(late_ms[1]) < 500 * slower
+
+
 @pytest.mark.long
 def test_a_healthy_rtc_keeps_the_contract_and_is_told_what_was_moved(tmp_path):
     status, checks, text = checked(tmp_path, "--yes", "--open-loop", "--seconds", "4")
@@ -84,7 +93,10 @@ def test_each_fault_is_named_by_its_line_and_by_no_other(tmp_path, fault):
     asking = LINES[fault] & {"columns", "commit", "dither"}
     options = ["--yes", "--seconds", "1", "--only", *asking] if asking else ["--passive"]
     status, checks, text = checked(tmp_path, *options, faults=(fault,))
-    assert {name for name, one in checks.items() if one["outcome"] in FLAGGED} == LINES[fault], text
+    found = {name for name, one in checks.items() if one["outcome"] in FLAGGED}
+    if late_with_the_machine(checks):
+        found -= {"delivery"} - LINES[fault]
+    assert found == LINES[fault], text
     wrong = any(one["outcome"] == "wrong" for one in checks.values())
     assert status == int(wrong)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cacao_bridge.calibration import Calibration
 from cacao_bridge.dither import Mirror, Player, refusal
-from cacao_bridge.rows import Rows
+from cacao_bridge.rows import LEAST_KEPT, Rows
 from cacao_bridge.settings import Settings
 from cacao_bridge.streams import GoneError, Stream, StreamError, path_of, settled
 from service.wire import (
@@ -72,6 +72,7 @@ class Cacao:
             self._loop.n_modes,
             self._loop.delay_frames,
             dither=bool(self._names.dither),
+            kept=max(LEAST_KEPT, round(self._loop.frame_rate_hz)),  # a second: it may stand still
         )
         self._lock = threading.Lock()
         self._swaps: deque[tuple[str, int]] = deque(maxlen=16)

@@ -20,7 +20,9 @@ Array32 = NDArray[np.float32]
 PATIENCE_FRAMES: Final = 64
 """A row whose command has not come so many frames later is left out, and counted."""
 
-_KEPT: Final = 512
+LEAST_KEPT: Final = 512
+"""Frames of each stream that are held at least."""
+
 _NEVER: Final = -(2**62)
 
 
@@ -35,14 +37,25 @@ class Rows:
         From an exposure to the one that the answer to it is on the mirror for; 1 or more.
     dither
         Whether rows end with the dither's share of the command.
+    kept
+        Frames of each stream that are held: more at once are too many.
     """
 
-    def __init__(self, n_slopes: int, n_modes: int, delay_frames: float, *, dither: bool) -> None:
+    def __init__(
+        self,
+        n_slopes: int,
+        n_modes: int,
+        delay_frames: float,
+        *,
+        dither: bool,
+        kept: int = LEAST_KEPT,
+    ) -> None:
+        self._kept = kept
         self._delay = int(delay_frames)
         self._older = np.float32(delay_frames - self._delay)
-        self._slopes = np.zeros((_KEPT, n_slopes), dtype=np.float32)
-        self._commands_m = np.zeros((_KEPT, n_modes), dtype=np.float32)
-        self._dither_m = np.zeros((_KEPT, n_modes if dither else 0), dtype=np.float32)
+        self._slopes = np.zeros((kept, n_slopes), dtype=np.float32)
+        self._commands_m = np.zeros((kept, n_modes), dtype=np.float32)
+        self._dither_m = np.zeros((kept, n_modes if dither else 0), dtype=np.float32)
         n_bytes = 4 * (n_slopes + n_modes * (1 + dither))
         self._per_message = max(1, min(FRAMES_PER_BATCH, BATCH_LIMIT // n_bytes))
         self.n_unpaired = 0
@@ -51,7 +64,7 @@ class Rows:
 
     def forget(self) -> None:
         """Begin anew: what comes has nothing to do with what came."""
-        self._of_slopes, self._of_commands = np.full((2, _KEPT), _NEVER)
+        self._of_slopes, self._of_commands = np.full((2, self._kept), _NEVER)
         self._dither_m[:] = 0.0
         self.next = self._newest = -1
         """The first frame that has not left; -1: there is none."""
@@ -73,12 +86,12 @@ class Rows:
 
         Where nothing is said after the slopes have come, nothing was played.
         """
-        self._dither_m[np.arange(max(first, last - _KEPT + 1), last + 1) % _KEPT] = values
+        self._dither_m[np.arange(max(first, last - self._kept + 1), last + 1) % self._kept] = values
 
     def _put(self, kept: Array32, counters: NDArray[np.int64], first: int, values: Array32) -> None:
-        values = values[-_KEPT:]
+        values = values[-self._kept :]
         frames = np.arange(len(values)) + first
-        kept[frames % _KEPT], counters[frames % _KEPT] = values, frames
+        kept[frames % self._kept], counters[frames % self._kept] = values, frames
 
     def ready(self, answers_to: int | None = None) -> list[tuple[int, Array32]]:
         """Return the rows that are complete, as runs of consecutive frames with their first.
@@ -89,7 +102,7 @@ class Rows:
         runs: list[tuple[int, Array32]] = []
         if self.next < 0:
             return runs
-        self.skip(self._newest - _KEPT + self._delay + 2)
+        self.skip(self._newest - self._kept + self._delay + 2)
         newest = self._newest if answers_to is None else min(self._newest, answers_to + self._delay)
         frames = np.arange(self.next, newest + 1)
         whole = self._complete(frames)
@@ -106,9 +119,9 @@ class Rows:
         return runs
 
     def _complete(self, frames: NDArray[Any]) -> NDArray[np.bool_]:
-        whole: NDArray[np.bool_] = self._of_slopes[frames % _KEPT] == frames
+        whole: NDArray[np.bool_] = self._of_slopes[frames % self._kept] == frames
         for answered in (frames - self._delay, frames - self._delay - 1)[: 1 + bool(self._older)]:
-            whole &= self._of_commands[answered % _KEPT] == answered
+            whole &= self._of_commands[answered % self._kept] == answered
         return whole
 
     @property
@@ -127,14 +140,14 @@ class Rows:
         commands_m = self._on_mirror(self._commands_m, frames)
         if dither_m.shape[1]:
             commands_m += dither_m
-        return np.hstack([self._slopes[frames % _KEPT], commands_m, dither_m])
+        return np.hstack([self._slopes[frames % self._kept], commands_m, dither_m])
 
     def _on_mirror(self, answers: Array32, frames: NDArray[Any]) -> Array32:
         """Return the mean over each exposure of answers that came a part of a frame late."""
-        newer: Array32 = answers[(frames - self._delay) % _KEPT]
+        newer: Array32 = answers[(frames - self._delay) % self._kept]
         if not self._older:
             return newer
-        older = answers[(frames - self._delay - 1) % _KEPT]
+        older = answers[(frames - self._delay - 1) % self._kept]
         return np.asarray(self._older * older + (1 - self._older) * newer)
 
 

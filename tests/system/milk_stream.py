@@ -14,9 +14,9 @@ from tests.unit.cacao.milk import Milk
 
 
 def main(folder, hz, n_slopes, n_modes, seconds):
-    slopes = Milk(path_of(folder, "aol1_imWFS2"), (n_slopes,), n_ring=round(hz / 4), pid=1000)
+    slopes = Milk(path_of(folder, "aol1_imWFS2"), (n_slopes,), n_ring=round(hz), pid=1000)
     values = Milk(path_of(folder, "aol1_modevalWFS"), (n_modes,), n_ring=4, pid=2000)
-    mirror = Milk(path_of(folder, "aol1_modevalDM"), (n_modes,), n_ring=round(hz / 4), pid=3000)
+    mirror = Milk(path_of(folder, "aol1_modevalDM"), (n_modes,), n_ring=round(hz), pid=3000)
     Milk(path_of(folder, "aol1_modesWFS"), (n_slopes, 1, n_modes)).put(np.ones(n_slopes * n_modes))
     sys.stdout.write("runs\n")
     sys.stdout.flush()

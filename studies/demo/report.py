@@ -216,9 +216,15 @@ def _stages(report: Report, reconstructors: list[View], truth: TruthFile) -> Non
         report.start = _stage(foreign[0], truth)
     if applied:
         report.first_update = _stage(applied[0], truth)
-    larger = [r for r in applied if report.start.n_modes and r["n_modes"] > report.start.n_modes]
+    larger = [
+        _stage(r, truth)
+        for r in applied
+        if report.start.n_modes and r["n_modes"] > report.start.n_modes
+    ]
     if larger:
-        report.target_modes = _stage(larger[-1], truth)
+        # one applied just before the end has no wavefront error yet
+        seen = [stage for stage in larger if stage.wavefront_error_nm is not None]
+        report.target_modes = (seen or larger)[-1]
 
 
 def _stage(record: View, truth: TruthFile) -> Stage:

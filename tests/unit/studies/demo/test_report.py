@@ -144,6 +144,14 @@ def test_more_modes_that_do_not_lower_the_wavefront_error_fail(truth):
     assert report.failures == ["the wavefront error with more modes is not below that of the start"]
 
 
+def test_a_matrix_applied_just_before_the_end_is_not_yet_the_one_that_is_judged(truth):
+    records = shelf()
+    last = records[-1] | {"id": "cm-501", "parent": "cm-500"}
+    report = make_report(service_state(), [*records, last], truth, WELL)
+    assert report.good
+    assert report.target_modes.id == "cm-500"
+
+
 def test_a_night_without_more_modes_fails(truth):
     report = make_report(service_state(), shelf()[:2], truth, WELL)
     assert report.target_modes.id is None

@@ -18,7 +18,7 @@ from service.telemetry import loopcheck
 from service.telemetry.frames import FrameBlock
 from service.telemetry.loopcheck import FoundLaw, LoopCheck, LoopLaw, Obedience
 from service.telemetry.windows import ClosedLoop
-from service.tracking.loop import last_seq, same_loop
+from service.tracking.loop import closed_loop, last_seq, same_loop
 from service.wire import (
     Acknowledgement,
     FrameBatch,
@@ -204,14 +204,7 @@ class LoopWatch:
             return None
         if not status.in_loop or len(matrix) > status.n_modes:
             return None
-        return ClosedLoop(
-            cm_id=cm_id,
-            reconstructor=matrix,
-            gains=np.array(status.gains[: len(matrix)], np.float32),
-            leak=status.leak,
-            delay_frames=status.delay_frames,
-            frame_rate_hz=status.frame_rate_hz,
-        )
+        return closed_loop(status, cm_id, matrix)
 
     def _judge(self, terms: ClosedLoop, seq: int) -> None:
         span = loopcheck.last_samples(self._check, seq)

@@ -28,6 +28,7 @@ from service.telemetry.random_dither import Correlated, RandomDither
 from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.tracking.dither_request import SETTLING_S, Dither, asked_of, lock_in_plan, random_plan
 from service.tracking.loop import (
+    closed_loop,
     last_seq,
     same_but_for_modes,
     same_loop,
@@ -222,14 +223,7 @@ def _terms(streams: Streams, cm_id: str | None) -> ClosedLoop | None:
         return None
     if matrix.shape[1] != rtc.n_slopes or len(matrix) > rtc.n_modes:
         return None
-    return ClosedLoop(
-        cm_id=cm_id,
-        reconstructor=matrix,
-        gains=np.array(rtc.gains[: len(matrix)], np.float32),
-        leak=rtc.leak,
-        delay_frames=rtc.delay_frames,
-        frame_rate_hz=rtc.frame_rate_hz,
-    )
+    return closed_loop(rtc, cm_id, matrix)
 
 
 def _lawful(streams: Streams, before: Status | None, rtc: Status) -> Streams:

@@ -9,6 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from service.telemetry.windows import ClosedLoop
 from service.wire import Loop, Pointing, Status
 
 SAME_GAIN = 0.05
@@ -22,6 +23,18 @@ SAME_LEAK = 1e-6
 
 SAME_RATE = 1e-5
 """Relative: a rate that is measured, and not nominal, is told differently every time."""
+
+
+def closed_loop(rtc: Status, cm_id: str, matrix: NDArray[np.float32]) -> ClosedLoop:
+    """Return the loop that a status tells and a matrix ``(n_controlled, n_slopes)`` closes."""
+    return ClosedLoop(
+        cm_id=cm_id,
+        reconstructor=matrix,
+        gains=np.array(rtc.gains[: len(matrix)], np.float32),
+        leak=rtc.leak,
+        delay_frames=rtc.delay_frames,
+        frame_rate_hz=rtc.frame_rate_hz,
+    )
 
 
 def same_gains(some: Sequence[float], others: Sequence[float]) -> bool:

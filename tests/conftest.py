@@ -1,5 +1,6 @@
 """Settings that must hold before any test module imports numpy, and the order of the suite."""
 
+import inspect
 import os
 import signal
 import tempfile
@@ -90,7 +91,7 @@ def pytest_collection_modifyitems(config, items):
         # of each try, not of the first one and the second together
         limit = pytest.mark.timeout(patience(limit_s), func_only=in_system)
         item.add_marker(limit, append=False)
-        if in_system:
+        if in_system or inspect.iscoroutinefunction(getattr(item, "obj", None)):
             # Real time on a machine that others use: a change refused for a moment's stall costs
             # hours, and what is broken fails twice. The first failure is told at the end.
             item.add_marker(pytest.mark.flaky(reruns=1))

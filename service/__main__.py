@@ -22,6 +22,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 done, 1 failed, 2 refused at the start, 3 a service that was to be asked is not reached.
     """
+    try:
+        try:
+            return _carry_out(arguments)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # whoever reads has seen enough, and Python would complain at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _carry_out(arguments: Sequence[str] | None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words and words[0] in OTHER_PROGRAMS:
         program, _ = OTHER_PROGRAMS[words[0]]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -361,16 +360,12 @@ def main(options: argparse.Namespace) -> int:
         status: int = import_module(f"service.commands.{request.module}").carry_out(
             service, request, options
         )
-        sys.stdout.flush()
     except RefusedError as error:
         say(f"pyrcal: {request.name}: {error}")
         return NOT_DONE
     except UnreachableError as error:
         say(f"pyrcal: {error}")
         return UNREACHABLE
-    except BrokenPipeError:  # whoever reads has seen enough, and Python would complain at its end
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return DONE
     return status
 
 

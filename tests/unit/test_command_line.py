@@ -43,6 +43,15 @@ def test_the_version_is_printed(capsys):
     assert capsys.readouterr().out.strip() == f"pyrcal {__version__}"
 
 
+@pytest.mark.parametrize("words", [["--completion", "bash"], ["--help"]])
+def test_whoever_reads_may_have_seen_enough(monkeypatch, words):
+    end, begin = os.pipe()
+    os.close(end)
+    with os.fdopen(begin, "w") as nobody_reads:
+        monkeypatch.setattr(sys, "stdout", nobody_reads)
+        assert main(words) == 0
+
+
 @pytest.mark.parametrize("words", [[], ["fly"], ["run", "--mode", "wild"], ["run", "--prot", "1"]])
 def test_a_command_line_that_makes_no_sense_is_refused(capsys, words):
     with pytest.raises(SystemExit) as end:

@@ -204,10 +204,7 @@ const NEEDS = {
     return known?.validity === "invalid" ? `α is invalid: ${known.validity_reason}` : "";
   },
   reject: (orders) => (orders.proposal ? "" : "no reconstructor is proposed"),
-  rollback: (orders, state) => {
-    if (!orders.before) return "no earlier reconstructor has been in use";
-    return state.waiting_for.some((w) => w.name === "matrix") ? "a reconstructor is being computed: wait for it" : "";
-  },
+  rollback: (orders) => (orders.before ? "" : "no earlier reconstructor has been in use"),
   hold: (orders, state) => (state.mode === "hold" ? "mode is hold already" : ""),
   abort: (orders, state) => (state.acquisition.under_way ? "" : "no acquisition is under way"),
   "give-up": (orders, state) => (state.measuring ?? state.gathering ? "" : "nothing is being measured"),
@@ -351,10 +348,16 @@ const ORDERS = {
         `When it was judged last: ${verdict(before.gate)}. The gate judges it anew where it can.`,
         state.mode === "hold" ? "Mode stays hold." : `Mode becomes hold (it is ${state.mode}), so that the service does not undo it.`,
       ],
+      fields: [{
+        name: "anyway",
+        label: "If the gate refuses it",
+        options: { "": "nothing is sent", yes: "it goes out all the same: α may be what is wrong" },
+      }],
       button: "Roll back",
       asked: true,
       method: "POST",
       path: "v1/rollback",
+      body: ({ anyway }) => (anyway ? { anyway: true } : {}),
     };
   },
   hold: (orders) => ORDERS.mode(orders, "hold"),

@@ -351,7 +351,7 @@ async def publish(client: ClientDep, matrix_id: MatrixId, said: Said) -> Accepte
 
 @router.post("/rollback", status_code=202, responses={**DECISION})
 async def rollback(client: ClientDep, command: Annotated[Rollback, body(Rollback)]) -> AcceptedView:
-    """Go back to the one in use before, unless the gate refuses it.
+    """Go back to the one in use before, unless the gate refuses it; with ``anyway`` even then.
 
     It is sent even where the gate cannot judge it: α unknown, or the loop open.
     """

@@ -194,6 +194,8 @@ class Actions:
             unknown = "α is unknown" if registration is None else "an open loop tells no gains"
             why = f"{why}; the gate could not judge it: {unknown}"
         refused = gate is not None and not gate.accepted
+        if gate is not None and refused and effect.anyway:
+            why, gate, judged, refused = f"{why}, though {gate.reason}", None, None, False
         record = replace(
             self._record(len(matrix), why, None, effect.source),
             state=MatrixState.REFUSED if refused else MatrixState.PROPOSED,
@@ -206,7 +208,7 @@ class Actions:
             sha256=wire.checksum(matrix),
         )
         await self._keep(record, matrix, None, why)
-        return ev.MatrixMade(record=record, wanted=effect.judged)
+        return ev.MatrixMade(record=record, wanted=effect.judged, anyway=effect.anyway)
 
     async def _judge(
         self, effect: ev.JudgeMatrix | ev.JudgeProposal, state: TrackerState

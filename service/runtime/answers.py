@@ -108,11 +108,14 @@ class Given:
         known = {record.id for record in self.before.reconstructors}
         made = [r for r in now.reconstructors if r.parent == source and r.id not in known]
         if made:
+            if made[-1].state is MatrixState.REFUSED and isinstance(self.command, cmd.Rollback):
+                text = f"{_why_not(made[-1])}; ordered with anyway, it goes out all the same"
+                raise CommandError(text)
             answer = self._sent(now, made[-1].id)
             return Answer(f"{answer.text}; it is {source} again; mode is {now.mode}", answer.final)
-        if now.making_since_ns_utc is None:
-            failed = [line for line in new_lines(self.then, now) if line.name == "job.failed"]
-            raise CommandError(failed[-1].text if failed else f"no copy of {source} was made")
+        failed = [line for line in new_lines(self.then, now) if line.name == "job.failed"]
+        if now.making_since_ns_utc is None and failed:
+            raise CommandError(failed[-1].text)
         return Answer(f"{source} is being judged before it is sent again", final=False)
 
     def _sent(self, now: TrackerState, name: str) -> Answer:
@@ -227,4 +230,6 @@ def _why_not(record: ReconstructorRecord) -> str:
     who = {MatrixState.REJECTED: "the RTC", MatrixState.REFUSED: "the gate"}.get(record.state)
     if who is None:
         return f"{record.id} is {record.state}: {record.reason}"
-    return f"{who} refused {record.id}: {record.reason}"
+    gate = record.gate
+    reason = record.reason if gate is None or gate.accepted else gate.reason
+    return f"{who} refused {record.id}: {reason}"

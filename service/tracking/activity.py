@@ -73,7 +73,7 @@ ALLOWS: dict[Activity, frozenset[type]] = {
     Activity.OWN_DITHER: _ALL - {cmd.Measure, cmd.StartDither},
     Activity.OTHER_DITHER: _ALL - {cmd.Measure, cmd.StartDither, cmd.MeasureNoisy},
     Activity.STANDING_BY: _ALWAYS - {cmd.AbortAcquisition, cmd.GiveUp, cmd.StopDither},
-    Activity.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish, cmd.Rollback},
+    Activity.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish},
     Activity.SENDING: _ALL - {cmd.Measure},
 }
 """Commands that are carried out while it runs; a gain ramp also lets the loop be opened."""

@@ -172,6 +172,9 @@ class Publish(Instruction):
 class Rollback(Instruction):
     """Go back to the reconstructor that was in use before the present one."""
 
+    anyway: bool = False
+    """Send it though the gate refuses it for the α of now: α may be what is wrong."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasureChoice(Instruction):

@@ -46,6 +46,9 @@ class CopyMatrix:
     judged: bool = True
     """Ask the gate; False: nobody has asked for it, and what the gate said of the earlier holds."""
 
+    anyway: bool = False
+    """An operator wants it even where the gate refuses it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JudgeMatrix:
@@ -227,6 +230,9 @@ class MatrixMade:
     record: ReconstructorRecord
     wanted: bool
     """An operator asked for this very matrix: no further approval is needed."""
+
+    anyway: bool = False
+    """Not the gate's either: it has been in use, and its reason says what the gate says."""
 
     asked_modes: int | None = None
     """Modes it should have had; None: nobody asked for a number."""

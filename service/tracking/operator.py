@@ -89,7 +89,7 @@ def publish(turn: Turn, command: cmd.Publish) -> None:
     _copy(turn, record.id, f"the operator publishes {record.id} again")
 
 
-def roll_back(turn: Turn, _: cmd.Rollback) -> None:
+def roll_back(turn: Turn, command: cmd.Rollback) -> None:
     """Offer the reconstructor again that was in use before.
 
     Raises
@@ -100,7 +100,7 @@ def roll_back(turn: Turn, _: cmd.Rollback) -> None:
     earlier = turn.state.previous
     if earlier is None:
         raise CommandError("rollback: no earlier reconstructor has been in use")
-    _copy(turn, earlier, f"the operator goes back to {earlier}")
+    _copy(turn, earlier, f"the operator goes back to {earlier}", anyway=command.anyway)
 
 
 def refit(turn: Turn, command: cmd.Refit) -> None:
@@ -179,11 +179,11 @@ def _planned(turn: Turn, rtc: Status, command: cmd.StartDither) -> Dither:
     return dither
 
 
-def _copy(turn: Turn, source: str, why: str) -> None:
+def _copy(turn: Turn, source: str, why: str, *, anyway: bool = False) -> None:
     """Offer an earlier matrix again; hold, or the service would replace it at once."""
     if turn.rtc is None:
         raise CommandError("no RTC is there")
-    reconstructors.make(turn, ev.CopyMatrix(source=source, why=why))
+    reconstructors.make(turn, ev.CopyMatrix(source=source, why=why, anyway=anyway))
     hold(turn, why)
 
 

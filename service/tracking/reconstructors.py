@@ -146,7 +146,9 @@ def on_matrix(turn: Turn, made: ev.MatrixMade) -> None:
         turn.log("reconstructor.discarded", text)
         return
     held = why_unsendable(turn.state, record) or _beyond_judging(turn.state, record)
-    if not held and (wanted or _may_follow(turn.state)):
+    if not held and made.anyway:
+        send(turn, record.id)
+    elif not held and (wanted or _may_follow(turn.state)):
         send_once_judged(turn, record.id, wanted=wanted)
 
 
@@ -408,11 +410,12 @@ def why_unsendable(state: TrackerState, record: ReconstructorRecord) -> str | No
     """Return why a reconstructor may not be published now, whoever wants it, or None."""
     if state.rtc is None:
         return "no RTC is there"
-    if state.registration is not None and state.registration.candidate is not None:
-        return "a jump is suspected: the next window of telemetry decides"
-    known = _was_in_use(state, record)
-    if state.registration is not None and state.registration.doubt and not known:
-        return f"α is invalid ({state.registration.doubt})"
+    known, registration = _was_in_use(state, record), state.registration
+    if registration is not None and not known:  # one must be able to go back
+        if registration.candidate is not None:
+            return "a jump is suspected: the next window of telemetry decides"
+        if registration.doubt:
+            return f"α is invalid ({registration.doubt})"
     act = Act.SEND_KNOWN if known else Act.SEND_NEW
     alarm = forbidding(state, act)
     return why_unread(state, state.rtc.cm_id) if alarm is None else alarm.text

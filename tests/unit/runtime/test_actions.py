@@ -168,6 +168,15 @@ async def test_a_copy_that_would_not_hold_the_loop_any_more_is_refused(actions):
         ev.CopyMatrix(source=source.id, why="back"), replace(state, registration=far)
     )
     assert event.record.state is MatrixState.REFUSED
+    event = await actions.perform(
+        ev.CopyMatrix(source=source.id, why="back", anyway=True), replace(state, registration=far)
+    )
+    assert (event.record.state, event.record.gate, event.anyway) == (
+        MatrixState.PROPOSED,
+        None,
+        True,
+    )
+    assert event.record.reason.startswith("back, though ")
 
 
 async def test_the_margin_is_judged_at_the_registration_of_now(actions):

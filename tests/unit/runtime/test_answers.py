@@ -11,7 +11,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import AckState, Pattern, Reply
-from tests.unit.tracking.situations import acknowledged, verdict
+from tests.unit.tracking.situations import acknowledged, record, verdict
 from tests.unit.tracking.test_activity import (
     acquiring,
     gathering,
@@ -101,6 +101,17 @@ def test_a_copy_that_may_not_be_sent_now_is_said_to_be_kept_and_why():
     new = world.state.reconstructors[-1].id
     assert text.startswith(f"{new} is proposed and not sent: the RTC's matrix is of other slopes")
     assert final
+
+
+def test_a_copy_that_the_gate_refuses_tells_why_and_that_one_can_go_back_anyway():
+    world = idle()
+    order = given(world, cmd.Rollback())
+    world.pending.clear()
+    back = record("cm-back", MatrixState.REFUSED, reason="the operator goes back to initial")
+    world.tell(ev.MatrixMade(record=back, wanted=True))
+    words = f"the gate refused cm-back: {back.gate.reason}; ordered with anyway"
+    with pytest.raises(CommandError, match=words):
+        order.answer(world.state)
 
 
 def test_a_copy_that_cannot_be_made_is_refused_with_the_reason():

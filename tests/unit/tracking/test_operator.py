@@ -8,7 +8,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
 from service.wire import DitherRequest
-from tests.unit.tracking.situations import Story, of_kind, rtc, stopping
+from tests.unit.tracking.situations import Story, moved, of_kind, record, rtc, stopping
 
 
 @pytest.fixture
@@ -120,6 +120,28 @@ class TestGoingBack:
         story.tell(cmd.Rollback())
         assert not of_kind(story.make("cm-3", MatrixState.REFUSED, wanted=True), ev.SendMatrix)
 
+    def test_but_an_operator_goes_back_anyway(self, story):
+        (copied,) = of_kind(story.tell(cmd.Rollback(anyway=True)), ev.CopyMatrix)
+        assert copied.anyway
+        why = "the operator goes back to cm-1, though the gate refuses it"
+        back = record("cm-3", parent="cm-1", gate=None, judged=None, reason=why)
+        (sent,) = of_kind(
+            story.tell(ev.MatrixMade(record=back, wanted=True, anyway=True)), ev.SendMatrix
+        )
+        assert sent.id == "cm-3"
+        assert why in story.state.log[-1].text
+        assert story.state.log[-1].level is Level.WARNING
+
+    def test_a_suspected_jump_keeps_nobody_from_it(self, story):
+        shelf = story.state.reconstructors
+        summed = tuple(replace(r, sha256="ab") if r.id == "cm-1" else r for r in shelf)
+        story.state = replace(story.state, reconstructors=summed)
+        story.see(moved(shift_x_subap=0.15))
+        assert story.state.registration.candidate is not None
+        story.tell(cmd.Rollback())
+        made = story.make("cm-3", wanted=True, parent="cm-1", sha256="ab")
+        assert of_kind(made, ev.SendMatrix)
+
     def test_nothing_replaces_it_by_itself(self, story):
         story.tell(cmd.Rollback())
         story.use("cm-3")
@@ -166,10 +188,15 @@ class TestGoingBack:
     def test_there_must_be_something_to_go_back_to(self):
         refused(Story().meet(), cmd.Rollback(), "no earlier reconstructor has been in use")
 
-    @pytest.mark.parametrize("command", [cmd.Rollback(), cmd.Publish(id="cm-1")])
-    def test_it_waits_for_a_computation_under_way(self, story, command):
+    def test_it_need_not_wait_for_a_computation_under_way(self, story):
         story.tell(cmd.Refit())
-        refused(story, command, "being computed; wait")
+        story.tell(cmd.Rollback())
+        assert not of_kind(story.make("cm-3"), ev.SendMatrix), "mode is hold by now"
+        assert of_kind(story.make("cm-4", wanted=True, parent="cm-1"), ev.SendMatrix)
+
+    def test_to_publish_one_again_waits_for_it(self, story):
+        story.tell(cmd.Refit())
+        refused(story, cmd.Publish(id="cm-1"), "being computed; wait")
 
     @pytest.mark.parametrize("command", [cmd.Rollback(), cmd.Publish(id="cm-1")])
     def test_it_needs_an_rtc(self, story, command):

@@ -245,7 +245,7 @@ class Acquisition:
         return self.stage in UNDER_WAY
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)  # without slots: see Turn
 class TrackerState:
     """Everything the service knows; ``service.tracker.step`` makes the next one."""
 

@@ -10,7 +10,7 @@ from service.tracking.state import TrackerState
 
 NAMES = {field.name for field in fields(TrackerState)}
 PACKAGE = Path(tracking.__file__).parent
-REPLACED = ("replace(turn.state,", "replace(self.state,", "replace(state,")
+STATES = ("turn.state", "self.state", "state")
 CALLED = {"known": "registration"}
 """Fields that a turn has under another name."""
 
@@ -22,8 +22,9 @@ def written(tree):
             for target in node.targets:
                 if isinstance(target, ast.Attribute) and ast.unparse(target.value) == "turn":
                     yield CALLED.get(target.attr, target.attr)
-        elif isinstance(node, ast.Call) and ast.unparse(node).startswith(REPLACED):
-            yield from (keyword.arg for keyword in node.keywords)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "replace":
+            of_state = ast.unparse(node.args[0]) in STATES
+            yield from (keyword.arg for keyword in node.keywords if of_state)
 
 
 def test_every_field_of_the_state_is_written_by_one_module():

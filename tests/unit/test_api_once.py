@@ -87,13 +87,17 @@ async def test_a_refusal_is_an_answer_too_but_not_that_nothing_could_be_done(cli
 
 
 async def test_of_clicks_that_waited_for_a_failure_one_is_carried_out(client, service):
-    service.refusal = StorageError("the disk is full")
-    clicks = [asyncio.create_task(keyed(client)) for _ in range(4)]
-    await asyncio.sleep(0.005)  # the first is at work, the others wait
-    first = await clicks[0]
-    service.refusal = None
+    obeyed = service.submit
+
+    async def full_at_first(*_):
+        service.submit = obeyed
+        await asyncio.sleep(0.01)  # the others wait
+        raise StorageError("the disk is full")
+
+    service.submit = full_at_first
+    first, *others = await asyncio.gather(*(keyed(client) for _ in range(4)))
     assert first.status_code == 507
-    assert {(await click).json()["text"] for click in clicks[1:]} == {"order 1"}
+    assert {click.json()["text"] for click in others} == {"order 1"}
     assert len(service.commands) == 1
 
 

@@ -59,12 +59,15 @@ async def taken(desk, content=HDF5, asked=ASKED, length=None):
     return await desk.take(asked, in_chunks(content), length)
 
 
+async def until(condition):
+    async with asyncio.timeout(50.0):
+        while not condition():  # noqa: ASYNC110 - nobody tells
+            await asyncio.sleep(0.02)
+
+
 async def finished(desk, job):
-    for _ in range(1000):
-        await asyncio.sleep(0.05)
-        if desk.job(job.id).state in {FitState.DONE, FitState.FAILED}:
-            break
-    await asyncio.sleep(0.1)  # its files go last
+    await until(lambda: desk.job(job.id).state in {FitState.DONE, FitState.FAILED})
+    await until(lambda: not (desk._folder / job.id).exists())  # its files go last
     return desk.job(job.id)
 
 
@@ -96,8 +99,7 @@ async def test_a_fit_that_cannot_be_made_says_why(opened, tmp_path):
 async def test_fits_run_one_after_the_other(opened):
     desk = opened(sleeping)
     first, second = await taken(desk), await taken(desk)
-    await asyncio.sleep(0.2)
-    assert desk.job(first.id).state is FitState.RUNNING
+    await until(lambda: desk.job(first.id).state is FitState.RUNNING)
     assert desk.job(second.id).state is FitState.WAITING
     assert [job.id for job in desk.jobs()] == [first.id, second.id]
 
@@ -110,10 +112,7 @@ def at_a_stage(folder, asked):
 async def test_what_a_fit_is_at_is_told_and_it_ends_when_it_is_given_up(opened, tmp_path):
     desk = opened(at_a_stage)
     first, second = await taken(desk), await desk.take(ASKED, in_chunks(HDF5), None, "im.h5")
-    for _ in range(200):
-        if desk.job(first.id).stage:
-            break
-        await asyncio.sleep(0.05)
+    await until(lambda: desk.job(first.id).stage)
     assert desk.job(first.id).stage == "orientation"
     assert (await desk.give_up(second.id)).name == "im.h5"
     ended = await desk.give_up(first.id)

@@ -29,7 +29,7 @@ demo: $(STAMP) $(MANUAL) ## service and simulated RTC together; ARGS="--seconds 
 docs: $(MANUAL) ## build the manual, which the service shows at /manual/
 
 test: $(STAMP) ## all that a change needs, what is known soonest first; ARGS go to pytest
-	@$(PYTEST) -n 2 -m 'not long and not slow' $(ARGS)
+	@$(PYTEST) -n 3 -m 'not long and not slow' $(ARGS)  # for two cores: one may wait
 
 test-long: $(STAMP) ## the other tests: what takes minutes of real time
 	@$(PYTEST) -n 4 -m 'long and not slow' $(ARGS)  # they wait more than they work

@@ -1,5 +1,6 @@
 """Settings that must hold before any test module imports numpy, and the order of the suite."""
 
+import gc
 import inspect
 import os
 import signal
@@ -21,6 +22,9 @@ os.environ.setdefault(
 # A shell's background job inherits SIGINT as ignored, and would hand it on to the programs that the
 # system tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# What is collected stays: nobody need look through thousands of tests for garbage, then or later.
+gc.disable()
 
 ORDER = ("tests/unit/", "tests/properties/", "tests/physics/", "tests/system/")
 """What is known soonest comes first."""
@@ -95,6 +99,13 @@ def pytest_collection_modifyitems(config, items):
             # Real time on a machine that others use: a change refused for a moment's stall costs
             # hours, and what is broken fails twice. The first failure is told at the end.
             item.add_marker(pytest.mark.flaky(reruns=1))
+
+
+def pytest_collection_finish():
+    """Look for garbage among what comes from now on."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -95,6 +96,16 @@ def test_what_can_only_be_fitted_offline_is_refused(instrument):
         OpticsWorker(replace(instrument, frames=FrameWindows()), COMPUTE)
 
 
+ALPHA_SMALL = replace(ALPHA, rotation_rad=0.004)
+
+
+@cache
+def matrix_at(alpha):
+    """The small instrument's, in the conventions' axes."""
+    small = small_instrument()
+    return InteractionModel(small, modal_basis(small)).interaction_matrix(alpha)
+
+
 class Mistold:
     """A workbench whose instrument file tells another listing of the slopes than the RTC's."""
 
@@ -104,14 +115,10 @@ class Mistold:
         told = replace(small, slopes=SlopeRecipe(orientation=Orientation()))
         self.told = OpticsWorker(told, COMPUTE)
         self.auto = OpticsWorker(small, COMPUTE)
-        model = InteractionModel(small, modal_basis(small))
         mask = rtc_valid_subapertures(small)
-        self.seen = to_rtc(model.interaction_matrix(ALPHA_SMALL), *self.setting, mask)
-        at_rest = to_rtc(model.interaction_matrix(Misregistration()), *self.setting, mask)
+        self.seen = to_rtc(matrix_at(ALPHA_SMALL), *self.setting, mask)
+        at_rest = to_rtc(matrix_at(Misregistration()), *self.setting, mask)
         self.own = np.linalg.pinv(at_rest[:, :N_CONTROLLED]).astype(np.float32)
-
-
-ALPHA_SMALL = replace(ALPHA, rotation_rad=0.004)
 
 
 @pytest.mark.parametrize(

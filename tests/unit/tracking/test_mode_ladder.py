@@ -195,14 +195,12 @@ class Declined(Night):
 
     def for_s(self, seconds, decline):
         """Let windows come for so long; every reconstructor asked for is made and declined."""
-        asked, effects = [], ()
-        for _ in range(round(seconds / 2.0)):
-            effects = (*effects, *self.see())
-            for effect in of_kind(effects, ev.MakeMatrix):
+        asked = []
+        for _ in range(round(seconds / 10.0)):
+            for effect in of_kind(self.see(every_s=10.0), ev.MakeMatrix):
                 asked.append(effect)
                 made = self.make_for_nobody(effect)
                 decline(self, f"cm-{self.made}", made)
-            effects = ()
         return asked
 
     def make_for_nobody(self, effect):

@@ -23,9 +23,6 @@ os.environ.setdefault(
 # system tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# What is collected stays: nobody need look through thousands of tests for garbage, then or later.
-gc.disable()
-
 ORDER = ("tests/unit/", "tests/properties/", "tests/physics/", "tests/system/")
 """What is known soonest comes first."""
 
@@ -101,11 +98,16 @@ def pytest_collection_modifyitems(config, items):
             item.add_marker(pytest.mark.flaky(reruns=1))
 
 
-def pytest_collection_finish():
-    """Look for garbage among what comes from now on."""
-    gc.collect()
-    gc.freeze()
-    gc.enable()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Look for no garbage among thousands of tests, neither now nor later: they stay."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.collect()
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -64,8 +64,8 @@ class Telescope:
     drive: MirrorDrive | None
     """Limits and lag of the mirror; None: it obeys at once."""
 
-    move: Callable[[NDArray[np.float64]], None] | None
-    """Moves the mirror's image by ``(4,)``, numeric units; None: nothing can."""
+    move: Callable[[NDArray[np.float64]], float] | None
+    """Moves the mirror's image by ``(4,)``, numeric units, and tells when; None: nothing can."""
 
     def computer(self, blocks: Iterator[Block]) -> RealTimeComputer:
         """Return a computer that runs on these blocks of the feed."""
@@ -163,12 +163,12 @@ def build_telescope(
 
 def build_stage(
     options: Options, optics: MovingOptics
-) -> Callable[[NDArray[np.float64]], None] | None:
+) -> Callable[[NDArray[np.float64]], float] | None:
     """Return what moves the mirror's image when it is asked to, as well as it obeys."""
-    obedience = options.stage
-    if obedience is None:
+    if options.stage is None:
         return None
-    return lambda vector: optics.move(obedience * vector)
+    obedience, takes_s = options.stage
+    return lambda vector: optics.move(obedience * vector, takes_s)
 
 
 def build_plant(

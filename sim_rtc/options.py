@@ -193,10 +193,13 @@ class Options:
         "dead pixels: dark, and their subapertures read slopes of 0",
         count(0, 100),
     )
-    stage: float | None = option(
-        "--stage RATIO",
-        "a stage moves the mirror's image on request, by so much of what it is asked",
-        within(0.1, 2.0),
+    stage: tuple[float, float] | None = several(
+        "--stage RATIO[,SECONDS]",
+        "a stage moves the mirror's image on request, by so much of what it is asked, in 3 s: "
+        "its optics are computed meanwhile, which takes the full instrument 10",
+        lambda ratio, seconds=3.0: (ratio, seconds),
+        lambda ratio, seconds=3.0: 0.1 <= ratio <= 2.0 and 0.0 <= seconds <= 45.0,
+        ", 0.1 to 2 in 0 to 45 seconds",
     )
     frame_rate_hz: float = option(
         "--rate HZ", "frame rate", within(10.0, 4000.0), default=1000.0, chapter="loop"

@@ -39,7 +39,9 @@ _MESSAGE_S = 0.05
 _MOST_MESSAGE_FRAMES = 50
 """More are refused by the wire."""
 
-_BLOCK_FRAMES = 500
+BLOCK_FRAMES = 500
+"""Frames that are made at once, at most."""
+
 _PHASE_BLOCK_FRAMES = 200
 _AHEAD_BLOCKS = 2
 _POLL_S = 0.2
@@ -211,7 +213,7 @@ class OpenLoopFeed(Feed):
         **source: Unpack[Source],
     ) -> None:
         """Take the static OPD ``(n_points,)`` that only the sensor sees."""
-        super().__init__(batch_frames, _BLOCK_FRAMES, source)
+        super().__init__(batch_frames, BLOCK_FRAMES, source)
         self._sources = np.column_stack([self._sky.vibrations.phase_per_line, sensor_opd_m])
         self._source_slopes = np.empty((0, 0), dtype=np.float32)
         """``(n_lines + 1, n_slopes)`` of the vibrations, and what is static."""

@@ -28,7 +28,7 @@ from service.wire import (
     Status,
 )
 from sim_rtc.computer.activities import LARGEST_DITHER_M, Activities, refusal
-from sim_rtc.computer.feed import BATCH_FRAMES, Block
+from sim_rtc.computer.feed import BATCH_FRAMES, BLOCK_FRAMES, Block
 from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, Plan, ramp_refusal
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.computer.measure import Measurement, MeasurementRules
@@ -73,7 +73,7 @@ class RealTimeComputer:
         stroke_m: float,
         drive: MirrorDrive | None = None,
         mode_to_actuator: NDArray[np.float64] | None = None,
-        move: Callable[[NDArray[np.float64]], None] | None = None,
+        move: Callable[[NDArray[np.float64]], float] | None = None,
     ) -> None:
         self._blocks = blocks
         self._move = move
@@ -386,8 +386,9 @@ class RealTimeComputer:
         if self._move is None:
             return refused(request.id, "unsupported: nothing moves the mirror's image (--stage)")
         asked = [getattr(request, name) for name in PARAMETERS]
-        self._move(np.array(asked) / BOUNDARY_SCALE)
-        return Reply(id=request.id, accepted=True, reason="", start_seq=None)
+        there_s = self._move(np.array(asked) / BOUNDARY_SCALE)
+        there = round(there_s * self._settings.frame_rate_hz)
+        return accepted(request.id, there + BLOCK_FRAMES)  # the block that is under way then ends
 
     def _change_loop(self, request: LoopRequest) -> Reply:
         reason = loop_refusal(request, self._n_modes)

@@ -208,11 +208,18 @@ class MovingOptics:
         self._segment: _Segment | None = None
         self._next: Future[_Segment] | None = None
         self._current: tuple[int, Optics] | None = None
-        self._demands: SimpleQueue[Array] = SimpleQueue()
+        self._demands: SimpleQueue[tuple[float, Array]] = SimpleQueue()
+        self._seen_s = 0.0
 
-    def move(self, vector: Array) -> None:
-        """Move the mirror's image by ``(4,)``, numeric units, once the optics there are ready."""
-        self._demands.put(vector)
+    def move(self, vector: Array, takes_s: float) -> float:
+        """Move the mirror's image by ``(4,)``, numeric units; return when it stands still.
+
+        In seconds of loop time, so long after what was asked for last. If its optics are late, the
+        old ones stay until they are ready.
+        """
+        there_s = self._seen_s + takes_s
+        self._demands.put((there_s, vector))
+        return there_s
 
     def start(self) -> Optics:
         """Compute the optics at time 0; takes seconds."""
@@ -221,16 +228,17 @@ class MovingOptics:
 
     def at(self, time_s: float) -> Optics:
         """Return the optics at this time: the same object for as long as nothing has moved."""
+        self._seen_s = time_s
+        if not self._demands.empty():
+            there_s, vector = self._demands.get()
+            start = Misregistration.from_vector(self._schedule.start.vector + vector)
+            self._schedule = replace(self._schedule, start=start)
+            self._next = self._executor.submit(self._compute, there_s, None)
         if self._next is not None and self._next.done() and time_s >= self._next.result().start_s:
             self._adopt(self._next.result())
         segment = self._segment
         if segment is None:
             return self.start()
-        if not self._demands.empty():
-            there = self._schedule.start.vector + self._demands.get()
-            start = Misregistration.from_vector(there)
-            self._schedule = replace(self._schedule, start=start)
-            self._next = self._executor.submit(self._compute, time_s, None)
         if segment.first is segment.last:
             return segment.first
         share = min(1.0, (time_s - segment.start_s) / (segment.stop_s - segment.start_s))

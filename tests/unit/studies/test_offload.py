@@ -63,7 +63,7 @@ def test_from_30_percent_and_half_a_degree_it_is_home_in_five_moves(tmp_path):
     """Within 2 % of a subaperture and 0.02 deg, no more than a tenth of the way too far."""
     path = tmp_path / "pixels.toml"
     path.write_text(INSTRUMENT.read_text() + '\n[slopes]\nkind = "intensity"\n')
-    night = a_night(26.0, path, "--alpha=0.3,-0.2,0.5,1.004", "--stage=1.2")
+    night = a_night(26.0, path, "--alpha=0.3,-0.2,0.5,1.004", "--stage=1.2,0")
     assert night.state.rtc.n_slopes == 4 * int(night.dome.telescope.plant.valid.sum())
     assert logged(night, "instrument-mismatch") == []
     assert len(night.swaps) >= 2

@@ -203,6 +203,8 @@ def test_the_image_is_moved_by_who_can_and_refused_by_who_cannot(computer):
     assert not refused.accepted
     assert refused.reason.startswith("unsupported: ")
     moved = []
-    computer._move = moved.append
-    assert computer.execute(request).accepted
+    computer._move = lambda vector: moved.append(vector) or 2.5
+    reply = computer.execute(request)
+    assert reply.accepted
+    assert reply.start_seq >= 2500
     np.testing.assert_allclose(moved, [[-0.1, 0.0, np.pi / 2, 0.002]])

@@ -102,8 +102,10 @@ def test_a_stage_moves_what_drifts_and_jumps_by_themselves_as_well():
     schedule = Schedule(start=START, jumps=(Jump(time_s=10.0, shift_y_subap=0.2),))
     optics = MovingOptics(Plant(), schedule, AtOnce())
     assert optics.start().alpha.shift_x_subap == pytest.approx(0.1)
-    optics.move(np.array([-0.1, 0.0, 0.01, 0.0]))
+    optics.at(1.0)
+    assert optics.move(np.array([-0.1, 0.0, 0.01, 0.0]), 1.5) == 2.5
     seen = {time_s: optics.at(time_s).alpha for time_s in (2.0, 2.5, 9.0, 10.0, 10.5)}
+    assert seen[2.0].shift_x_subap == pytest.approx(0.1)
     assert seen[2.5].shift_x_subap == pytest.approx(0.0)
     assert seen[2.5].rotation_rad == pytest.approx(START.rotation_rad + 0.01)
     assert seen[10.5].shift_y_subap == pytest.approx(START.shift_y_subap + 0.2)

@@ -211,17 +211,26 @@ def _saved_of(values: dict[str, Any]) -> Saved:
         values, Saved, dec_hook=lambda _kind, value: np.array(value, dtype=np.float64)
     )
     refuse_unknown(values, saved)
-    if saved.registration is None and saved.acquisition is None and saved.orders is None:
+    parts = (saved.registration, saved.acquisition, saved.orders, saved.move)
+    if all(part is None for part in parts):
         raise ValueError("neither an α nor an acquisition nor an order")
     if saved.registration is not None:
         _check(saved.registration)
     found = None if saved.acquisition is None else saved.acquisition.found
     if found is not None and not np.isfinite(found.gains).all():
         raise ValueError("a gain is not finite")
+    if saved.move is not None:
+        _check_shapes([(saved.move.step, (4,)), (saved.move.total, (4,))])
     orders = saved.orders
     if orders is not None and (orders.mode is None) is not (orders.settings_mode is None):
         raise ValueError(f"mode is {orders.mode!r} and of the settings {orders.settings_mode!r}")
     return saved
+
+
+def _check_shapes(arrays: list[tuple[NDArray[Any], tuple[int, ...]]]) -> None:
+    for values, shape in arrays:
+        if values.shape != shape or not np.isfinite(values).all():
+            raise ValueError(f"found numbers of shape {values.shape}, expected {shape} finite ones")
 
 
 def _check(known: Registration) -> None:
@@ -232,9 +241,7 @@ def _check(known: Registration) -> None:
         arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, 4))]
         arrays += [(bias.excess, (4,)), (np.array(bias.loop), (len(bias.loop),))]
         arrays += [(np.array(bias.scatter), ())]
-    for values, shape in arrays:
-        if values.shape != shape or not np.isfinite(values).all():
-            raise ValueError(f"found numbers of shape {values.shape}, expected {shape} finite ones")
+    _check_shapes(arrays)
     covariance = known.covariance
     if bias is not None:
         covariance = np.block([[covariance, bias.shared.T], [bias.shared, bias.covariance]])

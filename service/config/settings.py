@@ -256,7 +256,7 @@ class OffloadTable(Table):
     """Of one move."""
 
     reach: FourAxes = (1.0, 1.0, 1.0, 0.02)
-    """Of all moves together since the service began, either way; 0: what cannot be moved."""
+    """Of all moves together, either way, also before a restart; 0: what cannot be moved."""
 
     settle_s: float = Field(default=3.0, ge=0.0, le=50.0)
     """From the reply until the image stands still, where the reply does not say, seconds."""

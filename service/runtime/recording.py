@@ -423,8 +423,10 @@ def is_urgent(before: TrackerState, after: TrackerState) -> bool:
     """Return whether what is not saved yet cannot wait: whose the RTC's open loop is, and orders.
 
     A service killed a second later would leave its own loop open to one that cannot know, or one
-    that undoes what an operator has ordered.
+    that undoes what an operator has ordered; or would not know where the mirror's image was moved.
     """
+    if before.move is not after.move:
+        return True
     return orders_of(before) != orders_of(after) or _course(before) != _course(after)
 
 

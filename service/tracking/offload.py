@@ -119,6 +119,18 @@ def on_failure(turn: Turn, name: str, text: str) -> None:
     turn.warn("offload.failed", f"{move.id}: {text}; whether it was made must be measured")
 
 
+def go_on(turn: Turn, move: Move) -> None:
+    """Take over the last demand of the service before; one without a reply may have been made.
+
+    A service that asks for no moves forgets it: somebody may bring the device elsewhere meanwhile.
+    """
+    if turn.policy.offloading is None:
+        return
+    turn.state = replace(turn.state, move=move)
+    if move.state is MoveState.ASKED:
+        on_failure(turn, move.id, "the service ended before the reply came")
+
+
 def _may_move(turn: Turn, known: Registration, rtc: Status, limits: Offloading) -> bool:
     """Return whether α is beyond doubt, nothing else is under way, and nobody forbids it."""
     state, last = turn.state, turn.state.move

@@ -306,7 +306,7 @@ class Move:
     """``(4,)`` by how much α was to change, numeric units."""
 
     total: Array
-    """``(4,)`` of all demands that were carried out since the service began, numeric units."""
+    """``(4,)`` of all demands that were carried out, numeric units; outlives the service."""
 
     asked_ns_utc: int
     n_moves: int = 0

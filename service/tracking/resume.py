@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from service.errors import CommandError
 from service.tracking import commands as cmd
-from service.tracking import dither
+from service.tracking import dither, offload
 from service.tracking.acquisition import inherit, left_behind
 from service.tracking.acquisition_stages import abort
 from service.tracking.activity import ramping
@@ -140,7 +140,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     if known is not None:
         bias = known.bias and replace(known.bias, earlier=None)
         known = replace(known, bias=bias, candidate=None, earlier=None)
-    elif acquisition is None and orders == Orders():
+    elif acquisition is None and state.move is None and orders == Orders():
         return None
     return Saved(
         system=state.system,
@@ -151,6 +151,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
         registration=known,
         acquisition=acquisition,
         orders=None if orders == Orders() else orders,
+        move=state.move,
     )
 
 
@@ -176,11 +177,18 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
         if saved.orders.stopped:
             _stay(turn, saved.orders.stopped)
         take_over(turn, saved.orders)
-    reason = _why_not(state, saved, now_ns)
+    _take_over_alpha(turn, saved, now_ns)
+    if saved.move is not None and saved.system == state.system:
+        offload.go_on(turn, saved.move)
+    return turn.state
+
+
+def _take_over_alpha(turn: Turn, saved: Saved, now_ns: int) -> None:
+    reason = _why_not(turn.state, saved, now_ns)
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"
         turn.warn("registration.not-restored", text)
-        return turn.state
+        return
     if saved.acquisition is not None:
         inherit(turn, saved.acquisition)
     known = saved.registration
@@ -190,7 +198,6 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
         text = f"α of {away_s:.0f} s ago; {saved.in_use or 'no known matrix'} was in use then"
         turn.log("registration.restored", text)
         age(turn)
-    return turn.state
 
 
 def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:

@@ -483,6 +483,9 @@ class Saved:
     orders: Orders | None = None
     """None: nothing was ordered that the settings do not say."""
 
+    move: Move | None = None
+    """The last demand to move the mirror's image, with all before it; None: there was none."""
+
     @property
     def tells_of_alpha(self) -> bool:
         """Whether it says what α was, or why it is not known."""

@@ -140,23 +140,47 @@ def test_an_rtc_that_is_killed_and_restarted_is_calibrated_again(night):
 
 
 @pytest.mark.long
-def test_a_service_that_is_killed_and_restarted_picks_up_where_it_was(night):
-    service = night.service("auto")
-    night.rtc()
-    night.wait_for_modes(N_TARGET)
+def test_a_service_killed_after_a_move_picks_up_where_it_was_and_leads_the_image_home(night):
+    """Its RTC sends pixels, and has a stage that overdoes what it is asked by a fifth."""
+    pixels = night.directory / "pixels.toml"
+    text = INSTRUMENT.read_text(encoding="utf-8")
+    pixels.write_text(text + '\n[slopes]\nkind = "intensity"\n', encoding="utf-8")
+    with night.settings.open("a", encoding="utf-8") as settings:
+        settings.write("[offload]\nenabled = true\n")
+    truth = night.directory / "truth.jsonl"
+    service = night.service("auto", pixels)
+    night.rtc("--stage=1.2,2", "--truth", str(truth), instrument=pixels)
+
+    def moves(n):
+        found = night.state["move"]
+        return found if found is not None and found["n_moves"] >= n else None
+
+    wait_for(lambda: moves(1), 40.0, "a move")
+    assert night.state["rtc"]["n_slopes"] == 448
     in_use, ids = night.state["in_use"], [r["id"] for r in night.shelf if r["parent"]]
+    saved = night.directory / "data" / "tracking.json"
+    wait_for(lambda: saved.exists() and '"n_moves": 1' in saved.read_text(), what="it is saved")
     service.kill()
 
-    night.service("auto")
+    again = night.service("auto", pixels)
     wait_for(lambda: night.state["in_use"] == in_use, 20.0, "the matrix in use is known")
     kept = [record["id"] for record in night.shelf if record["parent"]]
     assert kept[: len(ids)] == ids
     assert night.state["registration"]["restored_ns_utc"] is not None
-    check_registration(night.state["registration"])
-    wait_for(lambda: night.state["registration"]["n_windows"] >= 2, 30.0, "two windows")
-    check_registration(night.state["registration"])
+    assert moves(1)["total"]["shift_x_subap"] == pytest.approx(-0.1, abs=0.03)
     matrix = night.client.get(f"/v1/reconstructors/{in_use}/matrix")
     assert matrix.status_code == 200
+
+    def home():
+        told = [line for line in truth.read_text().split("\n")[:-1] if '"rotation_deg"' in line]
+        known, true = night.state["registration"], json.loads(told[-1])
+        found = [known["alpha"][name] - true[name] for name in TOLERANCE]
+        near = [abs(error) < TOLERANCE[name] for error, name in zip(found, TOLERANCE, strict=True)]
+        return all(near) and known["n_windows"] >= 2 and moves(2)
+
+    wait_for(home, 40.0, lambda: f"α as it is, after two moves; {night.state['registration']}")
+    assert "registration.jump" not in again.log + service.log
+    assert "Traceback" not in again.log
 
 
 @pytest.mark.long

@@ -7,12 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.archive.records import TrackingFile
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.runtime.recording import is_urgent
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.policy import Offloading
 from service.tracking.registration import MoveState, Validity
-from service.tracking.state import Mode
+from service.tracking.resume import resumed, saved_of
+from service.tracking.state import Mode, TrackerState
 from service.wire import OffloadRequest, Reply
 from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, moved, rtc
 
@@ -157,6 +160,45 @@ def test_the_reach_of_the_device_is_never_left():
     story.wait(4.0)
     story.see(moved(shift_x_subap=-0.04, shift_y_subap=0.03), n_windows=6)
     assert len(story.asked(OffloadRequest)) == 1
+
+
+def restarted(story, tmp_path):
+    """The service five seconds later: what it knows went through the file on the disk."""
+    file = TrackingFile(tmp_path / "tracking.json")
+    file.write(saved_of(story.state, story.now_ns))
+    now_ns = story.now_ns + 5 * SECOND
+    fresh = TrackerState(system="flao", mode=Mode.AUTO)
+    again = Story(Mode.AUTO, story.policy, state=resumed(fresh, file.read(), story.policy, now_ns))
+    again.now_ns = now_ns
+    return again
+
+
+def test_the_reach_is_not_left_though_the_service_restarts_between_two_moves(tmp_path):
+    short = replace(LIMITS, reach=np.array([0.04, 0.03, 0.0, 0.0]) / BOUNDARY_SCALE)
+    story = a_story(policy=replace(MOVES, offloading=short))
+    answer(story)
+    again = restarted(story, tmp_path)
+    np.testing.assert_allclose(again.state.move.total, story.state.move.total)
+    assert again.state.move.n_moves == 1
+    again.meet(cm_id="cm-1")
+    again.see(moved(shift_x_subap=-0.04, shift_y_subap=0.03), n_windows=20)
+    assert again.asked(OffloadRequest) == []
+
+
+def test_a_move_that_nobody_had_answered_when_the_service_ended_may_have_been_made(tmp_path):
+    story = a_story()
+    assert is_urgent(replace(story.state, move=None), story.state)
+    again = restarted(story, tmp_path)
+    assert again.state.move.state is MoveState.FAILED
+    before, after = (one.state.registration.covariance[0, 0] for one in (story, again))
+    assert after >= before + 0.06**2
+
+
+def test_a_service_that_moves_nothing_forgets_where_the_device_was(tmp_path):
+    story = a_story()
+    answer(story)
+    story.policy = STAYS
+    assert restarted(story, tmp_path).state.move is None
 
 
 def test_the_image_is_not_led_away_from_the_matrix_in_use():

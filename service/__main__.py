@@ -14,7 +14,7 @@ from service.commands.arguments import (
     command_line,
     with_negative_numbers,
 )
-from service.errors import PyrcalError, shown
+from service.commands.program import INTERRUPTED, status_of
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -38,10 +38,11 @@ def _carry_out(arguments: Sequence[str] | None) -> int:
         program, _ = OTHER_PROGRAMS[words[0]]
         os.execv(sys.executable, [sys.executable, "-m", program, *words[1:]])
     if arguments is None:
-        _leave_when_asked(0 if words[:1] == ["run"] else 130)
+        _leave_when_asked(0 if words[:1] == ["run"] else INTERRUPTED)
     options = command_line().parse_args(with_negative_numbers(words))
     options.own_process = arguments is None
-    try:
+
+    def carry_out() -> int:
         check_files(options)
         module = getattr(options, "module", options.command.replace("-", "_"))
         command = import_module(f"service.commands.{module}")
@@ -49,12 +50,9 @@ def _carry_out(arguments: Sequence[str] | None) -> int:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
         status: int = command.main(options)
-    except PyrcalError as error:
-        sys.stderr.write(f"pyrcal: {shown(str(error))}\n")
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    return status
+        return status
+
+    return status_of(carry_out)
 
 
 def _leave_when_asked(status: int) -> None:

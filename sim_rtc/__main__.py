@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import logging
-import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 
 import structlog
 from threadpoolctl import threadpool_limits
 
+from service.commands.program import log_to_terminal, status_of, told_to_stop
 from service.config import load_instrument
-from service.errors import ConfigurationError, PyrcalError
+from service.errors import ConfigurationError
 from service.files.recorder import RecordingWriter
 from service.files.recording import Recording
 from sim_rtc.assembly import Telescope, build_telescope
@@ -37,31 +35,25 @@ _log = structlog.get_logger("sim_rtc")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the simulated RTC until its time is up or it is told to stop; return the exit status."""
     options = parse_options(arguments)
-    _configure_log(quiet=options.quiet)
-    stopped = threading.Event()
+    log_to_terminal(quiet=options.quiet)
+    stopped = told_to_stop()
+    return status_of(lambda: _build_and_run(options, stopped), "sim_rtc")
 
-    def stop(_signal: int, _frame: FrameType | None) -> None:
-        stopped.set()
 
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, stop)
-    try:
-        if options.replay is not None:
-            return _replay(options.replay, options, stopped)
-        instrument = load_instrument(options.instrument)
-        _check_writable(options.truth)
-        # Nested threading makes small products slower, and the service needs the other core.
-        with threadpool_limits(1):
-            telescope = build_telescope(
-                options, instrument, batch_frames=message_frames(options.frame_rate_hz)
-            )
-            if options.snapshot is not None:
-                write_snapshot(telescope, options.snapshot)
-                return 0
-            run(telescope, options, stopped)
-    except PyrcalError as error:
-        print(f"sim_rtc: {error}", file=sys.stderr)
-        return 2
+def _build_and_run(options: Options, stopped: threading.Event) -> int:
+    if options.replay is not None:
+        return _replay(options.replay, options, stopped)
+    instrument = load_instrument(options.instrument)
+    _check_writable(options.truth)
+    # Nested threading makes small products slower, and the service needs the other core.
+    with threadpool_limits(1):
+        telescope = build_telescope(
+            options, instrument, batch_frames=message_frames(options.frame_rate_hz)
+        )
+        if options.snapshot is not None:
+            write_snapshot(telescope, options.snapshot)
+            return 0
+        run(telescope, options, stopped)
     return 0
 
 
@@ -186,20 +178,6 @@ def _check_writable(path: Path | None) -> None:
         path.open("w", encoding="utf-8").close()
     except OSError as error:
         raise ConfigurationError(f"--truth: cannot write {path}: {error.strerror}") from error
-
-
-def _configure_log(*, quiet: bool) -> None:
-    structlog.configure(
-        processors=[
-            structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.processors.KeyValueRenderer(key_order=["timestamp", "level", "event"]),
-        ],
-        wrapper_class=structlog.make_filtering_bound_logger(
-            logging.WARNING if quiet else logging.INFO
-        ),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
-    )
 
 
 if __name__ == "__main__":

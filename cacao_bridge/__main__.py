@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import queue
-import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 import numpy as np
@@ -24,7 +21,8 @@ from typing_extensions import override
 from cacao_bridge.calibration import consent
 from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
-from service.errors import PyrcalError
+from service.commands.program import log_to_terminal, status_of, told_to_stop
+from service.commands.terminal import print_lines
 from service.wire import FrameHeader, Keys, encode
 from service.wire.frames import encode_frames
 from sim_rtc.computer.feed import Background
@@ -65,23 +63,18 @@ def arguments_parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the bridge until it is told to stop; return the exit status."""
     options = arguments_parser().parse_args(arguments)
-    _configure_log()
-    stopped = threading.Event()
+    log_to_terminal()
+    stopped = told_to_stop()
+    return status_of(lambda: _run(options, stopped), "pyrcal cacao")
 
-    def stop(_signal: int, _frame: FrameType | None) -> None:
-        stopped.set()
 
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, stop)
-    try:
-        settings = load(options.config)
-        if options.apply is not None:
-            print(f"{consent(settings, options.apply)}: the bridge writes it; restart cacao's loop")
-            return 0
-        bridge = Bridge(settings)
-    except PyrcalError as error:
-        print(f"pyrcal cacao: {error}", file=sys.stderr)
-        return 2
+def _run(options: argparse.Namespace, stopped: threading.Event) -> int:
+    settings = load(options.config)
+    if options.apply is not None:
+        applied = consent(settings, options.apply)
+        print_lines([f"{applied}: the bridge writes it; restart cacao's loop"])
+        return 0
+    bridge = Bridge(settings)
     if options.seconds is not None:
         threading.Timer(options.seconds, stopped.set).start()
     bridge.run(stopped)
@@ -183,18 +176,6 @@ class Bridge:
             cpu_s=round(time.process_time(), 2),
             wrong=self._cacao.complaint,
         )
-
-
-def _configure_log() -> None:
-    structlog.configure(
-        processors=[
-            structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.processors.KeyValueRenderer(key_order=["timestamp", "level", "event"]),
-        ],
-        wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
-    )
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cacao_bridge.calibration import Calibration
 from cacao_bridge.dither import Mirror, Player, refusal
 from cacao_bridge.rows import LEAST_KEPT, Rows
-from cacao_bridge.settings import Settings
+from cacao_bridge.settings import OF_THE_SUM, Settings
 from cacao_bridge.streams import GoneError, Stream, StreamError, path_of, settled
 from service.wire import (
     Command,
@@ -96,6 +96,8 @@ class Cacao:
         self._played.clear()
         self._slopes_at: int | None = None
         self._commands_at: int | None = None
+        self._moves = False
+        """Whether the newest command is anything but 0."""
         self._offset: int | None = self._loop.counter_offset
         self._moved_s = {"slopes": time.monotonic(), "commands": time.monotonic()}
         self._clock: tuple[int, int] | None = None
@@ -198,6 +200,10 @@ class Cacao:
             return
         self._commands_at = frames.first + len(frames.values) - 1
         self._moved_s["commands"] = time.monotonic()
+        moves = np.concatenate([[self._moves], frames.values.any(axis=1)])
+        self._moves = bool(moves[-1])
+        if np.any(moves[:-1] & ~moves[1:]):
+            raise GoneError(f"{commands.name}: set to zero (loopZERO): the integrator began anew")
         before = self._offset
         if self._loop.counter_offset is None:
             self._offset = settled(lambda: _behind(commands, slopes.inode), before)
@@ -240,8 +246,8 @@ class Cacao:
         for name, moved_s in self._moved_s.items():
             stream = self._streams[name]
             if time.monotonic() - moved_s > _STANDS_S:
-                doubt = "" if name == "slopes" else ": is the loop on?"
-                return f"{stream.name}: its counter stands at {stream.counter}{doubt}"
+                why = stream.orphaned or ("" if name == "slopes" else "is the loop on (loopON)?")
+                return f"{stream.name}: its counter stands at {stream.counter}; {why}".rstrip("; ")
         return ""
 
     def _off_rate(self) -> str:
@@ -370,7 +376,7 @@ class Cacao:
     def _gains_and_leak(self) -> tuple[tuple[float, ...], float]:
         """Return gains ``(n_modes,)`` and leak as the contract has them.
 
-        cacao's is ``c = mult (c + gain (0 - m))``: its leak is mult, its gain their product.
+        cacao's mult is its leak; by the law in which it holds for the sum it is in the gain, too.
         """
         n_modes, told = self._loop.n_modes, [self._loop.gain, self._loop.leak]
         both = np.tile(np.array(told, dtype=np.float64)[:, None], n_modes)
@@ -391,8 +397,9 @@ class Cacao:
             self._law_trouble = (
                 f"{self._names.factors}: found {span}, expected the same for all modes"
             )
-        product = np.clip(gains * factors if self._names.gains else gains, 0.0, None)
-        self._law = tuple(product.tolist()), min(max(leak, 0.0), 1.0)
+        if self._names.gains and self._loop.law == OF_THE_SUM:
+            gains *= factors
+        self._law = tuple(np.clip(gains, 0.0, None).tolist()), min(max(leak, 0.0), 1.0)
         return self._law
 
     def execute(self, command: Command) -> Reply:

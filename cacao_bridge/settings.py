@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,10 @@ Counted = Annotated[int, Field(ge=1, le=1_000_000)]
 Opaque = Annotated[str, Field(min_length=1, max_length=128)]
 Name = Annotated[str, Field(min_length=1, max_length=79, pattern=r"^[^/]+$")]
 Optional = Annotated[str, Field(max_length=79, pattern=r"^[^/]*$")]
+
+
+OF_THE_SUM: Final = "mult (c - gain m)"
+"""A law of the integrator in which mult holds for the new command, too."""
 
 
 class WireTable(Table):
@@ -83,6 +87,9 @@ class LoopTable(Table):
     counter_offset: int | None = None
     """Counter of a frame of ``slopes`` less that of the ``commands`` that answer it; left out: as
     the commands' trace tells."""
+
+    law: Literal["mult c - gain m", "mult (c - gain m)"] = "mult c - gain m"
+    """How the modal filter integrates: that of today's cacao, or the one of before."""
 
     gain: Annotated[float, Field(ge=0.0)] = 0.0
     leak: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0

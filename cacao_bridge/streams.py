@@ -96,6 +96,7 @@ _LOOKS: Final = 4
 _LOOK_S: Final = 3e-4
 """Between two of them."""
 
+_MAKE_ANEW: Final = "make it anew with milk and cacao of that format"
 _TWO_WRITERS_S: Final = 10.0
 """Within which a process that was taken over from may not come back."""
 
@@ -232,7 +233,7 @@ class Stream:
         about = self._about
         version = bytes(about["version"]).decode("ascii", "replace")
         if version != VERSION:
-            raise self._error(f"version {version!r:.40}", f"{VERSION!r}")
+            raise self._error(f"version {version!r:.40}", f"{VERSION!r}: {_MAKE_ANEW}")
         naxis, size = int(about["naxis"]), about["size"]
         if not 1 <= naxis <= 3:
             raise self._error(f"{naxis} axes", "1 to 3")
@@ -242,7 +243,8 @@ class Stream:
             name = _TYPE_NAMES.get(kind, "unknown")
             raise self._error(f"numbers of type {kind} ({name})", "float (9) or double (10)")
         if int(about["location"]) != -1:
-            raise self._error("its data in a GPU's memory", "a stream in the host's")
+            found = f"its data in the memory of GPU {about['location']}"
+            raise self._error(found, "a stream in the host's memory: make it so, or a copy there")
         n_bytes = int(about["nelement"]) * np.dtype(_TYPES[kind]).itemsize
         if int(about["imdatamemsize"]) != n_bytes:
             raise self._error(f"{about['imdatamemsize']} bytes of data", f"{n_bytes}")
@@ -288,6 +290,17 @@ class Stream:
     def writer(self) -> int:
         """Process that wrote it last, as its trace tells; 0: it tells none."""
         return int(self._trace["pid"][0]) if len(self._trace) else 0
+
+    @property
+    def orphaned(self) -> str:
+        """That the process that wrote it last is there no more, for people; empty: it is there."""
+        try:
+            os.kill(self.writer, 0)
+        except ProcessLookupError:
+            return f"process {self.writer}, which wrote it, has ended"
+        except PermissionError:
+            pass
+        return ""
 
     @property
     def written_ns(self) -> int:
@@ -369,7 +382,8 @@ class Stream:
         if turn is not None and self._offset in {None, turn}:
             self._offset = turn
             return turn
-        raise StreamError(f"{self.name}: ring and counter drift apart: do two processes write it?")
+        why = self.orphaned or "do two processes write it?"
+        raise StreamError(f"{self.name}: ring and counter drift apart: {why}")
 
     def _seen_turn(self) -> int | None:
         idle, place = not self._writing[0], self._place

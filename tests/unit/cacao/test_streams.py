@@ -133,7 +133,7 @@ WRONG = {
     "size": (lambda milk: setattr(milk.md, "nelement", 7), "found 7 numbers, expected 6 for axes"),
     "type": (lambda milk: setattr(milk.md, "datatype", 3), r"type 3 \(uint16\), expected float"),
     "no type": (lambda milk: setattr(milk.md, "datatype", 99), r"type 99 \(unknown\), expected fl"),
-    "gpu": (lambda milk: setattr(milk.md, "location", 0), "in a GPU's memory, expected"),
+    "gpu": (lambda milk: setattr(milk.md, "location", 0), "in the memory of GPU 0, expected"),
     "bytes": (lambda milk: setattr(milk.md, "imdatamemsize", 1), "found 1 bytes of data, expected"),
     "cut off": (cut, "found 200 bytes, expected at least 384"),
     "short": (shorter, "found a file of .* bytes, expected one of .* format 2.00"),

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from service.commands.arguments import OneLineParser, seconds
+from service.commands.program import imported_and_run
 from service.commands.remote import add, words
-from service.errors import PyrcalError, shown
 
 _EPILOG = """
 One line for each thing that docs/rtc.md asks: what was found, what the contract says, where it
@@ -44,6 +44,7 @@ def check_parser() -> argparse.ArgumentParser:
         words("--only CHECK,...", "these checks and no others", type=_names, default=()),
         words("--passive", "only listen: ask and move nothing"),
         words("--open-loop", "also what opens the loop: loop, measure"),
+        words("--move-image", "also what moves the mirror's image on the sensor: offload"),
         words("--yes", "move what is said without asking"),
         words("--json", "print one JSON object at the end"),
     )
@@ -57,20 +58,15 @@ def _names(text: str) -> tuple[str, ...]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Check; return the exit status: 0 nothing is wrong, 1 something is, 2 nothing was checked."""
     options = check_parser().parse_args(arguments)
-    if arguments is None:  # nothing has begun that an interrupt could cut in two
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from check_rtc.check import check
 
-    if arguments is None:  # told to end, it first stops its dither and closes the loop again
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler)
-    try:
-        return check(options)
-    except PyrcalError as error:
-        sys.stderr.write(f"pyrcal: {shown(str(error))}\n")
-        return 2
-    except KeyboardInterrupt:
-        return 130
+    def load() -> Callable[[], int]:
+        from check_rtc.check import check
+
+        return lambda: check(options)
+
+    # told to end, it first stops its dither and closes the loop again
+    heard = (signal.SIGINT, signal.SIGTERM)
+    return imported_and_run(load, own_process=arguments is None, heard=heard)
 
 
 if __name__ == "__main__":

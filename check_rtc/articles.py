@@ -42,6 +42,9 @@ class Moves(StrEnum):
     LOOP = "loop"
     """It opens the loop for some seconds, and closes it again."""
 
+    IMAGE = "image"
+    """It has the mirror's image moved on the sensor, and back."""
+
 
 @dataclass(frozen=True, slots=True)
 class Article:
@@ -133,6 +136,11 @@ ARTICLES: Final[dict[str, Article]] = {
         "a measured matrix comes in slope per metre; the loop is closed again",
         "measure",
         Moves.LOOP,
+    ),
+    "offload": Article(
+        "a demand moves the image as asked for, once, and stands still from start_seq on",
+        "offload",
+        Moves.IMAGE,
     ),
 }
 """By name, in the order in which they are told."""

@@ -27,6 +27,8 @@ from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
 from service.model.slopes import likely_kind
 from service.prepared import Prepared, usual_folder
+from service.telemetry.lockin import Spectra, WindowEstimate, WindowRefused
+from service.telemetry.windows import ClosedLoop
 
 KEPT, BROKEN = 0, 1
 
@@ -61,7 +63,9 @@ def check(options: argparse.Namespace) -> int:
         basis_id=instrument.basis_id,
         config_id=instrument.config_id,
         consent=lambda moved: _agreed(moved, yes=options.yes),
+        move_image=options.move_image,
         dialect=lambda matrix: compared(instrument, matrix),
+        registered=lambda window, loop: registered(instrument, window, loop),
     )
     checks = []
     with Ear(endpoint, as_service=not options.passive) as ear:
@@ -117,6 +121,21 @@ def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> Dialect | s
     except ModelError as error:
         return f"the model of {instrument.name} cannot tell: {error}"
     return replace(dialect, adopted=instrument.slopes.orientation is None)
+
+
+def registered(
+    instrument: Instrument, window: Spectra, loop: ClosedLoop
+) -> WindowEstimate | WindowRefused:
+    """Return α of a window of dither, as the service would make it."""
+    from service.worker import OpticsWorker
+    from service.worker.records import Compute
+
+    try:
+        worker = OpticsWorker(instrument, Compute(cache=usual_folder(os.environ)))
+        worker.listen(loop.reconstructor, None)
+        return worker.fit(window, loop, None)
+    except ModelError as error:
+        return WindowRefused(reason=str(error), t_ns_utc=window.t_end_ns_utc)
 
 
 def _agreed(moved: tuple[str, ...], *, yes: bool) -> bool:

@@ -22,14 +22,17 @@ from check_rtc.moving import (
     reconnect,
     rejection,
 )
+from check_rtc.offload import STEP, Registered, offload
 from check_rtc.talk import TOTAL_M, Talk, dither, dithered_modes, replies
 from service.errors import LinkError, WireError
 from service.fit.dialect import Dialect
+from service.telemetry.lockin import WindowRefused
 from service.wire import Status
 
 _SWAPS: Final = ("commit", "chunks", "rejection")
 _UNKNOWN: Final = "the matrix in use is not to be had on rtc/cm/applied"
 
+NO_INSTRUMENT: Final = "no instrument was named"
 NO_ANSWER: Final = "no answer"
 """How an error begins that says that nobody was there."""
 
@@ -39,13 +42,16 @@ class Examination:
     """What is to be checked, and how."""
 
     only: frozenset[str] = frozenset()
-    """Names of checks; empty: all that do not open the loop."""
+    """Names of checks; empty: all that neither open the loop nor move the image."""
 
     passive: bool = False
     """Only what moves and asks nothing."""
 
     open_loop: bool = False
     """Also what opens the loop."""
+
+    move_image: bool = False
+    """Also what moves the mirror's image on the sensor."""
 
     listen_s: float = 8.0
     wait_s: float = 30.0
@@ -58,15 +64,21 @@ class Examination:
     consent: Callable[[tuple[str, ...]], bool] = lambda _: False
     """Is told what would be moved, and answers whether it may be."""
 
-    dialect: Callable[[NDArray[np.float32]], Dialect | str] = lambda _: "no instrument was named"
+    dialect: Callable[[NDArray[np.float32]], Dialect | str] = lambda _: NO_INSTRUMENT
     """Compares the matrix in use with the instrument file; a text says why it does not."""
+
+    registered: Registered = lambda _, __: WindowRefused(reason=NO_INSTRUMENT, t_ns_utc=0)
+    """Makes α of a window of dither, by the instrument file."""
 
     def wants(self, name: str) -> bool:
         """Return whether a check is to be made, if it may."""
         moves = ARTICLES[name].moves
         if self.passive and moves is not Moves.NOTHING:
             return False
-        return name in self.only if self.only else moves is not Moves.LOOP or self.open_loop
+        if self.only:
+            return name in self.only
+        agreed = {Moves.LOOP: self.open_loop, Moves.IMAGE: self.move_image}
+        return agreed.get(moves, True)
 
 
 def examine(talk: Talk, wish: Examination) -> Iterator[Checked]:
@@ -159,6 +171,11 @@ def moved_by(names: list[str], status: Status) -> tuple[str, ...]:
             "measure: the RTC opens THE LOOP, pushes and pulls two modes by "
             f"{1e9 * STROKE_M:.0f} nm RMS, and closes it again"
         )
+    if "offload" in names:
+        lines.append(
+            f"offload: THE MIRROR'S IMAGE is moved by {STEP:g} subap along x, and back; meanwhile "
+            f"{1e9 * TOTAL_M:.0f} nm RMS of dither"
+        )
     return tuple(lines)
 
 
@@ -178,6 +195,8 @@ def _asking(talk: Talk, wish: Examination, status: Status) -> Iterator[Checked]:
         in_use = _in_use(talk)
         found = skipped("measure", _UNKNOWN)
         yield found if in_use is None else measure(talk, talk.watch.status or status, in_use)
+    if wish.wants("offload"):
+        yield offload(talk, talk.watch.loop.matrix, wish.registered)
 
 
 def _swapping(talk: Talk, wish: Examination) -> Iterator[Checked]:

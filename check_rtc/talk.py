@@ -118,6 +118,8 @@ def _questions(talk: Talk, status: Status) -> list[_Question]:
     measure |= dict.fromkeys(("frequency_hz", "duration_s"))
     measure |= {"amplitude_m": [1e-12], "n_average": 1}
     ramp = {"v": 1, "id": new("ramp"), "groups": [[1, 0]], "gains": [0.1], "frames_per_gain": 1}
+    offload = {"v": 1, "id": new("offload"), "rotation_deg": 0.0, "magnification": 0.0}
+    offload |= {"shift_x_subap": 0.0}
     dithering = CommandKind.DITHER
     without = {key: value for key, value in told.items() if key != "modes"}
     return [
@@ -143,6 +145,13 @@ def _questions(talk: Talk, status: Status) -> list[_Question]:
             optional=True,
         ),
         _Question(CommandKind.RAMP, msgpack.packb(ramp), "a ramp of modes 1 to 0", optional=True),
+        _Question(
+            CommandKind.OFFLOAD,
+            msgpack.packb(offload),
+            "an offload demand of 0 without the key shift_y_subap",
+            ("missing", "unsupported"),
+            optional=True,
+        ),
     ]
 
 
@@ -251,7 +260,7 @@ def dither(
     try:
         ledger = _played(talk, status, request, reply.start_seq, matrix)
     finally:  # also where it is broken off
-        stopped = _stopped(talk)
+        ended = stopped(talk)
     told_seq = ledger.next_seq
     gone = talk.listen(
         _STOPS_S,
@@ -263,11 +272,9 @@ def dither(
     )
     talk.watch.block_takers.remove(ledger.take)
     judged = _judged(talk, request, reply.start_seq, ledger)
-    if not judged and not (stopped.accepted and gone):
+    if not judged and not (ended.accepted and gone):
         still_s = (ledger.last_seq - told_seq) / status.frame_rate_hz
-        judged = (
-            f"told to stop, it went on for {still_s:.1f} s, or its status does: {stopped.reason}"
-        )
+        judged = f"told to stop, it went on for {still_s:.1f} s, or its status does: {ended.reason}"
     if judged:
         return [wrong("dither", judged), _columns(ledger, modes, status)]
     found_m = ledger.findings[-1].found_m
@@ -278,7 +285,8 @@ def dither(
     return [fine("dither", found), _columns(ledger, modes, status)]
 
 
-def _stopped(talk: Talk) -> Reply:
+def stopped(talk: Talk) -> Reply:
+    """Tell the dither to stop; return what is replied, also where nothing is."""
     try:
         return talk.ear.command(DitherStop(id=talk.ear.new_id("stop")))
     except LinkError as error:

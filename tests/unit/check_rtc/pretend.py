@@ -6,6 +6,7 @@ It keeps the contract; what a test sets in ``twists`` it does otherwise.
 import itertools
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from check_rtc.talk import Talk
 from check_rtc.watch import Watch
 from service.errors import LinkError, WireError
 from service.link.session import Endpoint
+from service.model.misregistration import Misregistration
 from service.wire import (
     Acknowledgement,
     DitherRequest,
@@ -26,6 +28,7 @@ from service.wire import (
     Manifest,
     MeasuredManifest,
     MeasureRequest,
+    OffloadRequest,
     Reply,
     Status,
     command_id,
@@ -81,6 +84,8 @@ class Pretend:
             config_id="mask-1",
             system="bench",
         )
+        self.image = 0.1
+        """Where the mirror's is on the sensor, along x."""
         self._hear(Topic.ALIVE, alive=True)
 
     def talk(self):
@@ -258,6 +263,8 @@ class Pretend:
                 return self._change_loop(command)
             case MeasureRequest():
                 return self._measure(command)
+            case OffloadRequest():
+                return self._offload(command)
         return Reply(id=command.id, accepted=False, reason="unsupported: no", start_seq=None)
 
     def _start_dither(self, command):
@@ -286,6 +293,21 @@ class Pretend:
             self.closed = True
             self.session = self.twists.get("session_when_closed", self.session)
         return Reply(id=command.id, accepted=True, reason="", start_seq=self.seq)
+
+    def _offload(self, command):
+        if "stage" not in self.twists:
+            return Reply(
+                id=command.id, accepted=False, reason="unsupported: no stage", start_seq=None
+            )
+        self.image = self.image + self.twists["stage"] * command.shift_x_subap
+        start_seq = self.twists.get("stands", lambda seq: seq + 500)(self.seq)
+        return Reply(id=command.id, accepted=True, reason="", start_seq=start_seq)
+
+    def registered(self, _window, _loop):
+        """What somebody who knows the optics makes of a window; a window is of some second."""
+        return SimpleNamespace(
+            alpha=Misregistration(shift_x_subap=self.image), covariance=1e-6 * np.eye(4)
+        )
 
     def _start_over(self, session):
         self.closed, self.session = False, session

@@ -1,6 +1,7 @@
 """What an RTC does when it is asked: each check names what is done otherwise, and agrees else."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,9 @@ def asked(rtc, *names, **wish):
 
 
 def test_an_rtc_that_keeps_the_contract_is_told_so_whatever_it_is_asked():
-    checks = asked(Pretend())
+    rtc = Pretend(stage=1.0)
+    checks = asked(rtc, registered=rtc.registered)
+    assert rtc.image == pytest.approx(0.1)
     assert {one.name: one.found for one in checks.values() if one.outcome is not Outcome.OK} == {}
     assert set(checks) == ASKING
     assert "slopes lag +0.00 frames" in checks["columns"].found.replace("-0.00", "+0.00")
@@ -110,6 +113,53 @@ def test_slopes_of_the_other_sign_and_slopes_that_lag_are_told_apart():
         return np.concatenate([before, slopes[:-2]])
 
     wrong(columns(late), "slopes lag +2.0")
+
+
+# --- the image
+
+
+def moved(**twists):
+    rtc = Pretend(**twists)
+    check = asked(rtc, "offload", registered=rtc.registered)["offload"]
+    assert rtc.told_dither is None
+    return rtc, check
+
+
+@pytest.mark.parametrize(
+    ("twists", "words"),
+    [
+        ({"stage": 0.4}, "moved by 0.40 of the 0.1 subap"),
+        ({"stage": 0.0}, "0.00 of the 0.1 subap"),
+        ({"stage": -1.0}, "that is the other sign"),
+        ({"stage": 2.0}, "carried out twice"),
+        ({"stage": 1.0, "stands": lambda seq: seq - 300}, "start_seq is -0.3 s ahead"),
+        ({"stage": 1.0, "stands": lambda seq: seq + 90_000}, "start_seq is 90.0 s ahead"),
+        ({"reply": lambda _, reply: replace(reply, reason=reply.reason and "no")}, "will not: no"),
+    ],
+)
+def test_an_image_that_does_not_move_as_asked_is_named_and_brought_back(twists, words):
+    rtc, check = moved(**twists)
+    wrong(check, words)
+    assert rtc.image == pytest.approx(0.1)
+
+
+def test_who_moves_a_repeated_demand_again_is_named():
+    rtc = Pretend(stage=1.0)
+    rtc.cache = SimpleNamespace(handle=lambda command, _now_s: rtc._execute(command))
+    check = asked(rtc, "offload", registered=rtc.registered)["offload"]
+    wrong(check, "moved by 2.00", "carried out twice")
+
+
+def test_who_has_no_stage_and_who_does_not_answer_is_left_alone():
+    for twists in ({}, {"no_command": ("offload",)}):
+        assert moved(**twists)[1].outcome is Outcome.SKIPPED
+
+
+def test_where_the_image_stands_still_need_not_be_known():
+    rtc, check = moved(stage=0.8, stands=lambda _seq: None)
+    assert check.outcome is Outcome.OK
+    assert "0.80 of the 0.1 subap" in check.found
+    assert rtc.image == pytest.approx(0.1)
 
 
 # --- matrices

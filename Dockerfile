@@ -3,6 +3,9 @@ FROM ${BASE} AS manual
 WORKDIR /opt
 COPY constraints.txt ./
 RUN pip install --no-cache-dir -c constraints.txt sphinx myst-parser
+# the manual links into these
+COPY examples examples
+COPY sim_rtc sim_rtc
 COPY docs docs
 RUN python -m sphinx -q docs manual
 

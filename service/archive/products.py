@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,8 +31,18 @@ PROBE_BYTES = 1 << 20
 """Least that must fit on the disk for it to be called writable."""
 
 
+_ALIVE = {
+    MatrixState.PROPOSED: "waits for an operator",
+    MatrixState.PUBLISHED: "on its way to the RTC",
+    MatrixState.STAGED: "held by the RTC",
+    MatrixState.APPLIED: "in use",
+}
+
+
 class ReconstructorArchive(Store[ReconstructorRecord]):
     """Reconstructors, and beside each what has become of it, for the day when the index is lost."""
+
+    lost_with_it = "it cannot be sent, nor gone back to; what is known of it is in the index"
 
     def __init__(self, directory: Path, index: Index) -> None:
         description = "(n_modes, n_slopes), metres OPD per slope"
@@ -41,6 +51,13 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
         )
         self.largest_bytes = PROBE_BYTES
         """Of all matrices so far: what must fit on the disk."""
+
+    @override
+    def kept(self, records: Iterable[ReconstructorRecord]) -> dict[str, str]:
+        """Return what is in use, or on its way, and what it was made from."""
+        alive = [record for record in records if record.state in _ALIVE]
+        parents = {r.parent: f"{r.id} was made from it" for r in alive if r.parent}
+        return {**parents, **{record.id: _ALIVE[record.state] for record in alive}}
 
     def store(
         self,

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import msgspec
+from typing_extensions import override
 
+from service.archive.store import Folder
 from service.errors import ArchiveError, ConfigurationError, StorageError
 from service.files.recording import Recording
 
@@ -40,35 +42,21 @@ class RecordingRecord:
     """Messages that are not in it: the disk was too slow."""
 
 
-class Recordings:
+class Recordings(Folder):
     """The folder of recordings: beside each, as JSON, what is known of it.
 
     They are kept until somebody removes them, and are no part of what ``keep_gb`` limits.
     """
 
-    noun: Final = "recording"
+    counted = False
+    lost_with_it = "it cannot be replayed, nor exported"
 
     def __init__(self, directory: Path) -> None:
-        self.directory = directory
-
-    def path_of(self, recording_id: str) -> Path:
-        """Return where the file of a recording is, or would be."""
-        return self.directory / f"{recording_id}.h5"
+        super().__init__(directory, "recording")
 
     def stored(self) -> frozenset[str]:
         """Return the ids of those that lie here."""
         return frozenset(path.stem for path in self.directory.glob("*.h5"))
-
-    def prepare(self) -> tuple[str, ...]:
-        """Make the folder.
-
-        Raises
-        ------
-        OSError
-            If it cannot be made.
-        """
-        self.directory.mkdir(parents=True, exist_ok=True)
-        return ()
 
     def adopt(self, *, anew: bool) -> list[str]:
         """Call those ended that a service before this one has left; nothing is wrong with them."""
@@ -112,9 +100,10 @@ class Recordings:
         except OSError as error:
             raise StorageError(f"{path}: cannot be written: {error}") from error
 
-    def kept(self) -> Mapping[str, str]:
-        """Return by id why each is kept."""
-        return {one.id: f"asked for by {one.who}: {one.why}" for one in self.records()}
+    @override
+    def kept(self, records: Iterable[RecordingRecord]) -> dict[str, str]:
+        """Return who has asked for each."""
+        return {one.id: f"asked for by {one.who}: {one.why}" for one in records}
 
     def matrix(self, recording_id: str) -> None:
         """Read a whole recording, as those of other folders read a matrix.
@@ -130,18 +119,3 @@ class Recordings:
                     pass
         except (ConfigurationError, OSError, RuntimeError, ValueError, KeyError) as error:
             raise ArchiveError(f"{self.path_of(recording_id)}: damaged: {error}") from error
-
-    def remove(self, recording_id: str) -> None:
-        """Remove one.
-
-        Raises
-        ------
-        StorageError
-            If the disk refuses.
-        """
-        path = self.path_of(recording_id)
-        try:
-            for one in (path, path.with_suffix(".json")):
-                one.unlink(missing_ok=True)
-        except OSError as error:
-            raise StorageError(f"{one}: cannot be removed: {error}") from error

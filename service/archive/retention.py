@@ -12,21 +12,14 @@ from typing import Any
 from service.archive.archive import Archive
 from service.archive.index import AuditEntry
 from service.archive.nights import DAY_NS
-from service.archive.recordings import Recordings
+from service.archive.store import Folder
 from service.errors import ArchiveError
-from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.products import MatrixState
 
 NEWEST_KEPT = 10
 """Of each kind, whatever their age: those to go back to."""
 
 GIGABYTE = 1_000_000_000
-
-_ALIVE = {
-    MatrixState.PROPOSED: "waits for an operator",
-    MatrixState.PUBLISHED: "on its way to the RTC",
-    MatrixState.STAGED: "held by the RTC",
-    MatrixState.APPLIED: "in use",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +52,9 @@ class Item:
     """When its file was written, by the service's clock; 0: it is not there."""
 
     n_bytes: int
+    counted: bool = True
+    """Whether it counts in ``keep_gb``."""
+
     kept_because: str = ""
     """Why it is kept for ever; empty: it goes when it is old, or there is too much."""
 
@@ -93,35 +89,31 @@ def items(archive: Archive, in_use: Collection[str] = ()) -> tuple[Item, ...]:
     found, pins = [], archive.pins()
     for store in archive.stores:
         records = {record.id: record for record in store.records()}
-        there = [_item(store.noun, store.path_of(one), one, records) for one in store.stored()]
+        there = [_item(store, one, records) for one in store.stored()]
         there.sort(key=lambda item: item.stored_ns_utc)
         kept = {item.id: f"one of the newest {NEWEST_KEPT}" for item in there[-NEWEST_KEPT:]}
-        for item in there:
-            record = records.get(item.id)
-            alive = _ALIVE.get(record.state) if isinstance(record, ReconstructorRecord) else None
-            if alive and isinstance(record, ReconstructorRecord) and record.parent:
-                kept.setdefault(record.parent, f"{item.id} was made from it")
-            if alive or item.id in in_use:
-                kept[item.id] = alive or "in use"
+        kept |= dict.fromkeys(in_use, "in use") | store.kept(records.values())
         kept |= {pin.id: f"pinned by {pin.who}: {pin.why}" for pin in pins}
-        if isinstance(store, Recordings):
-            kept |= store.kept()
         found += [
             replace(item, kept_because=item.kept_because or kept.get(item.id, "")) for item in there
         ]
     return tuple(sorted(found, key=lambda item: item.stored_ns_utc))
 
 
-def _item(kind: str, path: Path, product_id: str, records: Mapping[str, Any]) -> Item:
+def _item(store: Folder, product_id: str, records: Mapping[str, Any]) -> Item:
     """Return a product; one that somebody has to look at is kept until then."""
     record = records.get(product_id)
     try:
-        status, fault = path.stat(), "" if record else "its record is not understood"
+        status, fault = (
+            store.path_of(product_id).stat(),
+            "" if record else "its record is not understood",
+        )
     except OSError as error:
         status, fault = None, f"its file cannot be found: {error.strerror}"
     return Item(
         id=product_id,
-        kind=kind,
+        kind=store.noun,
+        counted=store.counted,
         state="" if record is None else record.state,
         stored_ns_utc=0 if status is None else status.st_mtime_ns,
         n_bytes=0 if status is None else status.st_size,
@@ -134,7 +126,7 @@ def due(every: Collection[Item], keeping: Keeping, now_ns: int) -> Iterator[tupl
 
     Recordings are large, and stay until somebody removes them: no matrix goes because of one.
     """
-    n_bytes = sum(item.n_bytes for item in every if item.kind != Recordings.noun)
+    n_bytes = sum(item.n_bytes for item in every if item.counted)
     for item in sorted(every, key=lambda item: item.stored_ns_utc):
         age_days = (now_ns - item.stored_ns_utc) / DAY_NS
         if item.kept_because:
@@ -176,20 +168,15 @@ def verify(archive: Archive, which: Collection[Item]) -> Iterator[Damage | None]
         try:
             of_kind[item.kind].matrix(item.id)
         except ArchiveError as error:
-            yield _damage(item, of_kind[item.kind].path_of(item.id), str(error))
+            yield _damage(item, of_kind[item.kind], str(error))
         else:
             yield None
 
 
-def _damage(item: Item, path: Path, found: str) -> Damage:
+def _damage(item: Item, store: Folder, found: str) -> Damage:
+    path, means = store.path_of(item.id), store.lost_with_it
     if item.state == MatrixState.APPLIED:
         means = "the RTC has it, and goes on; it could not be sent again to one that restarts"
-    elif item.kind == "reconstructor":
-        means = "it cannot be sent, nor gone back to; what is known of it is in the index"
-    elif item.kind == Recordings.noun:
-        means = "it cannot be replayed, nor exported"
-    else:
-        means = "it cannot be fitted or compared any more; what is known of it is in the index"
     return Damage(
         id=item.id,
         kind=item.kind,
@@ -215,5 +202,6 @@ def low_on_space(directory: Path, keeping: Keeping, *, low: bool) -> str | None:
         return None
     return (
         f"{free_gb:.1f} GB are free in {directory}, reserve_gb is {keeping.reserve_gb:g}: free "
-        "space there, or lower [archive] keep_days or keep_gb; once it is full no order is taken"
+        "space there, remove recordings, or lower [archive] keep_days or keep_gb; once it is full "
+        "no order is taken"
     )

@@ -1,4 +1,4 @@
-"""Products of one kind: each an immutable HDF5 file, complete or absent, and a row of the index."""
+"""What is kept, a folder for each kind; products: immutable HDF5 files, and rows of the index."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service import __version__
 from service.archive.index import Index, Product, begun_ns_utc
@@ -27,7 +28,70 @@ DAMAGE = (OSError, RuntimeError, *NOT_UNDERSTOOD)
 Record = TypeVar("Record", bound=Product)
 
 
-class Store(Generic[Record]):
+class Folder:
+    """A folder with a file for each of what is kept, and beside it, as JSON, what is to be known.
+
+    Parameters
+    ----------
+    directory
+        Of the files.
+    noun
+        What one of them is called.
+    """
+
+    counted = True
+    """Whether they count in ``keep_gb``."""
+
+    lost_with_it = "it cannot be fitted or compared any more; what is known of it is in the index"
+    """What it means that one is damaged."""
+
+    def __init__(self, directory: Path, noun: str) -> None:
+        self.directory = directory
+        self.noun = noun
+        """What one of them is called."""
+
+    def path_of(self, product_id: str) -> Path:
+        """Return where the file of one is, or would be."""
+        return self.directory / f"{product_id}.h5"
+
+    def prepare(self) -> tuple[str, ...]:
+        """Make the folder, remove what was half-written; return a line for what will not go.
+
+        Raises
+        ------
+        OSError
+            If the folder cannot be made.
+        """
+        self.directory.mkdir(parents=True, exist_ok=True)
+        told = []
+        for leftover in sorted(self.directory.glob("*.part")):
+            try:
+                leftover.unlink()
+            except OSError as error:
+                told.append(f"{leftover}: cannot be removed and is left alone: {error.strerror}")
+        return tuple(told)
+
+    def remove(self, product_id: str) -> None:
+        """Remove one.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses.
+        """
+        try:
+            # what became of it goes last: without that a file taken in again would be as when made
+            for path in (self.path_of(product_id), self.path_of(product_id).with_suffix(".json")):
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be removed: {error}") from error
+
+    def kept(self, _records: Iterable[Any]) -> dict[str, str]:
+        """Return, by id, why some of them are kept for ever whatever their age."""
+        return {}
+
+
+class Store(Folder, Generic[Record]):
     """Products of one kind: their files, and their table in the index.
 
     The file of each holds its matrix, a checksum and its record. What a call has written is on the
@@ -58,11 +122,9 @@ class Store(Generic[Record]):
         description: str,
         dataset: str = "interaction_matrix",
     ) -> None:
-        self.directory = directory
+        super().__init__(directory, noun)
         self._index = index
         self._kind = kind
-        self.noun = noun
-        """What one of them is called."""
         self._table = noun.replace(" ", "_")
         self._description = description
         self._dataset = dataset
@@ -73,6 +135,7 @@ class Store(Generic[Record]):
         """Return the ids of those whose numbers lie here."""
         return frozenset(self._index.checksums(self._table))
 
+    @override
     def remove(self, product_id: str) -> None:
         """Remove the numbers of one; what is known of it stays in the index.
 
@@ -84,33 +147,7 @@ class Store(Generic[Record]):
             If the disk refuses.
         """
         self._index.forget_numbers(self._table, product_id)
-        try:
-            # what became of it goes last: without that a file taken in again would be as when made
-            for path in (self.path_of(product_id), self.path_of(product_id).with_suffix(".json")):
-                path.unlink(missing_ok=True)
-        except OSError as error:
-            raise StorageError(f"{path}: cannot be removed: {error}") from error
-
-    def path_of(self, product_id: str) -> Path:
-        """Return where the file of a product is, or would be."""
-        return self.directory / f"{product_id}.h5"
-
-    def prepare(self) -> tuple[str, ...]:
-        """Make the folder, remove what was half-written; return a line for what will not go.
-
-        Raises
-        ------
-        OSError
-            If the folder cannot be made.
-        """
-        self.directory.mkdir(parents=True, exist_ok=True)
-        told = []
-        for leftover in sorted(self.directory.glob("*.part")):
-            try:
-                leftover.unlink()
-            except OSError as error:
-                told.append(f"{leftover}: cannot be removed and is left alone: {error.strerror}")
-        return tuple(told)
+        super().remove(product_id)
 
     def adopt(self, *, anew: bool) -> list[str]:
         """Take in complete files that the index, made ``anew`` or not, does not know.

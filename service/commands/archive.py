@@ -64,8 +64,11 @@ def _list(every: tuple[Item, ...], *, as_json: bool) -> int:
         return DONE
     for item in every:
         print(shown(_line(item)))
-    n_bytes = sum(item.n_bytes for item in every)
-    say(f"{len(every)} products, {n_bytes / 1e6:.1f} MB")
+    counted, others = (
+        sum(item.n_bytes for item in every if item.counted is so) / 1e6 for so in (True, False)
+    )
+    text = f"{counted:.1f} MB that count in keep_gb, {others:.1f} MB that do not"
+    say(f"{len(every)} products: {text}")
     return DONE
 
 

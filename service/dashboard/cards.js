@@ -74,7 +74,7 @@ export function showWaiting(service, orders) {
 function listed(list, lines) {
   if ((list.dataset.lines ?? "") === lines.join("\n")) return;
   list.dataset.lines = lines.join("\n");
-  list.replaceChildren(...lines.map((text) => make("li", { text })));
+  list.replaceChildren(...lines.map((text) => make("li", { text, title: text })));
 }
 
 export function showWork(service, orders) {
@@ -104,7 +104,7 @@ export function showLoop(service, mirror) {
   gauge($("#margin"), judged && judged.radius / judged.bound, judged ? judged.text : DASH);
   const edge = state?.margin?.edge_motion_m;
   const limit = mirror?.edge_limit_m;
-  gauge($("#edge"), present(edge) && limit ? edge / limit : null, present(edge) ? `${nanometres(edge)} of ${nanometres(limit)} per unit of slope noise` : DASH);
+  gauge($("#edge"), present(edge) && limit ? edge / limit : null, present(edge) ? `${nanometres(edge)} of ${nanometres(limit)}` : DASH);
   const dither = state?.dithering;
   put($("#dither"), !rtc && dither ? `${dither.phase}: ${dither.reason}` : dither ? `${dither.phase}, ${nanometres(dither.mean_cost_m)} of ${nanometres(dither.budget_m)}: ${dither.reason}` : DASH);
   const link = state?.link;
@@ -116,7 +116,8 @@ function gauge(root, share, text) {
   const bar = root.querySelector("meter");
   bar.hidden = !present(share);
   if (present(share)) bar.value = Math.min(Math.max(share, 0), 1.2);
-  put(root.querySelector("span"), present(share) && share > 1 ? `▲ ${text}` : text);
+  const word = !present(share) || share <= bar.low ? "" : share <= 1 ? ", near" : ", beyond";
+  put(root.querySelector("span"), `${share > 1 ? "▲ " : ""}${text}${word}`);
 }
 
 export function showProvenance(service, orders) {
@@ -148,7 +149,7 @@ export function showReconstructors(service, orders) {
     make("td", { className: "n", text: String(r.n_modes) }),
     make("td", { text: shortly(r.alpha, r.sigma), title: registrationOf(r.alpha, r.sigma) }),
     make("td", { text: `${r.gate && !r.gate.accepted ? "REFUSED, " : ""}${margin(r.gate)?.text ?? "not judged"}`, title: verdict(r.gate) }),
-    make("td", { text: r.created_ns_utc > 0 ? ago(milliseconds(r.created_ns_utc), now) : DASH }),
+    make("td", { text: r.created_ns_utc > 0 ? ago(milliseconds(r.created_ns_utc), now, true) : DASH }),
     make("td", { text: r.reason || DASH, title: r.reason }),
   ));
   if (!rows.length) rows.push(make("tr", {}, make("td", { colspan: "7", text: "no reconstructor is known yet" })));

@@ -43,9 +43,11 @@ export function day(ms) {
   return new Date(ms).toISOString().slice(0, 10);
 }
 
-export function span(seconds) {
+// Two units, or coarse, one: 1 min 17 s, 1 min.
+export function span(seconds, coarse = false) {
   if (!present(seconds)) return DASH;
   const s = Math.max(0, seconds);
+  if (coarse && s >= 60) return span(s - (s < 3600 ? s % 60 : s < 86400 ? s % 3600 : s % 86400)).replace(/ 0 .*/, "");
   if (s < 10) return `${s.toFixed(1)} s`;
   if (s < 60) return `${Math.round(s)} s`;
   if (s < 3600) return `${Math.floor(s / 60)} min ${Math.round(s % 60)} s`;
@@ -53,8 +55,8 @@ export function span(seconds) {
   return `${Math.floor(s / 86400)} d ${Math.floor((s % 86400) / 3600)} h`;
 }
 
-export function ago(ms, now) {
-  return present(ms) && ms > 0 ? `${span((now - ms) / 1000)} ago` : DASH;
+export function ago(ms, now, coarse = false) {
+  return present(ms) && ms > 0 ? `${span((now - ms) / 1000, coarse)} ago` : DASH;
 }
 
 export function milliseconds(ns) {
@@ -86,7 +88,7 @@ export function verdict(gate) {
 }
 
 export function registrationOf(four, sigma) {
-  if (!four) return "for an unknown registration";
+  if (!four) return "an unknown registration";
   return PARAMETERS.map((p) => {
     const { value, sigma: error } = rounded(four[p.key], sigma?.[p.key], p);
     return `${p.label} ${value}${error === DASH ? "" : ` ± ${error}`}${p.short && ` ${p.short}`}`;

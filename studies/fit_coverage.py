@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
@@ -116,7 +116,7 @@ def table(truth: str, found: list[dict[str, Any]]) -> str:
     """Return the campaign as lines of a table."""
     errors = np.array([one["error"] for one in found])
     sigmas = np.array([one["sigma"] for one in found])
-    inside = np.mean([one["chi2"] < chi2.ppf(0.95, 4) for one in found])
+    inside = np.mean([one["chi2"] < scipy.stats.chi2.ppf(0.95, 4) for one in found])
     accepted = sum(one["accepted"] for one in found)
     lines = [
         f"{truth}: {len(found)} telescopes, {accepted} accepted, {inside:.0%} inside the 95 % "

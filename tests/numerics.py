@@ -8,8 +8,8 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from service.config.instrument import load_instrument
 from service.config.mirrors import rings
@@ -203,16 +203,17 @@ def closed_loop(loop: ClosedLoop, sky: Sky, dither: Array) -> FrameBlock:
     added = np.vstack([np.zeros((settling, N_MODES)), dither])
     sensor = sky.optical_gain * small_model().interaction_matrix(sky.alpha).astype(float)
     fresh = np.sqrt(1 - sky.memory**2) * rng.normal(size=(n_frames, N_MODES))
-    wave = lfilter([1.0], [1.0, -sky.memory], fresh, axis=0)
+    wave = scipy.signal.lfilter([1.0], [1.0, -sky.memory], fresh, axis=0)
     wave *= sky.turbulence * np.sqrt(small_basis().variance_m2)
     outside = wave @ sensor.T + sky.noise * rng.normal(size=(n_frames, len(sensor)))
     back = -loop.gains[:N_CONTROLLED, None] * loop.reconstructor.astype(float)
-    integrator = np.zeros((n_frames + 2, N_MODES))
-    slopes = np.empty((n_frames, len(sensor)))
+    # what the loop adds to its command by itself, and by what it has done: slopes come all at once
+    given = (outside + added @ sensor.T) @ back.T
+    own = back @ sensor[:, :N_CONTROLLED]
+    controlled = np.zeros((n_frames + 2, N_CONTROLLED))
     for k in range(n_frames):
-        slopes[k] = outside[k] + sensor @ (integrator[k] + added[k])
-        integrator[k + 2, :N_CONTROLLED] = (
-            loop.leak * integrator[k + 1, :N_CONTROLLED] + back @ slopes[k]
-        )
-    commands = integrator[:n_frames] + added
+        controlled[k + 2] = loop.leak * controlled[k + 1] + given[k] + own @ controlled[k]
+    commands = added.copy()
+    commands[:, :N_CONTROLLED] += controlled[:n_frames]
+    slopes = outside + commands @ sensor.T
     return block_of(slopes[settling:], commands[settling:], dither)

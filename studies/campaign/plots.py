@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from studies.campaign.rows import Row
 from studies.campaign.summary import distances, model_errors
@@ -34,7 +34,9 @@ def plot(path: Path, rows: list[Row], floor: NDArray[np.float64]) -> None:
     squares = np.sort(distances(errors, covariances, floor))
     share = np.arange(1, len(squares) + 1) / len(squares)
     axes[4].plot(squares, share, drawstyle="steps-post", label="found")
-    axes[4].plot(squares, chi2.cdf(squares, 4), label="chi-squared, 4 degrees of freedom")
+    axes[4].plot(
+        squares, scipy.stats.chi2.cdf(squares, 4), label="chi-squared, 4 degrees of freedom"
+    )
     axes[4].set(xlabel="normalised squared error", ylabel="share below")
     axes[4].legend()
     figure.savefig(path, dpi=120)

@@ -6,8 +6,8 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from service.telemetry.estimate import model_error
 from studies.campaign.plan import Estimator
@@ -54,7 +54,7 @@ def _line(key: tuple[Any, ...], rows: list[Row], floor: Array) -> str:
     sigma = np.sqrt(np.mean(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
     scatter = _within(errors, seeds)
     squares = distances(errors, covariances + model_errors(good), floor)
-    inside = np.mean(squares < chi2.ppf(0.95, 4))
+    inside = np.mean(squares < scipy.stats.chi2.ppf(0.95, 4))
     return line(
         *(name, counted),
         four(errors.mean(axis=0) * UNITS),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 
@@ -57,7 +58,7 @@ class FftPyramid:
         field = self.amplitude * np.exp(2j * np.pi * opd_m / self.wavelength_m)
         intensity = np.zeros((len(to_y), len(to_x)))
         for tilt in self._modulation():
-            focus = np.fft.fft2(field * tilt, s=mask.shape)
+            focus = scipy.fft.fft2(field * tilt, s=mask.shape)
             intensity += np.abs(to_y @ (focus * mask) @ to_x.T) ** 2
         n, nd = self.n_subapertures, self.n_nodes
         nodes = intensity.reshape(2, n, nd, 2, n, nd) / self.n_modulation

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.signal import welch
+import scipy
 
 from service.model.instrument import KarhunenLoeve
 from service.model.turbulence import von_karman_covariance
@@ -73,7 +73,9 @@ def temporal_spectrum_m2_hz(frequency_hz, points_m, weights):
 
 
 def measured_spectrum(series):
-    return welch(series, fs=SPEED_M_S / PITCH_M, nperseg=2048, window="hann", detrend="constant")
+    return scipy.signal.welch(
+        series, fs=SPEED_M_S / PITCH_M, nperseg=2048, window="hann", detrend="constant"
+    )
 
 
 def band_means(frequency_hz, power, edges_hz):

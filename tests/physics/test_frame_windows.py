@@ -67,9 +67,10 @@ class Camera:
         """``(2, width, 2, width)`` pixels."""
         width = self.sensor.n_subapertures
         images = np.empty((2, width, 2, width))
+        seen = {at: self.sensor.images(opd_m, at) for at in {(x, y) for y, x in self.offsets_px}}
         for place, (row, column) in enumerate(self.offsets_px):
             y, x = divmod(place, 2)
-            images[y, :, x] = self.sensor.images(opd_m, (column, row))[y, :, x]
+            images[y, :, x] = seen[column, row][y, :, x]
         return images
 
     def differential(self):

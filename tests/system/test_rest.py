@@ -144,6 +144,7 @@ def test_a_page_from_elsewhere_and_a_foreign_name_give_no_orders(shared):
     assert refused == ["request.foreign-origin", "request.foreign-host"]
 
 
+@pytest.mark.long
 def test_on_a_disk_that_refuses_nothing_is_ordered_and_afterwards_all_is_on_record(night):
     (process,) = night.processes
     with no_file_may_grow(process):
@@ -166,6 +167,7 @@ def test_on_a_disk_that_refuses_nothing_is_ordered_and_afterwards_all_is_on_reco
     assert process.ended(30.0) == 0, process.log
 
 
+@pytest.mark.long
 def test_what_was_stopped_stays_so_though_the_service_is_killed_at_once(night):
     order = {"by": "Ada", "reason": "someone is on the platform"}
     answer = night.client.post("/v1/stop", json=order)

@@ -63,6 +63,7 @@ def open_router(port: int) -> zenoh.Session:
     return zenoh.open(config)
 
 
+@pytest.mark.long
 def test_a_second_of_linear_telemetry_costs_little_more_than_a_large_product():
     """Beside a product of 2000 x 2000: what else the machine does slows both."""
     assert measure_linear(4).in_products < 2.5

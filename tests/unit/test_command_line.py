@@ -175,10 +175,13 @@ def test_simulator_campaigns_and_demo_are_reached_through_the_same_program(words
     assert found.stderr.startswith(begins)
 
 
-def processor_s(*words):
-    """Return the processor time of a whole run of the program, the best of three, and its end."""
-    spent, status = [], 0
-    for _ in range(3):
+def processor_s(*words, enough_s):
+    """Return the processor time of a whole run of the program, and its end.
+
+    It is the best of three, or of as many as it takes to be enough.
+    """
+    spent = []
+    while len(spent) < 3 and min(spent, default=enough_s) >= enough_s:
         process = subprocess.Popen(
             [sys.executable, "-m", "service", *words],
             stdout=subprocess.DEVNULL,
@@ -216,7 +219,7 @@ def processor_s(*words):
 )
 def test_what_needs_no_mathematics_comes_at_once(words, status):
     """0.3 s on the machine of docs/operating.md; a slower one may take twice as long."""
-    spent_s, found = processor_s(*words)
+    spent_s, found = processor_s(*words, enough_s=0.6)
     assert found == status
     assert spent_s < 0.6
 

@@ -40,6 +40,7 @@ once = cache(working_point)
 """Each takes a second or two."""
 
 
+@cache
 def on_sky(strength):
     """A bench whose sensor is that of a residual of another strength, for good."""
     instrument = small_instrument()

@@ -71,6 +71,11 @@ def short(bench, policy, seconds, mode=Mode.AUTO, **changes):
     return night
 
 
+@pytest.fixture(scope="module")
+def three_seconds(bench, policy):
+    return short(bench, policy, 3.0)
+
+
 def times_s(night, name):
     return [(e.t_ns_utc - START_NS) * 1e-9 for e in night.state.log if e.name == name]
 
@@ -118,8 +123,8 @@ def test_the_truth_moves_when_it_should_and_by_as_much(night):
     assert x[JUMP_S + 0.05] - x[JUMP_S] == pytest.approx(JUMP_SUBAP)
 
 
-def test_the_same_orders_make_the_same_night_and_without_dither_a_calmer_one(bench, policy):
-    night = short(bench, policy, 3.0)
+def test_the_same_orders_make_the_same_night_and_without_dither_a_calmer_one(three_seconds):
+    night = three_seconds
     errors = [m.wavefront_nm for m in night.dome.moments]
     again = replayed(WORDS, night.dome.orders, 3.0)
     assert [m.wavefront_nm for m in again.moments] == errors
@@ -131,8 +136,8 @@ def test_the_same_orders_make_the_same_night_and_without_dither_a_calmer_one(ben
     assert added == pytest.approx(dithers, rel=0.5)
 
 
-def test_two_nights_of_one_seed_are_one_night(bench, policy):
-    first, second = (short(bench, policy, 2.5) for _ in range(2))
+def test_two_nights_of_one_seed_are_one_night(bench, policy, three_seconds):
+    first, second = three_seconds, short(bench, policy, 3.0)
     assert [m.wavefront_nm for m in first.dome.moments] == [
         m.wavefront_nm for m in second.dome.moments
     ]

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+import scipy
 
 from service.config.mirrors import rings
 from service.model.instrument import KarhunenLoeve
@@ -48,7 +48,7 @@ def turbulence(seed: int, memory_s: float = 0.05, strength: float = 1.0) -> np.n
     rng = np.random.default_rng(seed)
     memory = np.exp(-0.01 / memory_s)
     fresh = np.sqrt(1 - memory**2) * rng.normal(size=(100 * SECONDS, N_MODES))
-    wave = lfilter([1.0], [1.0, -memory], fresh, axis=0)
+    wave = scipy.signal.lfilter([1.0], [1.0, -memory], fresh, axis=0)
     return strength * wave * np.sqrt(basis().variance_m2)
 
 

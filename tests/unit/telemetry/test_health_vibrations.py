@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+import scipy
 
 from service.telemetry.health import (
     MIN_SEGMENTS,
@@ -23,7 +23,7 @@ def slopes(seed: int, vibrations: dict[float, float], n_segments: int = 12) -> n
     """Turbulence-like noise with a red spectrum, and sines on tip: Hz to amplitude in σ."""
     rng = np.random.default_rng(seed)
     n_frames = n_segments * SEGMENT_FRAMES
-    noise = lfilter([1.0], [1.0, -0.9], rng.normal(size=(n_frames, N_SLOPES)), axis=0)
+    noise = scipy.signal.lfilter([1.0], [1.0, -0.9], rng.normal(size=(n_frames, N_SLOPES)), axis=0)
     for frequency, amplitude in vibrations.items():
         turns = frequency * np.arange(n_frames) / 1000.0
         noise[:, : N_SLOPES // 2] += amplitude * np.sin(2 * np.pi * turns)[:, None]
@@ -53,7 +53,9 @@ def test_lines_are_found_to_a_bin():
 def test_the_steep_end_of_turbulence_is_no_line():
     rng = np.random.default_rng(3)
     # a loop's own overshoot at 5 Hz, where turbulence bends
-    steep = lfilter([1.0], [1.0, -1.993, 0.994], rng.normal(size=(12 * 1024, N_SLOPES)), axis=0)
+    steep = scipy.signal.lfilter(
+        [1.0], [1.0, -1.993, 0.994], rng.normal(size=(12 * 1024, N_SLOPES)), axis=0
+    )
     assert listened(steep).lines_hz() == ()
 
 

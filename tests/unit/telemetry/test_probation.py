@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.signal
+import scipy
 
 from service.telemetry.frames import FrameBlock
 from service.telemetry.probation import WITHIN_S, Comparison, Verdict, begun_anew, observe

@@ -207,12 +207,24 @@ def test_it_is_carried_out_and_all_ends_or_it_is_refused_in_one_line(activity, c
     assert "\n" not in refusal
     if refusal.startswith(f"{type(command).__name__}: "):
         assert any(one.text in refusal for one in running)
+    # refused, it has changed nothing: all goes on as if nothing had been said
+    after = left_alone(activity) if refusal else ended(world)
+    assert not strands(after)
+    assert not [entry.text for entry in after.state.log if "busy: " in entry.text]
+
+
+@cache
+def left_alone(activity):
+    return ended(activity())
+
+
+def ended(world):
+    """Let everything come to its end, or the longest time pass."""
     passed_s = 0
     while strands(world) and passed_s < LONGEST_S:
         world.pass_(5.0)
         passed_s += 5
-    assert not strands(world)
-    assert not [entry.text for entry in world.state.log if "busy: " in entry.text]
+    return world
 
 
 def refused(world, command):

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.signal import welch
+import scipy
 
 from sim_rtc.telescope.sky import Shape, VibrationLine, Vibrations
 
@@ -51,7 +51,7 @@ def test_a_shaken_oscillator_has_its_rms_its_frequency_and_its_width():
     strength = np.concatenate([source.frames(500)[:, 0] for _ in range(400)]).astype(float)
     # 400 s, coherent for 1 / (damping 2 pi f) = 0.13 s: 2.6 % on the variance.
     assert strength.var() == pytest.approx((20e-9) ** 2, rel=0.08)
-    frequency, power = welch(strength, fs=RATE_HZ, nperseg=4096)
+    frequency, power = scipy.signal.welch(strength, fs=RATE_HZ, nperseg=4096)
     peak = frequency[power.argmax()]
     assert peak == pytest.approx(frequency_hz, rel=damping)
     # The half-power width of a resonance is 2 damping f.

@@ -1,9 +1,9 @@
-"""A whole RTC, from docs/rtc.md alone: ``python examples/rtc.py ENDPOINT SYSTEM PLANT.npz``.
+"""A whole RTC, from docs/rtc.md alone: ``python -m examples.rtc ENDPOINT SYSTEM PLANT.npz``.
 
-PLANT.npz stands for the telescope: ``response`` (n_slopes, n_modes), slope per metre, ``sigma_m``
-(n_modes,) of the turbulence, and the ``matrix`` (n_controlled, n_slopes) to begin with.
+PLANT.npz has a telescope and the ``matrix`` (n_controlled, n_slopes) to begin with.
 """
 
+import functools
 import hashlib
 import json
 import sys
@@ -15,158 +15,136 @@ import numpy as np
 import zenoh
 import zenoh.ext
 
+from examples.telescope import Telescope
+
 endpoint, system, file = sys.argv[1:]
-plant, rng, lock, root = np.load(file), np.random.default_rng(), threading.Lock(), f"ao/v1/{system}"
-D, sigma_m, R = plant["response"], plant["sigma_m"], plant["matrix"].astype("<f4")
-(n_slopes, n), rows, hz, lead, most_m = D.shape, len(R), 500.0, 20, 50e-9
-c, turbulence, seq, start_ns = np.zeros((2, n)), np.zeros(n), 0, time.time_ns()
-ids, answered, used, parts = {"basis_id": "plant-1", "config_id": "plant-1"}, {}, {}, {}
-status = {"v": 1, "session": f"{start_ns:x}", "seq": None, "t_ns": start_ns, "loop": "closed"}
-status |= {"frame_rate_hz": hz, "delay_frames": 2.0, "leak": 0.99, "n_slopes": n_slopes, **ids}
-status |= {"gains": [0.4] * rows + [0.0] * (n - rows), "n_modes": n, "n_controlled": rows}
-status |= {"cm_id": f"own-{start_ns:x}", "dither": None, "max_dither_m": most_m}
-status |= {"max_dither_modes": 8, "magnitude": None, "flux": None}
+plant, root, start_ns, lock = np.load(file), f"ao/v1/{system}", time.time_ns(), threading.Lock()
+telescope, R, (n_slopes, n) = Telescope(plant), plant["matrix"], plant["response"].shape
+c, hz, most_m, seq, n_next, used = np.zeros((2, n)), 500.0, 50e-9, 0, len(R), {}
+ids = {"v": 1, "basis_id": "plant-1", "config_id": "plant-1"}
+now = {"session": str(start_ns), "loop": "closed", "frame_rate_hz": hz, "delay_frames": 2.0, **ids}
+now |= {"leak": 0.99, "gains": [0.4] * len(R) + [0.0] * (n - len(R)), "n_controlled": len(R)}
+now |= {"n_slopes": n_slopes, "n_modes": n, "cm_id": f"own-{start_ns}", "magnitude": None}
+now |= {"flux": None, "dither": None, "max_dither_m": most_m, "max_dither_modes": 8}
 
 
-def dither(k):  # metres, of frame k; one that is over ends
-    told, u = status["dither"], np.zeros(n)
-    k -= told["start_seq"] if told else 0
-    if told and 0 <= k < round(told["duration_s"] * hz):
-        turns = np.array(told["frequency_hz"]) * k / hz
-        u[told["modes"]] = np.array(told["amplitude_m"]) * 2**0.5 * np.sin(2 * np.pi * turns)
-    elif told and k >= 0:
-        status["dither"] = None
-    return u
-
-
-def obey(kind, asked):  # return why not
-    global rows
-    if kind == "dither" and asked["action"] == "stop":
-        status["dither"] = None
-    elif kind == "dither" and status["dither"]:
-        return f"busy: {status['dither']['id']} plays"
-    elif kind == "dither" and asked["kind"] != "sine":
-        return "unsupported: random signs"
-    elif kind == "dither":
-        if max(asked["modes"]) >= n or max(asked["amplitude_m"]) > most_m:
-            return f"range: modes up to {n - 1}, amplitude_m up to {most_m}"
-        status["dither"] = {**asked, "start_seq": seq + lead}
-    elif len(asked["gains"] or status["gains"]) != n:
+def obey(kind, asked):  # or return why not
+    global n_next
+    if kind == "loop" and len(asked["gains"] or now["gains"]) != n:
         return f"range: {len(asked['gains'])} gains, expected {n}"
+    if kind == "loop":
+        if asked["loop"] == "open" and now["loop"] == "closed":  # that begins a session
+            c[:], now["dither"], now["session"] = 0.0, None, str(time.time_ns())
+        n_next = asked["n_controlled"] or n_next
+        now.update({key: asked[key] for key in ("gains", "leak", "loop") if asked[key] is not None})
+    elif asked["action"] == "stop":
+        now["dither"] = None
+    elif now["dither"]:
+        return "busy: a dither plays"
+    elif asked["kind"] != "sine" or max(asked["modes"]) >= n or max(asked["amplitude_m"]) > most_m:
+        return f"range: expected sines of modes below {n} and at most {most_m} m"
     else:
-        if asked["loop"] == "open" and status["loop"] == "closed":  # that begins a session
-            c[:], status["dither"], status["session"] = 0.0, None, f"{time.time_ns():x}"
-        rows = asked["n_controlled"] or rows
-        status.update({k: asked[k] for k in ("gains", "leak", "loop") if asked[k] is not None})
+        now["dither"] = {**asked, "start_seq": seq + 20}
     return ""
 
 
-def on_command(query):
+@functools.cache  # the same again is answered as before, and not carried out again
+def reply(kind, data):
     name, reason = None, ""
-    with query, lock:
-        try:
-            asked = msgpack.unpackb(query.payload.to_bytes())
-            name, kind = asked["id"], str(query.key_expr).split("/")[-1]
-            if name not in answered:
-                reason = obey(kind, asked) if asked["v"] == 1 else "v: expected 1"
-        except KeyError as error:
-            reason = f"missing: {error}"
-        except Exception as error:
-            reason = f"range: {error}"
-        start = None if reason else seq + lead
-        said = {"v": 1, "id": name, "accepted": not reason, "reason": reason, "start_seq": start}
-        query.reply(
-            query.key_expr, msgpack.packb(answered.setdefault(name, said) if name else said)
-        )
-
-
-def acknowledge(told, state, reason="", frame=None):
-    said = {"v": 1, "session": status["session"], "state": state, "reason": reason}
-    said |= {"id": told.get("id"), "sha256": told.get("sha256"), "frame_seq": frame}
-    session.put(f"{root}/cm/ack", msgpack.packb(said), congestion_control=block)
-
-
-def on_chunk(sample):
-    *_, name, _, k = str(sample.key_expr).split("/")
-    parts.setdefault(name, {})[int(k)] = sample.payload.to_bytes()
-
-
-def on_commit(sample):  # what follows may wait: not in zenoh's thread
-    threading.Thread(target=swap, args=[sample.payload.to_bytes()]).start()
-
-
-def swap(data):
-    global R
     try:
-        told = msgpack.unpackb(data)
-        name, wanted, shape = told["id"], range(told["n_chunks"]), told["shape"]
-        before, frame = used.get(name, (None, None))
+        asked = msgpack.unpackb(data)
+        name = asked["id"]
+        reason = obey(kind, asked) if asked["v"] == 1 else "v: expected 1"
     except Exception as error:
-        return acknowledge({}, "rejected", f"range: {error}")
-    if before is not None and before == told["sha256"]:
-        return acknowledge(told, "applied", "", frame)
-    have, end_s = parts.setdefault(name, {}), time.time() + 2.0
-    while not before and any(k not in have for k in wanted) and time.time() < end_s:
-        time.sleep(0.01)
-    for k in wanted:  # what is missing is asked for
-        if k not in have and not before:
-            for reply in session.get(f"{root}/cm/{name}?chunk={k}", timeout=2.0):
-                have[k] = reply.ok.payload.to_bytes() if reply.ok else b""
-    data = b"".join(have.get(k, b"") for k in wanted)
-    right = hashlib.sha256(data).hexdigest() == told["sha256"] and ids.items() <= told.items()
-    if before or not right or shape != [rows, n_slopes]:
-        return acknowledge(told, "rejected", "range: id, sha256, shape, basis or configuration")
-    with lock:
-        R, frame = np.frombuffer(data, "<f4").reshape(shape), seq
-        c[:, rows:] = 0.0
-        status.update(cm_id=name, n_controlled=rows)
-    used[name] = told["sha256"], frame
-    return acknowledge(told, "applied", "", frame)
+        reason = f"{'missing' if isinstance(error, KeyError) else 'range'}: {error}"
+    start = None if reason else seq + 20
+    return {"v": 1, "id": name, "accepted": not reason, "reason": reason, "start_seq": start}
 
 
-def on_applied(query):
-    data = R.tobytes()
-    told = {"v": 1, "id": status["cm_id"], "shape": R.shape, "dtype": "<f4", "n_chunks": 1, **ids}
-    told |= {"chunk_bytes": len(data), "sha256": hashlib.sha256(data).hexdigest(), "system": system}
-    told |= dict.fromkeys(("alpha", "sigma", "im_id", "parent")) | {"created_ns": start_ns}
-    with query:
-        query.reply(query.key_expr, data if query.parameters.get("chunk") else msgpack.packb(told))
+def in_use():  # the matrix that the loop multiplies with, and its manifest
+    data = R.astype("<f4").tobytes()
+    told = {"id": now["cm_id"], "sha256": hashlib.sha256(data).hexdigest(), "shape": R.shape, **ids}
+    told |= {"dtype": "<f4", "n_chunks": 1, "chunk_bytes": len(data), "created_ns": start_ns}
+    told |= {"system": system, "alpha": None, "sigma": None, "im_id": None, "parent": None}
+    return data, told
 
 
-config, block = zenoh.Config(), zenoh.CongestionControl.BLOCK
+def answer(query):
+    with query, lock:
+        kind, chunk = str(query.key_expr).split("/")[-1], query.parameters.get("chunk")
+        data, told = in_use() if kind == "applied" else (b"", reply(kind, query.payload.to_bytes()))
+        query.reply(query.key_expr, data if chunk else msgpack.packb(told))
+
+
+@functools.cache
+def swap(commit):  # every part is asked for, and none waited for
+    global R
+    said = {"v": 1, "id": None, "sha256": None, "state": "rejected", "frame_seq": None}
+    try:
+        told = msgpack.unpackb(commit)
+        asked = [session.get(f"{root}/cm/{told['id']}?chunk={k}") for k in range(told["n_chunks"])]
+        data = b"".join(part.ok.payload.to_bytes() for parts in asked for part in parts if part.ok)
+        said |= {"id": told["id"], "sha256": told["sha256"]}
+        said["reason"] = "range: id, sum, shape, basis, configuration, system, or not finite"
+        terms = {**ids, "shape": [n_next, n_slopes], "system": system}
+        right = hashlib.sha256(data).hexdigest() == told["sha256"] and terms.items() <= told.items()
+        matrix = np.frombuffer(data, "<f4")
+        if right and np.isfinite(matrix).all() and used.setdefault(told["id"], commit) == commit:
+            with lock:
+                R = matrix.reshape(told["shape"])
+                c[:, len(R) :] = 0.0
+                now.update(cm_id=told["id"], n_controlled=len(R))
+                said |= {"state": "applied", "reason": "", "frame_seq": seq}
+    except Exception as error:
+        said["reason"] = f"range: {error}"
+    return said
+
+
+def take(commits):  # in a thread of its own: it waits
+    for commit in commits:
+        said = swap(commit.payload.to_bytes()) | {"session": now["session"]}
+        session.put(f"{root}/cm/ack", msgpack.packb(said), congestion_control=block)
+
+
+def frame():  # slopes, commands and dither; then the loop's answer, two frames later
+    told, u = now["dither"], np.zeros(n)
+    if told and seq >= told["start_seq"] + round(told["duration_s"] * hz):
+        now["dither"] = None
+    elif told and seq >= told["start_seq"]:
+        turns = np.array(told["frequency_hz"]) * (seq - told["start_seq"]) / hz
+        u[told["modes"]] = np.array(told["amplitude_m"]) * 2**0.5 * np.sin(2 * np.pi * turns)
+    s, row = telescope.expose(c[0] + u), [*c[0] + u, *u]
+    c[:] = c[1], now["leak"] * c[1]
+    c[1, : len(R)] -= (now["loop"] == "closed") * np.array(now["gains"])[: len(R)] * (R @ s)
+    return [*s, *row]
+
+
 retry = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
-connect = {"endpoints": [endpoint], "retry": retry, "timeout_ms": -1}
-for key, value in {"mode": "client", "connect": connect, "timestamping/enabled": True}.items():
-    config.insert_json5(key, json.dumps(value))
-session = zenoh.open(config)
-keep = {"cache": zenoh.ext.CacheConfig(round(5 * hz / 10)), "publisher_detection": True}
-keep["sample_miss_detection"] = zenoh.ext.MissDetectionConfig(heartbeat=0.2)
-frames = zenoh.ext.declare_advanced_publisher(session, f"{root}/tel/frames", **keep)
-held = [session.declare_subscriber(f"{root}/cm/*/chunk/*", on_chunk)]
-held += [session.declare_subscriber(f"{root}/cm/*/commit", on_commit)]
-held += [session.declare_queryable(f"{root}/cmd/rtc/dither", on_command)]
-held += [session.declare_queryable(f"{root}/cmd/rtc/loop", on_command)]
-held += [session.declare_queryable(f"{root}/rtc/cm/applied", on_applied)]
+connect = {"endpoints": [endpoint], "timeout_ms": -1, "retry": retry}
+settings = {"mode": "client", "connect": connect, "timestamping": {"enabled": True}}
+config = zenoh.Config.from_json5(json.dumps(settings))
+session, block = zenoh.open(config), zenoh.CongestionControl.BLOCK
+recovery = {"cache": zenoh.ext.CacheConfig(round(hz / 2)), "publisher_detection": True}
+recovery["sample_miss_detection"] = zenoh.ext.MissDetectionConfig(heartbeat=0.2)
+frames = zenoh.ext.declare_advanced_publisher(session, f"{root}/tel/frames", **recovery)
+commits = session.declare_subscriber(f"{root}/cm/*/commit")
+threading.Thread(target=take, args=[commits], daemon=True).start()
+keys = f"{root}/cmd/rtc/dither", f"{root}/cmd/rtc/loop", f"{root}/rtc/cm/applied"
+held = [session.declare_queryable(key, answer) for key in keys]
 held += [session.liveliness().declare_token(f"{root}/alive/rtc")]
-start_ns = time.time_ns()
 while True:
-    batch = np.zeros((10, n_slopes + 2 * n), "<f4")
+    rows = []
     with lock:
-        head = {"v": 1, "session": status["session"], "seq0": seq, "n": 10, "dither": True, **ids}
-        head |= {"n_slopes": n_slopes, "n_modes": n, "cm_id": status["cm_id"]}
+        head = {"session": now["session"], "cm_id": now["cm_id"], "seq0": seq, "n": 10, **ids}
         head |= {"t0_ns": start_ns + round(seq * 1e9 / hz), "dt_ns": round(1e9 / hz)}
-        for row in batch:
-            turbulence = 0.998 * turbulence + 0.063 * sigma_m * rng.standard_normal(n)
-            u = dither(seq)
-            s = D @ (c[0] + u + turbulence) + 2e-3 * rng.standard_normal(n_slopes)
-            row[:] = np.concatenate([s, c[0] + u, u])
-            after = status["leak"] * c[1]
-            after[: len(R)] -= np.array(status["gains"])[: len(R)] * (R @ s)
-            c[:] = c[1], after * (status["loop"] == "closed")
+        head |= {"n_slopes": n_slopes, "n_modes": n, "dither": True}
+        for _ in range(10):
+            rows += frame()
             seq += 1
-        status.update(seq=seq - 1, t_ns=head["t0_ns"] + 9 * head["dt_ns"])
-        told = msgpack.packb(status)
-    frames.put(batch.tobytes(), attachment=msgpack.packb(head))
+        now.update(seq=seq - 1, t_ns=head["t0_ns"] + 9 * head["dt_ns"])
+        status = msgpack.packb(now)
+    payload = np.array(rows, "<f4").tobytes()
+    frames.put(payload, attachment=msgpack.packb(head))
     if seq % 100 == 0:
-        session.put(f"{root}/tel/status", told)
+        session.put(f"{root}/tel/status", status)
     time.sleep(max(0.0, start_ns / 1e9 + seq / hz - time.time()))

@@ -3,9 +3,10 @@
  * The bytes alone, as in docs/rtc/frames.* and status-minimal.msgpack:
  *     cc -std=c99 -Wall -Wextra telemetry.c -o telemetry && ./telemetry FOLDER
  * Sent with zenoh-c 1.x (https://github.com/eclipse-zenoh/zenoh-c):
- *     cc -std=c99 -DWITH_ZENOH telemetry.c -lzenohc -o telemetry && ./telemetry ENDPOINT SYSTEM
+ *     cc -std=c11 -DWITH_ZENOH telemetry.c -lzenohc -o telemetry && ./telemetry ENDPOINT SYSTEM
  *
- * The tests compile the first only. The machine is little-endian, as the floats of a payload are.
+ * The tests run the first, and compile the second against zenoh-c's declarations without the library:
+ * no package has it. The machine is little-endian, as the floats of a payload are.
  */
 #include <stdbool.h>
 #include <stdint.h>

@@ -5,7 +5,7 @@ import pytest
 
 from tests.system.night import ALPHA, INSTRUMENT, N_START, N_TARGET, ROOT, a_night, wait_for
 from tests.system.stranger import small_telescope
-from tests.system.test_check_rtc import checked_beside
+from tests.system.test_check_rtc import checked_beside, late_with_the_machine
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
@@ -24,7 +24,7 @@ def plant(tmp_path):
 
 
 def test_they_are_as_short_as_the_page_says():
-    for name, most in (("subscribe", 42), ("rtc", 180)):
+    for name, most in (("subscribe", 42), ("rtc", 150)):
         text = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
         assert text.count("\n") <= most
         assert "service" not in {
@@ -65,6 +65,8 @@ def test_the_rtc_keeps_the_contract(tmp_path, plant):
     status, checks, text = checked_beside(
         tmp_path, lambda endpoint: ["examples.rtc", endpoint, SYSTEM, str(plant)], "--yes"
     )
-    assert status == 0, text
     flagged = {name for name, one in checks.items() if one["outcome"] != "ok"}
-    assert flagged == {"late-join"}
+    if "delivery" in flagged and late_with_the_machine(checks["delivery"]):
+        flagged.remove("delivery")
+    assert flagged == {"late-join"}, text
+    assert status == int(any(one["outcome"] == "wrong" for one in checks.values()))

@@ -197,6 +197,14 @@ def test_the_example_in_c_writes_those_bytes(tmp_path):
         assert (tmp_path / name).read_bytes() == (FOLDER / name).read_bytes(), name
 
 
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_the_example_in_c_calls_zenoh_as_it_is_declared():
+    root = FOLDER.parents[1]
+    strict = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-DWITH_ZENOH", "-fsyntax-only"]
+    declared = f"-I{root / 'tests' / 'data' / 'zenoh'}"
+    subprocess.run(["cc", *strict, declared, str(root / "examples" / "telemetry.c")], check=True)
+
+
 def test_a_status_of_64_subapertures_with_light_and_800_modes_is_read():
     told = {
         **named("status-full").told["message"],

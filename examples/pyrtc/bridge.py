@@ -1,0 +1,219 @@
+"""The bench as an RTC of pyrcal's contract: telemetry out, dithers and matrices in."""
+
+import threading
+import time
+
+import numpy as np
+
+from service.wire import (
+    CHUNK_LIMIT,
+    DitherRequest,
+    DitherStop,
+    FrameHeader,
+    Keys,
+    Loop,
+    LoopRequest,
+    Manifest,
+    Reply,
+    Status,
+    checksum,
+    encode,
+    encode_frames,
+    layout_of,
+)
+from service.wire.status import DitherStatus
+from sim_rtc.computer.reconstructors import Terms
+from sim_rtc.computer.telemetry import Identity, Reconstructor, new_session
+from sim_rtc.link.matrices import Matrices
+from sim_rtc.link.replies import Replies
+from sim_rtc.link.session import Token, frames_publisher, open_session, status_publisher
+
+from .bench import DELAY, RATE_HZ
+
+MOST_DITHER_M, MOST_DITHER_MODES = 60e-9, 8
+BATCH, DT_NS = 10, round(1e9 / RATE_HZ)
+STATUS_PERIOD_S = 0.2
+
+
+class Bridge:
+    """What pyrcal asks of an RTC (``sim_rtc.link.replies.Computer``), of a bench of pyRTC's.
+
+    One thread makes frames; the others ask and command, and are heard between two frames.
+    """
+
+    def __init__(self, bench, system, matrix):
+        self.bench, self.lock = bench, threading.Lock()
+        basis = checksum(bench.modes.astype(np.float32))[:8]  # OOPAO's differ from run to run
+        names = {"basis_id": f"kl-{bench.n_modes}-{basis}", "config_id": "pyramid"}
+        self.identity = Identity(system=system, **names)
+        manifest = Manifest(
+            id=f"own-{checksum(matrix)[:12]}",
+            layout=layout_of(matrix, CHUNK_LIMIT),
+            alpha=None,
+            sigma=None,
+            im_id=None,
+            parent=None,
+            created_ns=time.time_ns(),
+            system=system,
+            **names,
+        )
+        self.reconstructor = Reconstructor(manifest=manifest, matrix=matrix)
+        self.staged, self.swaps, self.dither, self.n_next = None, [], None, len(matrix)
+        self.session, self.seq, self.start_ns = new_session(), 0, time.time_ns()
+        bench.use(matrix)
+
+    @property
+    def largest_matrix_bytes(self):
+        return 4 * self.bench.loop.cm.size
+
+    @property
+    def gains(self):
+        gains = self.bench.loop.effective_gains.copy()
+        gains[len(self.reconstructor.matrix) :] = 0.0
+        return tuple(gains.tolist())
+
+    def terms(self):
+        n_slopes, n_now = self.bench.loop.signal_size, len(self.reconstructor.matrix)
+        known = {"session": self.session, "identity": self.identity, "n_slopes": n_slopes}
+        return Terms(**known, n_controlled=(n_now, self.n_next))
+
+    def stage(self, reconstructor):
+        with self.lock:
+            self.staged = reconstructor
+
+    def take_swaps(self):
+        swaps, self.swaps = self.swaps, []
+        return swaps
+
+    def take_measured(self):
+        return []
+
+    def execute(self, command):
+        with self.lock:
+            reason, start_seq = self._obey(command)
+        return Reply(id=command.id, accepted=not reason, reason=reason, start_seq=start_seq)
+
+    def _obey(self, command):
+        """Return why not, and from which frame on."""
+        if isinstance(command, DitherStop):
+            self.dither = None
+        elif isinstance(command, DitherRequest):
+            reason = self._refusal(command)
+            start_seq = None if reason else self.seq + DELAY + BATCH
+            if not reason:
+                self.dither = DitherStatus(request=command, start_seq=start_seq)
+            return reason, start_seq
+        elif isinstance(command, LoopRequest):
+            return self._change_loop(command), None
+        else:
+            return "unsupported: pyRTC measures and tunes by its own means", None
+        return "", None
+
+    def _refusal(self, asked):
+        if self.dither is not None:
+            return f"busy: {self.dither.request.id} plays"
+        if asked.frequency_hz is None:
+            return "unsupported: random signs"
+        if len(asked.modes) > MOST_DITHER_MODES:
+            return f"range: {len(asked.modes)} modes, expected at most {MOST_DITHER_MODES}"
+        if max(asked.modes) >= self.bench.n_modes or max(asked.amplitude_m) > MOST_DITHER_M:
+            return f"range: modes below {self.bench.n_modes}, at most {MOST_DITHER_M} m"
+        if max(asked.frequency_hz) >= RATE_HZ / 2:
+            return f"range: frequency_hz {max(asked.frequency_hz)}, expected below {RATE_HZ / 2}"
+        return ""
+
+    def _change_loop(self, asked):
+        loop = self.bench.loop
+        if asked.leak is not None:
+            loop.leaky_gain = 1.0 - asked.leak
+        if asked.gains is not None:
+            if len(asked.gains) != self.bench.n_modes:
+                return f"range: {len(asked.gains)} gains, expected {self.bench.n_modes}"
+            loop.set_modal_gains(np.array(asked.gains) / loop.gain)
+        self.n_next = asked.n_controlled or self.n_next
+        if asked.loop is Loop.OPEN and loop.running:  # that begins a session
+            loop.stop()
+            self.bench.flatten()
+            self.session, self.dither = new_session(), None
+        elif asked.loop is Loop.CLOSED:
+            loop.start()
+        return ""
+
+    def status(self):
+        loop, n_controlled = self.bench.loop, len(self.reconstructor.matrix)
+        return Status(
+            session=self.session,
+            seq=self.seq - 1 if self.seq else None,
+            t_ns=self.time_ns(max(self.seq - 1, 0)),
+            loop=Loop.CLOSED if loop.running else Loop.OPEN,
+            frame_rate_hz=RATE_HZ,
+            delay_frames=DELAY,
+            gains=self.gains,
+            leak=1.0 - loop.leaky_gain,
+            n_slopes=loop.signal_size,
+            n_modes=self.bench.n_modes,
+            n_controlled=n_controlled,
+            cm_id=self.reconstructor.manifest.id,
+            basis_id=self.identity.basis_id,
+            config_id=self.identity.config_id,
+            dither=self.dither,
+            max_dither_m=MOST_DITHER_M,
+            max_dither_modes=MOST_DITHER_MODES,
+            magnitude=None,
+        )
+
+    def time_ns(self, seq):
+        """Return the end of a frame's exposure: of the simulated sky, however long it takes."""
+        return self.start_ns + seq * DT_NS
+
+    def _dither_m(self, seq):
+        told, u = self.dither, np.zeros(self.bench.n_modes)
+        if told is not None and seq >= told.start_seq + round(told.request.duration_s * RATE_HZ):
+            self.dither = None
+        elif told is not None and seq >= told.start_seq:
+            turns = np.array(told.request.frequency_hz) * (seq - told.start_seq) / RATE_HZ
+            strokes = np.sqrt(2.0) * np.array(told.request.amplitude_m)
+            u[list(told.request.modes)] = strokes * np.sin(2.0 * np.pi * turns)
+        return u
+
+    def batch(self):
+        """Return header and rows of the next frames; a new matrix multiplies from the first on."""
+        with self.lock:
+            if self.staged is not None:
+                self.reconstructor, self.staged = self.staged, None
+                self.bench.use(self.reconstructor.matrix)
+                self.swaps.append((self.reconstructor.manifest.id, self.seq))
+            header = FrameHeader(
+                session=self.session,
+                seq0=self.seq,
+                n=BATCH,
+                t0_ns=self.time_ns(self.seq),
+                dt_ns=DT_NS,
+                n_slopes=self.bench.loop.signal_size,
+                n_modes=self.bench.n_modes,
+                dither=True,
+                cm_id=self.reconstructor.manifest.id,
+                basis_id=self.identity.basis_id,
+                config_id=self.identity.config_id,
+            )
+            first = self.seq + DELAY
+            rows = [self.bench.frame(self._dither_m(seq)) for seq in range(first, first + BATCH)]
+            self.seq += BATCH
+        return header, np.array(rows, dtype=np.float32)
+
+    def run(self, endpoint, n_frames):
+        """Be an RTC of the service at ``endpoint``, which may be late, for so many frames."""
+        keys = Keys(self.identity.system)
+        with open_session(endpoint, threading.Event()) as session:
+            Replies(keys, self).declare(session)
+            frames = frames_publisher(session, keys, RATE_HZ / BATCH)
+            status, told_s, said = status_publisher(session, keys), 0.0, None
+            with Matrices(session, keys, self) as matrices, Token(session, keys, None):
+                while self.seq < n_frames:
+                    payload, attachment = encode_frames(*self.batch())
+                    frames.put(payload, attachment=attachment)
+                    if self.swaps:
+                        matrices.look()
+                    if time.monotonic() - told_s > STATUS_PERIOD_S or said != self.session:
+                        said, told_s = self.session, time.monotonic()
+                        status.put(encode(self.status()))

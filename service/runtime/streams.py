@@ -410,8 +410,7 @@ def _listening(streams: Streams, rtc: Status, block: FrameBlock) -> Streams:
     if streams.meter is not None:
         meter, found = measured(streams.meter, block)
         streams = replace(streams, meter=meter, played=found or streams.played)
-    # an RTC may always send the columns
-    if block.dither_m is not None and block.dither_m.any():
+    if block.is_dithered:
         return replace(streams, dither_seen_seq=next_seq, dither_silent_s=0.0)
     if dither is None:
         return streams

@@ -55,6 +55,12 @@ class FrameBlock:
         """End of exposure of the frame after the last row."""
         return self.t0_ns_utc + self.n_frames * self.dt_ns
 
+    @property
+    def is_dithered(self) -> bool:
+        """Whether a dither moves anything: an RTC may always send its columns."""
+        dither = self.dither_m
+        return dither is not None and bool(dither[-1:].any() or dither.any())
+
     def rows(self, start: int, stop: int) -> FrameBlock:
         """Return these rows as a block: a view."""
         some = slice(start, stop)

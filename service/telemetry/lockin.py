@@ -9,7 +9,6 @@ instrumental variable; only its correlation with the slopes is used.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,11 @@ from typing_extensions import override
 from service.errors import ModelError
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
+from service.telemetry.comb import SIDE_OFFSETS_HZ as SIDE_OFFSETS_HZ
+from service.telemetry.comb import Comb
 from service.telemetry.estimate import DitheredEstimate
 from service.telemetry.frames import FrameBlock
 from service.telemetry.windows import (
-    CHUNK_FRAMES,
     ClosedLoop,
     Telemetry,
     Window,
@@ -32,9 +32,6 @@ from service.telemetry.windows import (
 from service.telemetry.windows import WindowRefused as WindowRefused
 
 Array = NDArray[Any]
-
-SIDE_OFFSETS_HZ = np.concatenate([np.arange(-20.0, -2.0), np.arange(3.0, 21.0)])
-"""Where the noise is measured, relative to each dither line: 36 bins; 6 were too few."""
 
 CUT_PERIODS = 0.01
 """Of a line, by which a window may be too long or too short: a rate of the RTC's that differs by
@@ -81,6 +78,13 @@ class LockInPlan(WindowPlan):
             raise ModelError(f"lock-in: lines {lines} Hz closer than 4 bins in one window")
 
     @property
+    def comb(self) -> Comb:
+        """What a window is summed with."""
+        return Comb(
+            lines_hz=self.frequencies_hz, frame_rate_hz=self.frame_rate_hz, n_frames=self.n_frames
+        )
+
+    @property
     def bins_hz(self) -> NDArray[np.float64]:
         """``(n_lines, 1 + n_side)`` frequencies: each line, then its side bins."""
         lines = np.array(self.frequencies_hz)[:, None]
@@ -116,11 +120,9 @@ class LockInSums:
     """Sums so far."""
 
     slopes: Array
-    """``(2 * n_bins, n_slopes)``: real parts of every bin, then imaginary ones; so the others."""
+    """As :meth:`Comb.empty` has them; so the commands. They are added to where they are."""
 
     commands: Array
-    """``(2 * n_bins, n_modes)``."""
-
     dither: Array
     """``(2 * n_lines, n_modes)``."""
 
@@ -132,33 +134,29 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
     @override
     def begin(self, block: FrameBlock) -> LockInSums:
         """Return empty sums for frames like these."""
-        n_bins, n_modes = self.plan.bins_hz.size, block.commands_m.shape[1]
+        comb, n_modes = self.plan.comb, block.commands_m.shape[1]
         return LockInSums(
-            slopes=np.zeros((2 * n_bins, block.slopes.shape[1]), np.float32),
-            commands=np.zeros((2 * n_bins, n_modes), np.float32),
+            slopes=comb.empty(block.slopes.shape[1]),
+            commands=comb.empty(n_modes),
             dither=np.zeros((2 * len(self.plan.modes), n_modes), np.float32),
         )
 
     @override
     def add(self, sums: LockInSums, block: FrameBlock, place: int) -> LockInSums:
         """Return the sums with a block that begins at this place of the window."""
-        phasors = _phasors(self.plan, place, block.n_frames)
-        # real products: the columns are real
-        parts = np.concatenate([phasors.real, phasors.imag])
-        lines = parts[:: self.plan.bins_hz.shape[1]]
+        comb = self.plan.comb
         # no block without dither columns comes this far
         dither = block.commands_m if block.dither_m is None else block.dither_m
-        return LockInSums(
-            slopes=sums.slopes + parts @ block.slopes,
-            commands=sums.commands + parts @ block.commands_m,
-            dither=sums.dither + lines @ dither,
-        )
+        comb.add(sums.slopes, block.slopes, place)
+        comb.add(sums.commands, block.commands_m, place)
+        return replace(sums, dither=sums.dither + comb.at_lines(dither, place))
 
     @override
     def close(self, window: Window[LockInSums]) -> Spectra | WindowRefused:
         """Return the finished window, or why its dither is not the one asked for."""
         plan, sums = self.plan, window.sums
-        dither = _complex(sums.dither, len(plan.modes))
+        real, imaginary = np.split(sums.dither, 2)
+        dither = (real + 1j * imaginary).astype(np.complex64)
         weight = 0.5 * plan.n_frames / np.sqrt(2.0)
         applied = np.abs(dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
         reason = plan.refusal(applied, tuple(f"{line} Hz" for line in plan.frequencies_hz))
@@ -166,8 +164,8 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
             return WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
         return Spectra(
             plan=plan,
-            slopes=_complex(sums.slopes, *plan.bins_hz.shape),
-            commands=_complex(sums.commands, *plan.bins_hz.shape),
+            slopes=plan.comb.at_bins(sums.slopes),
+            commands=plan.comb.at_bins(sums.commands),
             dither=dither,
             **window.telemetry,
         )
@@ -200,28 +198,6 @@ def joined(one: Spectra, other: Spectra) -> Spectra | None:
         dither=share * one.dither + turned[:, 0] * other.dither,
         n_windows=n_windows,
     )
-
-
-@lru_cache(maxsize=4)
-def _turning(plan: LockInPlan) -> Array:
-    """Return ``exp(-i w k)`` of every bin, ``(n_bins, 2 * CHUNK_FRAMES)``, from k = 0."""
-    turns = np.outer(plan.bins_hz.ravel() / plan.frame_rate_hz, np.arange(2 * CHUNK_FRAMES))
-    return np.asarray(np.exp(-2j * np.pi * turns), np.complex64)
-
-
-def _phasors(plan: LockInPlan, place: int, n_frames: int) -> Array:
-    """Return ``h_k exp(-i w k)`` of frames from this place of a window, ``(n_bins, n_frames)``."""
-    index = place + np.arange(n_frames)
-    hann = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / plan.n_frames)
-    start = np.exp(-2j * np.pi * place * plan.bins_hz.ravel() / plan.frame_rate_hz)
-    phasors = _turning(plan)[:, :n_frames] * start.astype(np.complex64)[:, None]
-    return np.asarray(phasors * hann.astype(np.float32))
-
-
-def _complex(parts: Array, *shape: int) -> Array:
-    """Return real and imaginary parts, one above the other, as complex numbers."""
-    real, imaginary = np.split(parts, 2)
-    return np.asarray((real + 1j * imaginary).reshape(*shape, -1))
 
 
 N_STEPS = 5

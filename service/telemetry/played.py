@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.telemetry.comb import cosines_and_sines
 from service.telemetry.frames import FrameBlock
 
 Array = NDArray[Any]
@@ -30,6 +31,9 @@ STRAY = 0.2
 """Share of what was asked for in all that modes nobody asked for may carry together."""
 
 _NAMED = 4
+
+_GLANCED = 8
+"""Slopes of a frame that tell whether all need be compared."""
 
 SIDES_HZ = (-13, -11, -9, -7, -5, -3, 3, 5, 7, 9, 11, 13)
 """Where the noise of the slopes is measured, relative to a line; whole periods of a second."""
@@ -113,7 +117,8 @@ class Meter:
     """The frame those are followed by."""
 
     slopes: Array | None = None
-    """``(n_heard * (1 + n_sides), n_slopes)`` slopes, demodulated on and beside each line heard."""
+    """``(2 * n_heard * (1 + n_sides), n_slopes)`` slopes times cosines, then sines, on and beside
+    each line heard."""
 
     n_repeated: int = 0
     """Frames with the very slopes of the frame before."""
@@ -125,26 +130,35 @@ class Meter:
 
 def measured(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
     """Add a block of frames; return what was found if a second of them is full."""
-    if block.dither_m is None:
-        return meter, None
-    asked = meter.asked
-    rows = slice(
-        max(asked.first_seq - block.first_seq, 0),
-        max(min(asked.stop_seq - block.first_seq, block.n_frames), 0),
-    )
-    dither = block.dither_m[rows]
-    if not dither.any():
+    asked, found = meter.asked, None
+    start = max(asked.first_seq - block.first_seq, 0)
+    stop = max(min(asked.stop_seq - block.first_seq, block.n_frames), 0)
+    while start < stop:
+        end = min(start + _enough(asked) - meter.n_frames, stop)
+        meter, new = _added(meter, block.rows(start, end))
+        start, found = end, new or found
+    return meter, found
+
+
+def _enough(asked: Asked) -> int:
+    return max(round(CHECK_S * asked.frame_rate_hz), LEAST_FRAMES)
+
+
+def _added(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
+    """Add frames that fill a second at most."""
+    asked, dither = meter.asked, block.dither_m
+    if dither is None or not block.is_dithered:
         return meter, None
     squares = np.einsum("km,km->m", dither, dither).astype(float)
-    meter, lines = _demodulated(meter, block, rows, dither[:, list(asked.modes)])
-    meter = _heard(meter, block.slopes[rows], block.first_seq + rows.start)
+    meter, lines = _demodulated(meter, block, dither[:, list(asked.modes)])
+    meter = _heard(meter, block.slopes, block.first_seq)
     meter = replace(
         meter,
         n_frames=meter.n_frames + len(dither),
         squares=squares if meter.squares is None else meter.squares + squares,
         lines=lines if meter.lines is None else meter.lines + lines,
     )
-    if meter.n_frames < max(round(CHECK_S * asked.frame_rate_hz), LEAST_FRAMES):
+    if meter.n_frames < _enough(asked):
         return meter, None
     powers = _powers(meter)
     unanswered = _unanswered(powers, asked)
@@ -154,9 +168,7 @@ def measured(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
     return begun, replace(_found(meter), unanswered=unanswered)
 
 
-def _demodulated(
-    meter: Meter, block: FrameBlock, rows: slice, dither: Array
-) -> tuple[Meter, Array]:
+def _demodulated(meter: Meter, block: FrameBlock, dither: Array) -> tuple[Meter, Array]:
     """Return ``(2, n_asked)`` sums at the lines; random signs have none and are left out.
 
     Of the commands the steps from frame to frame: turbulence that is played on the mirror is slow.
@@ -164,14 +176,13 @@ def _demodulated(
     asked = meter.asked
     if not asked.frequency_hz:
         return meter, np.zeros((2, len(asked.modes)), complex)
-    commands = block.commands_m[rows][:, list(asked.modes)].astype(float)
-    first_seq = block.first_seq + rows.start
-    follows = meter.last_m is not None and meter.next_seq == first_seq
+    commands = block.commands_m[:, list(asked.modes)].astype(float)
+    follows = meter.last_m is not None and meter.next_seq == block.first_seq
     before = meter.last_m if follows else commands[0]
     steps = np.diff(commands, axis=0, prepend=np.asarray(before)[None])
-    seq = first_seq + np.arange(len(commands))
+    seq = block.first_seq + np.arange(len(commands))
     phasors = np.exp(-2j * np.pi * np.outer(seq / asked.frame_rate_hz, asked.frequency_hz))
-    meter = replace(meter, last_m=commands[-1], next_seq=first_seq + len(commands))
+    meter = replace(meter, last_m=commands[-1], next_seq=block.next_seq)
     return meter, np.stack([(phasors * dither).sum(axis=0), (phasors * steps).sum(axis=0)])
 
 
@@ -183,15 +194,20 @@ def _heard(meter: Meter, slopes: Array, first_seq: int) -> Meter:
         return meter
     bins_hz = (lines[:, None] + np.array([0, *SIDES_HZ])).ravel()
     seq = first_seq - asked.first_seq + np.arange(len(slopes))
-    phasors = np.exp(-2j * np.pi * np.outer(bins_hz / asked.frame_rate_hz, seq))
-    parts = np.concatenate([phasors.real, phasors.imag]).astype(np.float32) @ slopes
-    summed = parts[: len(bins_hz)] + 1j * parts[len(bins_hz) :]
-    same = np.count_nonzero((slopes[1:] == slopes[:-1]).all(axis=1))
+    turns = np.outer(bins_hz / asked.frame_rate_hz, seq)
+    summed = np.concatenate(cosines_and_sines(turns)) @ slopes
     return replace(
         meter,
         slopes=summed if meter.slopes is None else meter.slopes + summed,
-        n_repeated=meter.n_repeated + int(same),
+        n_repeated=meter.n_repeated + _repeated(slopes),
     )
+
+
+def _repeated(slopes: Array) -> int:
+    """Return how many frames have the very slopes of the frame before."""
+    first = slopes[:, :_GLANCED]
+    again = 1 + np.flatnonzero((first[1:] == first[:-1]).all(axis=1))
+    return int(np.count_nonzero((slopes[again] == slopes[again - 1]).all(axis=1)))
 
 
 def _powers(meter: Meter) -> tuple[float, float, float]:
@@ -202,7 +218,8 @@ def _powers(meter: Meter) -> tuple[float, float, float]:
     asked, heard, before = meter.asked, meter.asked.heard, meter.powers
     if meter.slopes is None or meter.lines is None or meter.n_repeated > REPEATED * meter.n_frames:
         return before
-    power = np.sum(np.abs(meter.slopes) ** 2, axis=1).reshape(len(heard), -1)
+    parts = np.einsum("ks,ks->k", meter.slopes, meter.slopes).astype(float)
+    power = parts.reshape(2, len(heard), -1).sum(axis=0)
     sides = power[:, 1:]
     beyond = np.sum(power[:, 0] - sides.mean(axis=1))
     variance = np.sum(sides.var(axis=1, ddof=1)) * (1.0 + 1.0 / sides.shape[1])

@@ -26,6 +26,9 @@ class ClosedLoop(ControlLoop):
 CHUNK_FRAMES = 512
 """Frames multiplied at once: the sums, some MB, are read from memory once for all of them."""
 
+ENOUGH_FRAMES = 256
+"""With so many the sums need not wait for more."""
+
 MAX_MISSING_FRACTION = 0.05
 """A window with more frames missing than this is refused."""
 
@@ -273,7 +276,7 @@ class WindowCutter(Generic[P, S, F]):
             n_missing=window.n_missing + rows.first_seq - window.next_seq,
             waiting=(*window.waiting, rows),
         )
-        enough = sum(block.n_frames for block in window.waiting) >= CHUNK_FRAMES
+        enough = sum(block.n_frames for block in window.waiting) >= ENOUGH_FRAMES
         return self._added(window) if enough else window
 
     def _added(self, window: Window[S]) -> Window[S]:

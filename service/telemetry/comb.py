@@ -1,0 +1,129 @@
+"""Sums of telemetry at lines and at many frequencies beside each, by way of a few smooth shapes.
+
+Against its line every bin beside it turns slowly: within a stretch of frames the window's weight
+``h_k``, ``h_k cos(v k)`` and ``h_k sin(v k)``, whatever the offset v, are combinations of a few
+smooth shapes. Frames are multiplied with each line times each of these; the bins follow from those
+sums, a tenth as many as there are frames. Nothing is left out: shapes weaker than rounding are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+SIDE_OFFSETS_HZ = np.concatenate([np.arange(-20.0, -2.0), np.arange(3.0, 21.0)])
+"""Where the noise is measured, relative to each dither line: 36 bins; 6 were too few."""
+
+STRETCH_S = 0.12
+"""Of frames: with longer ones it takes more shapes, with shorter ones more sums."""
+
+LEAST_STRETCH = 16
+
+FAINTEST_SHAPE = 1e-7
+"""Of the strongest: what weaker ones have in a bin is rounding."""
+
+_BESIDE_HZ = np.unique(np.abs(SIDE_OFFSETS_HZ))
+_N_SHAPES = 1 + 2 * len(_BESIDE_HZ)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comb:
+    """Lines, and ``SIDE_OFFSETS_HZ`` beside each, in a Hann window."""
+
+    lines_hz: tuple[float, ...]
+    frame_rate_hz: float
+    n_frames: int
+    """Length of the window."""
+
+    def empty(self, n_columns: int) -> Array:
+        """Return the sums of no frames, ``(n_shapes, 2 * n_lines, n_columns)``."""
+        return np.zeros((_N_SHAPES, 2 * len(self.lines_hz), n_columns), np.float32)
+
+    def add(self, sums: Array, columns: Array, place: int) -> None:
+        """Add frames ``(n, n_columns)`` to sums; the first has this place in the window."""
+        length = _smooth(self.frame_rate_hz, self.n_frames).shape[1]
+        end = place + len(columns)
+        cuts = [place, *range(place // length * length + length, end, length), end]
+        stretches = [_stretch(self, *cut) for cut in pairwise(cuts)]
+        bins = np.hstack([stretch.bins for stretch in stretches])
+        found = np.empty((len(stretches), len(stretches[0].lines), columns.shape[1]), np.float32)
+        for stretch, (first, stop), part in zip(stretches, pairwise(cuts), found, strict=True):
+            np.matmul(stretch.lines, columns[first - place : stop - place], out=part)
+        sums += (bins @ found.reshape(bins.shape[1], -1)).reshape(sums.shape)
+
+    def at_bins(self, sums: Array) -> Array:
+        """Return ``(n_lines, 1 + n_side, n_columns)`` sums of ``h_k x_k exp(-i w k)``."""
+        real, imaginary = np.split(sums, 2, axis=1)
+        shapes = (real + 1j * imaginary).astype(np.complex64)
+        cosines, sines = np.split(shapes[1:], 2)
+        which = np.searchsorted(_BESIDE_HZ, np.abs(SIDE_OFFSETS_HZ))
+        turning = (1j * np.sign(SIDE_OFFSETS_HZ)).astype(np.complex64)[:, None, None]
+        sides = cosines[which] - turning * sines[which]
+        return np.asarray(np.concatenate([shapes[:1], sides]).transpose(1, 0, 2))
+
+    def at_lines(self, columns: Array, place: int) -> Array:
+        """Return ``(2 * n_lines, n_columns)`` sums at the lines: real parts, imaginary ones."""
+        frames = place + np.arange(len(columns))
+        return np.asarray((_lines(self, frames) * _hann(self.n_frames, frames)) @ columns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Stretch:
+    """The two steps that lead from some frames in a row to the bins."""
+
+    lines: Array
+    """``(n_smooth * 2 * n_lines, n)`` each smooth shape times the two parts of each line."""
+
+    bins: Array
+    """``(n_shapes, n_smooth)`` the combinations: of 1, the cosines, then the sines."""
+
+
+@lru_cache(maxsize=16)
+def _stretch(comb: Comb, first: int, end: int) -> _Stretch:
+    """Return what leads from the frames of a stretch, or a part of one, to the bins."""
+    smooth = _smooth(comb.frame_rate_hz, comb.n_frames)
+    length = smooth.shape[1]
+    whole = first // length * length + np.arange(length)
+    turns = np.outer(_BESIDE_HZ / comb.frame_rate_hz, whole)
+    turning = np.vstack([np.ones(length), *cosines_and_sines(turns)])
+    here = slice(first - whole[0], end - whole[0])
+    lines = smooth[:, None, here] * _lines(comb, whole[here])
+    return _Stretch(
+        lines=lines.reshape(-1, end - first),
+        bins=np.asarray((turning * _hann(comb.n_frames, whole)) @ smooth.T, np.float32),
+    )
+
+
+@lru_cache(maxsize=4)
+def _smooth(frame_rate_hz: float, n_frames: int) -> Array:
+    """Return ``(n_smooth, length)`` orthonormal shapes: all that bins can be in a stretch."""
+    length = max(round(STRETCH_S * frame_rate_hz), LEAST_STRETCH)
+    # a Hann window is a mean and a turn more or less
+    weight_hz = np.array([-1.0, 0.0, 1.0]) * frame_rate_hz / n_frames
+    slow_hz = np.add.outer([0.0, *_BESIDE_HZ], weight_hz)
+    turns = 2 * np.pi * np.outer(slow_hz / frame_rate_hz, np.arange(length))
+    _, size, shapes = np.linalg.svd(np.vstack([np.cos(turns), np.sin(turns)]), full_matrices=False)
+    return np.asarray(shapes[size > FAINTEST_SHAPE * size[0]], np.float32)
+
+
+def _lines(comb: Comb, frames: Array) -> Array:
+    """Return ``exp(-i w k)`` of every line, ``(2 * n_lines, n)``: real parts, imaginary ones."""
+    cosines, sines = cosines_and_sines(np.outer(comb.lines_hz, frames / comb.frame_rate_hz))
+    return np.concatenate([cosines, -sines])
+
+
+def cosines_and_sines(turns: Array) -> tuple[Array, Array]:
+    """Return both of so many turns, whole ones taken off before precision is."""
+    angles = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+    return np.cos(angles), np.sin(angles)
+
+
+def _hann(n_frames: int, frames: Array) -> Array:
+    return np.asarray(0.5 - 0.5 * np.cos(2 * np.pi * (frames + 0.5) / n_frames), np.float32)

@@ -185,21 +185,19 @@ def edge_watch(
 
 def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
     """Return the health after one more block, of which a frame now and then is looked at."""
-    start = 0
-    while start < block.n_frames:
-        stop = min(start + LOOK_FRAMES, block.n_frames)
-        lasted_s = (stop - start) * block.dt_ns * 1e-9
-        health = _seen(health, block.commands_m[stop - 1], lasted_s, watch)
-        start = stop
+    n_frames = np.diff([*range(0, block.n_frames, LOOK_FRAMES), block.n_frames])
+    moved = block.commands_m[np.cumsum(n_frames) - 1][:, watch.modes]
+    inner = np.einsum("km,km->k", moved @ watch.inner, moved)
+    each = zip(moved @ watch.outer.T, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
+    for outer, mean_square, lasted_s in each:
+        health = _seen(health, outer, float(mean_square), float(lasted_s))
     return health
 
 
 def _seen(
-    health: EdgeHealth, command: NDArray[np.float32], lasted_s: float, watch: EdgeWatch
+    health: EdgeHealth, outer: NDArray[np.float32], inner: float, lasted_s: float
 ) -> EdgeHealth:
-    """Return the health after a command that stands for so much time."""
-    moved = command[watch.modes]
-    outer, inner = watch.outer @ moved, float(moved @ (watch.inner @ moved))
+    """Return the health after positions of the ring that stand for so much time."""
     fade = float(np.exp(-lasted_s / _EDGE_MEMORY_S))
     position = (1.0 - fade) * outer
     if health.position is not None:

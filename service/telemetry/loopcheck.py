@@ -34,8 +34,8 @@ Array = NDArray[Any]
 SAMPLES_PER_S = 20.0
 """Frames looked at: at 1 kHz one in 50."""
 
-BATCH = 8
-"""Samples multiplied at once: the reconstructor is read from memory once for all of them."""
+BATCH = 32
+"""Samples that may wait to be multiplied: the reconstructor is read once for all of them."""
 
 KEPT_SAMPLES = 512
 """The oldest give way."""
@@ -235,7 +235,7 @@ def obedience(
 
 def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
     """Return the span of the last ``ENOUGH_SAMPLES`` samples up to a frame; None: too few."""
-    seq = np.concatenate([batch.seq for batch in check.batches] or [np.empty(0, int)])
+    seq = np.array([k for b in check.batches for k in b.seq] + [s.seq for s in check.waiting])
     seq = seq[seq <= before_seq][-ENOUGH_SAMPLES:]
     return (int(seq[0]), int(seq[-1])) if len(seq) == ENOUGH_SAMPLES else None
 

@@ -110,8 +110,10 @@ class HighPass:
         newest = len(self.taps) - 1
         n_rows = len(commands) - newest
         out = self.taps[0] * commands[newest : newest + n_rows]
+        part = np.empty_like(out)
         for j in range(1, len(self.taps)):
-            out += self.taps[j] * commands[newest - j : newest - j + n_rows]
+            np.multiply(commands[newest - j : newest - j + n_rows], self.taps[j], out=part)
+            out += part
         return np.asarray(out)
 
     @property
@@ -277,15 +279,19 @@ def _others(state: Passive, *blocks: FrameBlock) -> NDArray[np.intp]:
 
 
 def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:
-    """Keep one filtered frame in ``SAMPLE_FRAMES``."""
+    """Keep one filtered frame in ``SAMPLE_FRAMES``; all blocks but the last are short."""
     first, n_rows = blocks[0].first_seq, sum(block.n_frames for block in blocks) - _REACH
-    if n_rows < 1 or first // SAMPLE_FRAMES == (first + n_rows) // SAMPLE_FRAMES:
+    n_due = (first + n_rows) // SAMPLE_FRAMES - first // SAMPLE_FRAMES
+    if n_rows < 1 or not n_due:
         return state
     head = joined_frames(tuple(block.rows(0, N_TAPS) for block in blocks)).rows(0, N_TAPS)
-    chosen = high_pass(state.delay_frames)
-    filtered = chosen(head.commands_m[:, : state.n_modes])[0]
-    sample = (chosen.taps[::-1] @ head.slopes, filtered)
-    return replace(state, samples=(*state.samples, sample)[-SAMPLES_KEPT:])
+    n_before, chosen = n_rows + _REACH - blocks[-1].n_frames, high_pass(state.delay_frames)
+    later = range(SAMPLE_FRAMES - n_before, n_rows - n_before, SAMPLE_FRAMES)[: n_due - 1]
+    samples = list(state.samples)
+    for rows in (head, *(blocks[-1].rows(start, start + N_TAPS) for start in later)):
+        filtered = chosen(rows.commands_m[:, : state.n_modes])[0]
+        samples.append((chosen.taps[::-1] @ rows.slopes, filtered))
+    return replace(state, samples=tuple(samples[-SAMPLES_KEPT:]))
 
 
 def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:

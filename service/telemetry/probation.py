@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ WITHIN_S = 3.0
 
 PART_S = 0.1
 """Between two looks."""
+
+LONGEST_PART_S = 0.2
+"""A block that lasts longer makes more than one part."""
 
 LEAST_PART = 50
 """Frames: fewer scatter too much to be looked at."""
@@ -217,7 +221,22 @@ def observe(
     """Add a block of a closed loop of these modes.
 
     ``lines_hz`` are those of the dither that plays; frames of a dither without lines do not count.
+    A long block makes several parts: they scatter as those do that come one by one.
     """
+    n_parts = int(np.ceil(block.n_frames * block.dt_ns * 1e-9 / LONGEST_PART_S))
+    cuts = np.linspace(0, block.n_frames, max(n_parts, 1) + 1).astype(int).tolist()
+    for start, stop in pairwise(cuts):
+        state = _observed(state, block.rows(start, stop), modes, lines_hz, edge)
+    return state
+
+
+def _observed(
+    state: Comparison,
+    block: FrameBlock,
+    modes: NDArray[np.intp],
+    lines_hz: tuple[float, ...],
+    edge: EdgeWatch | None,
+) -> Comparison:
     if block.cm_id != state.cm_id or (state.tail and block.session != state.tail.session):
         state = _swapped(state, block)
     tail, state = state.tail, replace(state, modes=modes)

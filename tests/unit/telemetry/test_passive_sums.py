@@ -131,7 +131,7 @@ def test_a_loop_without_two_frames_of_delay_is_not_summed_and_says_why():
     assert young().why_unusable is None
 
 
-def test_samples_are_bounded():
-    state = fed(random_block(20000), 500)
-    assert len(state.samples) == 20000 // 500
-    assert len(fed(random_block(20000), 100).samples) == SAMPLES_KEPT
+@pytest.mark.parametrize("size", [100, 500, 6000])
+def test_samples_are_one_in_128_frames_however_they_come_and_bounded(size):
+    assert len(fed(random_block(6000), size).samples) == pytest.approx(6000 // 128, abs=1)
+    assert len(fed(random_block(20000), size).samples) == SAMPLES_KEPT

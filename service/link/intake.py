@@ -32,10 +32,10 @@ BURST_S: Final = 10.0
 LATENCIES: Final = 1024
 """Batches the median latency is taken over."""
 
-TAKE_FRAMES: Final = 256
+TAKE_FRAMES: Final = 512
 """Frames copied under one hold of the lock, so that ingest never waits for long."""
 
-STATUS_INTERVAL_S: Final = 0.1
+STATUS_INTERVAL_S: Final = 0.45
 """Between two statuses that say the same: of more, the latest is taken when it is over."""
 
 CHANGES: Final = 10

@@ -22,7 +22,7 @@ LEAP: Final = "leap"
 LEAP_S: Final = 10.0
 """Of frames: a longer leap of the sequence is believed only when more batches confirm it."""
 
-ROOM: Final = 512
+ROOM: Final = 1024
 """Frames there is memory for while the reader keeps up; one that falls behind needs more."""
 
 CONFIRMATIONS: Final = 2

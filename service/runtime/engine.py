@@ -33,6 +33,7 @@ from service.telemetry.windows import WindowRefused
 from service.tracker import step
 from service.tracking import alarms
 from service.tracking import events as ev
+from service.tracking.activity import Activity, under_way
 from service.tracking.alarms import Act, forbidding
 from service.tracking.dither import SILENT_S
 from service.tracking.events import Effect, Event
@@ -43,6 +44,9 @@ from service.worker import Description
 
 WATCH_INTERVAL_S = 4.0
 """Between two looks of the passive watchdog: a jump is to be seen within 5 s."""
+
+STEADY_GATHER_S = 0.45
+"""Of frames, while nothing happens: windows last four times as long, and alarms have a second."""
 
 Step = Callable[[TrackerState, Event, Policy, int], tuple[TrackerState, tuple[Effect, ...]]]
 
@@ -146,6 +150,19 @@ class Engine:
                     self._driver.fit(window)
         for event in news(was_silent_s, self.streams, self.state):
             self.post(event)
+
+    @property
+    def gather_s(self) -> float:
+        """Seconds of frames that may wait before they are taken in: each visit costs as much.
+
+        Longer while α is followed and nothing else happens: no alarm, no matrix made or tried.
+        """
+        state, now_ns = self.state, self._driver.now_ns()
+        if state.registration is None or state.alarms or state.on_probation:
+            return 0.0
+        dithers = (Activity.OWN_DITHER, Activity.OTHER_DITHER)
+        steady = all(running.activity in dithers for running in under_way(state, now_ns))
+        return STEADY_GATHER_S if steady else 0.0
 
     @property
     def look_interval_s(self) -> float:

@@ -243,19 +243,23 @@ class Supervisor:
         rung = asyncio.Event()
         loop = asyncio.get_running_loop()
         self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set))
+        fed_s = 0.0
         while True:
             # asyncio.wait_for of Python 3.11 swallows a cancel that meets the bell
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(POLL_S):
                     await rung.wait()
             rung.clear()
-            for heard in self._bridge.events():
+            events = self._bridge.events()
+            for heard in events:
                 if isinstance(heard, MeasuredMatrix):
                     self._start(self._keep_measured(heard))
                     continue
                 with self._surviving("an event of the link"):
                     self._engine.hear(heard)
-            self._feed()
+            if events or time.monotonic() - fed_s >= self._engine.gather_s:
+                self._feed()
+                fed_s = time.monotonic()
             await asyncio.sleep(GATHER_S)
 
     def _feed(self) -> None:

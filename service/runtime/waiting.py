@@ -118,7 +118,7 @@ def _flood(link: LinkStatistics) -> str:
     if rate_hz <= MOST_STATUSES_HZ:
         return ""
     spared = any(f.outcome == SPARED and f.n for f in link.fates)
-    taken = "the latest is taken ten times a second" if spared else "each says something else"
+    taken = "the latest is taken twice a second" if spared else "each says something else"
     return (
         f"the RTC floods the service with statuses: {rate_hz:.0f} a second, 1 to 10 are expected; "
         f"{taken}: slow them down"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.runtime.engine import news, shape_mismatch, troubles
+from service.runtime.engine import STEADY_GATHER_S, Engine, news, shape_mismatch, troubles
 from service.runtime.streams import (
     Streams,
     fed,
@@ -18,12 +18,15 @@ from service.telemetry.health import LOW_MODES, Actuators
 from service.telemetry.lockin import Spectra
 from service.telemetry.windows import WindowRefused
 from service.tracking import events as ev
+from service.tracking.alarms import Alarm
 from service.tracking.dither_request import Dither
+from service.tracking.products import MatrixState
 from service.tracking.state import TrackerState
 from service.wire import DitherKind, DitherRequest
 from service.worker import Description
+from tests.unit.runtime import handmade
 from tests.unit.telemetry import test_loopcheck as loops
-from tests.unit.tracking.situations import rtc
+from tests.unit.tracking.situations import POLICY, START_NS, foreign, rtc
 
 N_SLOPES, N_MODES = 6, 8
 DESCRIPTION = Description(
@@ -587,3 +590,23 @@ class TestGainsThatFollowTheSeeing:
         rate_hz = 1000.0
         jitter = {"frame_rate_hz": lambda t: rate_hz * (1.0 + 1e-6 * (-1) ** t)}
         assert self.windows(lambda t: 1.0, 2.0, **jitter) == (9, 0)
+
+
+def test_frames_wait_only_while_alpha_is_followed_and_nothing_else_happens():
+    class Driver:
+        def now_ns(self):
+            return START_NS
+
+    def gathered_s(**changes):
+        return Engine(replace(handmade.STATE, **changes), POLICY, Driver()).gather_s
+
+    assert gathered_s() == gathered_s(dither=DITHER) == STEADY_GATHER_S
+    sent = replace(foreign(), id="cm-2", state=MatrixState.PUBLISHED)
+    alarm = Alarm(name="edge-slip", since_ns_utc=START_NS, text="")
+    for changes in (
+        {"registration": None},
+        {"alarms": (alarm,)},
+        {"making_since_ns_utc": START_NS},
+        {"reconstructors": (foreign(), sent)},
+    ):
+        assert gathered_s(**changes) == 0.0

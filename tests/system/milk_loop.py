@@ -52,7 +52,7 @@ def main(folder, plant):
         seen = response @ (on_way[0] + turbulence) + 2e-3 * rng.standard_normal(n_slopes)
         slopes.put(seen)
         values.put(copied @ seen, slopes)
-        answer = np.float32(MULT) * (answer - np.float32(GAIN) * values.data[0])
+        answer = np.float32(MULT) * answer - np.float32(GAIN) * values.data[0]
         mirror.put(answer, values, slopes)
         command = np.zeros(n_modes)
         command[:rows] = UNIT * answer

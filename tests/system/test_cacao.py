@@ -74,7 +74,7 @@ def test_the_loop_is_registered_and_takes_up_a_matrix_and_what_is_wrong_is_said(
         wait_for(lambda: night.rtc_says("cm_id") == in_use, 10.0, "its status names it")
         status = night.state["rtc"]
         assert status["leak"] == pytest.approx(MULT)
-        first = {"first": 0, "last": N_START - 1, "gain": pytest.approx(GAIN * MULT)}
+        first = {"first": 0, "last": N_START - 1, "gain": pytest.approx(GAIN)}
         assert status["gains"][0] == first
         assert not night.alarms.keys() & {"loop-law", "columns-misaligned", "response-mismatch"}
 

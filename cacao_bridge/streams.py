@@ -97,6 +97,9 @@ _LOOK_S: Final = 3e-4
 """Between two of them."""
 
 _MAKE_ANEW: Final = "make it anew with milk and cacao of that format"
+_ADRIFT_S: Final = 0.5
+"""For which a writer may be put aside in the midst of a frame: less than a ring should hold."""
+
 _TWO_WRITERS_S: Final = 10.0
 """Within which a process that was taken over from may not come back."""
 
@@ -215,6 +218,8 @@ class Stream:
         self._index = memoryview(self._map)[296:300].cast("I")
         self._writing = memoryview(self._map)[288:289]
         self._offset: int | None = None
+        self._adrift_s = math.inf
+        """Since when ring and counter have not been seen together."""
         self._writers: list[tuple[int, float]] = []
 
     def __del__(self) -> None:
@@ -346,8 +351,11 @@ class Stream:
             return None
         if len(self._slots) < 2:
             return self._newest(counter)
+        turn = self._turn()
+        if turn is None:
+            return None
         first = max(counter + 1, now - self.n_kept + 1)
-        values = self._slots[self._slots_of(first, now)].astype(np.float32, copy=False)
+        values = self._slots[self._slots_of(first, now, turn)].astype(np.float32, copy=False)
         overwritten = max(0, self.counter - len(self._slots) + 2 - first)
         first, values = first + overwritten, values[overwritten:]
         return Frames(first, values, first - counter - 1) if len(values) else None
@@ -361,9 +369,9 @@ class Stream:
                 return Frames(now, values[None], now - after - 1)
         return None
 
-    def _slots_of(self, first: int, last: int) -> NDArray[np.int64]:
+    def _slots_of(self, first: int, last: int, turn: int) -> NDArray[np.int64]:
         counters = np.arange(first, last + 1)
-        slots = (counters + self._turn()) % len(self._slots)
+        slots = (counters + turn) % len(self._slots)
         if self._is_cube:
             place = self._at.counters
             kept = np.frombuffer(self._map, "<u8", len(self._slots), place)[slots]
@@ -372,16 +380,20 @@ class Stream:
                 raise self._error(told, f"{counters[:4].tolist()}...: another process writes it")
         return slots
 
-    def _turn(self) -> int:
+    def _turn(self) -> int | None:
         """Return what a frame's counter is behind its place in the ring; it has to stay.
 
         A writer moves the place first: what is seen is believed when it is seen again, and the
-        first time when it is the same several times.
+        first time when it is the same several times. None: not now; a busy machine may put a
+        writer aside in the midst of a frame.
         """
-        turn = settled(self._seen_turn, self._offset)
+        turn, now_s = settled(self._seen_turn, self._offset), time.monotonic()
         if turn is not None and self._offset in {None, turn}:
-            self._offset = turn
+            self._offset, self._adrift_s = turn, math.inf
             return turn
+        self._adrift_s = min(self._adrift_s, now_s)
+        if now_s - self._adrift_s < _ADRIFT_S:
+            return None
         why = self.orphaned or "do two processes write it?"
         raise StreamError(f"{self.name}: ring and counter drift apart: {why}")
 

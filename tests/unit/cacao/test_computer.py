@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -129,10 +128,8 @@ def test_a_writer_that_ended_in_the_midst_of_a_frame_is_named(loop, gone):
     loop.slopes.pid = gone
     loop.frame(0.5)
     loop.slopes.md.write = 1  # held for ever
-    began_s = time.monotonic()
     assert loop.rtc.poll() == []
-    assert time.monotonic() - began_s < 5.0
-    assert f"process {gone}, which wrote it, has ended" in loop.rtc.complaint
+    assert f"process {gone}, which wrote it, has ended" in loop.stands("slopes")
 
 
 @pytest.mark.parametrize(

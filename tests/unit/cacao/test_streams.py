@@ -194,6 +194,8 @@ def test_a_ring_that_drifts_from_its_counter_is_refused(path):
     milk.put(frame(1))
     assert stream.after(0).first == 1
     milk.md.cnt0 += 1  # counted by somebody who does not write the ring
+    assert stream.after(1) is None
+    stream._adrift_s -= 1.0  # a second ago
     with pytest.raises(StreamError, match="ring and counter drift apart"):
         stream.after(1)
     cube = Milk(path, (3, 2, 8), cube=True)
@@ -203,6 +205,25 @@ def test_a_ring_that_drifts_from_its_counter_is_refused(path):
     cube.counts[1] = 7
     with pytest.raises(StreamError, match=r"found slices of frames \[7, 2\].*, expected \[1, 2\]"):
         stream.after(0)
+
+
+@pytest.mark.parametrize("tells", [True, False])
+def test_a_writer_put_aside_in_the_midst_of_a_frame_costs_nothing(path, tells):
+    """It may be so for longer than anybody looks; not every writer says that it is at it."""
+    milk = Milk(path, (6,), n_ring=8)
+    stream = Stream(path)
+    for k in (1, 2, 3):
+        milk.put(frame(k))
+        stream.after(0)
+    before = milk.md.CBindex
+    milk.put(frame(4))
+    milk.put(frame(5))
+    milk.md.cnt0, milk.md.write = 4, int(tells)  # of frame 5 the place alone is told yet
+    assert stream.after(3) is None
+    milk.md.cnt0, milk.md.write = 5, 0
+    frames = stream.after(3)
+    assert (frames.first, frames.n_lost, before) == (4, 0, 3)
+    np.testing.assert_array_equal(frames.values[:, 0], [400.0, 500.0])
 
 
 def test_which_frame_of_another_stream_led_to_one(path, tmp_path):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from check_rtc.articles import ARTICLES, Checked, Outcome
 from check_rtc.ear import Ear
 from check_rtc.examine import Examination, examine
+from check_rtc.offload import Registered
 from check_rtc.talk import Talk
 from check_rtc.watch import Watch
 from service.commands.terminal import say
@@ -29,6 +32,9 @@ from service.model.slopes import likely_kind
 from service.prepared import Prepared, usual_folder
 from service.telemetry.lockin import Spectra, WindowEstimate, WindowRefused
 from service.telemetry.windows import ClosedLoop
+
+if TYPE_CHECKING:
+    from service.worker import OpticsWorker
 
 KEPT, BROKEN = 0, 1
 
@@ -65,7 +71,7 @@ def check(options: argparse.Namespace) -> int:
         consent=lambda moved: _agreed(moved, yes=options.yes),
         move_image=options.move_image,
         dialect=lambda matrix: compared(instrument, matrix),
-        registered=lambda window, loop: registered(instrument, window, loop),
+        registered=registering(instrument),
     )
     checks = []
     with Ear(endpoint, as_service=not options.passive) as ear:
@@ -123,19 +129,24 @@ def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> Dialect | s
     return replace(dialect, adopted=instrument.slopes.orientation is None)
 
 
-def registered(
-    instrument: Instrument, window: Spectra, loop: ClosedLoop
-) -> WindowEstimate | WindowRefused:
-    """Return α of a window of dither, as the service would make it."""
-    from service.worker import OpticsWorker
-    from service.worker.records import Compute
+def registering(instrument: Instrument) -> Registered:
+    """Return what makes α of a window of dither as the service does; its model is made once."""
 
-    try:
-        worker = OpticsWorker(instrument, Compute(cache=usual_folder(os.environ)))
-        worker.listen(loop.reconstructor, None)
-        return worker.fit(window, loop, None)
-    except ModelError as error:
-        return WindowRefused(reason=str(error), t_ns_utc=window.t_end_ns_utc)
+    @functools.cache
+    def worker() -> OpticsWorker:
+        from service.worker import OpticsWorker
+        from service.worker.records import Compute
+
+        return OpticsWorker(instrument, Compute(cache=usual_folder(os.environ)))
+
+    def registered(window: Spectra, loop: ClosedLoop) -> WindowEstimate | WindowRefused:
+        try:
+            worker().listen(loop.reconstructor, None)
+            return worker().fit(window, loop, None)
+        except ModelError as error:
+            return WindowRefused(reason=str(error), t_ns_utc=window.t_end_ns_utc)
+
+    return registered
 
 
 def _agreed(moved: tuple[str, ...], *, yes: bool) -> bool:

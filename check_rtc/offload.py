@@ -10,15 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from check_rtc.articles import Checked, fine, seen, skipped, wrong
-from check_rtc.talk import TOTAL_M, Talk, stopped
-from service.errors import LinkError
+from check_rtc.ear import ANSWER_S
+from check_rtc.talk import REPLY_S, TOTAL_M, Talk, stopped
+from service.errors import LinkError, WireError
 from service.model.misregistration import BOUNDARY_SCALE
 from service.telemetry.estimate import Estimate
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra, WindowRefused
 from service.telemetry.windows import ClosedLoop
 from service.tracking.loop import closed_loop
-from service.wire import DitherKind, DitherRequest, OffloadRequest, Reply, Status
+from service.wire import (
+    CommandKind,
+    DitherKind,
+    DitherRequest,
+    OffloadRequest,
+    Reply,
+    Status,
+    decode,
+    encode,
+)
 
 Registered = Callable[[Spectra, ClosedLoop], Estimate | WindowRefused]
 """Makes α of a window of dither."""
@@ -59,7 +69,7 @@ def offload(talk: Talk, matrix: NDArray[np.float32] | None, registered: Register
             return skipped("offload", f"there was no dither: {reply.reason}")
         loop = closed_loop(status, status.cm_id, matrix)
         return _moved(talk, request, reply.start_seq, lambda spectra: registered(spectra, loop))
-    except LinkError as error:
+    except (LinkError, WireError) as error:
         return wrong("offload", str(error))
     finally:
         stopped(talk)
@@ -83,12 +93,13 @@ def _moved(
     )
     talk.listen(_DRAINED_S)  # much has come while α was computed
     sent_seq = _next_seq(talk)
-    try:
-        reply = talk.ear.command(demand)
-    except LinkError as error:
-        if str(error).startswith("no answer"):
-            return skipped("offload", "nobody answers on cmd/rtc/offload")
-        raise
+    answer, took_s = talk.ear.ask(CommandKind.OFFLOAD, encode(demand))
+    if answer is None and took_s < ANSWER_S / 2:
+        return skipped("offload", "nobody answers on cmd/rtc/offload")
+    if answer is None or took_s > REPLY_S:
+        unknown = "whether the image has moved is not known: look where it is"
+        return wrong("offload", f"no answer within {REPLY_S:g} s; {unknown}")
+    reply = decode(Reply, answer)
     if not reply.accepted:
         allowed = reply.reason.partition(":")[0] in _ALLOWED
         return (skipped if allowed else wrong)("offload", f"it will not: {reply.reason}")

@@ -155,6 +155,12 @@ def test_who_has_no_stage_and_who_does_not_answer_is_left_alone():
         assert moved(**twists)[1].outcome is Outcome.SKIPPED
 
 
+def test_a_stage_that_answers_late_is_named_and_not_moved_blindly():
+    rtc, check = moved(stage=1.0, reply_s=1.5)
+    wrong(check, "no answer within 1 s; whether the image has moved is not known")
+    assert [type(one).__name__ for one in rtc.commands].count("OffloadRequest") == 1
+
+
 def test_where_the_image_stands_still_need_not_be_known():
     rtc, check = moved(stage=0.8, stands=lambda _seq: None)
     assert check.outcome is Outcome.OK

@@ -18,7 +18,8 @@ from service.wire.frames import BATCH_LIMIT, FRAMES_PER_BATCH
 Array32 = NDArray[np.float32]
 
 PATIENCE_FRAMES: Final = 64
-"""A row whose command has not come so many frames later is left out, and counted."""
+"""A row whose command has not come so many frames later is left out, and counted, if that of a
+later one has. Where none has come at all it is waited for longer: half of what is held."""
 
 LEAST_KEPT: Final = 512
 """Frames of each stream that are held at least."""
@@ -115,7 +116,7 @@ class Rows:
                 part = frames[start : min(start + self._per_message, last)]
                 runs.append((int(part[0]), self._rows(part)))
             self.next = int(frames[last - 1]) + 1
-        self.skip(self._newest - PATIENCE_FRAMES)
+        self.skip(self._newest - self._kept // 2)
         return runs
 
     def _complete(self, frames: NDArray[Any]) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cacao_bridge.rows import PATIENCE_FRAMES, Rows
+from cacao_bridge.rows import LEAST_KEPT, Rows
 
 N = 300
 
@@ -71,7 +71,21 @@ def test_no_command_at_all_sends_nothing_and_is_counted():
     for k in range(1000):
         rows.take_slopes(k, slopes_of(k)[None])
         assert rows.ready() == []
-    assert rows.n_unpaired == 999 - PATIENCE_FRAMES
+    assert rows.n_unpaired == 999 - LEAST_KEPT // 2
+
+
+def test_commands_that_come_a_look_later_than_many_slopes_cost_nothing():
+    """The bridge stood still, and then the writer was at the commands: 200 frames, none lost."""
+    rows = Rows(3, 2, 1.0, dither=False)
+    rows.take_slopes(0, slopes_of(0)[None])
+    rows.take_commands(0, answer_to(0)[None])
+    frames = range(1, 201)
+    rows.take_slopes(1, np.array([slopes_of(k) for k in frames]))
+    sent = rows_of(rows.ready())
+    rows.take_commands(1, np.array([answer_to(k) for k in frames]))
+    sent |= rows_of(rows.ready())
+    assert sent.keys() == set(frames)
+    assert rows.n_unpaired <= 1  # the first frame answers nothing
 
 
 def test_what_came_before_is_not_mixed_with_what_comes_after_a_new_stream():

@@ -115,6 +115,7 @@ def create_app(
     app.add_middleware(Traced)
     app.state.service = service
     app.state.keys = keys
+    app.state.slopes = numbers.SlopesShown()
     app.state.stream = stream.Stream(service, over or asyncio.Event())
     problems.install(app)
     page.install(app)

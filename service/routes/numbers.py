@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Depends, Path, Response
+from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
@@ -21,6 +22,7 @@ from service.model.interaction import rtc_valid_subapertures
 from service.model.slopes import slopes_of, to_conventions, turned_mask
 from service.routes.problems import INVALID, UNKNOWN, problem_response
 from service.routes.views import ServiceDep, answer, shows, view
+from service.runtime.supervisor import Supervisor
 from service.telemetry.frames import FrameBlock
 from service.tracking.products import MatrixState
 
@@ -203,6 +205,9 @@ class SlopeMaps:
     """Over these frames, about zero, in the slopes' own unit."""
 
 
+SHOWN_S = 0.5
+"""So long a picture of the slopes serves whoever asks."""
+
 SINGULAR = view("SingularValuesView", SingularValues)
 SLOPES = view("SlopeMapsView", SlopeMaps)
 
@@ -241,12 +246,28 @@ def _rounded(values: NDArray[np.float64]) -> list[float]:
     "/slopes",
     responses={200: shows(SLOPES), 404: problem_response("No telemetry has come yet")},
 )
-async def slopes(service: ServiceDep) -> Response:
+async def slopes(request: Request, service: ServiceDep) -> Response:
     """Return the RMS of the last residual slopes as maps."""
-    block = service.newest_frames
-    if block is None:
+    if service.newest_frames is None:
         raise UnknownIdError("slopes: no telemetry has come yet")
-    return answer(await run_in_threadpool(_maps, block, service.instrument))
+    shown: SlopesShown = request.app.state.slopes
+    return Response(await run_in_threadpool(shown.body, service), media_type="application/json")
+
+
+class SlopesShown:
+    """The last slopes as they leave, worked out once for all pages: each asks every second."""
+
+    def __init__(self) -> None:
+        self._body = b""
+        self._until_s = 0.0
+
+    def body(self, service: Supervisor) -> bytes:
+        """Return them as JSON, at most ``SHOWN_S`` old; telemetry must have come."""
+        block, now_s = service.newest_frames, time.monotonic()
+        if block is not None and now_s >= self._until_s:
+            self._body = bytes(answer(_maps(block, service.instrument)).body)
+            self._until_s = now_s + SHOWN_S
+        return self._body
 
 
 def _maps(block: FrameBlock, instrument: Instrument) -> SlopeMaps:

@@ -9,6 +9,7 @@ from service.config import packaged_instrument
 from service.control.reconstructor import invert
 from service.errors import UnknownIdError
 from service.model.interaction import rtc_valid_subapertures
+from service.routes import numbers
 from service.telemetry.frames import FrameBlock
 from tests.unit.test_api_fits import assert_problem
 
@@ -48,16 +49,32 @@ async def test_singular_values_are_those_of_the_matrix_it_inverts(client, servic
     assert_problem(unknown, 404, "unknown-id", "cm-2")
 
 
+def frames(slopes, t0_ns_utc=5):
+    return FrameBlock(
+        session="s", first_seq=1, t0_ns_utc=t0_ns_utc, dt_ns=1_000_000, slopes=slopes,
+        commands_m=np.zeros((2, 1), np.float32), dither_m=None, cm_id="cm-1",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("shown_s", "t_ns"), [(0.0, 6), (1e9, 5)])
+async def test_one_picture_of_the_slopes_serves_all_who_ask_soon(
+    client, service, monkeypatch, shown_s, t_ns
+):
+    monkeypatch.setattr(numbers, "SHOWN_S", shown_s)
+    slopes = np.zeros((2, 2 * int(rtc_valid_subapertures(service.instrument).sum())), np.float32)
+    for t0_ns in (5, 6):
+        service.newest_frames = frames(slopes, t0_ns)
+        told = (await client.get("/v1/slopes")).json()
+    assert told["t_ns_utc"] == t_ns
+
+
 async def test_slopes_lie_where_their_subapertures_are(client, service):
     assert_problem(await client.get("/v1/slopes"), 404, "unknown-id", "no telemetry has come yet")
     valid = rtc_valid_subapertures(service.instrument)
     half = int(valid.sum())
     slopes = np.zeros((2, 2 * half), np.float32)
     slopes[:, 0] = 0.3, -0.4  # the first x slope; its RMS about zero is sqrt((0.09 + 0.16) / 2)
-    service.newest_frames = FrameBlock(
-        session="s", first_seq=1, t0_ns_utc=5, dt_ns=1_000_000, slopes=slopes,
-        commands_m=np.zeros((2, 1), np.float32), dither_m=None, cm_id="cm-1",
-    )  # fmt: skip
+    service.newest_frames = frames(slopes)
     body = (await client.get("/v1/slopes")).json()
     maps = np.array(body["rms"], dtype=float)
     assert (body["n_frames"], body["cm_id"], maps.shape) == (2, "cm-1", (30, 60))

@@ -102,7 +102,8 @@ class _Manual(StaticFiles):
 class Packed(Middleware):
     """Compresses what the page is made of, and the long lists it reads.
 
-    Not what is compressed already or cannot be, as noise in a matrix, nor a stream.
+    Not what is compressed already or cannot be, as noise in a matrix, nor a stream, nor what every
+    page asks for every second: that would cost more than it saves.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -116,7 +117,7 @@ class Packed(Middleware):
 
 
 _PACKED: Final = re.compile(
-    r"/|/dashboard/.*|/v1/(alpha/history|marks|gains|slopes|mirror|events|reconstructors)"
+    r"/|/dashboard/.*|/v1/(alpha/history|marks|gains|mirror|events|reconstructors)"
     r"|/v1/fits/[^/]*/figures"
 )
 

@@ -21,6 +21,7 @@ from tests.system.night import (
     session_members,
     wait_for,
 )
+from tests.system.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 
@@ -107,7 +108,7 @@ def test_in_propose_the_operator_decides(night):
     copy = night.client.get(f"/v1/reconstructors/{night.state['in_use']}").json()
     assert copy["parent"] == initial
     assert night.state["mode"] == "hold"
-    time.sleep(1.0)  # one that was being made is on the shelf by now
+    time.sleep(patience(1.0))  # one that was being made is on the shelf by now
     n_known = len(night.shelf)
     time.sleep(4.0)
     assert len(night.shelf) == n_known

@@ -108,6 +108,16 @@ def settled(case: Case, spectra: list[Spectra]) -> list[WindowEstimate]:
     return estimates
 
 
+@cache
+def bright_estimates() -> list[WindowEstimate]:
+    return settled(BRIGHT, bright_windows())
+
+
+@cache
+def faint_estimates() -> list[WindowEstimate]:
+    return settled(FAINT, faint_windows())
+
+
 def errors(case: Case, estimates: list[WindowEstimate]) -> np.ndarray:
     return np.array([e.alpha.vector for e in estimates]) - case.sky.alpha.vector
 
@@ -119,14 +129,14 @@ def in_sigma_of_the_mean(error: np.ndarray) -> np.ndarray:
 @pytest.fixture(
     scope="module",
     params=[
-        pytest.param((BRIGHT, bright_windows), id="bright", marks=pytest.mark.long),
-        pytest.param((FAINT, faint_windows), id="faint"),
+        pytest.param((BRIGHT, bright_estimates), id="bright", marks=pytest.mark.long),
+        pytest.param((FAINT, faint_estimates), id="faint"),
     ],
 )
 def found(request):
     """A case and the estimates of its 48 windows."""
-    case, spectra = request.param
-    return case, settled(case, spectra())
+    case, estimates = request.param
+    return case, estimates()
 
 
 def test_the_mean_of_many_windows_is_the_truth(found):
@@ -155,7 +165,7 @@ def test_the_sigma_of_the_gains_is_the_scatter_that_is_seen(found):
 
 def test_the_command_as_its_own_instrument_is_biased(monkeypatch):
     """What the instrument is for: the command carries turbulence and noise of its own."""
-    right = errors(FAINT, settled(FAINT, faint_windows()))
+    right = errors(FAINT, faint_estimates())
     monkeypatch.setattr(
         lockin, "_instrument", lambda spectra, *_: spectra.commands[:, 0].astype(complex)
     )
@@ -166,14 +176,14 @@ def test_the_command_as_its_own_instrument_is_biased(monkeypatch):
 
 def test_the_optical_gain_and_the_alignment_of_the_columns_are_measured():
     """1 %: 48 windows at a signal to noise of a few hundred."""
-    estimates = settled(BRIGHT, bright_windows())
+    estimates = bright_estimates()
     gains = np.mean([e.optical_gain for e in estimates], axis=0)
     np.testing.assert_allclose(np.abs(gains), BRIGHT.sky.optical_gain, rtol=0.01)
     assert np.abs(np.mean([e.lag_frames for e in estimates], axis=0)).max() < 0.01
 
 
 def test_an_exact_model_leaves_nothing_but_noise():
-    misfit = np.mean([e.misfit for e in settled(BRIGHT, bright_windows())])
+    misfit = np.mean([e.misfit for e in bright_estimates()])
     assert misfit == pytest.approx(1.0, abs=0.1)
 
 

@@ -201,6 +201,7 @@ class Intake:
             self._rtc_alive = alive
             if not alive:
                 self._sessions.leave()
+                self._spared = None  # told later, it would say that the RTC is back
         appeared = ev.Noted(name="rtc.appeared", text="the RTC is there")
         self.event(appeared if alive else ev.RtcVanished())
 

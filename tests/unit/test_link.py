@@ -436,6 +436,15 @@ def test_of_a_flood_of_statuses_two_a_second_are_taken_and_the_latest_is_not_los
     assert intake.statistics().statuses_received == 5000 + 1
 
 
+def test_a_status_kept_back_is_not_told_once_the_rtc_is_gone(intake, clock):
+    for k in range(2):
+        say(intake, seq=k)
+    intake.events()
+    intake.liveliness(alive=False)
+    clock.now_s += 1.0
+    assert [type(event) for event in intake.events()] == [ev.RtcVanished]
+
+
 @pytest.mark.parametrize(
     "change", [{"loop": Loop.OPEN}, {"cm_id": "other"}, {"n_controlled": 1}, {"n_slopes": 4}]
 )

@@ -187,6 +187,7 @@ class Intake:
 
     def acknowledgement(self, acknowledgement: wire.Acknowledgement, *, known: bool) -> None:
         """Take the RTC's word on a reconstructor."""
+        self._take_spared(at_once=True)
         now_s = self._clock()
         with self._lock:
             self._counted["unknown"] += not known
@@ -197,11 +198,11 @@ class Intake:
 
     def liveliness(self, *, alive: bool) -> None:
         """Take the appearance or disappearance of the RTC's token."""
+        self._take_spared(at_once=True)
         with self._lock:
             self._rtc_alive = alive
             if not alive:
                 self._sessions.leave()
-                self._spared = None  # told later, it would say that the RTC is back
         appeared = ev.Noted(name="rtc.appeared", text="the RTC is there")
         self.event(appeared if alive else ev.RtcVanished())
 
@@ -223,6 +224,7 @@ class Intake:
 
     def event(self, event: LinkEvent) -> None:
         """Queue an event and wake the consumer."""
+        self._take_spared(at_once=True)
         with self._lock:
             self._put(event)
         self._wake()
@@ -262,11 +264,15 @@ class Intake:
             self._events.clear()
         return events
 
-    def _take_spared(self) -> None:
-        """Take the last of a flood of statuses in, once it is due."""
+    def _take_spared(self, *, at_once: bool = False) -> None:
+        """Take the last of a flood of statuses in once it is due, or before what it said next.
+
+        Told after its word on a matrix, or its end, it would deny what has happened since.
+        """
         with self._lock:
             data, last_s = self._spared, self._last_status_s
-            if data is None or (last_s or 0.0) + STATUS_INTERVAL_S > self._clock():
+            due = at_once or (last_s or 0.0) + STATUS_INTERVAL_S <= self._clock()
+            if data is None or not due:
                 return
             self._spared, self._changes = None, 0
         try:

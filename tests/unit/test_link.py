@@ -241,6 +241,18 @@ def test_frames_of_another_size_start_over_in_the_same_session(intake):
     assert block.commands_m.shape == (10, 4)
 
 
+def applied(intake, session):
+    said = Acknowledgement(
+        session=session,
+        id="cm-1",
+        sha256="0" * 64,
+        state=AckState.APPLIED,
+        reason="",
+        frame_seq=5,
+    )
+    intake.acknowledgement(said, known=True)
+
+
 def say(intake, **changes):
     """The RTC's status: 3 slopes, 2 modes unless told otherwise."""
     values = {
@@ -398,17 +410,7 @@ def test_no_message_of_an_unknown_session_takes_over_from_one_that_sends(intake,
     elif kind == "status":
         say(intake, session="other")
     else:
-        intake.acknowledgement(
-            Acknowledgement(
-                session="other",
-                id="cm-1",
-                sha256="0" * 64,
-                state=AckState.APPLIED,
-                reason="",
-                frame_seq=5,
-            ),
-            known=True,
-        )
+        applied(intake, session="other")
     events = intake.events()
     assert intake.statistics().session == "s1"
     assert not [e for e in events if isinstance(e, ev.SessionStarted) and e.session == "other"]
@@ -436,13 +438,19 @@ def test_of_a_flood_of_statuses_two_a_second_are_taken_and_the_latest_is_not_los
     assert intake.statistics().statuses_received == 5000 + 1
 
 
-def test_a_status_kept_back_is_not_told_once_the_rtc_is_gone(intake, clock):
+@pytest.mark.parametrize("follows", ["vanished", "applied"])
+def test_a_status_kept_back_is_told_before_what_the_rtc_does_next(intake, clock, follows):
     for k in range(2):
         say(intake, seq=k)
     intake.events()
-    intake.liveliness(alive=False)
+    if follows == "vanished":
+        intake.liveliness(alive=False)
+    else:
+        applied(intake, session="s1")
     clock.now_s += 1.0
-    assert [type(event) for event in intake.events()] == [ev.RtcVanished]
+    kept, after = intake.events()
+    assert kept.seq == 1
+    assert isinstance(after, ev.RtcVanished if follows == "vanished" else Acknowledgement)
 
 
 @pytest.mark.parametrize(

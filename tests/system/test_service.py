@@ -157,11 +157,17 @@ def test_a_service_killed_after_a_move_picks_up_where_it_was_and_leads_the_image
         found = night.state["move"]
         return found if found is not None and found["n_moves"] >= n else None
 
+    def true():
+        told = [line for line in truth.read_text().split("\n")[:-1] if '"rotation_deg"' in line]
+        return json.loads(told[-1])
+
     wait_for(lambda: moves(1), 40.0, "a move")
     assert night.state["rtc"]["n_slopes"] == 448
-    in_use, ids = night.state["in_use"], [r["id"] for r in night.shelf if r["parent"]]
     saved = night.directory / "data" / "tracking.json"
     wait_for(lambda: saved.exists() and '"n_moves": 1' in saved.read_text(), what="it is saved")
+    arrived = ALPHA["shift_x_subap"] - 0.05
+    wait_for(lambda: true()["shift_x_subap"] < arrived, 20.0, "the image stands elsewhere")
+    in_use, ids = night.state["in_use"], [r["id"] for r in night.shelf if r["parent"]]
     service.kill()
 
     again = night.service("auto", pixels)
@@ -174,9 +180,8 @@ def test_a_service_killed_after_a_move_picks_up_where_it_was_and_leads_the_image
     assert matrix.status_code == 200
 
     def home():
-        told = [line for line in truth.read_text().split("\n")[:-1] if '"rotation_deg"' in line]
-        known, true = night.state["registration"], json.loads(told[-1])
-        found = [known["alpha"][name] - true[name] for name in TOLERANCE]
+        known, truly = night.state["registration"], true()
+        found = [known["alpha"][name] - truly[name] for name in TOLERANCE]
         near = [abs(error) < TOLERANCE[name] for error, name in zip(found, TOLERANCE, strict=True)]
         return all(near) and known["n_windows"] >= 2 and moves(2)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from cacao_bridge.settings import Settings, load_index, load_modes
 from cacao_bridge.streams import Stream, StreamError, create, path_of
 from service.errors import ConfigurationError
-from service.wire import CHUNK_LIMIT, Manifest, checksum, decode, encode, layout_of
+from service.wire import Manifest, checksum, decode, encode
 from sim_rtc.computer.telemetry import Identity, Reconstructor
 
 Array32 = NDArray[np.float32]
@@ -127,19 +127,8 @@ class Calibration:
     def _foreign(self, cube: Array32) -> Reconstructor:
         """Return what somebody else has written, under a name of its own."""
         matrix = np.ascontiguousarray(cube[:, self.index] * self._unit)
-        manifest = Manifest(
-            id=f"own-{checksum(matrix)[:12]}",
-            layout=layout_of(matrix, CHUNK_LIMIT),
-            alpha=None,
-            sigma=None,
-            im_id=None,
-            parent=None,
-            basis_id=self._identity.basis_id,
-            config_id=self._identity.config_id,
-            system=self._identity.system,
-            created_ns=0,
-        )
-        own = Reconstructor(manifest=manifest, matrix=matrix)
+        name = f"own-{checksum(matrix)[:12]}"
+        own = Reconstructor.own(name, matrix, self._identity, created_ns=0)
         self._keep(own)
         return own
 

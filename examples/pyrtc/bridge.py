@@ -6,20 +6,17 @@ import time
 import numpy as np
 
 from service.wire import (
-    CHUNK_LIMIT,
     DitherRequest,
     DitherStop,
     FrameHeader,
     Keys,
     Loop,
     LoopRequest,
-    Manifest,
     Reply,
     Status,
     checksum,
     encode,
     encode_frames,
-    layout_of,
 )
 from service.wire.status import DitherStatus
 from sim_rtc.computer.reconstructors import Terms
@@ -45,19 +42,9 @@ class Bridge:
         self.bench, self.lock = bench, threading.Lock()
         basis = checksum(bench.modes.astype(np.float32))[:8]  # OOPAO's differ from run to run
         names = {"basis_id": f"kl-{bench.n_modes}-{basis}", "config_id": "pyramid"}
-        self.identity = Identity(system=system, **names)
-        manifest = Manifest(
-            id=f"own-{checksum(matrix)[:12]}",
-            layout=layout_of(matrix, CHUNK_LIMIT),
-            alpha=None,
-            sigma=None,
-            im_id=None,
-            parent=None,
-            created_ns=time.time_ns(),
-            system=system,
-            **names,
-        )
-        self.reconstructor = Reconstructor(manifest=manifest, matrix=matrix)
+        self.identity, now_ns = Identity(system=system, **names), time.time_ns()
+        name = f"own-{checksum(matrix)[:12]}"
+        self.reconstructor = Reconstructor.own(name, matrix, self.identity, created_ns=now_ns)
         self.staged, self.swaps, self.dither, self.n_next = None, [], None, len(matrix)
         self.session, self.seq, self.start_ns = new_session(), 0, time.time_ns()
         bench.use(matrix)

@@ -103,11 +103,9 @@ def items(archive: Archive, in_use: Collection[str] = ()) -> tuple[Item, ...]:
 def _item(store: Folder, product_id: str, records: Mapping[str, Any]) -> Item:
     """Return a product; one that somebody has to look at is kept until then."""
     record = records.get(product_id)
+    path, fault = store.path_of(product_id), "" if record else "its record is not understood"
     try:
-        status, fault = (
-            store.path_of(product_id).stat(),
-            "" if record else "its record is not understood",
-        )
+        status = path.stat()
     except OSError as error:
         status, fault = None, f"its file cannot be found: {error.strerror}"
     return Item(

@@ -22,13 +22,12 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import BasisKind, SignalKind
 from service.model.modes import ModalBasis
 from service.wire import (
-    CHUNK_LIMIT,
     TEXT_LIMIT,
     Acknowledgement,
     AckState,
     ChunkAssembler,
     Manifest,
-    layout_of,
+    checksum,
 )
 from sim_rtc.computer.telemetry import Identity, Reconstructor
 
@@ -237,20 +236,9 @@ def initial_reconstructor(
     aligned = instrument.start
     interaction = InteractionModel(instrument, basis).interaction_matrix(aligned)
     matrix = truncated_inverse(interaction[:, :n_controlled])
-    layout = layout_of(matrix, CHUNK_LIMIT)
-    manifest = Manifest(
-        id=f"initial-{n_controlled}-{layout.sha256[:8]}",
-        layout=layout,
-        alpha=aligned.to_boundary(),
-        sigma=None,
-        im_id=None,
-        parent=None,
-        basis_id=identity.basis_id,
-        config_id=identity.config_id,
-        system=identity.system,
-        created_ns=time.time_ns(),
-    )
-    return Reconstructor(manifest=manifest, matrix=matrix)
+    name = f"initial-{n_controlled}-{checksum(matrix)[:8]}"
+    made_ns, alpha = time.time_ns(), aligned.to_boundary()
+    return Reconstructor.own(name, matrix, identity, created_ns=made_ns, alpha=alpha)
 
 
 def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 import uuid
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.wire import FrameHeader, Manifest, Status
+from service.wire import CHUNK_LIMIT, FrameHeader, Manifest, Status, layout_of
 from sim_rtc.telescope.plant import Optics
 
 Array32 = NDArray[np.float32]
@@ -53,6 +55,31 @@ class Reconstructor:
     manifest: Manifest
     matrix: Array32
     """``(n_controlled, n_slopes)``, metres per slope."""
+
+    @classmethod
+    def own(
+        cls,
+        name: str,
+        matrix: Array32,
+        identity: Identity,
+        *,
+        created_ns: int,
+        alpha: Mapping[str, float] | None = None,
+    ) -> Self:
+        """Return a matrix that no service has sent: the RTC had it before, or somebody wrote it."""
+        manifest = Manifest(
+            id=name,
+            layout=layout_of(matrix, CHUNK_LIMIT),
+            alpha=alpha,
+            sigma=None,
+            im_id=None,
+            parent=None,
+            basis_id=identity.basis_id,
+            config_id=identity.config_id,
+            system=identity.system,
+            created_ns=created_ns,
+        )
+        return cls(manifest=manifest, matrix=matrix)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -25,8 +25,6 @@ from service.tracking.turn import Turn
 from service.tracking.worth import settled
 from service.wire import OffloadRequest, Reply, Status
 
-MOVING = "the mirror's image was being moved"
-
 DISOBEDIENCE = 0.3
 """1 σ of what a device does over what it was asked for, less 1."""
 
@@ -60,9 +58,9 @@ def demand(turn: Turn) -> None:
         total=np.zeros(4) if last is None else last.total,
         asked_ns_utc=turn.now_ns,
         n_moves=0 if last is None else last.n_moves,
+        still_ns_utc=_clock_ns(turn, limits.settle_s),
     )
     turn.state = replace(turn.state, move=move)
-    validity.void(turn, MOVING, _clock_ns(turn, limits.settle_s))
     named = dict(zip(PARAMETERS, (step * BOUNDARY_SCALE).tolist(), strict=True))
     turn.ask(ev.Ask(request=OffloadRequest(id=move.id, **named)))
     turn.log("offload.asked", f"{move.id}: α is to change by {_told(step)}")
@@ -93,8 +91,7 @@ def on_answer(turn: Turn, request: OffloadRequest, reply: Reply) -> None:
     if move is None or limits is None or move.id != request.id:
         return
     if not reply.accepted:
-        validity.void(turn, MOVING)
-        _end(turn, move, MoveState.REFUSED, reply.reason)
+        _end(turn, replace(move, still_ns_utc=0), MoveState.REFUSED, reply.reason)
         turn.warn("offload.refused", f"{move.id}: {reply.reason}")
         return
     lasts_s = limits.settle_s
@@ -102,9 +99,10 @@ def on_answer(turn: Turn, request: OffloadRequest, reply: Reply) -> None:
         until_s = (reply.start_seq - rtc.seq) / rtc.frame_rate_hz
         lasts_s = min(max(until_s, 0.0), LONGEST_S)
     spread = DISOBEDIENCE * np.abs(move.step) + _cross_talk(move.step, limits)
+    still_ns = _clock_ns(turn, lasts_s)
     done = replace(move, total=move.total + move.step, n_moves=move.n_moves + 1)
-    _end(turn, done, MoveState.MOVED, "")
-    validity.displace(turn, move.step, spread, MOVING, _clock_ns(turn, lasts_s))
+    _end(turn, replace(done, still_ns_utc=still_ns), MoveState.MOVED, "")
+    validity.displace(turn, move.step, spread, still_ns)
     turn.log("offload.moved", f"{move.id}: α is expected {_told(move.step)} away")
 
 
@@ -113,9 +111,10 @@ def on_failure(turn: Turn, name: str, text: str) -> None:
     move, limits = turn.state.move, turn.policy.offloading
     if move is None or limits is None or move.id != name:
         return
-    _end(turn, move, MoveState.FAILED, text)
+    still_ns = max(move.still_ns_utc, _clock_ns(turn, limits.settle_s))
+    _end(turn, replace(move, still_ns_utc=still_ns), MoveState.FAILED, text)
     spread = np.abs(move.step) + _cross_talk(move.step, limits)
-    validity.displace(turn, np.zeros(4), spread, MOVING, _clock_ns(turn, limits.settle_s))
+    validity.displace(turn, np.zeros(4), spread, still_ns)
     turn.warn("offload.failed", f"{move.id}: {text}; whether it was made must be measured")
 
 

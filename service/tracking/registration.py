@@ -312,6 +312,10 @@ class Move:
     n_moves: int = 0
     """Demands that were carried out."""
 
+    still_ns_utc: int = 0
+    """When the image stands still, by the RTC's clock: telemetry that began earlier measures
+    nothing; 0: it did not move, or nobody tells."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Watchdog:

@@ -44,6 +44,8 @@ timestamps: a window then takes 20 s."""
 CANDIDATE_FOR_S = 60.0
 """A jump that nothing has confirmed or denied for so long is no longer waited for."""
 
+MOVING = "the mirror's image was being moved"
+
 _WORTHLESS = (Validity.STALE, Validity.INVALID)
 
 Array = NDArray[np.float64]
@@ -74,9 +76,13 @@ def why_void(state: TrackerState, when: Taken) -> str | None:
 
     What is the matter now is asked of the alarms.
     """
-    if not precedes(state, when, state.void_before_ns_utc):
+    voids = [(state.void_before_ns_utc, state.void_because)]
+    if state.move is not None:
+        voids.append((state.move.still_ns_utc, MOVING))
+    because = next((why for before_ns, why in voids if precedes(state, when, before_ns)), None)
+    if because is None:
         return None
-    return f"{state.void_because} when it was taken: its telemetry is no measurement"
+    return f"{because} when it was taken: its telemetry is no measurement"
 
 
 def void(turn: Turn, because: str, t_ns_utc: int = 0) -> None:
@@ -126,7 +132,7 @@ def hold(turn: Turn, registration: Registration) -> None:
     turn.known = registration
 
 
-def displace(turn: Turn, step: Array, spread: Array, because: str, until_ns_utc: int) -> None:
+def displace(turn: Turn, step: Array, spread: Array, still_ns_utc: int) -> None:
     """Expect α elsewhere, for the mirror's image was moved; windows must confirm it.
 
     Parameters
@@ -135,10 +141,9 @@ def displace(turn: Turn, step: Array, spread: Array, because: str, until_ns_utc:
         The event being worked out.
     step, spread
         ``(4,)`` by how much, and 1 σ of it, numeric units.
-    because, until_ns_utc
-        What moved it; telemetry that began before that time of the RTC's clock measures nothing.
+    still_ns_utc
+        When the image stands still, by the RTC's clock.
     """
-    void(turn, because, until_ns_utc)
     known = turn.known
     if known is None:
         return
@@ -151,9 +156,9 @@ def displace(turn: Turn, step: Array, spread: Array, because: str, until_ns_utc:
         earlier=None,
         candidate=None,
         bias=bias,
-        passive_after_ns_utc=max(known.passive_after_ns_utc, until_ns_utc),
+        passive_after_ns_utc=max(known.passive_after_ns_utc, still_ns_utc),
     )
-    want_window(turn, because)
+    want_window(turn, MOVING)
     age(turn)
 
 

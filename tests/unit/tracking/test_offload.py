@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -43,6 +44,7 @@ def a_story(mode=Mode.AUTO, policy=MOVES, n_windows=3, alpha=ALPHA):
     story.use("cm-1")
     story.wait(40.0)
     story.tell(cmd.SetMode(mode=mode))
+    story.tell(rtc(cm_id="cm-1", t_ns=story.now_ns))
     story.policy = policy
     story.see(alpha, n_windows=n_windows)
     return story
@@ -194,6 +196,44 @@ def test_a_move_that_nobody_had_answered_when_the_service_ended_may_have_been_ma
     assert after >= before + 0.06**2
 
 
+@pytest.mark.parametrize("answered", [True, False])
+def test_telemetry_of_a_move_measures_nothing_for_the_next_service_either(tmp_path, answered):
+    slow = replace(LIMITS, settle_s=20.0)
+    story = a_story(policy=replace(MOVES, offloading=slow))
+    if answered:
+        answer(story)
+    again = restarted(story, tmp_path)
+    again.meet(cm_id="cm-1", t_ns=again.now_ns)
+    again.see(ALPHA, n_windows=3)
+    assert again.state.windows_refused == 3
+    assert again.state.registration.n_windows == 0
+    again.wait(20.0)
+    again.see(AFTER, n_windows=2)
+    assert again.state.registration.n_windows == 2
+    assert not [name for name in again.logged if "jump" in name]
+
+
+def test_a_file_from_before_the_end_of_a_move_was_saved_is_read(tmp_path):
+    story = a_story()
+    answer(story)
+    file = TrackingFile(tmp_path / "tracking.json")
+    file.write(saved_of(story.state, story.now_ns))
+    values = json.loads((tmp_path / "tracking.json").read_text())
+    del values["move"]["still_ns_utc"]
+    (tmp_path / "tracking.json").write_text(json.dumps(values))
+    assert file.read().move.still_ns_utc == 0
+
+
+def test_what_else_happens_meanwhile_does_not_make_the_image_stand_still():
+    story = a_story()
+    story.tell(rtc(cm_id="cm-1", t_ns=story.now_ns))
+    answer(story)
+    story.tell(ev.Trouble(name="loop-diverging", text="it does"))
+    story.tell(ev.Trouble(name="loop-diverging", text="", over=True))
+    story.see(ALPHA)
+    assert story.state.windows_refused == 1
+
+
 def test_a_service_that_moves_nothing_forgets_where_the_device_was(tmp_path):
     story = a_story()
     answer(story)
@@ -217,4 +257,4 @@ def test_the_reply_may_say_from_which_frame_on_the_image_stands_still():
     story.meet(seq=10_000)
     now_ns = story.state.rtc.t_ns
     answer(story, start_seq=17_000)
-    assert story.state.void_before_ns_utc == pytest.approx(now_ns + 8 * SECOND, abs=SECOND / 10)
+    assert story.state.move.still_ns_utc == pytest.approx(now_ns + 8 * SECOND, abs=SECOND / 10)

@@ -18,6 +18,7 @@ from service.runtime.streams import (
     REST_S,
     VERDICTS,
     Streams,
+    Window,
     fed,
     taken,
     with_dither,
@@ -95,6 +96,7 @@ class Engine:
 
         self._driver = driver
         self._step = step
+        self._lent: tuple[Streams, TrackerState] | None = None
 
     def prepared(self, description: Description) -> None:
         """Take what the optical model expects of telemetry: estimators begin to listen."""
@@ -105,6 +107,7 @@ class Engine:
 
     def begin_anew(self) -> None:
         """Give up what the estimators have gathered; they listen from here on."""
+        self._lent = None
         if self.streams is not None:
             self.streams = Streams(description=self.streams.description)
             self._follow()
@@ -138,17 +141,33 @@ class Engine:
 
     def feed(self, blocks: Iterable[FrameBlock]) -> None:
         """Take in frames; windows that end in them are handed on to be fitted."""
-        if self.streams is None:
+        streams = self.lend()
+        if streams is not None:
+            self.give_back(*looked_at(streams, blocks))
+
+    def lend(self) -> Streams | None:
+        """Return the estimators, to look at frames elsewhere; None: the model is being prepared.
+
+        Until they are given back they follow nothing, and nobody may have sums of them, or teach
+        them a matrix.
+        """
+        self._lent = None if self.streams is None else (self.streams, self.state)
+        return self.streams
+
+    def give_back(self, streams: Streams, windows: Iterable[Window]) -> None:
+        """Take the estimators as they are after frames, unless they have begun anew meanwhile."""
+        if self._lent is None:
             return
-        was_silent_s = self.streams.dither_silent_s
-        for block in blocks:
-            self.streams, windows = fed(self.streams, block)
-            for window in windows:
-                if isinstance(window, WindowRefused):
-                    self.post(ev.WindowLost(refused=window))
-                else:
-                    self._driver.fit(window)
-        for event in news(was_silent_s, self.streams, self.state):
+        (before, state), self._lent = self._lent, None
+        self.streams = streams
+        if self.state is not state:
+            self._follow()
+        for window in windows:
+            if isinstance(window, WindowRefused):
+                self.post(ev.WindowLost(refused=window))
+            else:
+                self._driver.fit(window)
+        for event in news(before.dither_silent_s, self.streams, self.state):
             self.post(event)
 
     @property
@@ -187,11 +206,20 @@ class Engine:
 
     def _follow(self) -> None:
         """Keep the estimators in step with the RTC and the dither."""
-        if self.streams is None:
+        if self.streams is None or self._lent is not None:
             return
         self.streams, note = followed(self.streams, self.state, self.policy)
         if note is not None:
             self.post(note)
+
+
+def looked_at(streams: Streams, blocks: Iterable[FrameBlock]) -> tuple[Streams, list[Window]]:
+    """Return the estimators after these frames, and the windows that ended in them."""
+    windows: list[Window] = []
+    for block in blocks:
+        streams, ended = fed(streams, block)
+        windows += ended
+    return streams, windows
 
 
 def followed(

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
 from service.runtime.answers import Given
-from service.runtime.engine import Engine
+from service.runtime.engine import Engine, looked_at
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.keeping import TelemetryKeeper
 from service.runtime.recording import Caller, Recorder, ids_of
@@ -98,6 +99,10 @@ class Supervisor:
         """Telemetry kept on request."""
         self._backlog = Backlog()
         self._meter = PaceMeter(workers)
+        self._eyes = ThreadPoolExecutor(1, "telemetry")
+        self._looking = asyncio.Lock()
+        """Held by whoever has, or changes, the estimators."""
+
         self._running: set[asyncio.Task[None]] = set()
         self._broken = ""
         """The last fault that nobody foresaw."""
@@ -209,6 +214,7 @@ class Supervisor:
             for action in self._running:
                 action.cancel()
             await asyncio.gather(*self._running, return_exceptions=True)
+            self._eyes.shutdown(wait=False)
             self._recorder.close()
 
     async def _work(self) -> None:
@@ -258,19 +264,24 @@ class Supervisor:
                 with self._surviving("an event of the link"):
                     self._engine.hear(heard)
             if events or time.monotonic() - fed_s >= self._engine.gather_s:
-                self._feed()
+                await self._feed()
                 fed_s = time.monotonic()
             await asyncio.sleep(GATHER_S)
 
-    def _feed(self) -> None:
-        if self._engine.streams is None:
-            return
-        blocks = tuple(self._bridge.drain())
-        self.newest_frames = blocks[-1] if blocks else self.newest_frames
-        for block in blocks:
-            self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
-        with self._surviving("telemetry"):
-            self._engine.feed(blocks)
+    async def _feed(self) -> None:
+        """Take in frames, in a thread: who asks something meanwhile has an answer."""
+        loop = asyncio.get_running_loop()
+        async with self._looking:
+            streams = self._engine.lend()
+            if streams is None:
+                return
+            blocks = await loop.run_in_executor(self._eyes, self._bridge.drain)
+            self.newest_frames = blocks[-1] if blocks else self.newest_frames
+            for block in blocks:
+                self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
+            with self._surviving("telemetry"):
+                found = await loop.run_in_executor(self._eyes, looked_at, streams, blocks)
+                self._engine.give_back(*found)
 
     @contextlib.contextmanager
     def _surviving(self, what: str) -> Iterator[None]:
@@ -362,7 +373,8 @@ class Supervisor:
         while True:
             await asyncio.sleep(self._engine.look_interval_s)
             async with self._workers.turn("watch"):
-                sums = self._engine.take_sums()
+                async with self._looking:
+                    sums = self._engine.take_sums()
                 event = await watched(sums, self._engine.state, self._workers)
             if event is not None:
                 self._post(event)
@@ -397,7 +409,8 @@ class Supervisor:
             await asyncio.to_thread(self._actions.offer, self._engine.state)
             if in_use is not None and self._engine.streams is not None:
                 matrix = await asyncio.to_thread(self._actions.matrix, in_use)
-                self._engine.learn(in_use, matrix)
+                async with self._looking:
+                    self._engine.learn(in_use, matrix)
                 await self._hear_out(in_use, matrix)
         except PyrcalError as error:
             self._note("reconstructor.not-offered", str(error), Level.WARNING)

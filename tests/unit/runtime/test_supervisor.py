@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import resource
+import threading
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -262,6 +263,27 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
         assert "telemetry was dropped" in entry.text
         assert supervisor._engine.streams.rtc is not None
         assert supervisor.snapshot().ready
+
+
+async def test_an_order_is_carried_out_while_frames_are_looked_at(supervisor, bridge, monkeypatch):
+    looking, go_on = threading.Event(), threading.Event()
+
+    def slowly(streams, block):
+        looking.set()
+        assert go_on.wait(patience(20.0))
+        return replace(streams, heard_ns_utc=1), []
+
+    async with running(supervisor):
+        blocks = [SimpleNamespace(n_frames=50, dt_ns=10**6)]
+        monkeypatch.setattr("service.runtime.engine.fed", slowly)
+        monkeypatch.setattr(bridge, "drain", lambda: [blocks.pop()] if blocks else [])
+        await until(looking.is_set, 20.0)
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
+        assert await supervisor.submit(cmd.SetMode(mode=Mode.AUTO)) == "mode is auto"
+        assert supervisor._engine.streams.heard_ns_utc != 1
+        go_on.set()
+        await until(lambda: supervisor._engine.streams.heard_ns_utc == 1, 20.0)
+        assert supervisor._engine.streams.rtc is not None  # what was heard meanwhile is followed
 
 
 async def test_estimators_that_break_whatever_is_posted_begin_anew(supervisor, monkeypatch):

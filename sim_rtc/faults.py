@@ -249,7 +249,7 @@ class ComputerFaults:
         while self._lasting and min(f.end_s for f in self._lasting) <= time_s:
             over = min(self._lasting, key=lambda fault: fault.end_s)
             self._lasting.remove(over)
-            self._end(over)
+            self._change(over, begins=False)
         while self._waiting and self._waiting[0].time_s <= time_s:
             fault = self._waiting.pop(0)
             _log.warning("fault", fault=str(fault), text="as asked for")
@@ -267,34 +267,23 @@ class ComputerFaults:
             case FaultKind.CLOCK:
                 self._clock.step(round(1e9 * fault.value("STEP")))
             case _:
-                self._change(fault)
+                self._change(fault, begins=True)
 
-    def _change(self, fault: Fault) -> None:
-        """Begin what lasts until ``_end``."""
+    def _change(self, fault: Fault, *, begins: bool) -> None:
+        """Begin or end what lasts."""
         match fault.kind:
             case FaultKind.OPEN:
-                self._command(fault, Loop.OPEN)
+                loop = Loop.OPEN if begins else Loop.CLOSED
+                self._target.execute(LoopRequest(id=f"fault-{fault.kind}", loop=loop))
             case FaultKind.SATURATION:
-                self._target.limit_stroke(1e-9 * fault.value("STROKE_NM"))
+                self._target.limit_stroke(1e-9 * fault.value("STROKE_NM") if begins else None)
             case FaultKind.DITHER_LOST:
-                self._target.delay_dithers(_NEVER_FRAMES)
-            case FaultKind.MIRROR_SILENT:
-                self._target.hide_dithers()
+                self._target.delay_dithers(_NEVER_FRAMES if begins else 0)
             case FaultKind.DITHER_LATE:
-                self._target.delay_dithers(round(1e9 * fault.value("DELAY") / self._clock.dt_ns))
-            case _:
-                pass
-
-    def _end(self, fault: Fault) -> None:
-        match fault.kind:
-            case FaultKind.OPEN:
-                self._command(fault, Loop.CLOSED)
-            case FaultKind.SATURATION:
-                self._target.limit_stroke(None)
-            case FaultKind.DITHER_LOST | FaultKind.DITHER_LATE:
-                self._target.delay_dithers(0)
+                n_frames = round(1e9 * fault.value("DELAY") / self._clock.dt_ns)
+                self._target.delay_dithers(n_frames if begins else 0)
             case FaultKind.MIRROR_SILENT:
-                self._target.hide_dithers(hidden=False)
+                self._target.hide_dithers(hidden=begins)
             case _:
                 pass
 
@@ -309,9 +298,6 @@ class ComputerFaults:
         stopped.wait(seconds)
         self._clock.step(round(1e9 * seconds))
         self._pace.forgive(seconds)
-
-    def _command(self, fault: Fault, loop: Loop) -> None:
-        self._target.execute(LoopRequest(id=f"fault-{fault.kind}", loop=loop))
 
 
 Sendable = tuple[bytes, bytes]

@@ -8,10 +8,11 @@ nothing holds a frame up.
 
 from __future__ import annotations
 
-import queue
 import threading
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Self, TypedDict, Unpack
 
@@ -43,8 +44,8 @@ BLOCK_FRAMES = 500
 """Frames that are made at once, at most."""
 
 _PHASE_BLOCK_FRAMES = 200
-_AHEAD_BLOCKS = 2
-_POLL_S = 0.2
+_AHEAD_BLOCKS = 3
+"""One of them under way."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -301,42 +302,29 @@ class Background(ABC):
         """Work until ``_stopped`` is set."""
 
 
-class Ahead(Background):
-    """Blocks computed ahead; two at most, then the thread waits."""
+class Ahead:
+    """Blocks computed ahead by a thread of its own while a ``with`` block lasts."""
 
     def __init__(self, blocks: Iterator[Block]) -> None:
-        super().__init__("open-loop")
         self._blocks = blocks
-        self._queue: queue.Queue[Block | BaseException] = queue.Queue(_AHEAD_BLOCKS)
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="open-loop")
+
+    def __enter__(self) -> Self:
+        self._coming = deque(self._next() for _ in range(_AHEAD_BLOCKS))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.shutdown(cancel_futures=True)
 
     def __iter__(self) -> Iterator[Block]:
-        """Yield the blocks until the ``with`` block ends; re-raise what stopped the thread."""
-        while not self._stopped.is_set():
-            try:
-                item = self._queue.get(timeout=_POLL_S)
-            except queue.Empty:
-                continue
-            if isinstance(item, BaseException):
-                raise item
-            yield item
+        """Yield the blocks; re-raise what has kept one from being made."""
+        while True:
+            block = self._coming.popleft().result()
+            self._coming.append(self._next())
+            yield block
 
-    @override
-    def _work(self) -> None:
-        try:
-            for block in self._blocks:
-                if not self._put(block):
-                    return
-        except Exception as error:  # noqa: BLE001 - handed to the loop, which re-raises it
-            self._put(error)
-
-    def _put(self, item: Block | BaseException) -> bool:
-        while not self._stopped.is_set():
-            try:
-                self._queue.put(item, timeout=_POLL_S)
-            except queue.Full:
-                continue
-            return True
-        return False
+    def _next(self) -> Future[Block]:
+        return self._thread.submit(next, self._blocks)
 
 
 def message_frames(frame_rate_hz: float) -> int:

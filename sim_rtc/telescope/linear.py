@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Unpack
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from typing_extensions import override
 
@@ -22,7 +21,7 @@ from service.model.pupil import instrument_pupil
 from service.model.pyramid import PyramidOptics
 from sim_rtc.telescope.atmosphere import PhaseResponse
 from sim_rtc.telescope.imperfections import Imperfections
-from sim_rtc.telescope.mirror import DrawnSurface
+from sim_rtc.telescope.mirror import DrawnSurface, modal_content
 from sim_rtc.telescope.plant import Departures, Optics, Plant, between, registration_between
 
 Array = NDArray[np.float64]
@@ -108,7 +107,8 @@ class LinearPlant(Plant):
         shapes, stuck_opd_m = self._render(alpha)
         modes = np.ascontiguousarray(shapes)
         matrix = jacobian @ modes
-        jacobian += (matrix * (self._gain - 1.0)) @ self._projection(modes)
+        content = modal_content(modes, self.weights).astype(np.float32)
+        jacobian += (matrix * (self._gain - 1.0)) @ content
         return LinearOptics(
             alpha=alpha,
             responses=((1.0, PhaseResponse(jacobian)),),
@@ -121,15 +121,6 @@ class LinearPlant(Plant):
     @override
     def _own_surface(self, mirror: Mirror, strokes: Array) -> tuple[DrawnSurface, Array]:
         return DrawnSurface(mirror=mirror, subaperture_m=self._instrument.subaperture_m), strokes
-
-    def _projection(self, modes: Array32) -> Array32:
-        """Return ``(n_modes, n_points)``: least-squares modal content of a phase, by area."""
-        weighted = modes * self.weights[:, None].astype(np.float32)
-        gram = (modes.T @ weighted).astype(np.float64)
-        return np.asarray(
-            scipy.linalg.cho_solve(scipy.linalg.cho_factor(gram), weighted.T.astype(np.float64)),
-            np.float32,
-        )
 
 
 def _modulation_points(radius_lambda_over_d: float) -> int:

@@ -186,6 +186,17 @@ def disobedient(
     return weights[:, :-1], weights[:, -1]
 
 
+def modal_content(modes: Array32, weights: Array) -> Array:
+    """Return ``(n_modes, n_points)``: how much of each mode is in a phase, least squares by area.
+
+    ``modes`` ``(n_points, n_modes)`` are shapes, ``weights`` ``(n_points,)`` shares of the area.
+    """
+    weighted = modes * weights[:, None].astype(np.float32)
+    gram = (modes.T @ weighted).astype(np.float64)
+    factor = scipy.linalg.cho_factor(gram)
+    return np.asarray(scipy.linalg.cho_solve(factor, weighted.T.astype(np.float64)))
+
+
 def heights(mirror: Mirror, strokes: Array) -> Array:
     """Return where these strokes put the surface at the actuators, both ``(n_actuators, n)``.
 

@@ -19,6 +19,7 @@ from service.errors import ConfigurationError
 from service.model.pupil import PupilGrid
 from service.wire import Pointing
 from sim_rtc.telescope.atmosphere import PhaseResponse
+from sim_rtc.telescope.mirror import modal_content
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -90,10 +91,8 @@ class PlayedTurbulence:
 
     def __init__(self, modes: Array32, weights: Array, *, passes: int) -> None:
         """Take the modes ``(n_points, n_modes)``, metres per metre of command, seen once."""
-        weighted = modes * weights[:, None].astype(np.float32)
-        gram = (modes.T @ weighted).astype(np.float64)
-        projection = np.linalg.solve(gram, weighted.T.astype(np.float64))
-        self.commands_per_phase: Array32 = (projection / passes).astype(np.float32)
+        content = modal_content(modes, weights)
+        self.commands_per_phase: Array32 = (content / passes).astype(np.float32)
         """``(n_modes, n_points)`` metres of command per metre of turbulence."""
         self.response = PhaseResponse(self.commands_per_phase)
 

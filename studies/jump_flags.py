@@ -27,6 +27,7 @@ from service.tracking.registration import Source
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
 from service.tracking.validity import taken
+from studies.campaign.rows import floats
 
 WINDOW_S = 2.0
 FIT_S = 0.5
@@ -155,14 +156,10 @@ def _sigma(rotation_mdeg: float) -> Array:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m studies.jump_flags", description=__doc__)
-    parser.add_argument("--sigma-mdeg", type=_floats, default=(15.0, 22.0), metavar="MDEG,MDEG...")
+    parser.add_argument("--sigma-mdeg", type=floats, default=(15.0, 22.0), metavar="MDEG,MDEG...")
     parser.add_argument("--hours", type=float, default=8.0, help="of windows without a jump")
     parser.add_argument("--jumps", type=int, default=300)
     return parser
-
-
-def _floats(text: str) -> tuple[float, ...]:
-    return tuple(float(word) for word in text.split(","))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,10 +152,7 @@ def main() -> int:
     """Run what is missing, then print the table."""
     given = _parser().parse_args()
     file = RowFile(given.output)
-    done = {_key(row) for row in file.rows}
-    for start in _starts(given):
-        if _key(asdict(start)) in done:
-            continue
+    for start in file.missing(_starts(given)):
         row = play(start)
         file.add(row)
         sys.stderr.write(f"{start.seed}: {row['text']}\n")
@@ -201,10 +197,6 @@ def _starts(given: argparse.Namespace) -> Iterator[Start]:
             within_s=given.within,
             sampling=given.sampling,
         )
-
-
-def _key(row: Row) -> tuple[Any, ...]:
-    return tuple(row[name] for name in asdict(Start()))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.telemetry.lockin import Spectra, WindowEstimate
-from service.telemetry.passive import Passive, PassiveEstimate
 from service.telemetry.random_dither import Correlated, RandomEstimate
 from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.worker import Compute, OpticsWorker
@@ -26,12 +25,12 @@ from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import Ahead
 from sim_rtc.options import parse_options
 from sim_rtc.truth import WavefrontError
-from studies.campaign.plan import Estimator, Night
+from studies.campaign.plan import Night
 from studies.campaign.telemetry import LINE_FRACTIONS, Arriving, Window, start_dither
 from studies.campaign.trouble import options_for, prepare
 
 Array = NDArray[np.float64]
-Outcome = WindowEstimate | RandomEstimate | PassiveEstimate | WindowRefused
+Outcome = WindowEstimate | RandomEstimate | WindowRefused
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,7 +58,7 @@ def play(night: Night, keep: Path | None = None) -> list[dict[str, Any]]:
             Compute(threads=1, working_point_modes=night.working_point_modes),
         )
         for k, seen in enumerate(_kept(night, keep)):
-            outcome = _estimated(night, seen, known, bench)
+            outcome = _estimated(seen, known, bench)
             if not isinstance(outcome, WindowRefused):
                 known = outcome.alpha
             alpha = (seen.true.vector * BOUNDARY_SCALE).tolist()
@@ -104,19 +103,7 @@ def _simulated_windows(night: Night) -> Iterator[Seen]:
 
 def simulated(night: Night) -> list[str]:
     """Return the simulator's options of a night."""
-    options = {
-        "plant": night.plant,
-        "imperfections": night.truth,
-        "mag": night.magnitude,
-        "seed": night.seed,
-        "gain": night.gain,
-        "n-controlled": night.n_controlled,
-    }
-    if night.profile is None:
-        options["wind"] = f"{night.wind_m_s},{37 + 61 * night.seed % 360}"
-    else:
-        options["profile"] = night.profile
-    words = [f"--{name}={value}" for name, value in options.items()]
+    words = [*night.words(37 + 61 * night.seed), f"--n-controlled={night.n_controlled}"]
     if night.camera == "emccd":
         words += ["--read-noise=0.4", "--excess-noise=2"]
     return words + options_for(night.trouble, LINE_FRACTIONS[1])
@@ -136,20 +123,14 @@ def loop_of(telescope: Telescope) -> ClosedLoop:
     )
 
 
-def _estimated(night: Night, seen: Seen, start: Misregistration, bench: OpticsWorker) -> Outcome:
-    window = seen.window
-    if isinstance(window, WindowRefused):
-        return window
-    if night.amplitude_nm == 0.0 and night.estimator is not Estimator.PASSIVE:
-        return WindowRefused(reason="no dither was asked for", t_ns_utc=0)
-    match window:
-        case Spectra():
+def _estimated(seen: Seen, start: Misregistration, bench: OpticsWorker) -> Outcome:
+    match seen.window:
+        case Spectra() as window:
             return bench.fit(window, seen.loop, start)
-        case Correlated():
+        case Correlated() as window:
             return bench.fit_random(window, start)
-        case Passive():
-            found = bench.watch(window, start)
-            return found or WindowRefused(reason="too few frames", t_ns_utc=0)
+        case refused:
+            return refused
 
 
 def _row(outcome: Outcome, seen: Seen) -> dict[str, Any]:
@@ -162,9 +143,6 @@ def _row(outcome: Outcome, seen: Seen) -> dict[str, Any]:
         return row | {"refused": outcome.reason}
     difference = outcome.alpha.vector - seen.true.vector
     covariance, gains = outcome.covariance, np.abs(outcome.optical_gain)
-    if isinstance(outcome, PassiveEstimate):
-        # nothing is known of the wind's bias in a night without a dither
-        covariance = covariance + np.diag(outcome.sigma**2 - np.diag(covariance))
     return row | {
         "refused": None,
         "error": (difference * BOUNDARY_SCALE).tolist(),

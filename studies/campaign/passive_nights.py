@@ -30,7 +30,7 @@ from sim_rtc.computer.feed import Ahead
 from sim_rtc.options import parse_options
 from studies.campaign.passive_table import table
 from studies.campaign.passive_watch import PassiveNight, Watch
-from studies.campaign.rows import Row, RowFile
+from studies.campaign.rows import Row, RowFile, floats, range_of, words
 
 REGISTERED_TO = np.array([0.005, 0.005, np.deg2rad(0.01), 3e-4])
 """1 σ of the α that the loop's reconstructor was made for, about the true one (numeric units)."""
@@ -53,11 +53,11 @@ def main() -> int:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m studies.campaign.passive_nights")
     parser.add_argument("--plant", choices=["linear", "diffractive"], default="diffractive")
-    parser.add_argument("--truths", default="ideal,realistic")
-    parser.add_argument("--magnitudes", default="8,10")
-    parser.add_argument("--winds", default="5,8,12,15,20,25", metavar="M_S,M_S...")
+    parser.add_argument("--truths", type=words, default="ideal,realistic")
+    parser.add_argument("--magnitudes", type=floats, default="8,10")
+    parser.add_argument("--winds", type=floats, default="5,8,12,15,20,25", metavar="M_S,M_S...")
     parser.add_argument("--profile", default=None, help="named layers instead of winds")
-    parser.add_argument("--seeds", default="0:1", metavar="FIRST:END")
+    parser.add_argument("--seeds", type=range_of, default="0:1", metavar="FIRST:END")
     parser.add_argument("--gain", type=float, default=0.6)
     parser.add_argument("--registered", action="store_true")
     parser.add_argument("--seconds", type=float, default=20.5)
@@ -68,11 +68,9 @@ def _arguments() -> argparse.Namespace:
 
 
 def _nights(given: argparse.Namespace) -> Iterator[PassiveNight]:
-    first, end = (int(word) for word in given.seeds.split(":"))
-    winds = [float(word) for word in given.winds.split(",")] if given.profile is None else [0.0]
-    magnitudes = [float(word) for word in given.magnitudes.split(",")]
+    winds = given.winds if given.profile is None else [0.0]
     for seed, wind, magnitude, truth in itertools.product(
-        range(first, end), winds, magnitudes, given.truths.split(",")
+        given.seeds, winds, given.magnitudes, given.truths
     ):
         yield PassiveNight(
             plant=given.plant,
@@ -91,7 +89,8 @@ def _nights(given: argparse.Namespace) -> Iterator[PassiveNight]:
 
 def play(night: PassiveNight) -> list[Row]:
     """Return a row for every look at the passive estimate, and for every dithered window."""
-    options = parse_options(_words(night))
+    # winds of one seed blow in as many directions
+    options = parse_options(night.words(37 + 61 * night.seed + 9 * night.wind_m_s))
     telescope = build_telescope(options, load_instrument(options.instrument))
     true = telescope.optics.start().alpha
     if night.registered:
@@ -111,22 +110,6 @@ def play(night: PassiveNight) -> list[Row]:
             }
             rows.append(row)
     return rows
-
-
-def _words(night: PassiveNight) -> list[str]:
-    options = {
-        "plant": night.plant,
-        "imperfections": night.truth,
-        "mag": night.magnitude,
-        "seed": night.seed,
-        "gain": night.gain,
-    }
-    if night.profile is None:
-        # winds of one seed blow in as many directions
-        options["wind"] = f"{night.wind_m_s},{(37 + 61 * night.seed + 9 * night.wind_m_s) % 360:g}"
-    else:
-        options["profile"] = night.profile
-    return [f"--{name}={value}" for name, value in options.items()]
 
 
 def _registered(telescope: Telescope, true: Misregistration, seed: int) -> Telescope:

@@ -29,6 +29,7 @@ from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from studies.campaign.night import loop_of
+from studies.campaign.plan import Observed
 from studies.campaign.small import bench_of
 from studies.campaign.telemetry import LINE_FRACTIONS, SETTLING_S, blocks_of
 
@@ -43,18 +44,9 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PassiveNight:
+class PassiveNight(Observed):
     """What is played; two nights that are equal give the same rows."""
 
-    plant: str
-    truth: str
-    magnitude: float
-    wind_m_s: float
-    profile: str | None
-    """Named layers instead of one wind."""
-
-    seed: int
-    gain: float
     registered: bool
     seconds: float
     look_s: float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 from studies.campaign.trouble import Trouble
@@ -13,19 +13,16 @@ class Estimator(StrEnum):
 
     LOCK_IN = "lock-in"
     RANDOM = "random"
-    PASSIVE = "passive"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Night:
-    """What is run; two nights that are equal give the same rows."""
+class Observed:
+    """A telescope, and what it looks at."""
 
     plant: str = "diffractive"
     truth: str = "ideal"
     """The simulator's set of imperfections."""
 
-    estimator: Estimator = Estimator.LOCK_IN
-    trouble: Trouble = Trouble.NONE
     magnitude: float = 10.0
     wind_m_s: float = 12.0
     profile: str | None = None
@@ -33,9 +30,32 @@ class Night:
 
     seed: int = 0
     gain: float = 0.6
+
+    def words(self, direction_deg: float) -> list[str]:
+        """Return the simulator's command line; one wind blows in this direction."""
+        options = {
+            "plant": self.plant,
+            "imperfections": self.truth,
+            "mag": self.magnitude,
+            "seed": self.seed,
+            "gain": self.gain,
+        }
+        if self.profile is None:
+            options["wind"] = f"{self.wind_m_s},{direction_deg % 360:g}"
+        else:
+            options["profile"] = self.profile
+        return [f"--{name}={value}" for name, value in options.items()]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Night(Observed):
+    """What is run; two nights that are equal give the same rows."""
+
+    estimator: Estimator = Estimator.LOCK_IN
+    trouble: Trouble = Trouble.NONE
     n_controlled: int = 400
     amplitude_nm: float = 5.0
-    """RMS of each of four modes; 0: the dither is left out, for the wavefront error."""
+    """RMS of each of four modes."""
 
     window_s: float = 5.0
     n_windows: int = 4
@@ -51,8 +71,3 @@ class Night:
     def dithered(self) -> tuple[int, ...]:
         """The modes a dither moves."""
         return self.modes or tuple(self.n_controlled + step for step in (9, 27, 45, 63))
-
-
-def without_dither(night: Night) -> Night:
-    """Return the twin of a night whose wavefront error shows what the dither costs."""
-    return replace(night, amplitude_nm=0.0)

@@ -201,15 +201,7 @@ class Night:
         return float(np.sqrt(np.mean(np.square(last))))
 
     def _at(self, away: Array, n_modes: int) -> NDArray[np.float32]:
-        alpha = Misregistration(
-            **dict(
-                zip(
-                    Misregistration.__dataclass_fields__,
-                    self.dome.alpha.vector + away * REACH,
-                    strict=True,
-                )
-            )
-        )
+        alpha = Misregistration.from_vector(self.dome.alpha.vector + away * REACH)
         recipe = Recipe(n_modes=n_modes)
         return np.ascontiguousarray(reconstruct(self._model.response(alpha), recipe).matrix)
 

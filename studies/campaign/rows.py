@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import sys
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 Row = dict[str, Any]
+Plan = TypeVar("Plan", bound="DataclassInstance")
+Result = TypeVar("Result")
 
 UNITS = np.array([100.0, 100.0, 1000.0, 100.0])
 """An α is printed in % of a subaperture, thousandths of a degree, %."""
@@ -25,11 +34,28 @@ class RowFile:
         self.rows: list[Row] = [json.loads(line) for line in path.read_text().splitlines()]
         """All there are, those of earlier runs first."""
 
+    def missing(self, plans: Iterable[Plan]) -> list[Plan]:
+        """Return those of these records that no row is of; a row has the fields of its record."""
+        every = list(plans)
+        names = [field.name for field in fields(every[0])] if every else []
+        done = {json.dumps([row[name] for name in names]) for row in self.rows}
+        return [p for p in every if json.dumps([getattr(p, name) for name in names]) not in done]
+
     def add(self, *rows: Row) -> None:
         """Keep more rows; they are in the file when this returns."""
         self.rows += rows
         with self._path.open("a") as file:
             file.writelines(json.dumps(row) + "\n" for row in rows)
+
+
+def played(play: Callable[[Plan], Result], plans: Iterable[Plan], workers: int) -> Iterator[Result]:
+    """Yield what comes of each plan, as it comes; several workers are processes of their own."""
+    if workers == 1:
+        yield from map(play, plans)
+        return
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as executor:
+        for finished in as_completed([executor.submit(play, plan) for plan in plans]):
+            yield finished.result()
 
 
 def heading(*columns: str) -> str:
@@ -52,6 +78,16 @@ def tell(text: str, path: Path | None, program: str) -> None:
     sys.stdout.write(text)
     if path is not None:
         path.write_text(f"Made by `{' '.join([program, *sys.argv[1:]])}`.\n\n{text}")
+
+
+def floats(text: str) -> tuple[float, ...]:
+    """Return the numbers with commas between them."""
+    return tuple(float(word) for word in text.split(","))
+
+
+def words(text: str) -> tuple[str, ...]:
+    """Return the words with commas between them."""
+    return tuple(text.split(","))
 
 
 def range_of(text: str) -> range:

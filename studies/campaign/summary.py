@@ -10,7 +10,6 @@ import scipy
 from numpy.typing import NDArray
 
 from service.telemetry.estimate import model_error
-from studies.campaign.plan import Estimator
 from studies.campaign.rows import UNITS, Row, four, heading, line
 
 Array = NDArray[np.float64]
@@ -69,8 +68,6 @@ def _line(key: tuple[Any, ...], rows: list[Row], floor: Array) -> str:
 
 def model_errors(rows: list[Row]) -> Array:
     """Return ``(n, 4, 4)`` what the misfit of each window adds, which the service adds as well."""
-    if rows[0]["estimator"] == Estimator.PASSIVE:
-        return np.zeros((len(rows), 4, 4))
     return np.array([np.diag(model_error(row["covariance"], row["misfit"]) ** 2) for row in rows])
 
 

@@ -9,14 +9,11 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import multiprocessing
 import sys
 import time
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -27,7 +24,7 @@ from service.wire import DitherRequest
 from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Observatory
 from studies.campaign.observatory_dome import replayed
-from studies.campaign.rows import Row, RowFile, range_of, tell
+from studies.campaign.rows import Row, RowFile, floats, played, range_of, tell, words
 from studies.campaign.system_cases import Case, Plan
 from studies.campaign.system_measures import row_of, wavefront_rms_nm
 from studies.campaign.system_table import table
@@ -40,10 +37,9 @@ def main() -> int:
     """Run what is missing, then print the table."""
     given = _parser().parse_args()
     file = RowFile(given.output)
-    done = {_key(row) for row in file.rows}
-    plans = [plan for plan in _plans(given) if _key(asdict(plan)) not in done]
+    plans = file.missing(_plans(given))
     started = time.monotonic()
-    for k, row in enumerate(_played(plans, given.workers), start=1):
+    for k, row in enumerate(played(play, plans, given.workers), start=1):
         file.add(row)
         spent_min = (time.monotonic() - started) / 60.0
         sys.stderr.write(f"\r{k} of {len(plans)} nights in {spent_min:.0f} min   ")
@@ -98,11 +94,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", type=Path, default=Path("system.jsonl"), help="rows, resumed")
     parser.add_argument("--table", type=Path, metavar="FILE.md")
     parser.add_argument(
-        "--cases", type=_words, default=("drift",), metavar="NAME,NAME...", help=", ".join(Case)
+        "--cases", type=words, default=("drift",), metavar="NAME,NAME...", help=", ".join(Case)
     )
     parser.add_argument("--seeds", type=range_of, default=range(2), metavar="FIRST:END")
-    parser.add_argument("--magnitudes", type=_floats, default=(10.0,), metavar="R,R...")
-    parser.add_argument("--truths", type=_words, default=("ideal",), metavar="NAME,NAME...")
+    parser.add_argument("--magnitudes", type=floats, default=(10.0,), metavar="R,R...")
+    parser.add_argument("--truths", type=words, default=("ideal",), metavar="NAME,NAME...")
     parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
     parser.add_argument("--instrument", default="flao-lbt", metavar="NAME|FILE")
     parser.add_argument("--gain", type=float, help="default: 0.4 linear, 0.6 diffractive")
@@ -138,27 +134,6 @@ def _plans(given: argparse.Namespace) -> Iterator[Plan]:
             instrument=given.instrument,
             settings=tuple(given.settings),
         )
-
-
-def _played(plans: Iterable[Plan], workers: int) -> Iterator[Row]:
-    if workers == 1:
-        yield from map(play, plans)
-        return
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as executor:
-        for finished in as_completed([executor.submit(play, plan) for plan in plans]):
-            yield finished.result()
-
-
-def _key(row: dict[str, Any]) -> str:
-    return json.dumps([row[name] for name in asdict(Plan(case=Case.DRIFT))])
-
-
-def _floats(text: str) -> tuple[float, ...]:
-    return tuple(float(word) for word in text.split(","))
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(text.split(","))
 
 
 if __name__ == "__main__":

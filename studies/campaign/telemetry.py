@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from service.telemetry import lockin, passive, random_dither
+from service.telemetry import lockin, random_dither
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra
-from service.telemetry.passive import Passive
 from service.telemetry.random_dither import Correlated, RandomDither, RandomPlan
 from service.telemetry.windows import WindowRefused
 from service.wire import DitherKind, DitherRequest
@@ -29,7 +28,7 @@ LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
 SETTLING_S = 0.5
 BLOCK_BATCHES = 20
 
-Window = Spectra | Correlated | Passive | WindowRefused
+Window = Spectra | Correlated | WindowRefused
 Plan = LockInPlan | RandomPlan
 
 
@@ -46,10 +45,6 @@ class Arriving:
 
     def windows(self, plan: Plan) -> Iterator[Window]:
         """Yield the windows of this plan, without end."""
-        quiet = self.night.estimator is Estimator.PASSIVE or self.night.amplitude_nm == 0.0
-        return self._quiet(plan) if quiet else self._dithered(plan)
-
-    def _dithered(self, plan: Plan) -> Iterator[Window]:
         sums: Any = RandomDither(plan=plan) if isinstance(plan, RandomPlan) else LockIn(plan=plan)
         random = isinstance(plan, RandomPlan)
         accumulate: Any = random_dither.accumulate if random else lockin.accumulate
@@ -67,22 +62,6 @@ class Arriving:
                 if strike(self.night.trouble, self.computer):
                     again = start_dither(self.night, self.computer, self._rate_hz)
                     sums = replace(sums, plan=again)
-
-    def _quiet(self, plan: Plan) -> Iterator[Window]:
-        watched = Passive(
-            n_modes=self.night.n_controlled,
-            memory_frames=2.0 * plan.n_frames,
-            delay_frames=self.telescope.settings.delay_frames,
-        )
-        n_frames = 0
-        for blocks in self._blocks(plan.first_seq):
-            for block in blocks:
-                if block.first_seq >= plan.first_seq:
-                    watched = passive.accumulate(watched, block)
-                    n_frames += block.n_frames
-            if n_frames >= plan.n_frames:
-                yield watched
-                n_frames = 0
 
     def _blocks(self, first_seq: int) -> Iterator[list[FrameBlock]]:
         """Yield what arrives, some batches at a time; their wavefront error is noted."""
@@ -105,24 +84,21 @@ def start_dither(night: Night, computer: RealTimeComputer, rate_hz: float) -> Pl
     n_frames = round(night.window_s * rate_hz)
     amplitude_m = (night.amplitude_nm * 1e-9,) * len(night.dithered)
     lines = tuple(round(f * rate_hz * night.window_s) / night.window_s for f in LINE_FRACTIONS)
-    first_seq = round(SETTLING_S * rate_hz)
-    silent = night.estimator is Estimator.PASSIVE or night.amplitude_nm == 0.0
-    if not silent:
-        sine = night.estimator is Estimator.LOCK_IN
-        reply = computer.execute(
-            DitherRequest(
-                id="campaign",
-                kind=DitherKind.SINE if sine else DitherKind.BINARY,
-                modes=told(night.trouble, night.dithered),
-                amplitude_m=amplitude_m,
-                frequency_hz=lines if sine else None,
-                duration_s=2.0 + 1.5 * night.window_s * (night.n_windows + 2),
-                seed=night.seed,
-            )
+    sine = night.estimator is Estimator.LOCK_IN
+    reply = computer.execute(
+        DitherRequest(
+            id="campaign",
+            kind=DitherKind.SINE if sine else DitherKind.BINARY,
+            modes=told(night.trouble, night.dithered),
+            amplitude_m=amplitude_m,
+            frequency_hz=lines if sine else None,
+            duration_s=2.0 + 1.5 * night.window_s * (night.n_windows + 2),
+            seed=night.seed,
         )
-        if reply.start_seq is None:
-            raise RuntimeError(f"the simulator refused the dither: {reply.reason}")
-        first_seq += reply.start_seq
+    )
+    if reply.start_seq is None:
+        raise RuntimeError(f"the simulator refused the dither: {reply.reason}")
+    first_seq = reply.start_seq + round(SETTLING_S * rate_hz)
     if night.estimator is Estimator.RANDOM:
         return RandomPlan(
             modes=night.dithered,
@@ -133,7 +109,7 @@ def start_dither(night: Night, computer: RealTimeComputer, rate_hz: float) -> Pl
     return LockInPlan(
         modes=night.dithered,
         frequencies_hz=lines,
-        amplitude_m=tuple(max(a, 1e-12) for a in amplitude_m),
+        amplitude_m=amplitude_m,
         frame_rate_hz=rate_hz,
         n_frames=n_frames,
         first_seq=first_seq,

@@ -35,7 +35,6 @@ from studies.registered import (
     registered,
     telescope_of,
 )
-from studies.slope_noise import noise_of_counts
 
 Array32 = NDArray[np.float32]
 
@@ -156,8 +155,7 @@ def main() -> None:
             dome = Dome(words=words, gain=given.gain, n_frames=n_frames)
             measured, telescope = measured_by_day(words, given.averages)
             fit = registered(model, measured)
-            counts = telescope.detector.counts(telescope.optics.at(0.0).images)
-            noise = float(np.median(noise_of_counts(counts, model.valid)))
+            noise = float(np.median(telescope.detector.sigma))
             linear = model.linearise(fit.alpha)
             for candidate in candidates(model, measured, fit, noise):
                 if given.only not in candidate.name:

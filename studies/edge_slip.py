@@ -22,6 +22,7 @@ from service.config import load_instrument
 from service.control.gate import edge_motion_m
 from service.control.loop import pole_radius
 from service.control.reconstructor import invert
+from service.files import parse_alpha
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -94,16 +95,9 @@ def actuators_of(instrument: Instrument) -> Actuators:
 
 def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, float]:
     """Return the worst pole radius and the motion of the outer ring, metres per unit of slope."""
-    x, y, rotation_deg, magnification = (float(word) for word in case.alpha.split(","))
-    alpha = Misregistration(
-        shift_x_subap=x,
-        shift_y_subap=y,
-        rotation_rad=np.deg2rad(rotation_deg),
-        magnification=magnification,
-    )
     n = case.n_controlled
     matrix = invert(model.interaction_matrix(Misregistration()), n).matrix
-    coupling = matrix @ model.interaction_matrix(alpha)[:, :n]
+    coupling = matrix @ model.interaction_matrix(parse_alpha(case.alpha))[:, :n]
     gains = np.full(n, gain * OPTICAL_GAIN)
     eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
     actuators = actuators_of(model.instrument)

@@ -17,12 +17,11 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.fit.light import CannotTell, find_pupil, measured_illumination
-from service.model.interaction import InteractionModel, valid_subapertures
+from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import Illumination
 from studies.registered import PASSES, STROKE_M, Array, measured_by_day, registered
-from studies.slope_noise import noise_of_counts
 
 N_FRAMES = 100
 """Averaged in the flux map."""
@@ -38,7 +37,7 @@ def main() -> None:
     parser.add_argument("--extra", default="", help="further options of the simulator, in quotes")
     given = parser.parse_args()
     instrument = load_instrument("flao-lbt")
-    basis, valid = karhunen_loeve_basis(instrument), valid_subapertures(instrument)
+    basis = karhunen_loeve_basis(instrument)
     sys.stdout.write(
         "| seed | light | residual | without noise | x, y / % of a subaperture | rotation / deg | "
         "magnification / % |\n| --- | --- | --- | --- | --- | --- | --- |\n"
@@ -61,7 +60,7 @@ def main() -> None:
             start = Misregistration(shift_x_subap=position.x_subap, shift_y_subap=position.y_subap)
             _tell(f"{seed} | images alone", None, 0.0, start, optics.alpha)
             read = np.abs(measured).sum(axis=1) > 0.0
-            noise = noise_share(measured, counts, valid, given.averages)
+            noise = noise_share(measured, telescope.detector.sigma, given.averages)
             lights: dict[str, Illumination | None] = {
                 "even": None,
                 "measured": measured_illumination(counts, instrument, position),
@@ -72,11 +71,11 @@ def main() -> None:
                 _tell(f"{seed} | {name}", fit.residual, noise, fit.alpha, optics.alpha)
 
 
-def noise_share(measured: Array, counts: Array, valid: NDArray[np.bool_], averages: int) -> float:
-    """Return the RMS noise of the matrix over its RMS, from the light alone."""
+def noise_share(measured: Array, sigma: NDArray[np.float32], averages: int) -> float:
+    """Return the RMS noise of the matrix over its RMS; ``sigma`` ``(n_slopes,)`` of a frame."""
     if averages == 0:
         return 0.0
-    slope = np.sqrt(np.mean(noise_of_counts(counts, valid) ** 2))
+    slope = np.sqrt(np.mean(sigma**2))
     element = slope / (STROKE_M * PASSES * np.sqrt(2 * averages))
     return float(element / np.sqrt(np.mean(measured**2)))
 

@@ -21,8 +21,9 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistr
 from service.model.modes import karhunen_loeve_basis
 from sim_rtc.telescope.linear import LinearPlant
 from sim_rtc.telescope.registration import random_registration
+from studies.registered import against, step_of
 
-MODES = (509, 527, 545, 563)
+MODES = [509, 527, 545, 563]
 N_STEPS = 3
 
 
@@ -33,16 +34,7 @@ def fitted(
     vector = start.vector
     for _ in range(N_STEPS):
         linear = model.linearise(Misregistration.from_vector(vector))
-        normal, score = np.zeros((4, 4)), np.zeros(4)
-        for mode in MODES:
-            column = linear.matrix[:, mode].astype(np.float64)
-            target = measured[:, mode].astype(np.float64)
-            gain = column @ target / (column @ column)
-            jacobian = gain * linear.derivatives[:, :, mode].astype(np.float64)
-            jacobian -= np.outer(jacobian @ column / (column @ column), column)
-            normal += jacobian @ jacobian.T / (target @ target)
-            score += jacobian @ (target - gain * column) / (target @ target)
-        vector = vector + np.linalg.solve(normal, score)
+        vector = vector + step_of(against(linear, measured[:, MODES], MODES))
     return vector
 
 

@@ -7,6 +7,7 @@ says, with a free gain for each.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import load_instrument
-from service.model.interaction import InteractionModel
+from service.fit.solver import Columns, Projection
+from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.wire import MeasureRequest, Pattern
 from sim_rtc.assembly import Telescope, build_telescope
@@ -100,35 +102,44 @@ def noise_free(telescope: Telescope) -> Array:
     return np.column_stack(columns)
 
 
+def against(
+    linear: Linearisation,
+    measured: Array,
+    modes: slice | Sequence[int] = slice(None),
+    read: NDArray[np.bool_] | None = None,
+) -> Projection:
+    """Return measured columns ``(n_slopes, n_modes)`` beside the model's of these modes.
+
+    Each has a gain of its own, and all weigh alike. ``read`` ``(n_slopes,)`` are the slopes that
+    count, None: all.
+    """
+    rows = np.ones(len(measured), dtype=np.bool_) if read is None else read
+    matrix = measured.astype(np.float64)
+    columns = Columns(matrix=matrix, weights=1.0 / np.sum(matrix[rows] ** 2, axis=0), rows=rows)
+    return columns.project(linear.matrix[:, modes], linear.derivatives[:, :, modes])
+
+
+def step_of(seen: Projection) -> NDArray[np.float64]:
+    """Return by how much α ``(4,)`` is off, to first order, numeric units."""
+    return np.linalg.solve(seen.normal, seen.scores.sum(axis=1))
+
+
 def registered(
     model: InteractionModel,
     measured: Array,
     start: Misregistration | None = None,
     read: NDArray[np.bool_] | None = None,
 ) -> Registered:
-    """Return the joint fit of α and a gain per mode, each mode weighted by its size.
-
-    ``read`` ``(n_slopes,)`` are the slopes that count; None: all.
-    """
+    """Return the joint fit of α and a gain per mode; ``read`` as of :func:`against`."""
     vector = (start or Misregistration()).vector
-    used = slice(None) if read is None else np.flatnonzero(read)
-    measured = measured[used]
-    n_modes = measured.shape[1]
-    weight = 1.0 / np.einsum("ij,ij->j", measured, measured)
     for _ in range(_N_STEPS):
         linear = model.linearise(Misregistration.from_vector(vector))
-        columns = linear.matrix[used, :n_modes].astype(np.float64)
-        power = np.einsum("ij,ij->j", columns, columns)
-        gains = np.einsum("ij,ij->j", columns, measured) / power
-        left = measured - gains * columns
-        jacobian = gains * linear.derivatives[:, used, :n_modes]
-        jacobian -= columns * (np.einsum("kij,ij->kj", jacobian, columns) / power)[:, None]
-        normal = np.einsum("kij,lij,j->kl", jacobian, jacobian, weight, optimize=True)
-        vector = vector + np.linalg.solve(
-            normal, np.einsum("kij,ij,j->k", jacobian, left, weight, optimize=True)
-        )
+        seen = against(linear, measured, slice(measured.shape[1]), read)
+        vector = vector + step_of(seen)
+    left = np.linalg.norm(seen.residual)
+    used = measured if read is None else measured[read]
     return Registered(
         alpha=Misregistration.from_vector(vector),
-        gains=gains,
-        residual=float(np.linalg.norm(left) / np.linalg.norm(measured)),
+        gains=seen.gains,
+        residual=float(left / np.linalg.norm(used)),
     )

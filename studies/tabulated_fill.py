@@ -28,6 +28,7 @@ from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
 from service.model.pyramid import Mapper
 from service.model.tabulated import filled
+from studies.registered import against, step_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -96,19 +97,8 @@ def registered(
     """
     alpha = Misregistration()
     for _ in range(N_STEPS):
-        rows = np.ones(len(measured), dtype=np.bool_)
-        if knowing is not None:
-            rows = ~knowing.unknown_rows(alpha)
-        found, target = model.interaction_matrix(alpha)[rows], measured[rows]
-        power = np.einsum("ij,ij->j", found, found)
-        gain = np.einsum("ij,ij->j", found, target) / power
-        weight = gain / np.linalg.norm(target, axis=0)
-        columns = []
-        for slope in model.derivatives(alpha)[:, rows]:
-            along = np.einsum("ij,ij->j", found, slope) / power
-            columns.append(((slope - found * along) * weight).ravel())
-        residual = (target / gain - found) * weight
-        step, *_ = np.linalg.lstsq(np.array(columns).T, residual.ravel(), rcond=None)
+        read = None if knowing is None else ~knowing.unknown_rows(alpha)
+        step = step_of(against(model.linearise(alpha), measured, read=read))
         alpha = Misregistration.from_vector(alpha.vector + step)
     return alpha
 

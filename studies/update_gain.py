@@ -21,6 +21,7 @@ from service.config import load_instrument
 from service.control.expected_gain import ExpectedGain, Sky, beyond_m2, expected_gain, noise_of_star
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
+from service.files import parse_alpha
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
@@ -49,17 +50,6 @@ SETTLING_FRAMES = 500
 SEEING_ARCSEC = 1.0
 OPTICAL_GAIN = 0.6
 """Of the diffractive telescope on average; the linear one is asked to have 1."""
-
-
-def misregistration(text: str) -> Misregistration:
-    """Return the registration ``X,Y,ROT_DEG,MAG``."""
-    x, y, rotation_deg, magnification = (float(word) for word in text.split(","))
-    return Misregistration(
-        shift_x_subap=x,
-        shift_y_subap=y,
-        rotation_rad=np.deg2rad(rotation_deg),
-        magnification=magnification,
-    )
 
 
 def mirrored(alpha: Misregistration) -> Misregistration:
@@ -139,7 +129,7 @@ def row(
 ) -> str:
     """Return what is predicted and seen of one registration, both its signs."""
     said, seen = [], []
-    for alpha in (misregistration(case), mirrored(misregistration(case))):
+    for alpha in (parse_alpha(case), mirrored(parse_alpha(case))):
         fresh = invert(model.interaction_matrix(alpha), given.modes).matrix
         said.append(predicted(model, [nominal, fresh], alpha, gain, given))
         seen.append(wavefront_errors_nm(telescope_of(alpha, given), [nominal, fresh], gain, given))

@@ -25,6 +25,7 @@ from service.model.turbulence import working_point
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.diffractive import DiffractiveOptics
 from studies.optical_gain import PROBE_M, closed_loop, telescope_of
+from studies.registered import against, step_of
 
 Array32 = NDArray[np.float32]
 
@@ -54,17 +55,8 @@ def error_of(
     linearisation: Linearisation, columns: Array32, modes: tuple[int, ...]
 ) -> tuple[NDArray[np.float64], float]:
     """Return the error of α ``(4,)``, boundary units, about the truth, and the mean gain."""
-    normal, score, gains = np.zeros((4, 4)), np.zeros(4), []
-    for mode in modes:
-        column = linearisation.matrix[:, mode].astype(np.float64)
-        target = columns[:, mode].astype(np.float64)
-        gain = column @ target / (column @ column)
-        jacobian = gain * linearisation.derivatives[:, :, mode].astype(np.float64)
-        jacobian -= np.outer(jacobian @ column / (column @ column), column)
-        normal += jacobian @ jacobian.T / (target @ target)
-        score += jacobian @ (target - gain * column) / (target @ target)
-        gains.append(gain)
-    return np.linalg.solve(normal, score) * BOUNDARY_SCALE, float(np.mean(gains))
+    seen = against(linearisation, columns[:, list(modes)], modes)
+    return step_of(seen) * BOUNDARY_SCALE, float(np.mean(seen.gains))
 
 
 def main() -> None:

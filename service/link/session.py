@@ -24,6 +24,10 @@ HISTORY_S = 0.5
 """Telemetry asked for when the service comes late: asking for all of an RTC's cache stalled its
 sender for seconds."""
 
+RX_BUFFER_BYTES = 16 * 65_535
+"""Buffers that a link reads into, used again and again: with the usual one alone zenoh makes and
+clears another for almost every 64 kB that come."""
+
 TOKENS_TIMEOUT_S = 1.0
 """For the routers to say which tokens are there; they do within milliseconds."""
 
@@ -101,6 +105,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "scouting/gossip/enabled": False,
         "timestamping/enabled": True,
         "transport/link/tx/lease": round(1000 * endpoint.lease_s),
+        "transport/link/rx/buffer_size": RX_BUFFER_BYTES,
         "transport/shared_memory/enabled": False,
     }
     try:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.slopes import likely_kind
 from service.runtime.streams import (
-    REST_S,
     VERDICTS,
     Streams,
     Window,
@@ -38,13 +37,13 @@ from service.tracking.activity import Activity, under_way
 from service.tracking.alarms import Act, forbidding
 from service.tracking.dither import SILENT_S
 from service.tracking.events import Effect, Event
-from service.tracking.policy import Policy
+from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.state import Level, TrackerState
 from service.wire import Status
 from service.worker import Description
 
-WATCH_INTERVAL_S = 4.0
-"""Between two looks of the passive watchdog: a jump is to be seen within 5 s."""
+TOLD_S = 8.0
+"""A window that was accepted since then has told where the mirror is."""
 
 STEADY_GATHER_S = 0.45
 """Of frames, while nothing happens: windows last four times as long, and alarms have a second."""
@@ -183,20 +182,20 @@ class Engine:
         steady = all(running.activity in dithers for running in under_way(state, now_ns))
         return STEADY_GATHER_S if steady else 0.0
 
-    @property
-    def look_interval_s(self) -> float:
-        """Seconds between two looks of the passive watchdog.
+    def take_sums(self) -> Passive | str | None:
+        """Return the sums of ordinary telemetry and begin new ones, or why there are none yet.
 
-        Windows of a dither show a jump themselves: every other stretch of telemetry is enough then.
+        None: some is left out beside a dither. Ask every ``WATCH_INTERVAL_S``.
         """
-        dithered = self.streams is not None and self.streams.cutter is not None
-        return WATCH_INTERVAL_S + (REST_S if dithered else 0.0)
-
-    def take_sums(self) -> Passive | str:
-        """Return the sums of ordinary telemetry and begin new ones, or why there are none yet."""
         if self.streams is None:
             return "no passive estimate: the optical model is being prepared"
-        self.streams, sums = taken(self.streams)
+        known, now_ns = self.state.registration, self._driver.now_ns()
+        told = (
+            known is not None
+            and not known.doubt
+            and now_ns - known.window_ns_utc < TOLD_S * SECOND_NS
+        )
+        self.streams, sums = taken(self.streams, told=told)
         return sums
 
     def learn(self, matrix_id: str, matrix: NDArray[np.float32]) -> None:

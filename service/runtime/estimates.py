@@ -154,12 +154,14 @@ def _reconstructor(
 
 
 async def watched(
-    sums: Passive | str, state: TrackerState, workers: WorkerPort
+    sums: Passive | str | None, state: TrackerState, workers: WorkerPort
 ) -> ev.Watched | ev.Unwatched | ev.Noted | None:
     """Return what the watchdog makes of ordinary telemetry, or why it can make nothing of it.
 
     None: there is no more to tell than before.
     """
+    if sums is None:
+        return None
     if isinstance(sums, str):
         return None if sums == state.unwatched else ev.Unwatched(text=sums)
     last = sums.tail

@@ -40,8 +40,16 @@ from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0
 
-REST_S = 4.0
-"""After a look, before ordinary telemetry is summed again while windows of a dither come."""
+WATCH_INTERVAL_S = 4.0
+"""Between two looks of the passive watchdog, and of telemetry in each: a jump is to be seen within
+5 s."""
+
+LEAST_LOOK_S = 3.0
+"""Of telemetry, beside a dither."""
+
+RESTS, LONG_RESTS = 1, 3
+"""Intervals left out after a look beside a dither, and while its windows are accepted: they show a
+jump sooner than a look does."""
 
 WINDOW_SAMPLES = 5
 """Frames of a window that must have been looked at before it can be said to be off the loop."""
@@ -271,7 +279,7 @@ def with_dither(streams: Streams, dither: Dither | None, window_s: float) -> Str
     rtc = streams.rtc
     if dither is None or dither.start_seq is None or rtc is None:
         return replace(
-            streams, cutter=None, dither=None, dither_silent_s=0.0, meter=None, played=None
+            _awake(streams), cutter=None, dither=None, dither_silent_s=0.0, meter=None, played=None
         )
     dither = replace(dither, asked_ns_utc=0)
     if dither == streams.dither:
@@ -354,13 +362,18 @@ def _dithered(streams: Streams, rtc: Status, block: FrameBlock) -> tuple[Streams
     return replace(streams, cutter=None if over else cutter), ended
 
 
-def taken(streams: Streams) -> tuple[Streams, Passive | str]:
+def taken(streams: Streams, *, told: bool = False) -> tuple[Streams, Passive | str | None]:
     """Return streams that begin new passive sums, and the old ones, or why there is no look yet.
 
     No two looks then share telemetry: their errors are independent, and one that lies wholly after
-    a jump says so.
+    a jump says so. Beside a dither some telemetry is left out, more where windows have ``told`` of
+    α just now; None: that is why. A rest ends early when they no longer do.
     """
+    streams = streams if told else _awake(streams)
     rtc, sums = streams.rtc, streams.passive
+    since_ns = 0 if streams.cutter is None or sums is None else sums.since_ns_utc
+    if streams.heard_ns_utc - since_ns < LEAST_LOOK_S * 1e9 and since_ns:
+        return streams, None
     if rtc is None or sums is None:
         return streams, "no passive estimate: there is no telemetry that could be used"
     if not rtc.in_loop:
@@ -383,16 +396,25 @@ def taken(streams: Streams) -> tuple[Streams, Passive | str]:
         since_ns_utc=streams.heard_ns_utc - waiting_ns,
     )
     if streams.cutter is not None and sums.tail is not None:
+        rest_s = WATCH_INTERVAL_S * (LONG_RESTS if told else RESTS)
         begun = replace(
             begun,
             waiting=(),
             begun=False,
-            from_seq=sums.tail.next_seq + round(REST_S * rtc.frame_rate_hz),
-            since_ns_utc=streams.heard_ns_utc + round(REST_S * 1e9),
+            from_seq=sums.tail.next_seq + round(rest_s * rtc.frame_rate_hz),
+            since_ns_utc=streams.heard_ns_utc + round(rest_s * 1e9),
         )
     # a window that is under way is of the gains with which it began
     loop = rtc if streams.cutter is None else streams.loop
     return replace(streams, passive=begun, loop=loop), sums
+
+
+def _awake(streams: Streams) -> Streams:
+    """Return streams whose passive sums, where they rest, begin with what comes."""
+    sums, heard_ns = streams.passive, streams.heard_ns_utc
+    if sums is None or sums.since_ns_utc <= heard_ns:
+        return streams
+    return replace(streams, passive=replace(sums, from_seq=0, since_ns_utc=heard_ns))
 
 
 def _beyond_the_dither(streams: Streams, rtc: Status, reading: LockIn | RandomDither) -> bool:

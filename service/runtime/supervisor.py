@@ -26,6 +26,7 @@ from service.runtime.engine import Engine, looked_at
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.keeping import TelemetryKeeper
 from service.runtime.recording import Caller, Recorder, ids_of
+from service.runtime.streams import WATCH_INTERVAL_S
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
 from service.snapshot import Snapshot
@@ -371,7 +372,7 @@ class Supervisor:
 
     async def _watch(self) -> None:
         while True:
-            await asyncio.sleep(self._engine.look_interval_s)
+            await asyncio.sleep(WATCH_INTERVAL_S)
             async with self._workers.turn("watch"):
                 async with self._looking:
                     sums = self._engine.take_sums()

@@ -22,6 +22,7 @@ from service.errors import PyrcalError
 from service.runtime.actions import Actions, Publishing, judged_now
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
+from service.runtime.streams import WATCH_INTERVAL_S
 from service.runtime.workers import PATIENCE_S
 from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
@@ -232,7 +233,7 @@ class Observatory:
         self._hear(ev.SessionStarted(session=session))
         self._every(self.latencies.status_s, self._hear_status)
         self._every(self.latencies.tick_s, lambda: self._post(ev.Tick()))
-        self._in(self._engine.look_interval_s, self._watch)
+        self._in(WATCH_INTERVAL_S, self._watch)
 
     def _idle_worker(self) -> None:
         self._jobs: list[tuple[float, int, Callable[[], _Job]]] = []
@@ -347,7 +348,7 @@ class Observatory:
         def done() -> None:
             if event is not None:
                 self._post(event)
-            self._in(self._engine.look_interval_s, self._watch)
+            self._in(WATCH_INTERVAL_S, self._watch)
 
         return 0.0 if event is None else self.latencies.watch_s, done
 

@@ -454,21 +454,61 @@ class TestLooks:
         assert both.n_effective == pytest.approx(first.n_effective + second.n_effective)
         np.testing.assert_allclose(both.power, first.power + second.power, rtol=1e-5, atol=1e-20)
 
-    def test_beside_windows_of_a_dither_every_other_stretch_is_left_out(self, streams):
+    def test_beside_windows_that_tell_of_alpha_one_stretch_in_four_is_looked_at(self, streams):
         """And a look says of which time it is."""
-        one, _ = play(streams, 0, 20)
-        rest, first = taken(one)
-        resting, _ = play(rest, 2000, 40)
-        assert isinstance(taken(resting)[1], str)
-        _, second = taken(play(resting, 6000, 20)[0])
+        one, _ = play(streams, 0, 40)
+        rest, first = taken(one, told=True)
+        resting, _ = play(rest, 4000, 120)
+        assert taken(resting, told=True)[1] is None
+        some, _ = play(resting, 16000, 20)
+        assert taken(some, told=True)[1] is None
+        _, second = taken(play(some, 18000, 20)[0], told=True)
         assert second.n_effective == pytest.approx(first.n_effective, rel=0.02)
-        assert second.since_ns_utc == first.tail.next_t_ns - 1_000_000 + 4_000_000_000
+        assert second.since_ns_utc == first.tail.next_t_ns - 1_000_000 + 12_000_000_000
+
+    def test_beside_windows_that_do_not_every_other_stretch_is_left_out(self, streams):
+        one, _ = play(streams, 0, 40)
+        rest, first = taken(one)
+        resting, _ = play(rest, 4000, 40)
+        assert taken(resting)[1] is None
+        _, second = taken(play(resting, 8000, 40)[0])
+        assert second.n_effective == pytest.approx(first.n_effective, rel=0.02)
+
+    @pytest.mark.parametrize("how", ["no window is accepted", "the dither ends"])
+    def test_a_rest_ends_where_windows_tell_of_alpha_no_longer(self, streams, how):
+        rest, first = taken(play(streams, 0, 40)[0], told=True)
+        resting, _ = play(rest, 4000, 40)
+        if how == "the dither ends":
+            resting = with_dither(resting, None, WINDOW_S)
+        else:
+            resting, sums = taken(resting)
+            assert sums is None
+        _, sums = taken(play(resting, 8000, 40)[0])
+        assert sums.since_ns_utc == 7_999_000_000
+        assert sums.n_effective == pytest.approx(first.n_effective, rel=0.05)
+
+    @pytest.mark.parametrize(
+        ("age_s", "doubt", "rest_s"), [(7.0, "", 12.0), (9.0, "", 4.0), (7.0, "a jump", 4.0)]
+    )
+    def test_windows_tell_of_alpha_while_they_are_accepted(self, streams, age_s, doubt, rest_s):
+        class Driver:
+            def now_ns(self):
+                return START_NS
+
+        since_ns = START_NS - round(age_s * 1e9)
+        known = replace(handmade.STATE.registration, window_ns_utc=since_ns, doubt=doubt)
+        engine = Engine(replace(handmade.STATE, registration=known), POLICY, Driver())
+        engine.streams, _ = play(streams, 0, 40)
+        assert engine.take_sums().n_effective > 1000
+        assert engine.streams.passive.from_seq == 4000 + 1000 * rest_s
 
     def test_what_is_taken_is_gone_at_once(self, streams):
         one, _ = play(streams, 0, 20)
         rest, sums = taken(one)
-        assert not isinstance(sums, str)
-        assert isinstance(taken(rest)[1], str)
+        assert sums.n_effective > 1000
+        assert taken(rest)[1] is None
+        quiet = with_dither(rest, None, WINDOW_S)
+        assert isinstance(taken(quiet)[1], str)
 
 
 class TestLaw:

@@ -86,8 +86,6 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         last_batch = float("inf")
         if options.seconds is not None:
             last_batch = round(options.seconds * options.frame_rate_hz / batch_frames)
-        if options.gain_ramp_s is not None:
-            computer.ramp_up(options.gain_ramp_s)
         watch = Watch(computer, pace, link, options)
         n_batches = 0
         _log.info("loop.start", rate_hz=options.frame_rate_hz, session=computer.session)

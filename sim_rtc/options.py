@@ -216,15 +216,6 @@ class Options:
         lambda *gains: min(gains) >= 0.0 and max(gains) <= 2.0,
         ", each 0 to 2",
     )
-    gain_ramp_s: float | None = option(
-        "--gain-ramp S",
-        "at the start raise the gain of tip and tilt, of the modes to 100, and of the rest in "
-        "turn, S seconds a step (default: 1), and keep those of least residual slopes; later "
-        "the service may ask for another",
-        within(0.05, 60.0),
-        nargs="?",
-        const=1.0,
-    )
     leak: float = option(
         "--leak L", "share of the command kept from frame to frame", within(0.0, 1.0), default=0.999
     )

@@ -1,17 +1,15 @@
 """The gain ramp: one group of modes after the other, the gain of least residual slopes is kept.
 
-The groups are the paper's three unless others are asked for: tip and tilt, the modes up to 100,
-the rest. A group tries its gains in turn while the others stay; once the residual has clearly
-grown it tries no higher one, which is well before the loop is lost. The residual slopes are judged
+A group tries its gains in turn while the others stay; once the residual has clearly grown it
+tries no higher one, which is well before the loop is lost. The residual slopes are judged
 as the group sees them, through its own rows of the reconstructor: in the RMS of all slopes the
 noise of 1400 of them hides tip and tilt.
 """
 
 from __future__ import annotations
 
+from bisect import bisect
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Self
 
 import numpy as np
 import structlog
@@ -27,9 +25,6 @@ LARGEST_GAIN = 2.0
 
 GROUP_ENDS = (2, 100)
 """First mode after each group but the last."""
-
-FACTORS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5)
-"""Gains tried at the start, over the gain the loop starts with."""
 
 _CLEARLY_WORSE = 1.5
 """Residual over the best so far from which on a group tries no higher gain.
@@ -51,81 +46,26 @@ class Step:
     """RMS of the slopes, reconstructed into the modes of the group, metres OPD."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """What a ramp tries."""
-
-    name: str
-    """In log and refusals: of the request, or "start"."""
-
-    groups: tuple[slice, ...]
-    """Modes that get one gain; those that the loop does not control are not judged."""
-
-    gains: tuple[tuple[float, ...], ...]
-    """Gains of each group, in the order in which they are tried."""
-
-    settling_frames: int
-    """Ignored after each change."""
-
-    judged_frames: int
-    """Judged after them."""
-
-    @classmethod
-    def at_start(
-        cls, gains: tuple[float, ...], *, n_controlled: int, frame_rate_hz: float, step_s: float
-    ) -> Self:
-        """Return the ramp of a loop that begins with these gains, one per mode of the basis.
-
-        Within a group the first one counts; modes beyond the loop get the last group's gain.
-        """
-        *first, last = groups_of(n_controlled)
-        groups = (*first, slice(last.start, len(gains)))
-        return cls(
-            name="start",
-            groups=groups,
-            gains=tuple(
-                tuple(min(gains[group.start] * factor, LARGEST_GAIN) for factor in FACTORS)
-                for group in groups
-            ),
-            settling_frames=round(_SETTLING_S * frame_rate_hz),
-            judged_frames=max(1, round(step_s * frame_rate_hz)),
-        )
-
-    @classmethod
-    def asked(cls, request: RampRequest, *, frame_rate_hz: float) -> Self:
-        """Return the ramp of a request: what settles is part of its frames, at most half."""
-        settling = min(round(_SETTLING_S * frame_rate_hz), request.frames_per_gain // 2)
-        return cls(
-            name=request.id,
-            groups=tuple(slice(first, last + 1) for first, last in request.groups),
-            gains=(request.gains,) * len(request.groups),
-            settling_frames=settling,
-            judged_frames=request.frames_per_gain - settling,
-        )
-
-
-def groups_of(n_controlled: int) -> tuple[slice, ...]:
-    """Return the modes of each group; one that the loop does not reach is left out."""
-    edges = (0, *(end for end in GROUP_ENDS if end < n_controlled), n_controlled)
-    return tuple(slice(a, b) for a, b in pairwise(edges))
-
-
-def by_group(gains: tuple[float, ...], n_modes: int) -> tuple[float, ...]:
-    """Return one gain per mode from one per group; groups the basis does not reach are ignored."""
-    spread = np.empty(n_modes)
-    for group, gain in zip(groups_of(n_modes), gains, strict=False):
-        spread[group] = gain
-    return tuple(spread.tolist())
+def by_group(gains: tuple[float, float, float], n_modes: int) -> tuple[float, ...]:
+    """Return one gain per mode from those of tip and tilt, of the modes to 100, and of the rest."""
+    return tuple(gains[bisect(GROUP_ENDS, mode)] for mode in range(n_modes))
 
 
 class GainRamp:
     """The ramp itself: shown a closed loop, it says which gains are to be tried next."""
 
-    def __init__(self, gains: tuple[float, ...], plan: Plan, *, wait_frames: int = 0) -> None:
-        """Take the gains as they are, one per mode, and the frames after which it begins."""
+    def __init__(
+        self, gains: tuple[float, ...], request: RampRequest, *, frame_rate_hz: float
+    ) -> None:
+        """Take the gains as they are, one per mode; what settles is at most half of its frames."""
+        self.name = request.id
+        """Of the request."""
         self._settled = np.array(gains)
-        self._plan = plan
-        self._wait_frames = wait_frames
+        self._groups = tuple(slice(first, last + 1) for first, last in request.groups)
+        self._gains = request.gains
+        self._frames_per_gain = request.frames_per_gain
+        settling = round(_SETTLING_S * frame_rate_hz)
+        self._settling_frames = min(settling, request.frames_per_gain // 2)
         self._loop: tuple[str, bool] | None = None
         self._group = 0
         self.steps: tuple[Step, ...] = ()
@@ -133,19 +73,14 @@ class GainRamp:
         self._begin_group()
 
     @property
-    def name(self) -> str:
-        """Of the request, or of the start."""
-        return self._plan.name
-
-    @property
     def done(self) -> bool:
         """Whether every group has its gain."""
-        return self._group == len(self._plan.groups)
+        return self._group == len(self._groups)
 
     @property
     def modes(self) -> slice:
         """The modes whose residual is judged now."""
-        return self._plan.groups[min(self._group, len(self._plan.groups) - 1)]
+        return self._groups[min(self._group, len(self._groups) - 1)]
 
     @property
     def settled(self) -> tuple[float, ...]:
@@ -156,7 +91,7 @@ class GainRamp:
     def gains(self) -> tuple[float, ...]:
         """One per mode: what is to be in force now, and once done what was chosen."""
         gains = self._settled.copy()
-        if not self.done and self._wait_frames <= 0:
+        if not self.done:
             gains[self.modes] = self._waiting[0]
         return tuple(gains.tolist())
 
@@ -164,7 +99,7 @@ class GainRamp:
     def gains_by_group(self) -> tuple[float, ...]:
         """The same, one per group."""
         gains = self.gains
-        return tuple(gains[group.start] for group in self._plan.groups)
+        return tuple(gains[group.start] for group in self._groups)
 
     def look(self, batch: Batch, matrix: Array32) -> bool:
         """Take a batch and the matrix that multiplied its slopes; return whether gains change.
@@ -174,9 +109,6 @@ class GainRamp:
         """
         loop = (batch.cm_id, batch.dither_m is None)
         known, self._loop = self._loop in {None, loop}, loop
-        if self._wait_frames > 0:
-            self._wait_frames -= len(batch.slopes)
-            return self._wait_frames <= 0
         if not known:
             self.again()
             return True
@@ -190,13 +122,12 @@ class GainRamp:
         Whether other gains are to be tried from now on.
         """
         self._frames += len(residual_m)
-        settling = self._plan.settling_frames
-        if self.done or self._frames <= settling:
+        if self.done or self._frames <= self._settling_frames:
             return False
         finite = residual_m[np.isfinite(residual_m).all(axis=1)].astype(np.float64)
         self._power += float((finite**2).sum())
         self._judged += finite.size
-        if self._frames < settling + self._plan.judged_frames:
+        if self._frames < self._frames_per_gain:
             return False
         self._judge()
         self._tell()
@@ -241,7 +172,7 @@ class GainRamp:
         self._begin_group()
 
     def _begin_group(self) -> None:
-        self._begin_step(() if self.done else self._plan.gains[self._group])
+        self._begin_step(() if self.done else self._gains)
 
     def _begin_step(self, waiting: tuple[float, ...]) -> None:
         self._waiting, self._frames, self._power, self._judged = waiting, 0, 0.0, 0

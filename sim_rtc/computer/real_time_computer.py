@@ -29,7 +29,7 @@ from service.wire import (
 )
 from sim_rtc.computer.activities import LARGEST_DITHER_M, Activities, refusal
 from sim_rtc.computer.feed import BATCH_FRAMES, BLOCK_FRAMES, Block
-from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, Plan, ramp_refusal
+from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, ramp_refusal
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.computer.measure import Measurement, MeasurementRules
 from sim_rtc.computer.reconstructors import Terms
@@ -51,9 +51,6 @@ is there before them."""
 
 _SETTLING_FRAMES = 20
 """Between the opening of the loop and the first stroke: the mirror comes to rest."""
-
-_START_S = 2.0
-"""Of closed loop before a ramp at the start begins."""
 
 
 class RealTimeComputer:
@@ -269,20 +266,6 @@ class RealTimeComputer:
             case OffloadRequest():
                 return self._offload(command)
 
-    def ramp_up(self, step_s: float) -> None:
-        """Try gains around those of the start, once the loop has been closed for a moment."""
-        with self._lock:
-            settings = self._settings
-            plan = Plan.at_start(
-                settings.gains,
-                n_controlled=len(self._active.matrix),
-                frame_rate_hz=settings.frame_rate_hz,
-                step_s=step_s,
-            )
-            wait_frames = round(_START_S * settings.frame_rate_hz)
-            ramp = GainRamp(settings.gains, plan, wait_frames=wait_frames)
-            self._set(self._activities.begin_ramp(ramp, settings))
-
     def _next_rows(self) -> tuple[Block, int]:
         if self._block is None or self._row >= self._block.n_frames:
             self._block, self._row = next(self._blocks), 0
@@ -377,8 +360,8 @@ class RealTimeComputer:
             )
             if reason:
                 return refused(request.id, reason)
-            plan = Plan.asked(request, frame_rate_hz=settings.frame_rate_hz)
-            ramp = GainRamp(settings.gains, plan)
+            rate_hz = settings.frame_rate_hz
+            ramp = GainRamp(settings.gains, request, frame_rate_hz=rate_hz)
             self._set(self._activities.begin_ramp(ramp, settings))
             return accepted(request.id, self._seq)
 

@@ -5,7 +5,6 @@ import pytest
 
 from service.wire import Loop, LoopRequest, MeasureRequest, Pattern, RampRequest
 from sim_rtc.computer.feed import OpenLoopBlock
-from sim_rtc.computer.gains import FACTORS
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import LoopSettings
 from tests.unit.sim_rtc.computer.test_real_time_computer import (
@@ -98,16 +97,6 @@ def test_each_gain_is_in_force_for_the_frames_asked_for(noisy):
     assert reply.start_seq == 0
     assert (first[0.1], first[0.9], first[0.5]) == (0, 400, 800)
     assert seen[-1] == (0.1, 1200), "chosen after the last"
-
-
-def test_the_ramp_at_the_start_waits_two_seconds_and_tries_around_what_is_there(noisy):
-    noisy.ramp_up(0.5)
-    run(noisy, 200)
-    assert noisy.status().gains[0] == pytest.approx(FACTORS[0] * 0.4)
-    run(noisy, 10 * 140)
-    gains = noisy.status().gains
-    assert gains[:3] == pytest.approx((FACTORS[0] * 0.4,) * 3), "noise alone wants the lowest"
-    assert gains[3] == 0.0, "not controlled"
 
 
 def test_while_one_runs_another_is_refused_and_so_is_what_would_spoil_it(noisy):

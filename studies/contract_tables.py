@@ -139,7 +139,7 @@ def rows_of(name: str) -> list[Row]:
 
 def _rows(name: str, record: type) -> Iterator[Row]:
     bases = reversed(record.__mro__[:-1])
-    texts = {key: text for base in bases for key, text in described_fields(base).items()}
+    texts = {key: text for base in bases for key, text in described(base).items()}
     known = {field.name: field.type for field in _info(record)}
     for field in fields(record):
         kind = known[field.name]
@@ -158,22 +158,26 @@ def _rows(name: str, record: type) -> Iterator[Row]:
             next((unit for end, unit in _UNITS.items() if field.name.endswith(end)), ""),
             _range(kind),
             nil,
-            texts[field.name].replace("None", "nil"),
+            texts[field.name].replace("None", "nil").replace("``", "`"),
         )
 
 
-def described_fields(record: type) -> dict[str, str]:
-    """Return the fields of a record with the text that follows each in its source."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(record)))
+def described(kind: type) -> dict[str, str]:
+    """Return the names in the body of a class with the text that follows each in its source."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
     (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
     texts: dict[str, str] = {}
     for statement, after in pairwise([*body, ast.Pass()]):
         match statement, after:
-            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(
-                value=ast.Constant(value=str(text))
+            case (
+                ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)),
+                ast.Expr(value=ast.Constant(value=str(text))),
             ):
-                texts[name] = " ".join(text.replace("``", "`").split())
-            case ast.AnnAssign(target=ast.Name(id=name)), _:
+                texts[name] = " ".join(text.split())
+            case (
+                ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)),
+                _,
+            ):
                 texts[name] = ""
             case _:
                 pass

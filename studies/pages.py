@@ -6,11 +6,8 @@ Run: ``python -m studies.pages``, then ``git diff``; a test compares.
 from __future__ import annotations
 
 import ast
-import inspect
 import json
-import textwrap
 from enum import StrEnum
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,7 +19,7 @@ from service.tracking.products import MatrixState, MeasureState, ProbationState
 from service.tracking.registration import Validity
 from service.tracking.state import AcquisitionStage, Mode
 from studies import reference
-from studies.contract_tables import table, with_tables
+from studies.contract_tables import described, table, with_tables
 
 ROOT = Path(__file__).parents[1]
 
@@ -141,20 +138,7 @@ def _refusals() -> list[tuple[str, ...]]:
 
 def _described(kind: type[StrEnum]) -> dict[str, str]:
     """Return the values of an enumeration with the text that follows each in its source."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
-    (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
-    texts: dict[str, str] = {}
-    for statement, after in pairwise([*body, ast.Pass()]):
-        match statement, after:
-            case ast.Assign(targets=[ast.Name(id=name)]), ast.Expr(
-                value=ast.Constant(value=str(text))
-            ):
-                texts[kind[name].value] = " ".join(text.split())
-            case ast.Assign(targets=[ast.Name(id=name)]), _:
-                texts[kind[name].value] = ""
-            case _:
-                pass
-    return texts
+    return {kind[name].value: text for name, text in described(kind).items()}
 
 
 def _lower(text: str) -> str:

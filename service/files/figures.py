@@ -316,14 +316,9 @@ def _columns(fit: Fit, column: int) -> dict[str, Any]:
     }
 
 
-def _percent(shares: Array) -> list[Any]:
-    rounded = np.where(np.isfinite(shares), np.round(100.0 * shares), np.nan)
-    plain = rounded.astype(object)
-    plain[np.isnan(rounded)] = None
-    plain[~np.isnan(rounded)] = rounded[~np.isnan(rounded)].astype(int)
-    listed: list[Any] = plain.tolist()
-    return listed
+def _percent(shares: Array) -> Any:  # noqa: ANN401 - as nested as the array
+    return np.ma.fix_invalid(np.round(100.0 * shares), fill_value=0.0).astype(int).tolist()
 
 
-def _plain(values: Array, digits: int) -> list[float | None]:
-    return [round(v, digits) if np.isfinite(v) else None for v in values.tolist()]
+def _plain(values: Array, digits: int) -> Any:  # noqa: ANN401 - as nested as the array
+    return np.ma.masked_invalid(np.round(values, digits)).tolist()

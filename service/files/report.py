@@ -112,10 +112,7 @@ def _four(values: NDArray[np.float64]) -> dict[str, float | None]:
 
 def _plain(values: float | NDArray[np.float64]) -> Any:  # noqa: ANN401 - as nested as the array
     """Return numbers or nested lists of them, None for what is not finite."""
-    array = np.asarray(values, dtype=np.float64)
-    plain = array.astype(object)
-    plain[~np.isfinite(array)] = None
-    return plain.tolist()
+    return np.ma.masked_invalid(np.asarray(values, dtype=np.float64)).tolist()
 
 
 _ROWS = (

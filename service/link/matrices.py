@@ -121,19 +121,6 @@ class Outbox:
         with self._lock:
             return None if self._current is None else self._offers.get(self._current)
 
-    def current_commit(self) -> bytes:
-        """Return the manifest that answers ``cm/current``.
-
-        Raises
-        ------
-        UnknownIdError
-            If there is nothing to offer.
-        """
-        with self._lock:
-            if self._current is None:
-                raise UnknownIdError("nothing to offer")
-            return self._offers[self._current].commit
-
     def answer(self, matrix_id: str, index: int | None, now_s: float) -> bytes:
         """Return the manifest of an offer, or its part ``index``.
 
@@ -164,7 +151,10 @@ class Outbox:
             If key or part are none.
         """
         if key == keys.current:
-            return self.current_commit()
+            offer = self.current
+            if offer is None:
+                raise UnknownIdError("nothing to offer")
+            return offer.commit
         index = None if part is None else wire.chunk_index(part, "a query")
         return self.answer(keys.matrix_id_of(key), index, now_s)
 

@@ -527,7 +527,7 @@ def test_an_offer_is_forgotten_after_its_time_unless_it_is_the_current_one():
     assert outbox.answer("old", 1, 59.0) == b"5678"
     with pytest.raises(UnknownIdError, match="old is not on offer"):
         outbox.answer("old", 1, 61.0)
-    assert outbox.answer("used", None, 1e6) == outbox.current_commit()
+    assert outbox.answer("used", None, 1e6) == outbox.current.commit
     assert outbox.knows("old")
 
 

@@ -23,7 +23,7 @@ from service.archive.retention import Item, items
 from service.routes.commands import AcceptedView, ClientDep, Said
 from service.routes.problems import INVALID, UNKNOWN
 from service.routes.reading import TimeParameters
-from service.routes.views import ServiceDep, answer, clock_of, is_time, picture, shows, view
+from service.routes.views import ServiceDep, answer, picture, shows, view
 from service.runtime.recording import needed
 
 router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
@@ -185,7 +185,7 @@ def _json_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
 def _csv_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
     """Yield a table; a cell that a spreadsheet would work out is kept from it by an apostrophe."""
     buffer = io.StringIO()
-    names = (n for name in ENTRY.paths for n in (name, clock_of(name))[: 1 + is_time(name)])
+    names = (n for name, part in ENTRY.parts.items() for n in (name, part.clock) if n)
     table = csv.DictWriter(buffer, list(names))
     table.writeheader()
     while True:

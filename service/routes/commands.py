@@ -280,7 +280,7 @@ class Client:
         return AcceptedView(text=text, links=links)
 
 
-def _client_of(request: Request, service: ServiceDep) -> Client:
+async def _client_of(request: Request, service: ServiceDep) -> Client:
     sent = request.headers
     strict = "handling=strict" in sent.get("prefer", "").replace(" ", "").lower()
     return Client(service, caller_of(request), sent.get("if-match"), strict)

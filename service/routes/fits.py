@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Annotated, Any
 
@@ -14,17 +15,28 @@ from starlette.requests import ClientDisconnect
 
 from service.errors import MatrixError
 from service.files import parse_alpha, parse_modes
-from service.files.uploads import FitAsked, FitState
+from service.files.uploads import FitAsked, FitJob, FitState
 from service.fit.matrix import FitOptions, Method
-from service.routes import views
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.routes.views import FitJobs, ServiceDep, answer, known, picture, shows
+from service.routes.views import ServiceDep, answer, known, picture, shows, view
 from service.runtime.uploads import FitQueue
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
 
 
-def _fits_of(request: Request) -> FitQueue:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitJobs:
+    """The fits the service remembers until it ends."""
+
+    fits: tuple[FitJob, ...]
+    """Oldest first."""
+
+
+FIT_JOB = view("FitJobView", FitJob, "id state stage name asked_ns_utc n_bytes sha256 reason")
+FIT_JOBS = view("FitJobsView", FitJobs)
+
+
+async def _fits_of(request: Request) -> FitQueue:
     fits: FitQueue = request.app.state.fits
     return fits
 
@@ -213,7 +225,7 @@ async def fit(
     return FitAcceptedView(id=job.id, links={"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"})
 
 
-@router.get("/fits", responses={200: shows(views.FIT_JOBS)})
+@router.get("/fits", responses={200: shows(FIT_JOBS)})
 async def fits_known(fits: FitsDep) -> Response:
     """Return the fits the service remembers, oldest first."""
     return answer(FitJobs(fits=tuple(fits.jobs())))
@@ -223,7 +235,7 @@ async def fits_known(fits: FitsDep) -> Response:
     "/fits/{id}",
     response_model=FitDocument,
     responses={
-        202: shows(views.FIT_JOB) | {"description": "Not finished yet"},
+        202: shows(FIT_JOB) | {"description": "Not finished yet"},
         **UNKNOWN,
     },
 )
@@ -287,7 +299,7 @@ async def fit_figures(fits: FitsDep, fit_id: FitId) -> Response:
     )
 
 
-@router.delete("/fits/{id}", responses={200: shows(views.FIT_JOB), **UNKNOWN, **COMMAND})
+@router.delete("/fits/{id}", responses={200: shows(FIT_JOB), **UNKNOWN, **COMMAND})
 async def give_up_fit(fits: FitsDep, fit_id: FitId) -> Response:
     """End a fit that waits or runs; 409 where it is over."""
     return answer(await fits.give_up(fit_id))

@@ -17,7 +17,7 @@ from service.routes import views
 from service.routes.commands import AcceptedView, ClientDep, Said, about, body
 from service.routes.numbers import MatrixParameters, describes_numbers, numbers_of
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
-from service.routes.views import ServiceDep, answer, known, shows
+from service.routes.views import ServiceDep, answer, known, shows, view
 from service.snapshot import Snapshot
 from service.tracking.commands import (
     GiveUp,
@@ -27,6 +27,8 @@ from service.tracking.commands import (
     NoisyChoice,
 )
 from service.tracking.dither_request import NOISY_DITHER
+from service.tracking.products import MeasurementRecord, NoisyFinding
+from service.tracking.state import TrackerState
 
 router = APIRouter(
     prefix="/v1", tags=["interaction matrices it has measured"], responses={**INVALID}
@@ -38,6 +40,26 @@ _NOISY = "/v1/noisy-matrix"
 
 MeasurementId = Annotated[str, Path(alias="id", description="Id of a measured matrix")]
 NoisyId = Annotated[str, Path(alias="id", description="Id of a noisy interaction matrix")]
+
+view(
+    "NoisyFindingView",
+    NoisyFinding,
+    "n_slopes n_frames n_missing snr alpha sigma optical_gain misfit cm_id session created_ns_utc "
+    "sha256",
+)
+NOISY = view(
+    "NoisyView",
+    MeasurementRecord,
+    "id state reason n_modes modes total_m amplitude_m=each_m duration_s window_s seed "
+    "asked_ns_utc basis_id config_id finding",
+)
+NOISY_MATRICES = view(
+    "NoisyListView",
+    TrackerState,
+    "noisy_matrices=noisy",
+    "Noisy interaction matrices.",
+    noisy_matrices=NOISY,
+)
 
 
 class MatrixAcceptedView(AcceptedView):
@@ -139,17 +161,17 @@ async def measure_noisy(
     return MatrixAcceptedView(id=command.id, **answered.model_dump())
 
 
-@noisy.get("/noisy-matrix", responses={200: shows(views.NOISY_MATRICES)})
+@noisy.get("/noisy-matrix", responses={200: shows(NOISY_MATRICES)})
 async def noisy_matrices(service: ServiceDep) -> Response:
     """Return the noisy interaction matrices the service remembers, oldest first."""
-    return answer(service.snapshot().tracker, views.NOISY_MATRICES)
+    return answer(service.snapshot().tracker, NOISY_MATRICES)
 
 
-@noisy.get("/noisy-matrix/{id}", responses={200: shows(views.NOISY), **UNKNOWN})
+@noisy.get("/noisy-matrix/{id}", responses={200: shows(NOISY), **UNKNOWN})
 async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return what is known of one, or how far it is."""
     record = service.snapshot().tracker.measurement(noisy_id)
-    return answer(known(record, f"noisy matrix {noisy_id}"), views.NOISY)
+    return answer(known(record, f"noisy matrix {noisy_id}"), NOISY)
 
 
 @noisy.delete("/noisy-matrix/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})

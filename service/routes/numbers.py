@@ -43,7 +43,7 @@ _ALIASES = {
 """Names for what changes, and what is said where there is none."""
 
 
-def _named(
+async def _named(
     service: ServiceDep,
     matrix_id: Annotated[
         str,

@@ -10,13 +10,13 @@ from contextlib import suppress
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Request
-from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.responses import StreamingResponse
 from starlette.types import Message, Receive, Scope, Send
 from typing_extensions import override
 
 from service.errors import BusyError
 from service.routes.problems import INVALID, problem_response
-from service.routes.views import picture
+from service.routes.views import as_json, picture
 from service.runtime.supervisor import Supervisor
 from service.tracking.state import LogEntry
 from service.tracking.turn import LOG_LENGTH
@@ -107,7 +107,7 @@ class Stream:
             lasting = _without_clocks(shown)
             self._version += lasting != self._lasting
             self._lasting = lasting
-            self._state = _event("state", JSONResponse(shown).body)
+            self._state = _event("state", as_json(shown))
         return now
 
     async def _next_look(self) -> None:
@@ -123,7 +123,7 @@ class Stream:
             return _event("reset", b'{"log":"/v1/events"}', self._ids[-1])
         first = self._ids.index(heard)
         lines = zip(self._ids[first + 1 :], (self._log or ())[first:], strict=True)
-        return b"".join(_event("log", JSONResponse(picture(e)).body, k) for k, e in lines)
+        return b"".join(_event("log", as_json(picture(e)), k) for k, e in lines)
 
 
 def _ids(log: Log, started_ns: int) -> list[str]:
@@ -146,9 +146,9 @@ def _without_clocks(shown: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _event(name: str, data: bytes | memoryview, identity: str = "") -> bytes:
+def _event(name: str, data: bytes, identity: str = "") -> bytes:
     head = f"event: {name}\n" + (f"id: {identity}\n" if identity else "")
-    return head.encode() + b"data: " + bytes(data) + b"\n\n"
+    return head.encode() + b"data: " + data + b"\n\n"
 
 
 class _Listening(StreamingResponse):
@@ -178,7 +178,7 @@ class _Listening(StreamingResponse):
             self._stream.n_listeners -= 1
 
 
-def _stream_of(request: Request) -> Stream:
+async def _stream_of(request: Request) -> Stream:
     stream: Stream = request.app.state.stream
     return stream
 

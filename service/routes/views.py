@@ -13,26 +13,26 @@ import math
 import re
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
-from functools import cache
+from functools import cache, lru_cache
 from hashlib import blake2b
 from itertools import pairwise
-from operator import attrgetter
+from operator import attrgetter, methodcaller
 from types import NoneType, UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import msgspec
 import numpy as np
-from fastapi import Depends, Request
-from fastapi.responses import JSONResponse
+from fastapi import Depends, Request, Response
 from numpy.typing import NDArray
 
+from service.archive import AuditEntry
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
 from service.errors import UnknownIdError
-from service.files.uploads import FitJob
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.runtime.supervisor import Supervisor
@@ -47,7 +47,6 @@ from service.tracking.products import (
     Assessment,
     MeasurementRecord,
     ModeLimit,
-    NoisyFinding,
     Probation,
     ReconstructorRecord,
 )
@@ -64,6 +63,20 @@ _LATEST_NS = 253_402_300_800 * 1_000_000_000
 """RFC 3339 has years of four digits."""
 
 
+class FieldShown(NamedTuple):
+    """A field of a picture."""
+
+    path: str
+    """Where to find it, from the record on."""
+
+    taken: Callable[[Any], Any]
+    below: View | None
+    """Of the records in it, where it is not the usual one."""
+
+    clock: str
+    """Name under which it leaves by the clock, too; empty: it is no time."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
     """A picture of a record."""
@@ -75,11 +88,8 @@ class View:
     text: str
     """What it shows."""
 
-    paths: Mapping[str, str]
-    """Where to find each field, from the record on, by the name it leaves under."""
-
-    below: Mapping[str, View]
-    """Views of the records in its fields, where they are not the usual ones."""
+    parts: Mapping[str, FieldShown]
+    """By the name each leaves under."""
 
 
 _USUAL: dict[type, View] = {}
@@ -103,13 +113,13 @@ def view(name: str, record: type, fields_of: str = "", text: str = "", **below: 
     **below
         Views of the records in its fields, where they are not the usual ones.
     """
-    words = fields_of.split() or [field.name for field in fields(record)]
-    paths = {}
-    for word in words:
+    parts = {}
+    for word in fields_of.split() or [field.name for field in fields(record)]:
         own, _, path = word.rpartition("=")
-        paths[own or path.rpartition(".")[2]] = path
+        own = own or path.rpartition(".")[2]
+        parts[own] = FieldShown(path, attrgetter(path), below.get(own), clock_of(own))
     text = text or inspect.cleandoc(record.__doc__ or "")
-    made = View(name=name, record=record, text=text, paths=paths, below=below)
+    made = View(name=name, record=record, text=text, parts=parts)
     _NAMED[name] = made
     _USUAL.setdefault(record, made)
     return made
@@ -119,22 +129,24 @@ def picture(record: object, of: View | None = None) -> dict[str, Any]:
     """Return what JSON can hold of a record, as its usual view or another shows it."""
     of = of or _USUAL[type(record)]
     shown = {}
-    for name, path in of.paths.items():
-        value = attrgetter(path)(record)
-        shown[name] = _plain(value, of.below.get(name))
-        if is_time(name):
-            shown[clock_of(name)] = rfc3339(value)
+    for name, (_, taken, below, clock) in of.parts.items():
+        value = taken(record)
+        shown[name] = _plain(value, below)
+        if clock:
+            shown[clock] = rfc3339(value)
     return shown
 
 
-def is_time(name: str) -> bool:
-    """Return whether a field is nanoseconds since the Unix epoch, by its name."""
-    return name.endswith("_ns_utc") or name == "now_ns"
+@lru_cache(maxsize=1500)
+def _lasting(record: HistoryEntry | LogEntry | AuditEntry) -> dict[str, Any]:
+    """Return the picture of what is asked for again and again, and never changes."""
+    return picture(record)
 
 
 def clock_of(name: str) -> str:
-    """Return the name under which a time leaves as operators read it."""
-    return f"{name.removesuffix('_utc').removesuffix('_ns')}_utc"
+    """Return the name under which a time in nanoseconds leaves by the clock; empty: it is none."""
+    is_time = name.endswith("_ns_utc") or name == "now_ns"
+    return f"{name.removesuffix('_utc').removesuffix('_ns')}_utc" if is_time else ""
 
 
 def rfc3339(t_ns: int | None) -> str | None:
@@ -145,12 +157,16 @@ def rfc3339(t_ns: int | None) -> str | None:
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
 
 
-def answer(record: object, of: View | None = None) -> JSONResponse:
+as_json = msgspec.json.Encoder(enc_hook=methodcaller("item")).encode
+"""Returns the JSON of a picture, in which numbers may be NumPy's."""
+
+
+def answer(record: object, of: View | None = None) -> Response:
     """Return the answer that shows a record."""
-    return JSONResponse(picture(record, of))
+    return Response(as_json(picture(record, of)), media_type="application/json")
 
 
-def tagged(record: object, of: View | None = None) -> JSONResponse:
+def tagged(record: object, of: View | None = None) -> Response:
     """Return the answer that shows a record, with an ETag that changes when it does."""
     shown = answer(record, of)
     shown.headers["ETag"] = f'"{blake2b(shown.body, digest_size=12).hexdigest()}"'
@@ -182,10 +198,12 @@ def finite(value: float) -> float | None:
 
 
 def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a record
-    if value is None or isinstance(value, str | int):
+    if value is None or isinstance(value, (str, int)):
         return value
     if isinstance(value, float):
         return finite(value)
+    if isinstance(value, _LASTING):
+        return _lasting(value)
     if isinstance(value, Misregistration):
         return four(value.vector)
     if isinstance(value, np.ndarray):
@@ -197,7 +215,11 @@ def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a 
     return picture(value, of)
 
 
-def _service_of(request: Request) -> Supervisor:
+_LASTING = (HistoryEntry, LogEntry, AuditEntry)
+
+
+# a plain function would be called in a thread, which takes as long as most answers
+async def _service_of(request: Request) -> Supervisor:
     service: Supervisor = request.app.state.service
     return service
 
@@ -221,13 +243,13 @@ def schemas() -> dict[str, Schema]:
     found: dict[str, Schema] = {"FourView": _FOUR}
     for of in _NAMED.values():
         properties = {}
-        for name, path in of.paths.items():
-            kind, text = _field(of.record, path)
-            properties[name] = _schema(kind, of.below.get(name), found)
+        for name, part in of.parts.items():
+            kind, text = _field(of.record, part.path)
+            properties[name] = _schema(kind, part.below, found)
             if text:
                 properties[name] = {**properties[name], "description": _for_readers(text)}
-            if is_time(name):
-                properties[clock_of(name)] = {**_CLOCK, "description": f"``{name}`` by the clock."}
+            if part.clock:
+                properties[part.clock] = {**_CLOCK, "description": f"``{name}`` by the clock."}
         found[of.name] = {
             "type": "object",
             "description": _for_readers(of.text),
@@ -339,14 +361,6 @@ def _for_readers(text: str) -> str:
 # --- what of each record leaves
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FitJobs:
-    """The fits the service remembers until it ends."""
-
-    fits: tuple[FitJob, ...]
-    """Oldest first."""
-
-
 view("PointingView", Pointing)
 view("ModeGainView", ModeGain, "mode gain gain_sigma=sigma gain_scatter=scatter t_ns_utc")
 view("VerdictView", GateVerdict)
@@ -426,34 +440,12 @@ MEASURING = view(
     "id state pattern modes asked_ns_utc opens_loop",
     "The interaction matrix being measured: ``/v1/measurements/{id}`` says more.",
 )
-view(
-    "NoisyFindingView",
-    NoisyFinding,
-    "n_slopes n_frames n_missing snr alpha sigma optical_gain misfit cm_id session created_ns_utc "
-    "sha256",
-)
-NOISY = view(
-    "NoisyView",
-    MeasurementRecord,
-    "id state reason n_modes modes total_m amplitude_m=each_m duration_s window_s seed "
-    "asked_ns_utc basis_id config_id finding",
-)
-NOISY_MATRICES = view(
-    "NoisyListView",
-    TrackerState,
-    "noisy_matrices=noisy",
-    "Noisy interaction matrices.",
-    noisy_matrices=NOISY,
-)
 GATHERING = view(
     "GatheringView",
     MeasurementRecord,
     "id state total_m duration_s asked_ns_utc",
     "The noisy interaction matrix under way: ``/v1/noisy-matrix/{id}`` says more.",
 )
-
-FIT_JOB = view("FitJobView", FitJob, "id state stage name asked_ns_utc n_bytes sha256 reason")
-FIT_JOBS = view("FitJobsView", FitJobs)
 
 view("RemarkView", Remark)
 view(

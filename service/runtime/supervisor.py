@@ -18,6 +18,7 @@ from service.archive import Archive, AuditEntry
 from service.archive.retention import EVERYTHING, Keeping
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.link.matrices import MeasuredMatrix
+from service.link.statistics import LinkStatistics
 from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
@@ -123,10 +124,11 @@ class Supervisor:
 
     def snapshot(self) -> Snapshot:
         """Return what is known now."""
-        waiting = self._waiting()
+        link = self._bridge.statistics()
+        waiting = self._waiting(link)
         return Snapshot(
             tracker=self._engine.state,
-            link=self._bridge.statistics(),
+            link=link,
             now_ns=time.time_ns(),
             started_ns=self._started_ns,
             ready=not any(wait.hinders for wait in waiting),
@@ -137,11 +139,11 @@ class Supervisor:
             archive_waiting=self._recorder.waiting,
         )
 
-    def _waiting(self) -> tuple[Waiting, ...]:
+    def _waiting(self, link: LinkStatistics) -> tuple[Waiting, ...]:
         """Return whom the service waits for now."""
         facts = Facts(
             state=self._engine.state,
-            link=self._bridge.statistics(),
+            link=link,
             preparing=self._engine.streams is None,
             worker_trouble=self._workers.trouble,
         )
@@ -323,9 +325,10 @@ class Supervisor:
             for trouble in self._meter.news(self._engine.state):
                 self._post(trouble)
             now_ns = time.time_ns()
-            for event in news_of_link(self._bridge.statistics(), self._engine.state, now_ns):
+            link = self._bridge.statistics()
+            for event in news_of_link(link, self._engine.state, now_ns):
                 self._post(event)
-            waiting = self._waiting()
+            waiting = self._waiting(link)
             for text in told.news(waiting, self._engine.state.alarms, now_ns):
                 self._note("waiting", text, Level.INFO)
             self._bridge.publish_state(state_message(self._engine.state, now_ns, waiting))

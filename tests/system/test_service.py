@@ -141,7 +141,7 @@ def test_an_rtc_that_is_killed_and_restarted_is_calibrated_again(night):
 
 
 @pytest.mark.long
-def test_a_service_killed_after_a_move_picks_up_where_it_was_and_leads_the_image_home(night):
+def test_a_service_killed_in_a_move_picks_up_where_it_was_and_leads_the_image_home(night):
     """Its RTC sends pixels, and has a stage that overdoes what it is asked by a fifth."""
     pixels = night.directory / "pixels.toml"
     text = INSTRUMENT.read_text(encoding="utf-8")
@@ -165,8 +165,6 @@ def test_a_service_killed_after_a_move_picks_up_where_it_was_and_leads_the_image
     assert night.state["rtc"]["n_slopes"] == 448
     saved = night.directory / "data" / "tracking.json"
     wait_for(lambda: saved.exists() and '"n_moves": 1' in saved.read_text(), what="it is saved")
-    arrived = ALPHA["shift_x_subap"] - 0.05
-    wait_for(lambda: true()["shift_x_subap"] < arrived, 20.0, "the image stands elsewhere")
     in_use, ids = night.state["in_use"], [r["id"] for r in night.shelf if r["parent"]]
     service.kill()
 

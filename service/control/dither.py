@@ -45,9 +45,6 @@ class Demand:
     window_s: float
     """Telemetry of one burst, in one window or several, seconds."""
 
-    settling_s: float = 0.0
-    """Dither before a burst that comes after a pause, seconds."""
-
     window_sigma: Array = field(default_factory=lambda: np.full(4, np.inf))
     """``(4,)`` 1 σ that one window may have where it follows on the last without pause."""
 
@@ -71,9 +68,6 @@ class Schedule:
     sufficient: bool
     """Whether that is what was asked for; otherwise the budget is spent and it is the best."""
 
-    mean_cost_m: float
-    """Quadratic mean of the dither over time, pauses included, metres OPD."""
-
 
 def schedule(precision: Array, demand: Demand) -> Schedule:
     """Return the schedule that keeps ``demand.sigma`` within the budget.
@@ -92,13 +86,11 @@ def schedule(precision: Array, demand: Demand) -> Schedule:
         interval_s = demand.window_s
         total_m = _without_pause(precision, demand)
     before = _variance_before(precision, demand, total_m, interval_s)
-    on_s = min(demand.window_s + demand.settling_s, interval_s)
     return Schedule(
         total_m=total_m,
         interval_s=interval_s,
         sigma=np.sqrt(before),
         sufficient=bool(np.all(before <= demand.sigma**2 * (1.0 + 1e-9))),
-        mean_cost_m=total_m * float(np.sqrt(on_s / interval_s)),
     )
 
 

@@ -105,26 +105,13 @@ def drop(turn: Turn) -> None:
     turn.dither = None
 
 
-def make_way(turn: Turn) -> bool:
-    """Stop the dither that runs, and adopt it no more; return whether one did."""
-    running = turn.dither.id if turn.dither is not None else None
-    if running is None and turn.rtc is not None:
-        running = turn.rtc.dither_id
-    if running is None:
-        return False
-    turn.dithering = replace(turn.dithering, stopped_id=running)
-    turn.dither = None
-    ask_to_stop(turn)
-    return True
-
-
-def make_way_for_noisy(turn: Turn) -> None:
-    """Stop whatever is played; a dither of the service's own ends without a result."""
-    own = turn.dither
-    if own is not None:
-        turn.dithering = replace(turn.dithering, stopped_id=own.id, ended_ns_utc=None)
+def make_way(turn: Turn) -> None:
+    """Stop the dither that runs, if one does; follow and adopt it no more."""
+    running = turn.dither.id if turn.dither is not None else turn.rtc and turn.rtc.dither_id
+    if running:
+        _note_stop(turn, running)
         turn.dither = None
-    ask_to_stop(turn)
+        ask_to_stop(turn)
 
 
 def allow(turn: Turn, *, allowed: bool = True) -> None:
@@ -142,7 +129,7 @@ def stop_by_operator(turn: Turn, _: cmd.StopDither) -> None:
 
 
 def tell_to_stop(turn: Turn) -> None:
-    """Ask the RTC to play no dither."""
+    """Ask the same of one that nobody wants."""
     turn.dithering = replace(turn.dithering, told_ns_utc=turn.now_ns)
     ask_to_stop(turn)
 
@@ -272,10 +259,8 @@ def stop_unanswered(turn: Turn, text: str) -> None:
     if turn.dither is not None:
         ended = f"{turn.dither.id} was ended, and another is tried after {CALM_S:.0f} s"
         turn.alarm(alarms.MIRROR_SILENT, f"the mirror does not answer: {text}; {ended}")
-        _note_stop(turn, turn.dither.id)
-        turn.dither = None
         turn.put_off(dither_s=CALM_S)
-        tell_to_stop(turn)
+        make_way(turn)
 
 
 def stop_unwanted(turn: Turn, rtc: Status) -> None:
@@ -290,7 +275,7 @@ def stop_unwanted(turn: Turn, rtc: Status) -> None:
         _meet_unwanted(turn, running)
         if loud is not None:
             _blame(turn, running, loud)
-    if turn.now_ns - turn.dithering.unwanted_since_ns_utc >= GONE_WITHIN_S * SECOND_NS:
+    if turn.now_ns - turn.dithering.stopped_ns_utc >= GONE_WITHIN_S * SECOND_NS:
         text = (
             f"{why}, and the RTC goes on playing {running}: it is asked every {TELL_EVERY_S:.0f} s "
             "to stop it; stop it at the RTC"
@@ -318,8 +303,7 @@ def _begin(turn: Turn, rtc: Status, wish: Wish) -> None:
     if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
         # left behind by this service: its window of another length, or to stop
         turn.put_off(dither_s=2.0)
-        _note_stop(turn, rtc.dither_id)
-        ask_to_stop(turn)
+        make_way(turn)
     elif turn.now_ns >= wish.next_ns_utc and not dither_plan.awaits_a_result(turn, wish):
         _ask(turn, rtc, wish)
 
@@ -360,13 +344,11 @@ def _end_when_done(turn: Turn, dither: Dither, wish: Wish) -> None:
     done = seen and wish.phase is DitherPhase.SPARSE and pause_s >= dither_plan.SHORTEST_PAUSE_S
     weak = wish.phase is DitherPhase.ACQUIRE and 2.0 * total_m(dither.request) < wish.choice.total_m
     if done or weak:
-        _note_stop(turn, dither.id)
-        turn.dither = None
         # the next one must not overtake the command to stop
         turn.put_off(dither_s=1.0)
         weakness = "" if done else " is too weak"
         turn.log("dither.stopped", f"{dither.id}{weakness}: {wish.reason}")
-        ask_to_stop(turn)
+        make_way(turn)
 
 
 def _adopt(turn: Turn, rtc: Status) -> bool:
@@ -464,7 +446,7 @@ def _meet_unwanted(turn: Turn, running: str) -> None:
     _note_stop(turn, running)
     if turn.dither is not None and turn.dither.id == running:
         turn.dither = None
-    turn.dithering = replace(turn.dithering, unwanted_id=running, unwanted_since_ns_utc=turn.now_ns)
+    turn.dithering = replace(turn.dithering, unwanted_id=running)
 
 
 def _blame(turn: Turn, running: str, loud: str) -> None:

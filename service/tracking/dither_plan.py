@@ -102,28 +102,26 @@ def wanted(turn: Turn, rtc: Status) -> tuple[Wish, DitherPlan]:
     found = schedule(kappa, demand)
     plan = _plan(state, found, demand, window_s, phase)
     fixed = policy.dither_amplitude_m is not None
-    choice = Choice(
-        total_m=demand.budget_m if fixed else plan.total_m,
-        window_s=window_s,
-        n_windows=max(int(max(demand.window_s, _lasting_s(phase)) / window_s + 1e-6), 1),
-        avoid_hz=(*policy.dither_avoid_hz, *state.vibrations_hz),
-        last_hz=state.dithering.lines_hz,
-    )
+    total_m = demand.budget_m if fixed else plan.total_m
+    choice = _choice(turn, total_m, window_s, max(demand.window_s, _lasting_s(phase)))
     return Wish(phase=phase, reason=reason, choice=choice, next_ns_utc=next_ns), plan
 
 
 def by_hand(turn: Turn, rtc: Status) -> Choice:
     """Return what an operator's dither is like where the operator does not say."""
-    state, policy = turn.state, turn.policy
-    plan = state.dithering.plan
+    policy, plan = turn.policy, turn.dithering.plan
     window_s = policy.window_s if plan is None else plan.window_s
     lasting_s = policy.dither_duration_s - SETTLING_S - SPARE_S
+    return _choice(turn, budget_m(rtc, policy), window_s, lasting_s)
+
+
+def _choice(turn: Turn, total_m: float, window_s: float, lasting_s: float) -> Choice:
     return Choice(
-        total_m=budget_m(rtc, policy),
+        total_m=total_m,
         window_s=window_s,
         n_windows=max(int(lasting_s / window_s + 1e-6), 1),
-        avoid_hz=(*policy.dither_avoid_hz, *state.vibrations_hz),
-        last_hz=state.dithering.lines_hz,
+        avoid_hz=(*turn.policy.dither_avoid_hz, *turn.state.vibrations_hz),
+        last_hz=turn.dithering.lines_hz,
     )
 
 
@@ -136,7 +134,7 @@ def _plan(
         total_m = demand.budget_m
     if phase is not DitherPhase.SPARSE:
         interval_s = window_s
-    on_s = min(demand.window_s + demand.settling_s, interval_s)
+    on_s = min(demand.window_s + SETTLING_S, interval_s)
     return DitherPlan(
         total_m=total_m,
         window_s=window_s,
@@ -173,7 +171,6 @@ def _demand(turn: Turn, rtc: Status, kappa: NDArray[np.float64]) -> Demand:
         drift_rate=np.sqrt(np.maximum(_walk_rate(turn), _SLOWEST**2)),
         budget_m=budget_m(rtc, policy),
         window_s=policy.window_s,
-        settling_s=SETTLING_S,
         window_sigma=JUMP / STANDS_OUT,
         longest_s=policy.longest_pause_s,
     )
@@ -234,7 +231,7 @@ def _unwatched(
 ) -> tuple[DitherPhase, str, int]:
     """Pace by how far α may have walked since the last window."""
     room = demand.sigma**2 - np.diag(known.covariance)
-    on_s = demand.settling_s + demand.window_s + SPARE_S
+    on_s = SETTLING_S + demand.window_s + SPARE_S
     pause_s = float(np.min(room / demand.drift_rate**2)) - on_s
     if pause_s < SHORTEST_PAUSE_S:
         text = "α walks too fast for a pause, or no window brings σ to what is asked"

@@ -114,7 +114,7 @@ def plan_dither(
     policy: Policy,
     now_ns: int,
     *,
-    choice: Choice | None = None,
+    choice: Choice,
     modes: tuple[int, ...] | None = None,
     amplitude_m: float | None = None,
     frequency_hz: tuple[float, ...] | None = None,
@@ -123,14 +123,9 @@ def plan_dither(
     """Return the dither to ask for: what is not given is the policy's own choice.
 
     The lines are rounded to whole periods in a window. The modes are ones the loop does not and
-    will not control: nothing there amplifies the dither or the noise. Without a ``choice`` it is
-    the whole budget for as long as the policy allows.
+    will not control: nothing there amplifies the dither or the noise.
     """
     asked = any(wish is not None for wish in (modes, amplitude_m, frequency_hz, duration_s))
-    n_windows = int((policy.dither_duration_s - SETTLING_S - SPARE_S) / policy.window_s)
-    choice = choice or Choice(
-        total_m=policy.dither_budget_m, window_s=policy.window_s, n_windows=max(n_windows, 1)
-    )
     chosen = (modes or policy.dither_modes or _uncontrolled_modes(rtc, policy))[
         : rtc.max_dither_modes
     ]
@@ -413,6 +408,9 @@ class Precision:
 class DitherPlan(Schedule):
     """The dither that is wanted in the present state."""
 
+    mean_cost_m: float
+    """Quadratic mean of the dither over time, pauses included, metres OPD."""
+
     window_s: float
     """Telemetry in one estimate, seconds."""
 
@@ -457,13 +455,10 @@ class Dithering:
     """The last dither that the service asked the RTC to stop by itself."""
 
     stopped_ns_utc: int = 0
-    """When it did."""
+    """When it did first."""
 
     unwanted_id: str | None = None
     """A dither the RTC plays and should not; None: none."""
-
-    unwanted_since_ns_utc: int = 0
-    """Since when the service knows of it."""
 
     told_ns_utc: int = 0
     """When the RTC was last told to stop one that nobody wants."""

@@ -12,7 +12,7 @@ import numpy as np
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither import ask_for, ask_to_stop, drop, make_way_for_noisy
+from service.tracking.dither import ask_for, make_way
 from service.tracking.dither_request import RANDOM_TOTAL_M, check_modes, cost_of, plan_random
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
@@ -110,8 +110,7 @@ def give_up(turn: Turn, measurement_id: str) -> None:
         _keep(turn, replace(given_up, reason="by the operator"))
         turn.log("noisy-matrix.given-up", record.id)
         if turn.dither is not None and turn.dither.id == record.id:
-            drop(turn)
-            ask_to_stop(turn)
+            make_way(turn)
         return
     text = "given up by the operator; the RTC may go on with it, what it sends is ignored"
     _keep(turn, replace(given_up, reason=text))
@@ -286,10 +285,7 @@ def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
         f"{duration_s:g} s"
     )
     turn.log("noisy-matrix.asked", text)
-    if turn.dither is None and rtc.dither_id is None:
-        _begin_noisy(turn, record, rtc)
-    else:
-        make_way_for_noisy(turn)
+    make_way(turn)
 
 
 def follow_noisy(turn: Turn) -> None:

@@ -5,7 +5,7 @@ import pytest
 from service.errors import ModelError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither_request import lock_in_plan, plan_dither
+from service.tracking.dither_request import Choice, lock_in_plan, plan_dither
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest, DitherStop
@@ -36,9 +36,13 @@ def story():
     return Story(Mode.AUTO).meet()
 
 
+CHOICE = Choice(total_m=8e-9, window_s=2.0, n_windows=59)
+
 OPEN = ({"loop": "open"}, {"loop": "partial", "gains": (0.0,) * N_MODES})
 """With all gains 0 no mode is in the loop, whatever the RTC calls that."""
 
+
+CHOICE = Choice(total_m=8e-9, window_s=2.0, n_windows=59)
 
 OPEN = ({"loop": "open"}, {"loop": "partial", "gains": (0.0,) * N_MODES})
 """With all gains 0 no mode is in the loop, whatever the RTC calls that."""
@@ -92,16 +96,16 @@ class TestDither:
         assert story.asked(DitherRequest)
 
     def test_its_modes_are_above_those_the_loop_will_control(self):
-        dither = plan_dither(rtc(), POLICY, START_NS).request
+        dither = plan_dither(rtc(), POLICY, START_NS, choice=CHOICE).request
         assert len(dither.modes) == len(set(dither.modes)) == 4
         assert all(500 <= mode < N_MODES for mode in dither.modes)
 
     def test_with_every_mode_controlled_it_takes_the_highest(self):
-        dither = plan_dither(rtc(N_MODES), POLICY, START_NS).request
+        dither = plan_dither(rtc(N_MODES), POLICY, START_NS, choice=CHOICE).request
         assert dither.modes == (590, 591, 592, 593)
 
     def test_its_lines_lie_above_a_fifth_of_the_frame_rate_and_fit_a_window(self):
-        dither = plan_dither(rtc(), POLICY, START_NS)
+        dither = plan_dither(rtc(), POLICY, START_NS, choice=CHOICE)
         assert all(200.0 < line < 350.0 for line in dither.frequency_hz)
         assert all((line * POLICY.window_s).is_integer() for line in dither.frequency_hz)
         sums = {a + b for a in dither.frequency_hz for b in dither.frequency_hz}
@@ -109,28 +113,36 @@ class TestDither:
         assert not (sums | differences) & set(dither.frequency_hz)
 
     def test_it_respects_the_limits_of_the_rtc(self):
-        dither = plan_dither(rtc(max_dither_m=1e-9, max_dither_modes=2), POLICY, START_NS).request
+        dither = plan_dither(
+            rtc(max_dither_m=1e-9, max_dither_modes=2), POLICY, START_NS, choice=CHOICE
+        ).request
         assert dither.amplitude_m == (1e-9, 1e-9)
         assert len(dither.modes) == len(dither.frequency_hz) == 2
 
     def test_settings_overrule_the_services_choice_and_a_request_overrules_both(self):
         policy = replace(POLICY, dither_modes=(7, 9), dither_frequencies_hz=(210.0, 260.0))
-        chosen = plan_dither(rtc(), policy, START_NS).request
+        chosen = plan_dither(rtc(), policy, START_NS, choice=CHOICE).request
         assert (chosen.modes, chosen.frequency_hz) == ((7, 9), (210.0, 260.0))
         asked = plan_dither(
-            rtc(), policy, START_NS, modes=(3,), frequency_hz=(300.0,), amplitude_m=2e-9
+            rtc(),
+            policy,
+            START_NS,
+            choice=CHOICE,
+            modes=(3,),
+            frequency_hz=(300.0,),
+            amplitude_m=2e-9,
         ).request
         assert (asked.modes, asked.frequency_hz, asked.amplitude_m) == ((3,), (300.0,), (2e-9,))
 
     def test_the_first_window_waits_until_the_loop_has_settled(self):
-        dither = replace(plan_dither(rtc(), POLICY, START_NS), start_seq=1000)
+        dither = replace(plan_dither(rtc(), POLICY, START_NS, choice=CHOICE), start_seq=1000)
         plan = lock_in_plan(dither, rtc(), 2.0)
         assert (plan.first_seq, plan.n_frames) == (1300, 2000)
 
     def test_lines_of_a_slow_loop_have_no_room_for_their_side_bins(self):
         slow = rtc(frame_rate_hz=60.0)
         with pytest.raises(ModelError, match="room for the side bins"):
-            lock_in_plan(plan_dither(slow, POLICY, START_NS), slow, 2.0)
+            lock_in_plan(plan_dither(slow, POLICY, START_NS, choice=CHOICE), slow, 2.0)
 
 
 class TestMargin:

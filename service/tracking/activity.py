@@ -7,6 +7,7 @@ which alarms last.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import get_args
@@ -106,8 +107,7 @@ def refuse_if_occupied(state: TrackerState, event: Event, now_ns: int) -> None:
 
 def under_way(state: TrackerState, now_ns: int) -> tuple[Running, ...]:
     """Return all that runs now, what is exclusive first."""
-    found = (*_exclusive(state, now_ns), _dither(state, now_ns), *_of_matrices(state))
-    return tuple(running for running in found if running is not None)
+    return (*_exclusive(state, now_ns), *_dither(state, now_ns), *_of_matrices(state))
 
 
 def ramping(state: TrackerState, now_ns: int) -> LoopCommand | None:
@@ -122,60 +122,47 @@ def ramping(state: TrackerState, now_ns: int) -> LoopCommand | None:
     return asked if accepted and now_ns < asked.until_ns_utc else None
 
 
-def _exclusive(state: TrackerState, now_ns: int) -> tuple[Running, ...]:
-    found = [
-        Running(Activity.STANDING_BY, alarm.text)
-        for alarm in state.alarms
-        if alarm.name == STANDING_BY
-    ]
+def _exclusive(state: TrackerState, now_ns: int) -> Iterator[Running]:
+    for alarm in state.alarms:
+        if alarm.name == STANDING_BY:
+            yield Running(Activity.STANDING_BY, alarm.text)
     if state.stopped_because:
-        text = f"{state.stopped_because}; release the stop first"
-        found.append(Running(Activity.STOPPED, text))
+        yield Running(Activity.STOPPED, f"{state.stopped_because}; release the stop first")
     if state.measuring is not None:
-        text = (
-            f"interaction matrix {state.measuring.id} is being measured; wait for it, or give it up"
-        )
-        found.append(Running(Activity.MEASURING, text))
+        text = f"interaction matrix {state.measuring.id} is being measured"
+        yield Running(Activity.MEASURING, f"{text}; wait for it, or give it up")
     if state.gathering is not None:
         text = f"noisy matrix {state.gathering.id} is under way; wait for it, or give it up"
-        found.append(Running(Activity.GATHERING, text))
+        yield Running(Activity.GATHERING, text)
     ramp = ramping(state, now_ns)
     if ramp is not None:
         left_s = max((ramp.until_ns_utc - now_ns) / SECOND_NS, 0.0) or ramp.lasts_s
-        text = (
-            f"gain ramp {ramp.id} is under way; wait for it, {left_s:.0f} s, or open the loop "
-            "to end it"
-        )
-        found.append(Running(Activity.RAMPING, text))
+        text = f"gain ramp {ramp.id} is under way; wait for it, {left_s:.0f} s"
+        yield Running(Activity.RAMPING, f"{text}, or open the loop to end it")
     if state.acquisition.under_way:
         text = f"an acquisition is under way ({state.acquisition.text}); wait for it, or abort it"
-        found.append(Running(Activity.ACQUIRING, text))
-    return tuple(found)
+        yield Running(Activity.ACQUIRING, text)
 
 
-def _dither(state: TrackerState, now_ns: int) -> Running | None:
-    """Return the dither that plays, followed or not; one that was told to stop does no more."""
+def _dither(state: TrackerState, now_ns: int) -> Iterator[Running]:
+    """Yield the dither that plays, followed or not; one that was told to stop does no more."""
     known = None if state.dither is None else state.dither.id
     told = now_ns - state.dithering.told_ns_utc < GONE_WITHIN_S * SECOND_NS
     seen = None if state.rtc is None or told else state.rtc.dither_id
     playing = known or (None if seen is None or seen.startswith(OUR_DITHERS) else seen)
-    if playing is None:
-        return None
-    own = playing.startswith(OWN_DITHER)
-    activity = Activity.OWN_DITHER if own else Activity.OTHER_DITHER
-    return Running(activity, f"{playing} is running; stop it first")
+    if playing is not None:
+        own = playing.startswith(OWN_DITHER)
+        activity = Activity.OWN_DITHER if own else Activity.OTHER_DITHER
+        yield Running(activity, f"{playing} is running; stop it first")
 
 
-def _of_matrices(state: TrackerState) -> tuple[Running, ...]:
-    found = []
+def _of_matrices(state: TrackerState) -> Iterator[Running]:
     if state.making_since_ns_utc is not None:
-        text = "a reconstructor is being computed; wait for it"
-        found.append(Running(Activity.MAKING, text))
+        yield Running(Activity.MAKING, "a reconstructor is being computed; wait for it")
     for record in state.reconstructors:
         if record.on_its_way:
             text = f"reconstructor {record.id} is on its way to the RTC; wait for it"
-            found.append(Running(Activity.SENDING, text))
-    return tuple(found)
+            yield Running(Activity.SENDING, text)
 
 
 def _opens(command: Command) -> bool:

@@ -136,13 +136,15 @@ def _flags(night: Night, rng: np.random.Generator, policy: Policy) -> list[tuple
 def _measured(night: Night, end_s: float, rng: np.random.Generator, policy: Policy) -> Measured:
     read = night.mean(end_s) + night.sigma * rng.normal(size=4)
     said = night.sigma * np.sqrt(rng.chisquare(DEGREES) / DEGREES) / BOUNDARY_SCALE
-    began_s = end_s - WINDOW_S
+    when = taken(*(START_NS + round(s * SECOND_NS) for s in (end_s - WINDOW_S, end_s)))
     return Measured(
         alpha=Misregistration.from_vector(Misregistration().vector + read / BOUNDARY_SCALE),
         covariance=np.diag(said**2),
         floor=policy.floor,
         misfit=1.0,
-        when=taken(*(START_NS + round(s * SECOND_NS) for s in (began_s, end_s))),
+        t_ns_utc=when.ended_ns_utc,
+        pointing=None,
+        when=when,
         source=Source.LOCK_IN,
         optical_gain=0.6,
         optical_gains=(),

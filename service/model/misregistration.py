@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.errors import ModelError
 
@@ -66,6 +67,12 @@ class Misregistration:
         if not np.all(np.isfinite(self.vector)) or self.magnification <= 0.0:
             raise ModelError(f"a registration needs finite numbers and a magnification > 0: {self}")
 
+    @override
+    def __str__(self) -> str:
+        """Return it for a person."""
+        x, y, turned, size = self.to_boundary().values()
+        return f"({x:+.2f}, {y:+.2f} subap, {turned:+.2f} deg, {size:.4f})"
+
     @property
     def vector(self) -> NDArray[np.float64]:
         """Numeric 4-vector: shifts in subapertures, rotation in radians, magnification."""
@@ -93,6 +100,12 @@ class Misregistration:
     def to_boundary(self) -> dict[str, float]:
         """Return the four named numbers used on the wire, in files and in REST (degrees)."""
         return at_boundary(self.vector)
+
+
+def step_text(step: NDArray[np.float64]) -> str:
+    """Return a change of α ``(4,)``, numeric units, for a person."""
+    x, y, turned, size = step * BOUNDARY_SCALE
+    return f"{x:+.3f}, {y:+.3f} subap, {turned:+.3f} deg, {size:+.4f}"
 
 
 def at_boundary(four: NDArray[np.float64]) -> dict[str, float]:

@@ -98,7 +98,7 @@ def find(spectra: Spectra, search: FarSearch) -> FarEstimate | WindowRefused:
             search.far, columns, start.vector, approached=APPROACHED, allowed=search.reaches
         )
         if not landed.converged:
-            reason = f"steps from {_said(start)} do not converge"
+            reason = f"steps from {start} do not converge"
             continue
         there = search.near.linearise(Misregistration.from_vector(landed.vector))
         estimate = fit_window(alone, there, loop)
@@ -151,17 +151,12 @@ def _why_not(found: FarEstimate, search: FarSearch) -> str | None:
     if abs(lag) > MAX_LAG_FRAMES:
         return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
     if not search.reaches(estimate.alpha.vector):
-        return f"{_said(estimate.alpha)} is out of range"
+        return f"{estimate.alpha} is out of range"
     if np.any(np.abs(estimate.step) > LONGEST_STEP):
-        return f"the finer model leads away from {_said(estimate.alpha)}"
+        return f"the finer model leads away from {estimate.alpha}"
     if found.unexplained > UNEXPLAINED:
         return (
-            f"{_said(estimate.alpha)} leaves {found.unexplained:.0%} of the response unexplained, "
+            f"{estimate.alpha} leaves {found.unexplained:.0%} of the response unexplained, "
             f"expected at most {UNEXPLAINED:.0%}"
         )
     return None
-
-
-def _said(alpha: Misregistration) -> str:
-    x, y, rotation, magnification = alpha.to_boundary().values()
-    return f"({x:+.2f}, {y:+.2f} subap, {rotation:+.2f} deg, {magnification:.4f})"

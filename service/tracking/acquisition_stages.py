@@ -15,7 +15,6 @@ from service.control.dither import (
     lines_of,
     modes_of,
 )
-from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import validity
@@ -332,7 +331,7 @@ def on_far(turn: Turn, event: ev.FarFitted) -> None:
         return
     covariance = estimate.covariance + np.diag(reach_of(before.stage).floor ** 2)
     turn.acquisition = replace(before, alpha=estimate.alpha, covariance=covariance)
-    place = f"{_said(estimate.alpha)} +- {sigma_of(turn.acquisition)}"
+    place = f"{estimate.alpha} +- {sigma_of(turn.acquisition)}"
     if before.stage is AcquisitionStage.COARSE or before.alpha is None or before.covariance is None:
         make_way(turn)
         enter_stage(turn, AcquisitionStage.CONFIRMING, f"{place}: other modes must confirm it")
@@ -342,7 +341,7 @@ def on_far(turn: Turn, event: ev.FarFitted) -> None:
     if chi2 > AGREE:
         turn.acquisition = before
         reason = (
-            f"two sets of modes disagree: {_said(before.alpha)} and {_said(estimate.alpha)}, "
+            f"two sets of modes disagree: {before.alpha} and {estimate.alpha}, "
             f"chi2 {chi2:.0f}, expected at most {AGREE}"
         )
         restart(turn, reason)
@@ -404,8 +403,3 @@ def _of_stage(turn: Turn, rtc: Status, modes: tuple[int, ...]) -> bool:
     """Return whether these are the modes of the present stage."""
     dither = far_dither(turn.acquisition.stage, rtc, turn.policy, 0)
     return not isinstance(dither, str) and dither.request.modes == modes
-
-
-def _said(alpha: Misregistration) -> str:
-    x, y, rotation, magnification = alpha.to_boundary().values()
-    return f"({x:+.2f}, {y:+.2f} subap, {rotation:+.2f} deg, {magnification:.4f})"

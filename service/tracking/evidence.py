@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.misregistration import Misregistration, step_text
 from service.telemetry import kalman
 from service.telemetry.kalman import Joint
 from service.telemetry.passive import PassiveEstimate
@@ -68,6 +68,8 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
     measured = Measured(
         alpha=estimate.alpha,
         covariance=estimate.covariance,
+        t_ns_utc=estimate.t_ns_utc,
+        pointing=validity.pointing_at(turn.state, estimate.t_ns_utc),
         when=when,
         source=Source.RANDOM if random else Source.LOCK_IN,
         optical_gain=float(gains.mean()),
@@ -111,12 +113,11 @@ def enter(turn: Turn, measured: Measured) -> None:
         joint = kalman.begin_joint(measured.alpha.vector, measured.covariance)
         filtering.accept(turn, Folded(joint=joint, n_windows=1, innovation=0.0), measured)
         return
-    reading = _reading(measured, turn.state)
     first = jumps.window_before(known)
-    if first is not None and jumps.pair_surprise(known, reading, turn.policy).far:
+    if first is not None and jumps.pair_surprise(known, measured, turn.policy).far:
         _jump(turn, known, first, measured)
         return
-    far = jumps.window_surprise(known, reading, turn.policy)
+    far = jumps.window_surprise(known, measured, turn.policy)
     if (
         known.doubt
         and not far.far
@@ -127,8 +128,8 @@ def enter(turn: Turn, measured: Measured) -> None:
         return
     if known.candidate is not None:
         text = (
-            f"the window {_step(known.candidate, known)} from α was not confirmed: the one after "
-            f"it lies {_step(measured, known)} away"
+            f"the window {_away(known.candidate, known)} from α was not confirmed: the one after "
+            f"it lies {_away(measured, known)} away"
         )
         n_outlying = turn.state.windows_outlying + 1
         turn.state = replace(turn.state, windows_outlying=n_outlying)
@@ -149,7 +150,7 @@ def _put_aside(turn: Turn, known: Registration, measured: Measured, far: Distanc
     """Put a window that is far out aside, and doubt α until another one has come."""
     innovation = far.innovation
     text = (
-        f"a window lies {_step(measured, known)} from α (innovation {innovation:.0f}, expected 4, "
+        f"a window lies {_away(measured, known)} from α (innovation {innovation:.0f}, expected 4, "
         f"rotation {np.sqrt(far.rotation):.1f} sigma): the next one decides; nothing is made or "
         "sent meanwhile"
     )
@@ -158,7 +159,6 @@ def _put_aside(turn: Turn, known: Registration, measured: Measured, far: Distanc
         covariance=measured.covariance,
         t_ns_utc=measured.t_ns_utc,
         held_ns_utc=turn.now_ns,
-        innovation=innovation,
     )
     doubt = "a jump is suspected"
     validity.hold(turn, replace(_doubted(known, doubt, measured.t_ns_utc), candidate=candidate))
@@ -177,7 +177,7 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
     policy = turn.policy
     prior = filtering.brought_forward(turn, known, measured.t_ns_utc)
     noise = measured.covariance
-    whole = jumps.wholly_after(first, _reading(measured, turn.state), known.alpha, policy)
+    whole = jumps.wholly_after(first, measured, known.alpha, policy)
     if whole:
         elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
         noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
@@ -193,7 +193,7 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
     validity.hold(turn, replace(known, passive_after_ns_utc=first.t_ns_utc))
     both = whole and known.candidate is not None
     filtering.accept(turn, folded, measured, n_accepted=2 if both else 1)
-    turn.warn("registration.jump", f"jumped by {_step(measured, known)}, as two windows have seen")
+    turn.warn("registration.jump", f"jumped by {_away(measured, known)}, as two windows have seen")
 
 
 def _count_refused(turn: Turn) -> None:
@@ -206,22 +206,12 @@ def _doubted(known: Registration, doubt: str, since_ns_utc: int) -> Registration
     return replace(known, doubt=doubt, doubted_ns_utc=since_ns)
 
 
-def _reading(measured: Measured, state: TrackerState) -> Reading:
-    return Reading(
-        alpha=measured.alpha,
-        covariance=measured.covariance,
-        t_ns_utc=measured.t_ns_utc,
-        pointing=validity.pointing_at(state, measured.t_ns_utc),
-    )
-
-
 def _innovation(prior: Joint, measured: Measured) -> float:
     return kalman.dithered_innovation(prior, measured.alpha.vector, measured.covariance)
 
 
-def _step(measured: Measured | Candidate, known: Registration) -> str:
-    step = (measured.alpha.vector - known.alpha.vector) * BOUNDARY_SCALE
-    return f"{step[0]:+.3f}, {step[1]:+.3f} subap, {step[2]:+.3f} deg, {step[3]:+.4f}"
+def _away(seen: Seen, known: Registration) -> str:
+    return step_text(seen.alpha.vector - known.alpha.vector)
 
 
 def on_watchdog(turn: Turn, event: ev.Watched) -> None:

@@ -22,8 +22,8 @@ from service.tracking.registration import (
     HistoryEntry,
     ModeGain,
     PassiveBias,
+    Reading,
     Registration,
-    Seen,
     Source,
 )
 from service.tracking.state import TrackerState
@@ -111,12 +111,8 @@ HISTORY_LENGTH = 5000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Measured:
-    """What one dithered window says of α."""
-
-    alpha: Misregistration
-    covariance: Array
-    """``(4, 4)`` numeric units, from its own data."""
+class Measured(Reading):
+    """What one dithered window says of α, and of what it was made."""
 
     when: Taken
     source: Source
@@ -131,16 +127,6 @@ class Measured:
 
     misfit: float
     """Residual power over what noise explains; 1: the model explains the window."""
-
-    @property
-    def t_ns_utc(self) -> int:
-        """End of the window, the RTC's clock."""
-        return self.when.ended_ns_utc
-
-    @property
-    def seen(self) -> Seen:
-        """Return what was measured, whatever the filter makes of it."""
-        return Seen(alpha=self.alpha, covariance=self.covariance, t_ns_utc=self.t_ns_utc)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -245,7 +231,7 @@ def accept(turn: Turn, folded: Folded, measured: Measured, *, n_accepted: int = 
         jumped_ns_utc=_jumped_ns_utc(known, folded, turn.now_ns),
         doubt=known.doubt if known is not None and doubted else "",
         doubted_ns_utc=known.doubted_ns_utc if known is not None and doubted else 0,
-        pointing=validity.pointing_at(turn.state, when.ended_ns_utc),
+        pointing=measured.pointing,
         window_pointing=validity.pointing_at(turn.state, when.began_ns_utc),
         restored_ns_utc=known.restored_ns_utc if known is not None else None,
         basis_id=turn.state.basis_id,
@@ -288,7 +274,7 @@ def _earlier(known: Registration | None, folded: Folded, measured: Measured) -> 
     before = known.earlier
     return replace(
         last_of(known),
-        then=measured.seen,
+        then=measured,
         earlier=None if before is None else replace(before, then=None, earlier=None),
     )
 

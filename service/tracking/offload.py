@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, wrapped
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, step_text, wrapped
 from service.tracking import events as ev
 from service.tracking import validity
 from service.tracking.activity import ramping
@@ -63,7 +63,7 @@ def demand(turn: Turn) -> None:
     turn.state = replace(turn.state, move=move)
     named = dict(zip(PARAMETERS, (step * BOUNDARY_SCALE).tolist(), strict=True))
     turn.ask(ev.Ask(request=OffloadRequest(id=move.id, **named)))
-    turn.log("offload.asked", f"{move.id}: α is to change by {_told(step)}")
+    turn.log("offload.asked", f"{move.id}: α is to change by {step_text(step)}")
 
 
 def wanted(state: TrackerState, known: Registration, start: Array, limits: Offloading) -> Array:
@@ -103,7 +103,7 @@ def on_answer(turn: Turn, request: OffloadRequest, reply: Reply) -> None:
     done = replace(move, total=move.total + move.step, n_moves=move.n_moves + 1)
     _end(turn, replace(done, still_ns_utc=still_ns), MoveState.MOVED, "")
     validity.displace(turn, move.step, spread, still_ns)
-    turn.log("offload.moved", f"{move.id}: α is expected {_told(move.step)} away")
+    turn.log("offload.moved", f"{move.id}: α is expected {step_text(move.step)} away")
 
 
 def on_failure(turn: Turn, name: str, text: str) -> None:
@@ -173,8 +173,3 @@ def _apart(alpha: Array, other: Array) -> Array:
     apart = alpha - other
     apart[2] = wrapped(float(apart[2]))
     return np.asarray(apart)
-
-
-def _told(step: Array) -> str:
-    x, y, turned, size = step * BOUNDARY_SCALE
-    return f"{x:+.3f}, {y:+.3f} subap, {turned:+.3f} deg, {size:+.4f}"

@@ -144,9 +144,6 @@ class Candidate(Seen):
     held_ns_utc: int
     """When it was put aside, by the service's clock."""
 
-    innovation: float
-    """Normalised innovation squared (4 degrees of freedom)."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:

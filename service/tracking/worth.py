@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.expected_gain import explained_by_noise
-from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.misregistration import Misregistration, step_text
 from service.tracking.commands import Reject
 from service.tracking.events import Event
 from service.tracking.loop import SAME_DELAY, SAME_LEAK, same_gains
@@ -112,11 +112,8 @@ def why_worthwhile(
     if state.margin is not None and not state.margin.accepted:
         return f"{in_use.id}: {state.margin.reason}"
     if moved(state, in_use, policy):
-        step = (known.alpha.vector - in_use.alpha.vector) * BOUNDARY_SCALE
-        return (
-            f"moved by {step[0]:+.3f}, {step[1]:+.3f} subap, {step[2]:+.3f} deg, {step[3]:+.4f} "
-            f"since {in_use.id}"
-        )
+        step = known.alpha.vector - in_use.alpha.vector
+        return f"moved by {step_text(step)} since {in_use.id}"
     if _jumped(state, in_use, known):
         return f"{in_use.id} was made before the mirror jumped"
     last = state.assessment

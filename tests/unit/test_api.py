@@ -406,7 +406,6 @@ async def test_a_suspected_jump_and_a_dither_that_is_due_are_seen(client, servic
         covariance=np.diag(SIGMA**2),
         t_ns_utc=95 * SECOND,
         held_ns_utc=95 * SECOND,
-        innovation=400.0,
     )
     service.change(
         registration=replace(STATE.registration, candidate=candidate, doubt="a jump"),

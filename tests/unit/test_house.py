@@ -23,7 +23,6 @@ ALIKE = {
     "Compute and ComputeTable",
     "DitherRequest and StartDither",
     "DitherRequest and MeasurementRecord",
-    "Estimate and Measured",
     "Estimate and NoisyFinding",
     "FitDocument and FourNumbers",
     "Instrument and InstrumentFile",

@@ -9,13 +9,14 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.gains import ModeGain
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
 from service.tracking.activity import Operating, operating
 from service.tracking.alarms import ALARMS, Kind, Note, Severity
 from service.tracking.attention import muted, note_of, stale, worst
 from service.tracking.commands import GainGroup
-from service.tracking.registration import ModeGain, Registration
+from service.tracking.registration import Registration
 from service.tracking.state import TrackerState, Waiting
 from service.wire import Status
 

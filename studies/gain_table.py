@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.control.gains import REFERENCE_GAINS, REFERENCE_MODES, gain_table
+from service.control.gains import REFERENCE_GAINS, REFERENCE_MODES, ModeGain, gain_table
 from sim_rtc.options import parse_options
 from studies.optical_gain import RUN_GAIN, closed_loop, optical_gains, telescope_of
 
@@ -34,6 +34,11 @@ def measured(seeing: float, n_frames: int) -> tuple[NDArray[np.float64], float]:
     telescope = telescope_of(options)
     run = closed_loop(telescope, np.full(options.n_controlled, RUN_GAIN, np.float32), n_frames)
     return optical_gains(run, MODES), 1e9 * run.error_m(telescope.weights)
+
+
+def mode_gain(mode: int, gain: float) -> ModeGain:
+    """Return one gain as the table is told it."""
+    return ModeGain(mode=int(mode), gain=float(gain), sigma=SIGMA, scatter=SIGMA, t_ns_utc=0)
 
 
 def row(name: str, values: NDArray[np.float64], digits: int) -> str:
@@ -55,8 +60,8 @@ def main() -> None:
             sys.stdout.write(row(f'{seeing}", {left_nm:.0f} nm left', gains, 3))
             sys.stdout.write(row("strength", np.log(gains) / np.log(reference), 2))
             for known in GIVEN:
-                told = np.isin(MODES, known)
-                table = gain_table(MODES[told], gains[told], np.full(told.sum(), SIGMA), 594)
+                pairs = [pair for pair in zip(MODES, gains, strict=True) if pair[0] in known]
+                table = gain_table([mode_gain(*pair) for pair in pairs], 594)
                 off = table.optical_gain[MODES] / gains - 1.0
                 sys.stdout.write(row(f"table from {known}, off by %", 100.0 * off, 1))
                 sys.stdout.write(row("its 1 sigma, %", 100.0 * table.relative_sigma[MODES], 1))

@@ -14,6 +14,7 @@ from typing_extensions import override
 from service.archive.index import Index
 from service.archive.records import from_json, to_json
 from service.archive.store import DAMAGE, Provenance, Store
+from service.control.gains import gain_table
 from service.errors import ArchiveError, StorageError
 from service.files.report import put_covariance
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
@@ -24,7 +25,6 @@ from service.tracking.products import (
     NoisyFinding,
     ReconstructorRecord,
 )
-from service.tracking.registration import table_of
 from service.wire import checksum
 
 PROBE_BYTES = 1 << 20
@@ -328,7 +328,7 @@ def _attributes(record: ReconstructorRecord) -> dict[str, Provenance]:
 
 def _add_gains(file: h5py.File, record: ReconstructorRecord) -> None:
     """Put the table of loop gains beside the matrix, which knows nothing of it."""
-    table = table_of(record.optical_gains, record.n_modes)
+    table = gain_table(record.optical_gains, record.n_modes)
     group = file.create_group("gains")
     group.attrs["description"] = "optical gain of every mode; not part of the reconstructor"
     group.attrs["measured_modes"] = [gain.mode for gain in record.optical_gains]

@@ -21,6 +21,7 @@ the modes that were dithered, as a Gaussian process whose uncertainty grows away
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,6 +136,26 @@ GATE_SWING = 0.05
 """Relative swing of the gain with the seeing, from one window to the next."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModeGain:
+    """The optical gain of one mode, followed over the windows that dithered it."""
+
+    mode: int
+    """0-based basis index."""
+
+    gain: float
+    """Modulus of the sensor's response over the model's."""
+
+    sigma: float
+    """1 σ of it at ``t_ns_utc``."""
+
+    scatter: float
+    """1 σ of a single window, as the windows themselves scattered."""
+
+    t_ns_utc: int
+    """End of the last window that held this mode."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GainTable:
     """The optical gain of the first modes of the basis, and what loop gains undo it."""
@@ -163,25 +184,17 @@ class GainTable:
         return np.asarray(mean * self.factors)
 
 
-def gain_table(
-    modes: NDArray[Any], gains: NDArray[Any], sigma: NDArray[Any], n_modes: int
-) -> GainTable:
-    """Return the table of ``n_modes`` modes from the gains ``(n,)`` of those measured.
-
-    ``sigma`` ``(n,)`` is 1 σ of each gain.
+def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
+    """Return the table of the first ``n_modes`` modes; nothing measured: what is expected.
 
     Raises
     ------
     ModelError
-        If the three differ in length, or a gain is not a positive number.
+        If a gain is not a positive number.
     """
-    modes = np.asarray(modes, dtype=np.intp)
-    found, spread = np.asarray(gains, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
-    if not len(modes) == len(found) == len(spread):
-        raise ModelError(
-            f"gain table: found {len(found)} gains and {len(spread)} sigmas for {len(modes)} "
-            "modes; expected one of each"
-        )
+    modes = np.array([gain.mode for gain in measured], dtype=np.intp)
+    found = np.array([gain.gain for gain in measured])
+    spread = np.array([gain.sigma for gain in measured])
     if not (np.all(np.isfinite(found) & (found > 0.0)) and np.all(spread >= 0.0)):
         raise ModelError(
             f"gain table: found gains {found.tolist()} and sigmas {spread.tolist()}; expected "

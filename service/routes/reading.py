@@ -14,6 +14,7 @@ from pydantic import AwareDatetime, BeforeValidator, Field, model_validator
 
 from service.archive import Archive, Mark, Night
 from service.archive.nights import FOREVER_NS
+from service.control.gains import ModeGain, gain_table
 from service.errors import CommandError
 from service.routes import views
 from service.routes.numbers import (
@@ -27,7 +28,7 @@ from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_
 from service.routes.views import ServiceDep, answer, known, shows, tagged, view
 from service.runtime.supervisor import Supervisor
 from service.snapshot import GainTableShown
-from service.tracking.registration import HistoryEntry, ModeGain, table_of
+from service.tracking.registration import HistoryEntry
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -326,7 +327,7 @@ async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Respo
 
 
 def _gain_table(matrix_id: str | None, measured: tuple[ModeGain, ...], n_modes: int) -> Response:
-    table = table_of(measured, n_modes)
+    table = gain_table(measured, n_modes)
     return answer(
         GainTableShown(
             reconstructor=matrix_id,

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from service.archive import AuditEntry
 from service.control.expected_gain import ExpectedGain
+from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
 from service.errors import UnknownIdError
 from service.link.statistics import LinkStatistics
@@ -50,7 +51,7 @@ from service.tracking.products import (
     Probation,
     ReconstructorRecord,
 )
-from service.tracking.registration import HistoryEntry, ModeGain, Move, Watchdog
+from service.tracking.registration import HistoryEntry, Move, Watchdog
 from service.tracking.state import Acquisition, LogEntry, ObservatoryValue, TrackerState, Waiting
 from service.wire import Pointing
 
@@ -409,7 +410,6 @@ view(
     "stage text under_way started_ns_utc since_ns_utc held_off commanded n_attempts=attempt alpha "
     "n_modes",
 )
-
 view("MoveView", Move, "id state text step total n_moves asked_ns_utc")
 RECONSTRUCTOR = view(
     "ReconstructorView",

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import __version__, wire
+from service.control.gains import gain_table
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.errors import CommandError, LinkError, UnknownIdError
@@ -29,7 +30,7 @@ from service.tracking.products import (
     MeasurementRecord,
     ReconstructorRecord,
 )
-from service.tracking.registration import Registration, table_of
+from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
 from service.worker import Conditions, OpticsWorker
 
@@ -377,7 +378,7 @@ def loop_to_judge(state: TrackerState, gains: tuple[float, ...]) -> ControlLoop:
     mean = registration.optical_gain
     highest: float | NDArray[np.float64] = 1.0 if mean is None else GAIN_SAFETY * mean
     if registration.optical_gains:
-        highest = table_of(registration.optical_gains, len(gains)).highest
+        highest = gain_table(registration.optical_gains, len(gains)).highest
     return ControlLoop(
         gains=np.array(gains),
         leak=rtc.leak,
@@ -391,7 +392,7 @@ def loop_to_judge(state: TrackerState, gains: tuple[float, ...]) -> ControlLoop:
 def expected_gains(registration: Registration, n_modes: int) -> NDArray[np.float64]:
     """Return the optical gain that each mode is expected to have, ``(n_modes,)``."""
     if registration.optical_gains:
-        return table_of(registration.optical_gains, n_modes).optical_gain
+        return gain_table(registration.optical_gains, n_modes).optical_gain
     return np.full(n_modes, registration.optical_gain or 1.0)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.control.gains import ModeGain
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import DitheredEstimate, model_error
 from service.telemetry.kalman import Drift, Joint, begin_joint, predicted
@@ -20,7 +21,6 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
     Earlier,
     HistoryEntry,
-    ModeGain,
     PassiveBias,
     Reading,
     Registration,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service.control.gains import gain_table
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -26,7 +27,6 @@ from service.tracking.dither_request import (
 from service.tracking.loop import CommandState, LoopCommand, extended_gains
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
-from service.tracking.registration import table_of
 from service.tracking.state import Level, Mode
 from service.tracking.turn import Turn
 from service.tracking.worth import outdated
@@ -343,7 +343,7 @@ def _compensated(turn: Turn, rtc: Status, in_effect: float, n_modes: int) -> tup
             "loop: found no measured optical gain; expected a dithered window before gains are "
             "compensated for it"
         )
-    gains = table_of(known.optical_gains, n_modes).loop_gains(in_effect)
+    gains = gain_table(known.optical_gains, n_modes).loop_gains(in_effect)
     return (*gains.tolist(), *(0.0,) * (rtc.n_modes - n_modes))
 
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.expected_gain import ExpectedGain
+from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration, at_boundary
 from service.telemetry.probation import ProbationFinding
-from service.tracking.registration import ModeGain
 from service.wire import Manifest, MatrixLayout, MeasuredManifest, Pattern, Status
 
 

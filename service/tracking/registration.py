@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.gains import GainTable, gain_table
+from service.control.gains import ModeGain
 from service.model.misregistration import Misregistration
 from service.wire import Pointing
 
@@ -55,26 +55,6 @@ class Standing:
     until_ns_utc: int | None = None
     """When it goes stale if nothing else is measured, by the service's clock; None: it is not
     valid, or never will go stale."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ModeGain:
-    """The optical gain of one mode, followed over the windows that dithered it."""
-
-    mode: int
-    """0-based basis index."""
-
-    gain: float
-    """Modulus of the sensor's response over the model's."""
-
-    sigma: float
-    """1 σ of it at ``t_ns_utc``."""
-
-    scatter: float
-    """1 σ of a single window, as the windows themselves scattered."""
-
-    t_ns_utc: int
-    """End of the last window that held this mode."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -338,13 +318,3 @@ class Watchdog:
 
     bias: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` what is known of its bias, numeric units; 0: nothing."""
-
-
-def table_of(measured: tuple[ModeGain, ...], n_modes: int) -> GainTable:
-    """Return the table of the first ``n_modes`` modes; nothing measured: what is expected."""
-    return gain_table(
-        np.array([gain.mode for gain in measured], dtype=np.intp),
-        np.array([gain.gain for gain in measured]),
-        np.array([gain.sigma for gain in measured]),
-        n_modes,
-    )

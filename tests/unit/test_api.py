@@ -16,6 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service import __version__
 from service.archive import Archive
+from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
 from service.errors import (
     ArchiveError,
@@ -51,7 +52,6 @@ from service.tracking.products import (
 from service.tracking.registration import (
     Candidate,
     HistoryEntry,
-    ModeGain,
     PassiveBias,
     Registration,
     Source,

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from service.control.gains import ModeGain
 from service.tracking.commands import SetLoop
-from service.tracking.registration import ModeGain
 from service.tracking.state import TrackerState
 from tests.unit.obedient import Obedient
 from tests.unit.runtime.handmade import REGISTRATION

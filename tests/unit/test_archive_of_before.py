@@ -9,8 +9,8 @@ import pytest
 
 from service.archive import Archive, AuditEntry
 from service.archive.records import TrackingFile
+from service.control.gains import ModeGain
 from service.tracking.products import MatrixState, MeasureState
-from service.tracking.registration import ModeGain
 from service.tracking.state import AcquisitionStage, Mode, Orders
 from service.wire import Pattern
 

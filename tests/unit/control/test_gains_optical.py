@@ -1,11 +1,24 @@
 import numpy as np
 import pytest
 
-from service.control.gains import FACTOR_BOUNDS, REFERENCE_GAINS, REFERENCE_MODES, gain_table
+from service.control.gains import (
+    FACTOR_BOUNDS,
+    REFERENCE_GAINS,
+    REFERENCE_MODES,
+    ModeGain,
+    gain_table,
+)
 from service.errors import ModelError
 
 HIGH = np.array([509, 527, 545, 563])
 NONE = np.array([])
+
+
+def table_of(modes, gains, sigma, n_modes):
+    each = zip(modes, gains, sigma, strict=True)
+    return gain_table(
+        [ModeGain(mode=m, gain=g, sigma=s, scatter=s, t_ns_utc=0) for m, g, s in each], n_modes
+    )
 
 
 def reference(modes):
@@ -13,13 +26,13 @@ def reference(modes):
 
 
 def test_with_nothing_measured_it_is_the_reference_and_says_how_little_it_knows():
-    table = gain_table(NONE, NONE, NONE, 594)
+    table = table_of(NONE, NONE, NONE, 594)
     np.testing.assert_allclose(table.optical_gain[list(REFERENCE_MODES)], REFERENCE_GAINS)
     assert table.relative_sigma[0] > 0.3
 
 
 def test_four_high_modes_leave_the_low_ones_uncertain():
-    table = gain_table(HIGH, reference(HIGH), np.full(4, 0.01), 594)
+    table = table_of(HIGH, reference(HIGH), np.full(4, 0.01), 594)
     np.testing.assert_allclose(table.optical_gain, reference(np.arange(594)), rtol=0.02)
     assert table.relative_sigma[500] < 0.03
     assert table.relative_sigma[20] > 3 * table.relative_sigma[500]
@@ -28,7 +41,7 @@ def test_four_high_modes_leave_the_low_ones_uncertain():
 
 def test_a_stronger_residual_lowers_low_modes_more():
     """The logarithm scales with the residual: half as much again, for all modes."""
-    table = gain_table(HIGH, reference(HIGH) ** 1.5, np.full(4, 0.01), 594)
+    table = table_of(HIGH, reference(HIGH) ** 1.5, np.full(4, 0.01), 594)
     truth = reference(np.arange(594)) ** 1.5
     departure = np.abs(np.log(table.optical_gain / truth)) / table.relative_sigma
     assert departure.max() < 2.0
@@ -38,39 +51,39 @@ def test_a_stronger_residual_lowers_low_modes_more():
 def test_a_measured_low_mode_decides_over_the_expectation():
     modes = np.append(HIGH, 20)
     gains = np.append(reference(HIGH), 0.4)
-    table = gain_table(modes, gains, np.full(5, 0.005), 594)
+    table = table_of(modes, gains, np.full(5, 0.005), 594)
     assert table.optical_gain[20] == pytest.approx(0.4, rel=0.03)
     assert table.relative_sigma[20] < 0.03
 
 
 def test_a_flat_wavefront_needs_no_compensation():
-    table = gain_table(HIGH, np.ones(4), np.full(4, 0.005), 594)
+    table = table_of(HIGH, np.ones(4), np.full(4, 0.005), 594)
     assert np.all(table.optical_gain > 0.85)
     assert table.factors.min() > 0.9
     assert table.factors.max() < 1.1
 
 
 def test_light_that_met_the_mirror_twice_is_twice_an_optical_gain():
-    once = gain_table(HIGH, reference(HIGH), np.full(4, 0.01), 594)
-    twice = gain_table(HIGH, 2 * reference(HIGH), np.full(4, 0.02), 594)
+    once = table_of(HIGH, reference(HIGH), np.full(4, 0.01), 594)
+    twice = table_of(HIGH, 2 * reference(HIGH), np.full(4, 0.02), 594)
     np.testing.assert_allclose(twice.optical_gain, 2 * once.optical_gain)
     np.testing.assert_allclose(twice.factors, once.factors)
 
 
 def test_factors_have_mean_one_and_stay_within_bounds():
-    table = gain_table(HIGH, reference(HIGH), np.full(4, 0.01), 594)
+    table = table_of(HIGH, reference(HIGH), np.full(4, 0.01), 594)
     assert table.factors.mean() == pytest.approx(1.0)
-    steep = gain_table(np.array([0, 300]), np.array([0.1, 1.0]), np.full(2, 1e-3), 594)
+    steep = table_of(np.array([0, 300]), np.array([0.1, 1.0]), np.full(2, 1e-3), 594)
     assert FACTOR_BOUNDS[0] <= steep.factors.min() <= steep.factors.max() == FACTOR_BOUNDS[1]
 
 
 def test_the_gains_act_alike_on_every_mode():
-    table = gain_table(HIGH, reference(HIGH), np.full(4, 0.01), 594)
+    table = table_of(HIGH, reference(HIGH), np.full(4, 0.01), 594)
     np.testing.assert_allclose(table.loop_gains(0.4) * table.optical_gain, 0.4)
 
 
 def test_the_gate_is_told_more_than_is_expected():
-    table = gain_table(HIGH, reference(HIGH), np.full(4, 0.01), 594)
+    table = table_of(HIGH, reference(HIGH), np.full(4, 0.01), 594)
     assert np.all(table.highest > 1.1 * table.optical_gain)
     assert table.highest[20] / table.optical_gain[20] > table.highest[520] / table.optical_gain[520]
 
@@ -78,11 +91,11 @@ def test_the_gate_is_told_more_than_is_expected():
 @pytest.mark.parametrize(
     ("gains", "sigma", "match"),
     [
-        ([0.5], [0.1, 0.1], "found 1 gains and 2 sigmas for 1 modes"),
         ([0.0], [0.1], "expected positive numbers"),
+        ([0.5], [-0.1], "expected positive numbers"),
         ([float("nan")], [0.1], "expected positive numbers"),
     ],
 )
 def test_what_is_no_gain_is_refused(gains, sigma, match):
     with pytest.raises(ModelError, match=match):
-        gain_table(np.array([3]), np.array(gains), np.array(sigma), 10)
+        table_of(np.array([3]), np.array(gains), np.array(sigma), 10)

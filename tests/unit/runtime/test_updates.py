@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from service.control.gains import ModeGain
 from service.control.gate import HELD_LIMIT_M, LIMIT_M
 from service.control.loop import ControlLoop
 from service.errors import CommandError
@@ -20,7 +21,6 @@ from service.runtime.actions import (
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState
-from service.tracking.registration import ModeGain
 from service.tracking.worth import fewer_than
 from service.wire import LoopRequest
 from service.worker import OpticsWorker

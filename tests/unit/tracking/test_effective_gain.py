@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.control.gains import ModeGain, gain_table
 from service.errors import CommandError
 from service.tracking import commands as cmd
-from service.tracking.registration import ModeGain, table_of
 from service.tracking.state import Mode
 from service.wire import LoopRequest
 from tests.unit.tracking.situations import N_MODES, START_NS, Story, of_kind
@@ -32,7 +32,7 @@ def test_they_act_alike_on_every_controlled_mode_and_the_gate_is_asked(story):
     assert effect.judged
     asked = effect.request
     assert len(asked.gains) == N_MODES
-    in_effect = np.array(asked.gains[:400]) * table_of(MEASURED, 400).optical_gain
+    in_effect = np.array(asked.gains[:400]) * gain_table(MEASURED, 400).optical_gain
     np.testing.assert_allclose(in_effect, 0.3, rtol=1e-12)
     assert set(asked.gains[400:]) == {0.0}
     assert "gain 0.3 in effect on every mode, by the gain table" in story.state.loop_command.text

@@ -14,6 +14,7 @@ import contextlib
 import multiprocessing
 import os
 import pickle
+import resource
 import signal
 import threading
 import time
@@ -105,7 +106,9 @@ class Apart:
         if self._line is None:
             context = multiprocessing.get_context("spawn")
             ours, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(theirs, self._nice), daemon=True)
+            process = context.Process(
+                target=_work, args=(theirs, self._nice, ITS_WORK), daemon=True
+            )
             with _deaf_to_the_keyboard():
                 process.start()
             self._process, self._line = process, ours
@@ -146,10 +149,10 @@ class Worker(Apart):
         return self.do(job)
 
 
-def _work(line: Connection, nice: int) -> None:
+def _work(line: Connection, nice: int, imports: str) -> None:
     """Be the process: do what comes and send what came of it, until the line is cut."""
     _be_polite(nice)
-    import_module(ITS_WORK)
+    import_module(imports)
     threadpool_limits(1)  # of BLAS, which has been imported now
     with contextlib.suppress(EOFError, OSError):
         while True:
@@ -163,6 +166,17 @@ def _answer(work: bytes) -> object:
         return error
     except Exception as error:  # noqa: BLE001 - sent home, where it is a failed job
         return WorkerError(f"failed unforeseen: {error!r}")
+
+
+def within(memory_mb: int, work: Callable[[], R]) -> R:
+    """Do the work in as much memory; in the process itself."""
+    most_bytes = memory_mb * 1_000_000
+    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
+    try:
+        return work()
+    except MemoryError as error:
+        text = f"needs more memory than {memory_mb} MB, the most it may have"
+        raise WorkerError(text) from error
 
 
 def _be_polite(nice: int) -> None:

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import heapq
 import itertools
-import resource
 import time
 from collections import defaultdict, deque
 from collections.abc import AsyncIterator, Callable
@@ -15,7 +14,7 @@ from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
-from service.processes import Apart, Worker
+from service.processes import Apart, Worker, within
 from service.snapshot import Pace
 from service.tracking import events as ev
 from service.tracking.alarms import WORKER_BEHIND, WORKER_LOST
@@ -219,7 +218,7 @@ async def run_in_process(
     """
     process = Apart(nice=nice)
     if memory_mb is not None:
-        work = partial(_within, memory_mb, work)
+        work = partial(within, memory_mb, work)
     try:
         async with asyncio.timeout(limit_s):
             return await asyncio.to_thread(process.do, work)
@@ -229,17 +228,6 @@ async def run_in_process(
         raise WorkerError("the process of the job died; out of memory?") from error
     finally:
         process.kill()
-
-
-def _within(memory_mb: int, work: Callable[[], R]) -> R:
-    """Do the work in as much memory; in the process itself."""
-    most_bytes = memory_mb * 1_000_000
-    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
-    try:
-        return work()
-    except MemoryError as error:
-        text = f"needs more memory than {memory_mb} MB, the most it may have"
-        raise WorkerError(text) from error
 
 
 # --- how the work keeps pace with the telemetry: what it costs, and what is said where it does not

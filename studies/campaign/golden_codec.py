@@ -22,6 +22,9 @@ Json = Any
 Value = Any
 """Of whatever type is asked for."""
 
+_PLAIN = frozenset({NoneType, bool, int, float, str})
+"""What JSON has as it is."""
+
 LEFT_OUT = frozenset({("Status", "flux")})
 """Fields that the tracker carries and does not read: class and field."""
 
@@ -34,19 +37,19 @@ def encoded(value: object) -> Json:
     TypeError
         If there is no way to write it.
     """
+    if type(value) in _PLAIN:
+        return value
     match value:
         case Enum():
             return value.value
         case np.generic():
             return encoded(value.item())
-        case None | bool() | int() | float() | str():
-            return value
         case bytes():
             return {"bytes": base64.b64encode(value).decode()}
         case np.ndarray():
             return _array_encoded(value)
         case tuple() | list():
-            return [encoded(item) for item in value]
+            return [item if type(item) in _PLAIN else encoded(item) for item in value]
         case _ if is_dataclass(value):
             return {"is": type(value).__name__} | {
                 field.name: encoded(getattr(value, field.name))
@@ -65,9 +68,9 @@ def decoded(hint: object, value: Json) -> Value:
     TypeError
         If the type does not have such values.
     """
-    origin = get_origin(hint)
-    if value is None:
+    if value is None or type(value) is hint:
         return value
+    origin = get_origin(hint)
     if origin in (Union, UnionType):
         return _of_union(hint, value)
     if isinstance(value, dict):
@@ -75,7 +78,10 @@ def decoded(hint: object, value: Json) -> Value:
     if origin is tuple:
         args = get_args(hint)
         hints = args[:1] * len(value) if args[1:] == (...,) else args
-        return tuple(decoded(each, item) for each, item in zip(hints, value, strict=True))
+        return tuple(
+            item if type(item) is each else decoded(each, item)
+            for each, item in zip(hints, value, strict=True)
+        )
     if isinstance(hint, type) and issubclass(hint, Enum):
         return hint(value)
     if hint is float:

@@ -1,8 +1,9 @@
 """The modulated pyramid as textbooks draw it: the slow reference the fast model is held against.
 
 Pupil field, zero padding, Fourier transform, four-face phase mask, and back to the detector, for
-every point of the modulation. It shares nothing with ``service.model`` but the conventions: arrays
-are ``[y, x]``, lengths in subapertures, frequencies in cycles per subaperture.
+every point of the modulation. The mask is the product of a roof in y and one in x, so all this is a
+matrix on either axis of the field. It shares nothing with ``service.model`` but the conventions:
+arrays are ``[y, x]``, lengths in subapertures, frequencies in cycles per subaperture.
 """
 
 from __future__ import annotations
@@ -54,12 +55,14 @@ class FftPyramid:
         """
         to_y, weights = self._detector_transform(shift[1])
         to_x, _ = self._detector_transform(shift[0])
-        mask = self._pyramid_mask()
+        n_padded = self.sampling * self.padded_subap
+        focus = scipy.fft.fft(np.eye(len(self.amplitude)), n=n_padded, axis=0)
+        roof = self.roof()[:, None]
+        seen_y, seen_x = to_y @ (roof * focus), to_x @ (roof * focus)
         field = self.amplitude * np.exp(2j * np.pi * opd_m / self.wavelength_m)
         intensity = np.zeros((len(to_y), len(to_x)))
         for tilt in self._modulation():
-            focus = scipy.fft.fft2(field * tilt, s=mask.shape)
-            intensity += np.abs(to_y @ (focus * mask) @ to_x.T) ** 2
+            intensity += np.abs(seen_y @ (field * tilt) @ seen_x.T) ** 2
         n, nd = self.n_subapertures, self.n_nodes
         nodes = intensity.reshape(2, n, nd, 2, n, nd) / self.n_modulation
         return np.asarray(np.einsum("iyaJxb,a,b->iyJx", nodes, weights, weights))
@@ -106,10 +109,10 @@ class FftPyramid:
         n = self.sampling * self.padded_subap
         return np.fft.fftfreq(n, d=1 / self.sampling).astype(np.float64)
 
-    def _pyramid_mask(self) -> NDArray[np.complex128]:
-        """Each face tilts the light of its quadrant, half the image separation in x and in y."""
-        path = np.abs(self._frequencies)
-        return np.exp(1j * np.pi * self.image_separation_subap * (path[:, None] + path))
+    def roof(self) -> NDArray[np.complex128]:
+        """Each side tilts its half of the light by half the image separation."""
+        tilted = np.exp(1j * np.pi * self.image_separation_subap * np.abs(self._frequencies))
+        return tilted.astype(np.complex128)
 
     def _modulation(self) -> list[NDArray[np.complex128]]:
         angle = 2 * np.pi * (np.arange(self.n_modulation) + 0.5) / self.n_modulation

@@ -81,6 +81,31 @@ def disagreement(
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
+def test_the_reference_is_the_pyramid_of_textbooks(basis):
+    """Plane by plane, in two dimensions: the light where no modulation is and one node looks."""
+    amplitude = optics(basis, 2, 2)[0].pupil.amplitude
+    unmodulated = FftPyramid(
+        amplitude=amplitude,
+        sampling=2,
+        wavelength_m=750e-9,
+        modulation_lambda_over_d=0.0,
+        n_modulation=1,
+        n_nodes=1,
+    )
+    opd_m = 30e-9 * np.random.default_rng(1).normal(size=amplitude.shape)
+    n, frequencies = 2 * 160, np.fft.fftfreq(2 * 160, 0.5)
+    padded = np.zeros((n, n), complex)
+    padded[: len(amplitude), : len(amplitude)] = amplitude * np.exp(2j * np.pi * opd_m / 750e-9)
+    faces = np.abs(frequencies[:, None]) + np.abs(frequencies)
+    on_detector = np.fft.ifft2(np.fft.fft2(padded) * np.exp(36j * np.pi * faces))
+    # a quarter of a subaperture aside the middles of its subapertures are points of the grid
+    middles = np.array([-18.0, 18.0])[:, None] + np.arange(30) - 14.5 - 0.25
+    at = np.rint(2 * (middles - unmodulated.coordinates[0])).astype(int).ravel()
+    expected = np.abs(on_detector[np.ix_(at, at)]) ** 2
+    found = unmodulated.images(opd_m, (0.25, 0.25)).reshape(60, 60)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
 def test_interaction_matrix_agrees_with_the_fft_pyramid(basis):
     """At the registration that leaves nothing as it was, by ten of the modes."""
     alpha = REGISTRATIONS["everything at once"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -65,20 +66,22 @@ def local_pixels(images, valid):
     return np.concatenate([images[y, :, x][valid] / own for y in (0, 1) for x in (0, 1)])
 
 
-def push_pull(model, alpha, signals):
-    """The matrix an FFT pyramid measures by poking the modes by a nanometre."""
+@cache
+def poked(alpha):
+    """What an FFT pyramid sees of the modes, poked by a nanometre to either side."""
+    model = model_of()
     sensor = fft_pyramid(model)
     shift = (alpha.shift_x_subap, alpha.shift_y_subap)
     opds = np.zeros((len(MODES), *model.pupil.amplitude.shape))
     opds[:, model.pupil.lit] = model.basis.render(model._mirror_points(alpha))[:, MODES].T
-    poke = STROKE_M
+    return [[sensor.images(sign * STROKE_M * opd, shift) for sign in (1, -1)] for opd in opds]
+
+
+def push_pull(model, alpha, signals):
+    """The matrix that comes of it."""
     columns = [
-        (
-            signals(sensor.images(poke * opd, shift), model.valid)
-            - signals(sensor.images(-poke * opd, shift), model.valid)
-        )
-        / (2 * poke)
-        for opd in opds
+        (signals(push, model.valid) - signals(pull, model.valid)) / (2 * STROKE_M)
+        for push, pull in poked(alpha)
     ]
     return np.stack(columns, axis=1)
 

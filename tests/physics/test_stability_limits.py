@@ -38,7 +38,11 @@ LIMITS = [
 
 
 @pytest.mark.parametrize(
-    ("n_modes", "limit", "place"), [(n, v, f) for n, _, v, f in LIMITS], ids=[x[1] for x in LIMITS]
+    ("n_modes", "limit", "place"),
+    [
+        pytest.param(n, v, f, id=name, marks=() if name == "shift" else pytest.mark.long)
+        for n, name, v, f in LIMITS
+    ],
 )
 def test_400_modes_hold_below_and_fail_above_the_limits_seen(n_modes, limit, place):
     """20 % either way: the limits were read off runs a step of 0.05 apart."""

@@ -394,11 +394,11 @@ ALWAYS = (
 """What holds after every event, whatever the mode."""
 
 LAWS = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
 
 
-@settings(LAWS, max_examples=150)
+@settings(LAWS, max_examples=100)
 @given(stories, st.sampled_from([Mode.AUTO, Mode.AUTO, Mode.PROPOSE, Mode.HOLD]))
 def test_nothing_but_a_command_is_ever_refused_and_every_law_holds(story, mode):
     night = Night(mode)

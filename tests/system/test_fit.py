@@ -70,17 +70,6 @@ def test_a_matrix_on_disk_becomes_a_reconstructor(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"fit.h5", "cm.h5"}
 
 
-def test_bad_input_is_one_sentence_and_status_2(tmp_path):
-    with h5py.File(MATRIX, "r") as measured, h5py.File(tmp_path / "t.h5", "w") as file:
-        file["interaction_matrix"] = measured["interaction_matrix"][()].T
-    refused = pyrcal("fit", TOML, "t.h5", "--json", folder=tmp_path)
-    assert refused.returncode == 2
-    assert refused.stdout == ""
-    assert refused.stderr.splitlines()[-1].startswith("pyrcal: ")
-    assert "transposed" in refused.stderr
-    assert "Traceback" not in refused.stderr
-
-
 @pytest.fixture
 def night(tmp_path):
     with a_night(tmp_path) as night:

@@ -22,6 +22,7 @@ FIRST_LOAD_BYTES = 300_000
 
 pytestmark = [
     pytest.mark.system,
+    pytest.mark.long,
     pytest.mark.timeout(150),
     pytest.mark.skipif(
         CHROMIUM is None or DRIVER is None, reason="no chromium and chromedriver: apt install them"

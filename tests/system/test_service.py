@@ -10,6 +10,7 @@ import time
 import pytest
 import zenoh
 
+from service.archive import Archive
 from service.wire import Keys
 from tests.system.fake_rtc import client_session
 from tests.system.night import (
@@ -222,32 +223,6 @@ class TestRefusedAtTheStart:
         assert "Traceback" not in process.log
         return lines[0]
 
-    def test_an_unknown_key_in_the_settings(self, night):
-        night.settings.write_text("[dither]\nampltude_m = 1e-9\n", encoding="utf-8")
-        line = self.refused(night, "--config", str(night.settings))
-        assert "ampltude_m" in line
-        assert str(night.settings) in line
-
-    def test_an_unknown_key_in_the_instrument(self, night):
-        path = night.directory / "typo.toml"
-        text = INSTRUMENT.read_text(encoding="utf-8")
-        text = text.replace("[wfs]", "[wfs]\nmodulation = 3.0")
-        path.write_text(text, encoding="utf-8")
-        line = self.refused(night, "--instrument", str(path), "--data-dir", str(night.directory))
-        assert "wfs.modulation" in line
-        assert str(path) in line
-
-    def test_a_file_that_is_not_there(self, night):
-        assert "nowhere.toml" in self.refused(night, "--config", "nowhere.toml")
-
-    def test_a_busy_rest_port(self, night):
-        with socket.create_server(("127.0.0.1", night.port)):
-            line = self.refused(
-                night, "--port", str(night.port), "--data-dir", str(night.directory / "data")
-            )
-        assert str(night.port) in line
-        assert "api.port" in line
-
     def test_a_busy_zenoh_port(self, night):
         port = int(night.zenoh.rpartition(":")[2])
         words = ["--port", "0", "--listen", night.zenoh, "--instrument", str(INSTRUMENT)]
@@ -256,9 +231,10 @@ class TestRefusedAtTheStart:
         assert str(port) in line
 
     def test_a_data_directory_another_service_uses(self, night):
-        night.service("hold")
-        data = str(night.directory / "data")
-        line = self.refused(night, "--port", "0", "--data-dir", data)
+        data = night.directory / "data"
+        with Archive(data) as archive:
+            archive.open()
+            line = self.refused(night, "--port", "0", "--data-dir", str(data))
         assert "in use by another service" in line
 
 

@@ -1,7 +1,9 @@
+import json
 import os
 import socket
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -154,17 +156,9 @@ def test_a_host_that_is_not_ours_is_refused_in_one_line(capsys):
     assert "192.0.2.1" in refused(capsys, "run", "--host", "192.0.2.1", "--port", "0")
 
 
-@pytest.mark.parametrize(
-    ("words", "begins"),
-    [
-        (["sim", "--alpha", "nonsense"], "sim_rtc: "),
-        (["campaign", "--plant", "nonsense"], "usage: pyrcal campaign"),
-        (["demo", "--seconds", "nan"], "pyrcal demo: "),
-    ],
-)
-def test_simulator_campaigns_and_demo_are_reached_through_the_same_program(words, begins):
+def test_the_simulator_is_reached_through_the_same_program():
     found = subprocess.run(
-        [sys.executable, "-m", "service", *words],
+        [sys.executable, "-m", "service", "sim", "--alpha", "nonsense"],
         capture_output=True,
         text=True,
         timeout=60,
@@ -172,7 +166,18 @@ def test_simulator_campaigns_and_demo_are_reached_through_the_same_program(words
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert found.returncode == 2
-    assert found.stderr.startswith(begins)
+    assert found.stderr.startswith("sim_rtc: ")
+
+
+@pytest.mark.parametrize("words", [["campaign", "--plant", "linear"], ["demo", "--seconds", "9"]])
+def test_each_has_a_module_of_its_own(monkeypatch, words):
+    asked = []
+    monkeypatch.setattr(os, "execv", lambda *given: asked.extend(given))
+    with pytest.raises(SystemExit):  # the rest is for one that comes back
+        main(words)
+    program, (_, dash_m, module, *rest) = asked
+    assert (program, dash_m, rest) == (sys.executable, "-m", words[1:])
+    assert find_spec(f"{module}.__main__") or find_spec(module)
 
 
 def processor_s(*words, enough_s):
@@ -194,28 +199,58 @@ def processor_s(*words, enough_s):
     return min(spent), process.returncode
 
 
+AT_ONCE = [
+    (["--version"], 0),
+    (["--help"], 0),
+    (["run", "--help"], 0),
+    (["fit", "--help"], 0),
+    (["fly"], 2),
+    (["run", "--prot", "1"], 2),
+    (["reconstruct", "flao-lbt", "0,0,0,1"], 2),
+    (["status", "--url", "http://127.0.0.1:1"], 3),
+    (["approve", "--help"], 0),
+    (["watch", "--url", "http://127.0.0.1:1"], 3),
+    (["run", "--config", "none.toml"], 2),
+    (["run", "--port", "99999"], 2),
+    (["run", "--instrument", "nobodys"], 2),
+    (["fit", "nobodys", "none.h5"], 2),
+    (["fit", "flao-lbt", "none.h5"], 2),
+    (["fit", "flao-lbt", __file__], 2),
+    (["fit", "a", "b", "--modes", "1,1"], 2),
+    (["reconstruct", "flao-lbt", "none.json", "--modes", "1", "--output", "cm.h5"], 2),
+]
+"""What needs no mathematics, and its status."""
+
+IN_TURN = """
+import json, sys
+from service.__main__ import main
+def status(words):
+    try:
+        return main(words)
+    except SystemExit as ended:
+        return ended.code
+found = [status(words) for words in json.loads(sys.argv[1])]
+late = {"numpy", "scipy", "h5py", "zenoh", "fastapi", "uvicorn", "httpx"} & set(sys.modules)
+print(json.dumps([found, sorted(late)]), file=sys.stderr)
+"""
+
+
+def test_what_needs_no_mathematics_imports_none(tmp_path):
+    found = subprocess.run(
+        [sys.executable, "-c", IN_TURN, json.dumps([words for words, _ in AT_ONCE])],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    statuses, late = json.loads(found.stderr.splitlines()[-1])
+    assert statuses == [status for _, status in AT_ONCE]
+    assert late == []
+
+
 @pytest.mark.parametrize(
     ("words", "status"),
-    [
-        (["--version"], 0),
-        (["--help"], 0),
-        (["run", "--help"], 0),
-        (["fit", "--help"], 0),
-        (["fly"], 2),
-        (["run", "--prot", "1"], 2),
-        (["reconstruct", "flao-lbt", "0,0,0,1"], 2),
-        (["status", "--url", "http://127.0.0.1:1"], 3),
-        (["approve", "--help"], 0),
-        (["watch", "--url", "http://127.0.0.1:1"], 3),
-        (["run", "--config", "none.toml"], 2),
-        (["run", "--port", "99999"], 2),
-        (["run", "--instrument", "nobodys"], 2),
-        (["fit", "nobodys", "none.h5"], 2),
-        (["fit", "flao-lbt", "none.h5"], 2),
-        (["fit", "flao-lbt", __file__], 2),
-        (["fit", "a", "b", "--modes", "1,1"], 2),
-        (["reconstruct", "flao-lbt", "none.json", "--modes", "1", "--output", "cm.h5"], 2),
-    ],
+    [one for one in AT_ONCE if one[0][0] in {"--help", "status"} or "none.h5" in one[0]],
 )
 def test_what_needs_no_mathematics_comes_at_once(words, status):
     """0.3 s on the machine of docs/operating.md; a slower one may take twice as long."""

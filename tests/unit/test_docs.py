@@ -31,6 +31,7 @@ SHELL_ALONE = {"cd", "docker", "export", "git", "grep", "zip"}
 """Programs of others: that the shell understands them is all that is looked at."""
 
 
+PARSER = command_line()
 REST = json.loads((ROOT / "docs" / "openapi.json").read_text(encoding="utf-8"))["paths"]
 
 
@@ -67,7 +68,7 @@ def check_pyrcal(words):
             case "sim":
                 parse_options([word.replace("bench.toml", "flao-lbt") for word in rest])
             case _:
-                command_line().parse_args(with_negative_numbers(words))
+                PARSER.parse_args(with_negative_numbers(words))
     except SystemExit as ended:
         if ended.code:  # --help ends with 0
             raise AssertionError(words) from ended

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from service.__main__ import main
+from service.commands import fit
+from service.files.run import fit_file
 from tests.data.tiny.make import ALPHA
 from tests.unit.files.test_report import KEYS
 
@@ -18,9 +20,22 @@ def empty_folder(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
+FITTED = {}
+
+
+def fitted_once(instrument, path, options, *, dataset, **_):
+    """The same fit of the same file, made once for all tests."""
+    content = Path(path).read_bytes() if Path(path).is_file() else None
+    key = (path, content, repr(options), dataset)
+    if key not in FITTED:
+        FITTED[key] = fit_file(instrument, path, options, dataset=dataset)
+    return FITTED[key]
+
+
 @pytest.fixture
-def run(capsys):
+def run(capsys, monkeypatch):
     """Run ``pyrcal fit`` with few modes; return the status and both streams."""
+    monkeypatch.setattr(fit, "fit_file", fitted_once)
 
     def go(*words, modes="0:20"):
         status = main(["fit", TINY, *map(str, words), "--modes", modes])

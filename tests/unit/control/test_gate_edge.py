@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -24,16 +26,25 @@ def reconstructor(seed: int = 2) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(N, 20)).astype(np.float32) * 1e-7
 
 
-def simulated(matrix, coupling, gain, ring, leak, delay) -> float:
-    """The same loop played on white noise: 250 of them, for 1000 frames after they have settled."""
-    settled = 200
-    rng = np.random.default_rng(3)
-    noise = rng.normal(size=(settled + 1000, 250, matrix.shape[1])) @ matrix.T
-    command = np.zeros((len(noise) + delay, *noise.shape[1:]))
-    for k, added in enumerate(noise):
+SETTLED = 200
+"""Frames before anything is measured."""
+
+
+@cache
+def noise() -> np.ndarray:
+    """White noise of the slopes as the reconstructor hands it on: 1000 frames of 250 loops."""
+    matrix = reconstructor()
+    slopes = np.random.default_rng(3).normal(size=(SETTLED + 1000, 250, matrix.shape[1]))
+    return slopes @ matrix.T
+
+
+def simulated(coupling, gain, ring, leak, delay) -> float:
+    """The same loop played on it."""
+    command = np.zeros((len(noise()) + delay, *noise().shape[1:]))
+    for k, added in enumerate(noise()):
         reply = added + command[k] @ coupling.T
         command[k + delay] = leak * command[k + delay - 1] - gain * reply
-    return float((command[settled:] @ ring.T).std(axis=(0, 1)).max())
+    return float((command[SETTLED:] @ ring.T).std(axis=(0, 1)).max())
 
 
 @pytest.mark.parametrize(("leak", "delay"), [(0.999, 2), (0.95, 1), (1.0, 3)])
@@ -49,7 +60,7 @@ def test_the_motion_is_that_of_a_loop_played_in_time(leak, delay):
         leak=leak,
         delay_frames=float(delay),
     )
-    played = simulated(matrix, coupling, gain, ring, leak, delay)
+    played = simulated(coupling, gain, ring, leak, delay)
     assert found == pytest.approx(played, rel=0.015)
 
 

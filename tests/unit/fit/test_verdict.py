@@ -138,7 +138,7 @@ def test_scattered_gains_are_refused_unless_the_stroke_is_unknown():
 
 
 def test_noise_alone_is_refused():
-    found = fit(RNG.normal(size=matrix().shape) * 1e6)
+    found = fit(RNG.normal(size=matrix()[:, :12].shape) * 1e6)
     assert not found.accepted
 
 

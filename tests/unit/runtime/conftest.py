@@ -9,6 +9,12 @@ from tests.unit.runtime.handmade import Clock, HandmadeBridge
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 
+@pytest.fixture
+def light_processes(monkeypatch):
+    """Processes that import no optics before their work, which is of these tests."""
+    monkeypatch.setattr("service.processes.ITS_WORK", "tests.unit.runtime.jobs")
+
+
 @pytest.fixture(scope="session")
 def workers():
     workers = WorkerPool(lambda: start_worker(small_instrument(), COMPUTE))

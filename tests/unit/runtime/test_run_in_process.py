@@ -13,12 +13,11 @@ from tests.unit.runtime.jobs import (
     hungry,
     killed,
     modest,
-    niceness,
-    process_id,
     refusing,
+    who,
 )
 
-pytestmark = pytest.mark.timeout(60)
+pytestmark = [pytest.mark.timeout(60), pytest.mark.usefixtures("light_processes")]
 
 
 async def gone(folder):
@@ -28,13 +27,10 @@ async def gone(folder):
         os.kill(pid, 0)
 
 
-async def test_every_job_has_a_process_of_its_own():
-    first, second = [await run_in_process(process_id, nice=0, limit_s=30.0) for _ in range(2)]
-    assert len({first, second, os.getpid()}) == 3
-
-
-async def test_the_process_is_nice():
-    assert await run_in_process(niceness, nice=4, limit_s=30.0) == os.nice(0) + 4
+async def test_every_job_has_a_process_of_its_own_and_it_is_nice():
+    first, second = [await run_in_process(who, nice=4, limit_s=30.0) for _ in range(2)]
+    assert len({first[0], second[0], os.getpid()}) == 3
+    assert first[1] == second[1] == os.nice(0) + 4
 
 
 async def test_what_a_job_refuses_is_said_as_it_said_it():

@@ -16,17 +16,16 @@ from service.errors import (
     TooSlowError,
     UnknownIdError,
 )
-from service.files.uploads import FitAsked, FitState
-from service.fit.matrix import FitOptions
+from service.files.uploads import FitState
 from service.runtime import uploads
 from service.runtime.uploads import FitLimits, FitQueue
 from tests.system.pace import in_time
-from tests.unit.runtime.jobs import refusing, sleeping, telling
+from tests.unit.runtime.jobs import Asked, at_a_stage, drawing, refusing, sleeping, telling
 
-pytestmark = pytest.mark.timeout(60)
+pytestmark = [pytest.mark.timeout(60), pytest.mark.usefixtures("light_processes")]
 
 LIMITS = FitLimits(most_bytes=10_000_000, waiting=2, seconds=30.0, nice=0, memory_mb=4000)
-ASKED = FitAsked(options=FitOptions())
+ASKED = Asked()
 HDF5 = b"\x89HDF\r\n\x1a\n" + b"\x00" * 5_000_000
 
 
@@ -75,8 +74,10 @@ def files(tmp_path):
     return [path for path in (tmp_path / "uploads").rglob("*") if path.is_file()]
 
 
-async def test_an_upload_is_kept_fitted_and_removed(opened, tmp_path):
-    desk = opened()
+async def test_an_upload_is_kept_fitted_and_removed_but_what_figures_are_drawn_from(
+    opened, tmp_path
+):
+    desk = opened(drawing)
     job = await taken(desk, asked=replace(ASKED, dataset="D"))
     assert job.state is FitState.WAITING
     assert job.n_bytes == len(HDF5)
@@ -84,6 +85,7 @@ async def test_an_upload_is_kept_fitted_and_removed(opened, tmp_path):
     done = await finished(desk, job)
     assert done.state is FitState.DONE
     assert done.document == {"verdict": f"accepted: {len(HDF5)} bytes of D"}
+    assert done.figures == b"{}"
     assert not list((tmp_path / "uploads").iterdir())
 
 
@@ -104,11 +106,6 @@ async def test_fits_run_one_after_the_other(opened):
     assert [job.id for job in desk.jobs()] == [first.id, second.id]
 
 
-def at_a_stage(folder, asked):
-    (folder / "stage").write_text("orientation")
-    time.sleep(60.0)
-
-
 async def test_what_a_fit_is_at_is_told_and_it_ends_when_it_is_given_up(opened, tmp_path):
     desk = opened(at_a_stage)
     first, second = await taken(desk), await desk.take(ASKED, in_chunks(HDF5), None, "im.h5")
@@ -121,16 +118,6 @@ async def test_what_a_fit_is_at_is_told_and_it_ends_when_it_is_given_up(opened, 
     assert not list((tmp_path / "uploads").iterdir())
     with pytest.raises(CommandError, match="is given-up: there is nothing to give up"):
         await desk.give_up(first.id)
-
-
-def drawing(folder, asked):
-    (folder / "figures.json").write_text("{}")
-    return telling(folder, asked)
-
-
-async def test_what_its_figures_are_drawn_from_is_kept(opened):
-    desk = opened(drawing)
-    assert (await finished(desk, await taken(desk))).figures == b"{}"
 
 
 async def test_too_many_unfinished_fits_are_refused_before_anything_is_read(opened):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import pytest
@@ -111,14 +111,19 @@ class Mistold:
 
     def __init__(self, order="xy", **axes):
         self.setting = SlopeOrder(order), Orientation(**axes)
-        small = small_instrument()
-        told = replace(small, slopes=SlopeRecipe(orientation=Orientation()))
-        self.told = OpticsWorker(told, COMPUTE)
-        self.auto = OpticsWorker(small, COMPUTE)
-        mask = rtc_valid_subapertures(small)
+        mask = rtc_valid_subapertures(small_instrument())
         self.seen = to_rtc(matrix_at(ALPHA_SMALL), *self.setting, mask)
         at_rest = to_rtc(matrix_at(Misregistration()), *self.setting, mask)
         self.own = np.linalg.pinv(at_rest[:, :N_CONTROLLED]).astype(np.float32)
+
+    @cached_property
+    def told(self):
+        slopes = SlopeRecipe(orientation=Orientation())
+        return OpticsWorker(replace(small_instrument(), slopes=slopes), COMPUTE)
+
+    @cached_property
+    def auto(self):
+        return OpticsWorker(small_instrument(), COMPUTE)
 
 
 @pytest.mark.parametrize(

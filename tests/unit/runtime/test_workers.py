@@ -124,14 +124,6 @@ async def test_a_worker_that_began_early_is_the_first_one_and_as_polite():
         workers.close()
 
 
-async def test_the_worker_is_polite():
-    workers = WorkerPool(lambda: start_worker(small_instrument(), type(COMPUTE)(threads=1, nice=5)))
-    try:
-        assert await workers.call(niceness) == os.nice(0) + 5
-    finally:
-        workers.close()
-
-
 @pytest.mark.parametrize("number", [signal.SIGCONT, signal.SIGSTOP])
 async def test_dismissing_ends_the_worker_whatever_it_is_at(workers, hired, number):
     await workers.call(process_id)

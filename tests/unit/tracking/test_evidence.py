@@ -136,7 +136,7 @@ class TestWindowFarOut:
         assert night.state.windows_outlying == 1
 
 
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     st.lists(
         st.tuples(st.integers(7, 40), st.integers(0, 12), st.sampled_from(["window", "look"])),

@@ -176,15 +176,32 @@ class Sky:
     seed: int = 1
 
 
+@cache
+def small_matrix(alpha: Misregistration) -> Array:
+    """D of the small instrument there, ``(n_slopes, 40)``."""
+    return _kept(small_model().interaction_matrix(alpha))
+
+
+@cache
+def small_reconstructor(alpha: Misregistration) -> Array:
+    """What was computed for ``alpha``."""
+    return _kept(invert(small_matrix(alpha), N_CONTROLLED).matrix)
+
+
+def _kept(matrix: Array) -> Array:
+    """The same, for all who ask."""
+    matrix.flags.writeable = False
+    return matrix
+
+
 def small_loop(
     *, gain: float = 0.3, leak: float = 0.999, alpha: Misregistration | None = None
 ) -> ClosedLoop:
     """A loop whose reconstructor was computed for ``alpha``, by default perfect registration."""
-    matrix = small_model().interaction_matrix(alpha or Misregistration())
     gains = np.zeros(N_MODES)
     gains[:N_CONTROLLED] = gain
     return ClosedLoop(
-        reconstructor=invert(matrix, N_CONTROLLED).matrix,
+        reconstructor=small_reconstructor(alpha or Misregistration()),
         gains=gains,
         leak=leak,
         delay_frames=2.0,
@@ -201,7 +218,7 @@ def closed_loop(loop: ClosedLoop, sky: Sky, dither: Array) -> FrameBlock:
     rng = np.random.default_rng(sky.seed)
     n_frames = len(dither) + settling
     added = np.vstack([np.zeros((settling, N_MODES)), dither])
-    sensor = sky.optical_gain * small_model().interaction_matrix(sky.alpha).astype(float)
+    sensor = sky.optical_gain * small_matrix(sky.alpha).astype(float)
     fresh = np.sqrt(1 - sky.memory**2) * rng.normal(size=(n_frames, N_MODES))
     wave = scipy.signal.lfilter([1.0], [1.0, -sky.memory], fresh, axis=0)
     wave *= sky.turbulence * np.sqrt(small_basis().variance_m2)

@@ -2,6 +2,7 @@
 
 import asyncio
 import re
+from functools import cache
 from http import HTTPStatus
 
 import httpx
@@ -60,14 +61,16 @@ def bearer(secret, **more):
     return {"Authorization": f"Bearer {secret}", **more}
 
 
+@cache
 def operations():
     """Every operation of the OpenAPI: method, path, the scopes it says."""
+    return list(_operations())
+
+
+def _operations():
     for path, methods in create_app(object(), object()).openapi()["paths"].items():
         for method, operation in methods.items():
             yield method.upper(), path, operation["security"]
-
-
-OPERATIONS = list(operations())
 
 
 def as_asked(path):
@@ -75,9 +78,9 @@ def as_asked(path):
 
 
 def test_every_route_says_which_scope_it_needs_and_what_needs_none_is_listed_here():
-    assert len(OPERATIONS) > 40
+    assert len(operations()) > 40
     scopes = {}
-    for method, path, security in OPERATIONS:
+    for method, path, security in operations():
         assert [set(one) for one in security] in ([], [{"bearer"}, {"cookie"}]), path
         said = {scope for one in security for (scope,) in one.values()}
         assert len(said) <= 1
@@ -119,13 +122,13 @@ async def test_without_key_with_a_wrong_one_or_from_a_foreign_page_0_succeed_and
     ]
     asked = [
         (method, path, headers, status, kind)
-        for method, path, _ in OPERATIONS
+        for method, path, _ in operations()
         for headers, status, kind in ways
         if (method, path) not in OPEN
     ]
     asked += [
         (method, path, bearer(secrets[scope]), 403, "scope")
-        for method, path, security in OPERATIONS
+        for method, path, security in operations()
         for scope in KeyScope
         if security and not scope.covers(KeyScope(security[0]["bearer"][0]))
     ]

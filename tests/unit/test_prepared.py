@@ -134,11 +134,11 @@ WRITER = """
 import sys
 from pathlib import Path
 import numpy as np
+from service.config import load_instrument
 from service.prepared import Prepared
-from tests.numerics import small_instrument
-kept = Prepared(Path(sys.argv[1]))
+instrument, kept = load_instrument(sys.argv[2]), Prepared(Path(sys.argv[1]))
 for k in range(60):
-    found = kept.arrays(small_instrument(), ("numbers",), lambda: {"numbers": np.full(50_000, 7.0)})
+    found = kept.arrays(instrument, ("numbers",), lambda: {"numbers": np.full(50_000, 7.0)})
     assert (found["numbers"] == 7.0).all() and len(found["numbers"]) == 50_000
     if k % 3 == 0:
         for path in Path(sys.argv[1]).glob("small-*"):
@@ -149,7 +149,8 @@ for k in range(60):
 def test_processes_that_write_read_and_delete_at_once_do_not_disturb_each_other(tmp_path):
     root = Path(__file__).parents[2]
     environment = os.environ | {"PYTHONPATH": str(root)}
-    command = [sys.executable, "-c", WRITER, str(tmp_path)]
+    small = root / "tests" / "system" / "small.toml"
+    command = [sys.executable, "-c", WRITER, str(tmp_path), str(small)]
     running = [
         subprocess.Popen(command, cwd=root, env=environment, stderr=subprocess.PIPE)
         for _ in range(2)

@@ -19,9 +19,10 @@ from service.files.uploads import (
     UploadFitter,
     opened_parcel,
 )
+from service.fit import matrix
 from service.fit.matrix import FitOptions
 from tests.data.tiny.make import ALPHA, HERE
-from tests.numerics import small_instrument
+from tests.numerics import flao_basis, small_instrument
 
 TOML = '[wfs]\nvalid_subapertures = "mask.h5:/mask"\n[mirror]\nmodes = "modes.fits"\n'
 
@@ -201,7 +202,8 @@ def test_an_instrument_may_come_with_the_matrix(tmp_path):
     assert not json.loads((folder / FIGURES).read_text())["own_instrument"]
 
 
-def test_a_packaged_instrument_may_be_named(tmp_path):
+def test_a_packaged_instrument_may_be_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(matrix, "modal_basis", lambda _instrument: flao_basis())
     asked = FitAsked(options=FitOptions(), instrument="flao-lbt")
     with pytest.raises(MatrixError, match=r"found shape \(224, 40\); expected \(1408 slopes"):
         fitter(small_instrument())(uploaded(tmp_path, HERE / "tiny.h5"), asked)

@@ -24,7 +24,7 @@ def found_in(counts, instrument=None) -> PupilPosition:
     return found
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (-0.92, 0.35), (1.4, -1.3), (2.3, 0.1)])
+@pytest.mark.parametrize("shift", [(-0.92, 0.35), (2.3, -1.3)])
 def test_an_even_pupil_is_found_to_a_fiftieth_of_a_subaperture(shift):
     found = found_in(counts_of(flao(), shift))
     assert (found.x_subap, found.y_subap) == pytest.approx(shift, abs=0.02)

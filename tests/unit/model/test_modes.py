@@ -121,6 +121,7 @@ def test_rounding_in_the_covariance_does_not_change_the_basis(monkeypatch, layou
     np.testing.assert_allclose(again, strokes, atol=STEEPEST * np.abs(strokes).max())
 
 
+@pytest.mark.long
 def test_rounding_does_not_change_the_basis_of_the_full_instrument(monkeypatch):
     strokes = flao_basis().mode_to_actuator
     again = perturbed(monkeypatch, load_instrument("flao-lbt")).mode_to_actuator

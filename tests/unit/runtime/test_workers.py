@@ -69,14 +69,6 @@ async def test_jobs_share_one_worker_and_its_workbench(shared):
     assert (await shared.call(OpticsWorker.describe)).n_modes == 90
 
 
-async def test_a_killed_worker_costs_one_job_and_the_next_one_works(workers, hired):
-    before = await workers.call(process_id)
-    with pytest.raises(WorkerError, match="died during killed"):
-        await workers.call(killed)
-    assert await workers.call(process_id) != before
-    assert (workers.n_lost, len(hired)) == (1, 2)
-
-
 async def test_jobs_that_waited_for_a_killed_worker_are_done_by_the_next(workers, hired):
     lost, first, second = await asyncio.gather(
         workers.call(killed),

@@ -131,7 +131,7 @@ def test_the_scatter_of_windows_is_the_one_stated():
     assert 1.1 < np.mean(squares) < 6.9
 
 
-@pytest.mark.parametrize("turbulence", [0.03, 0.1])
+@pytest.mark.parametrize("turbulence", [pytest.param(0.03, marks=pytest.mark.long), 0.1])
 def test_the_scatter_is_the_one_stated_where_fast_turbulence_is_left_in_the_slopes(turbulence):
     """Turbulence looks like modes, so its slopes are correlated: they are no white noise.
 

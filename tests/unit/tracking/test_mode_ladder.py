@@ -152,8 +152,8 @@ def test_a_number_lowered_again_soon_waits_longer_and_never_for_ever():
     for _ in range(8):
         limit = night.state.mode_limit
         waits.append(limit.wait_s)
-        n_windows = round(limit.wait_s / 10) + 2
-        (more,) = of_kind(night.see(n_windows=n_windows, every_s=10), ev.MakeMatrix)
+        n_windows = round(limit.wait_s / 30) + 2
+        (more,) = of_kind(night.see(n_windows=n_windows, every_s=30), ev.MakeMatrix)
         night.make_for(more, 500, state=MatrixState.REFUSED)
     assert waits[:4] == [60.0, 120.0, 240.0, 480.0]
     assert max(waits) == LONGEST_WAIT_S

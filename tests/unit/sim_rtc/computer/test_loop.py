@@ -39,7 +39,7 @@ def run(loop, wavefront_m, chosen, dither_m=None, n_block=10):
 @pytest.mark.parametrize("leak", [1.0, 0.98])
 @pytest.mark.parametrize("period", [400, 40, 12])
 def test_rejection_is_that_of_a_delayed_leaky_integrator(delay, leak, period):
-    gain, n_frames = 0.25, 12_000
+    gain, n_frames = 0.25, 10 * period + 1000  # in which all has settled
     loop = ModalLoop(n_modes=N_MODES, delay_frames=delay, stroke_m=STROKE_M)
     phasor = np.exp(2j * np.pi * np.arange(n_frames) / period)
     wavefront = np.zeros((n_frames, N_MODES))

@@ -51,11 +51,12 @@ class Comb:
         length = _smooth(self.frame_rate_hz, self.n_frames).shape[1]
         end = place + len(columns)
         cuts = [place, *range(place // length * length + length, end, length), end]
-        stretches = [_stretch(self, *cut) for cut in pairwise(cuts)]
+        stretches = [_stretch(self, first // length) for first in cuts[:-1]]
         bins = np.hstack([stretch.bins for stretch in stretches])
         found = np.empty((len(stretches), len(stretches[0].lines), columns.shape[1]), np.float32)
         for stretch, (first, stop), part in zip(stretches, pairwise(cuts), found, strict=True):
-            np.matmul(stretch.lines, columns[first - place : stop - place], out=part)
+            here = slice(first % length, first % length + stop - first)
+            np.matmul(stretch.lines[:, here], columns[first - place : stop - place], out=part)
         sums += (bins @ found.reshape(bins.shape[1], -1)).reshape(sums.shape)
 
     def at_bins(self, sums: Array) -> Array:
@@ -76,28 +77,27 @@ class Comb:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Stretch:
-    """The two steps that lead from some frames in a row to the bins."""
+    """The two steps that lead from the frames of a stretch to the bins."""
 
     lines: Array
-    """``(n_smooth * 2 * n_lines, n)`` each smooth shape times the two parts of each line."""
+    """``(n_smooth * 2 * n_lines, length)`` each smooth shape times the two parts of each line."""
 
     bins: Array
     """``(n_shapes, n_smooth)`` the combinations: of 1, the cosines, then the sines."""
 
 
-@lru_cache(maxsize=16)
-def _stretch(comb: Comb, first: int, end: int) -> _Stretch:
-    """Return what leads from the frames of a stretch, or a part of one, to the bins."""
+@lru_cache(maxsize=48)
+def _stretch(comb: Comb, index: int) -> _Stretch:
+    """Return what leads from the frames of a stretch to the bins: the same in every window."""
     smooth = _smooth(comb.frame_rate_hz, comb.n_frames)
     length = smooth.shape[1]
-    whole = first // length * length + np.arange(length)
-    turns = np.outer(_BESIDE_HZ / comb.frame_rate_hz, whole)
+    frames = index * length + np.arange(length)
+    turns = np.outer(_BESIDE_HZ / comb.frame_rate_hz, frames)
     turning = np.vstack([np.ones(length), *cosines_and_sines(turns)])
-    here = slice(first - whole[0], end - whole[0])
-    lines = smooth[:, None, here] * _lines(comb, whole[here])
+    lines = smooth[:, None] * _lines(comb, frames)
     return _Stretch(
-        lines=lines.reshape(-1, end - first),
-        bins=np.asarray((turning * _hann(comb.n_frames, whole)) @ smooth.T, np.float32),
+        lines=lines.reshape(-1, length),
+        bins=np.asarray((turning * _hann(comb.n_frames, frames)) @ smooth.T, np.float32),
     )
 
 

@@ -35,7 +35,7 @@ _NAMED = 4
 _GLANCED = 8
 """Slopes of a frame that tell whether all need be compared."""
 
-SIDES_HZ = (-13, -11, -9, -7, -5, -3, 3, 5, 7, 9, 11, 13)
+SIDES_HZ = (-11, -7, -3, 3, 7, 11)
 """Where the noise of the slopes is measured, relative to a line; whole periods of a second."""
 
 HEARD_LINES = 4

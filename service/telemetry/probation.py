@@ -288,20 +288,22 @@ def _part(
 ) -> Part:
     """Return the sums of one block; sines of these frequencies, cycles per frame, are left out."""
     n_frames = float(len(steps))
-    share = 1.0
+    power = np.zeros(block.commands_m.shape[1] + _OTHERS)
+    moved = np.einsum("km,km->m", steps, steps)
     if lines:
         sines = _sines(len(steps), lines)
-        steps = steps - sines @ (sines.T @ steps)
-        share = n_frames / (n_frames - sines.shape[1])
-    power = np.zeros(block.commands_m.shape[1] + _OTHERS)
-    power[: steps.shape[1]] = share * np.einsum("km,km->m", steps, steps)
+        played = sines.T @ steps
+        # of a basis: what is left has as much less power
+        moved = np.maximum(moved - np.einsum("km,km->m", played, played), 0.0)
+        moved *= n_frames / (n_frames - sines.shape[1])
+    power[: steps.shape[1]] = moved
     looked = block.slopes[::_SAMPLED]
     power[_SLOPES] = n_frames * np.vdot(looked, looked) / len(looked)
     if edge is not None:
-        moved = block.commands_m[-1, edge.modes]
-        outer = edge.outer @ moved
+        last = block.commands_m[-1, edge.modes]
+        outer = edge.outer @ last
         power[_OUTER] = n_frames * (outer @ outer) / len(outer)
-        power[_INNER] = n_frames * max(float(moved @ (edge.inner @ moved)), 0.0)
+        power[_INNER] = n_frames * max(float(last @ (edge.inner @ last)), 0.0)
     return Part(n_frames=n_frames, power=power)
 
 

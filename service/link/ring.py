@@ -29,6 +29,10 @@ CONFIRMATIONS: Final = 2
 """Batches that must go on where a leap has led."""
 
 
+Places = slice | NDArray[np.int64]
+"""Where frames are; a slice, where they lie in a row, is much quicker."""
+
+
 @dataclass(slots=True)
 class FrameCounts:
     """What has become of the frames of all sessions so far."""
@@ -142,11 +146,14 @@ class FrameRing:
         """
         header, counts = batch.header, self._counts
         self._leapt = []
-        seq = np.arange(header.seq0, header.seq0 + header.n)
+        follows, seq = header.seq0 == self._head, np.arange(header.seq0, header.seq0 + header.n)
         older = int(np.count_nonzero(seq < self._head))
         if header.seq0 + header.n > self._head:
             self._newest_ns = header.t0_ns + (header.n - 1) * header.dt_ns
         self._advance(header.seq0 + header.n, now_s)
+        if follows:  # as nearly always: every place is free
+            self._fill(batch, np.arange(header.n), _span(header.seq0, header.n, self._capacity))
+            return
         slots = seq % self._capacity
         here = self._seq[slots] == seq
         free = here & (self._state[slots] == MISSING) & (seq >= self._cursor)
@@ -190,14 +197,15 @@ class FrameRing:
         if head <= self._head:
             return
         cursor = max(self._cursor, head - self._capacity)
-        passed = np.arange(self._cursor, min(cursor, self._head)) % self._capacity
-        self._counts.overwritten += int(np.count_nonzero(self._state[passed] == HELD))
+        if cursor > self._cursor:
+            passed = np.arange(self._cursor, min(cursor, self._head)) % self._capacity
+            self._counts.overwritten += int(np.count_nonzero(self._state[passed] == HELD))
         self._counts.lost += head - self._head
         self._make_room(cursor, head)
         self._cursor = cursor
-        seq = np.arange(max(self._head, head - self._capacity), head)
-        slots = seq % self._capacity
-        self._seq[slots] = seq
+        first = max(self._head, head - self._capacity)
+        slots = _span(first, head - first, self._capacity)
+        self._seq[slots] = np.arange(first, head)
         self._state[slots] = MISSING
         self._noticed_s[slots] = now_s
         self._head = head
@@ -219,16 +227,19 @@ class FrameRing:
         for new, numbers in zip((self._slopes, self._commands, self._dither), old, strict=True):
             new[kept % self._room] = numbers[before]
 
-    def _fill(self, batch: FrameBatch, rows: NDArray[np.intp], slots: NDArray[np.int64]) -> None:
+    def _fill(self, batch: FrameBatch, rows: NDArray[np.intp], slots: Places) -> None:
+        """Put these rows of a batch into these places."""
         header = batch.header
-        whole = len(rows) == header.n  # as nearly always: views instead of copies
+        whole = len(rows) == header.n  # views instead of copies
         chosen: slice | NDArray[np.intp] = slice(None) if whole else rows
         finite = np.isfinite(batch.rows[chosen]).all(axis=1)
+        n_finite = int(np.count_nonzero(finite))
         self._state[slots] = np.where(finite, HELD, VOID)
         self._counts.lost -= len(rows)
-        self._counts.nonfinite += int(np.count_nonzero(~finite))
-        self._counts.received += int(np.count_nonzero(finite))
-        places = (header.seq0 + rows) % self._room
+        self._counts.nonfinite += len(rows) - n_finite
+        self._counts.received += n_finite
+        room = self._room
+        places = _span(header.seq0, header.n, room) if whole else (header.seq0 + rows) % room
         self._slopes[places] = batch.slopes[chosen]
         self._commands[places] = batch.commands_m[chosen]
         dither = batch.dither_m
@@ -266,3 +277,9 @@ class FrameRing:
             dither_m=self._dither[places] if self._has_dither[first] else None,
             cm_id=self._cm_id[first],
         )
+
+
+def _span(seq: int, n: int, size: int) -> Places:
+    """Return where ``n`` frames in sequence are, modulo the size."""
+    first = seq % size
+    return slice(first, first + n) if first + n <= size else np.arange(seq, seq + n) % size

@@ -289,9 +289,9 @@ def read(values: Map, kind: type[_R], where: str, extensions: tuple[str, ...] = 
     WireError
         If a key is missing or its value is not what the field's type says.
     """
-    for field in fields(kind):
-        if field.name not in extensions:
-            get(values, field.name, where)
+    for name in _names(kind):
+        if name not in values and name not in extensions:
+            get(values, name, where)
     try:
         record = msgspec.convert(values, kind, builtin_types=(bytes,))
     except msgspec.ValidationError as error:
@@ -369,6 +369,11 @@ def _refused(text: str, values: Any, kind: type[DataclassInstance], where: str) 
     if _words(at) == ID_EXPECTED:
         checked_id(values, f"key {key!r} in {where}")
     return refusal(key, values, _words(at), where)
+
+
+@cache
+def _names(kind: type[DataclassInstance]) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
 
 
 @cache

@@ -20,12 +20,18 @@ from service.telemetry.health import (
     observe_edge,
 )
 from service.telemetry.lockin import LockIn, Spectra
-from service.telemetry.loopcheck import LoopCheck, LoopLaw, Obedience
+from service.telemetry.loopcheck import (
+    ENOUGH_SAMPLES,
+    SAMPLES_PER_S,
+    LoopCheck,
+    LoopLaw,
+    Obedience,
+)
 from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, measured
 from service.telemetry.probation import Comparison
 from service.telemetry.random_dither import Correlated, RandomDither
-from service.telemetry.windows import ClosedLoop, WindowRefused
+from service.telemetry.windows import ClosedLoop, Telemetry, WindowRefused
 from service.tracking.dither_request import SETTLING_S, Dither, asked_of, lock_in_plan, random_plan
 from service.tracking.loop import (
     closed_loop,
@@ -57,7 +63,7 @@ WINDOW_SAMPLES = 5
 VERDICTS = 2
 """On the loop's law that must agree that something is otherwise than told."""
 
-AT_EASE_S = 0.8
+AT_EASE_S = 1.3
 """A loop that was just found to do as it is told to is not asked again before."""
 
 MATRICES_KEPT = 2
@@ -337,7 +343,7 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     streams, ended = _dithered(_listening(streams, rtc, block), rtc, block)
     if ended:
         streams = replace(streams, loop=rtc)  # the next one begins with the gains of now
-    return streams, [_obeying(streams, window) for window in ended]
+    return _obeying(streams, ended)
 
 
 def _moving(streams: Streams, block: FrameBlock) -> FrameBlock:
@@ -441,18 +447,36 @@ def _listening(streams: Streams, rtc: Status, block: FrameBlock) -> Streams:
     return replace(streams, dither_silent_s=silent / rtc.frame_rate_hz)
 
 
-def _obeying(streams: Streams, window: Window) -> Window:
-    """Return a window, or why its commands are not what the loop makes of its slopes."""
-    if isinstance(window, WindowRefused):
-        return window
+def _obeying(streams: Streams, ended: Sequence[Window]) -> tuple[Streams, list[Window]]:
+    """Return windows, or why the commands of one are not what the loop makes of its slopes."""
+    told: list[Window] = []
+    for window in ended:
+        if isinstance(window, WindowRefused):
+            told.append(window)
+            continue
+        streams, found = _obedience(streams, window)
+        if found is None or found.holds:
+            told.append(window)
+        else:
+            told.append(WindowRefused(reason=found.text, t_ns_utc=window.t_end_ns_utc))
+    return streams, told
+
+
+def _obedience(streams: Streams, window: Telemetry) -> tuple[Streams, Obedience | None]:
+    """Return how commands obeyed the loop in a window; None: nobody knows."""
     terms = _terms(streams, window.cm_id)
     if terms is None:
-        return window
+        return streams, None
     last_seq = window.first_seq + window.plan.n_frames - 1
-    _, found = loopcheck.obedience(streams.check, terms, window.first_seq, last_seq, WINDOW_SAMPLES)
-    if found is None or found.holds:
-        return window
-    return WindowRefused(reason=found.text, t_ns_utc=window.t_end_ns_utc)
+    check, found = loopcheck.obedience(
+        streams.check, terms, window.first_seq, last_seq, WINDOW_SAMPLES
+    )
+    streams = replace(streams, check=check)
+    lasts_s = window.plan.n_frames / terms.frame_rate_hz
+    if found is not None and found.holds and lasts_s >= ENOUGH_SAMPLES / SAMPLES_PER_S:
+        # what a long window shows need not be asked again
+        streams = replace(streams, obeyed_seq=max(last_seq, streams.obeyed_seq))
+    return streams, found
 
 
 def _fits(rtc: Status, block: FrameBlock) -> bool:

@@ -210,15 +210,16 @@ def test_an_rtc_of_another_shape_is_described_with_both_shapes():
 class TestCommandsOffTheLoop:
     R = np.random.default_rng(5).standard_normal((4, N_SLOPES)).astype(np.float32) * 1e-9
 
-    def telemetry(self, n_blocks, *, stroke_m=1.0):
-        """Blocks whose commands follow from their slopes, up to a stroke."""
+    def telemetry(self, n_blocks, *, stroke_m=1.0, from_frame=0):
+        """Blocks whose commands follow from their slopes, up to a stroke from some frame on."""
         blocks = [block(100 * index) for index in range(n_blocks)]
         slopes = np.concatenate([b.slopes for b in blocks])
         own = np.zeros((len(slopes) + 2, N_MODES), np.float32)
         for k in range(len(slopes)):
             own[k + 2] = np.float32(RTC.leak) * own[k + 1]
             own[k + 2, :4] -= np.float32(0.4) * (self.R @ slopes[k])
-            np.clip(own[k + 2], -stroke_m, stroke_m, out=own[k + 2])
+            if k >= from_frame:
+                np.clip(own[k + 2], -stroke_m, stroke_m, out=own[k + 2])
         return [
             replace(b, commands_m=own[100 * i : 100 * i + 100] + b.dither_m)
             for i, b in enumerate(blocks)
@@ -248,6 +249,24 @@ class TestCommandsOffTheLoop:
         assert "off the loop equation" in windows[0].reason
         assert off.index(True) * 0.2 < 2.0
         assert "4 of 4 modes (0-3)" in streams.off.text
+
+    @pytest.mark.parametrize("from_frame", [2300, 2700, 3100, 3500, 3900, 4300])
+    def test_whenever_it_begins_to_saturate_that_is_named_in_time(self, streams, from_frame):
+        """Frames wait half a second besides, and 3 s are promised: also just after a window."""
+        streams = with_matrix(with_dither(streams, None, 2.0), "initial", self.R)
+        streams = with_dither(streams, played(id="dither-2"), 2.0)
+        blocks = self.telemetry(70, stroke_m=5e-10, from_frame=from_frame)
+        _, windows, off = self.play(streams, blocks, status_every=5)
+        assert [type(windows[k]) for k in (0, -1)] == [Spectra, WindowRefused]
+        assert (500 * off.index(True) + 100 - from_frame) / 1000 <= 2.4
+
+    def test_what_a_window_shows_need_not_be_asked_again(self, streams):
+        streams = with_matrix(streams, "initial", self.R)
+        for window_s, obeyed_seq in ((0.5, 0), (1.0, 1299)):
+            begun = with_dither(streams, played(id=f"of {window_s}"), window_s)
+            for frames in self.telemetry(14):
+                begun, _ = fed(begun, frames)
+            assert begun.obeyed_seq == obeyed_seq
 
     def test_nobody_is_blamed_for_a_matrix_that_is_not_known(self, streams):
         blocks = self.telemetry(30, stroke_m=5e-10)

@@ -68,10 +68,10 @@ def _describe_run(run: argparse.ArgumentParser) -> None:
         words("--instrument NAME|FILE", "packaged name or TOML file"),
         words("--mode", "default: propose", choices=["auto", "propose", "hold"]),
         words("--data-dir DIR", "products, index, audit trail; default var"),
-        words("--listen ENDPOINT", "zenoh, default tcp/127.0.0.1:7447"),
-        words("--connect ENDPOINT", "an observatory's own zenoh router"),
+        words("--listen ENDPOINT", "zenoh, default tcp/127.0.0.1:7447", type=endpoint),
+        words("--connect ENDPOINT", "an observatory's own zenoh router", type=endpoint),
         words("--host HOST", "of the REST API, default 127.0.0.1"),
-        words("--port PORT", "of the REST API, default 8080", type=int),
+        words("--port PORT", "of the REST API, default 8080", type=port),
         words("--log-format", formats, choices=["auto", "text", "json"]),
     )
 
@@ -248,6 +248,34 @@ def seconds(text: str) -> float:
     return found
 
 
+def port(text: str) -> int:
+    """Return a TCP port; 0: any free one.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If the text says something else.
+    """
+    if not (text.isdecimal() and len(text) < 6 and int(text) <= 65535):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a port, 0 to 65535")
+    return int(text)
+
+
+def endpoint(text: str) -> str:
+    """Return an endpoint of zenoh: a protocol and an address.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If the text says something else.
+    """
+    if not re.fullmatch(r"[\w-]+/\S+", text):
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}, expected an endpoint like tcp/127.0.0.1:7447"
+        )
+    return text
+
+
 def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
     """Return a function that reads a text; what it refuses argparse prints as it is."""
 
@@ -268,10 +296,7 @@ def check_files(options: argparse.Namespace) -> None:
     PyrcalError
         One line that names the file.
     """
-    if getattr(options, "instrument", None) is not None:
-        from service.config import instrument_path
-
-        instrument_path(options.instrument)  # a wrong name is told without the schema
+    _check_settings(options)
     if options.command in {"fit", "reconstruct"}:
         from service.config.instrument_schema import read_instrument_file
 
@@ -287,6 +312,17 @@ def check_files(options: argparse.Namespace) -> None:
             parse_alpha(options.alpha)
         except ValueError as error:
             raise ConfigurationError(f"ALPHA: no such file, and {error}") from error
+
+
+def _check_settings(options: argparse.Namespace) -> None:
+    """Refuse an instrument that nobody has, and settings that are not there."""
+    if getattr(options, "instrument", None) is not None:
+        from service.config import instrument_path
+
+        instrument_path(options.instrument)  # a wrong name is told without the schema
+    for path in _paths(options, "config"):
+        if not path.exists():
+            raise ConfigurationError(f"{path}: cannot be read: no such file")
 
 
 def _paths(options: argparse.Namespace, *names: str) -> list[Path]:

@@ -174,3 +174,11 @@ def test_released_at_once_it_takes_no_dither_for_its_own_that_is_about_to_end():
     world.pass_(20.0)
     assert not [entry.text for entry in world.state.log if "busy: " in entry.text]
     assert world.playing is not None
+
+
+def test_a_dither_that_was_told_to_end_is_not_taken_for_one_that_runs():
+    world = own_dither()
+    world.tell(STOP)
+    world.tell(cmd.Resume())
+    assert world.state.rtc.dither_id is not None
+    assert world.state.dither is None

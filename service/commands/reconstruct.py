@@ -19,13 +19,14 @@ from service.archive.store import write_whole
 from service.commands.terminal import say, show_progress
 from service.config import load_instrument
 from service.control.gains import CalibrationGains
-from service.control.reconstructor import InversionMethod, Prior, Provenance, Recipe, reconstruct
+from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.errors import ConfigurationError, MatrixError
 from service.files import parse_alpha
 from service.files.container import file_sha256
 from service.files.light import read_light
 from service.files.report import (
     KnownFit,
+    Provenance,
     fill_reconstructor,
     instrument_sha256,
     orientation_words,
@@ -154,12 +155,9 @@ def _inverted(
     provenance = Provenance(
         recipe=recipe,
         inversion=reconstruct(matrix, recipe),
-        alpha=known.alpha,
-        covariance=known.covariance,
+        fit=known,
         gains=gains,
-        reference_sha256=known.reference_sha256,
         measured_illumination=options.flux_map is not None,
-        reference_passes=None if known.double_pass is None else 1 + known.double_pass,
     )
     return provenance, matrix
 

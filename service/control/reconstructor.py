@@ -1,4 +1,4 @@
-"""From an interaction matrix to a reconstructor, and what is written down about it.
+"""From an interaction matrix to a reconstructor.
 
 Two ways to invert. Truncated least squares (Heritier et al. 2018, section 2.2) needs nothing but
 the matrix. MAP, or generalised SVD, knows how strong each mode and the noise are:
@@ -6,9 +6,6 @@ the matrix. MAP, or generalised SVD, knows how strong each mode and the noise ar
 the basis, also those the loop does not control: what they show in the slopes is then explained by
 them and does not alias into the controlled ones. With no noise and as many modes as are controlled
 it is the least-squares inverse.
-
-The recipe says how a reconstructor is made; the provenance says of what, so that whoever finds the
-matrix years later can make it again.
 """
 
 from __future__ import annotations
@@ -21,9 +18,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.control.gains import CalibrationGains
 from service.errors import ModelError
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 
 Array = NDArray[np.float64]
 
@@ -212,75 +207,3 @@ def reconstruct(interaction_matrix: NDArray[Any], recipe: Recipe) -> Inversion:
     if recipe.prior is not None:
         return invert_with_prior(interaction_matrix, recipe.n_modes, recipe.prior)
     return invert(interaction_matrix, recipe.n_modes, max_condition=recipe.max_condition)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Provenance:
-    """What a reconstructor was made of."""
-
-    recipe: Recipe
-    """How it was inverted."""
-
-    inversion: Inversion
-    """What came of it."""
-
-    alpha: Misregistration | None = None
-    """Registration of a synthetic matrix."""
-
-    covariance: NDArray[np.float64] | None = None
-    """``(4, 4)`` of that registration, numeric units."""
-
-    gains: CalibrationGains | None = None
-    """Folded into the columns; None: the model's own."""
-
-    reference_sha256: str | None = None
-    """Digest of the measured matrix that was fitted or inverted."""
-
-    reference_passes: int | None = None
-    """How often light met the mirror in it; the reconstructor is for one pass all the same."""
-
-    measured_illumination: bool = False
-    """Whether the model's pupil was lit as the flux map says."""
-
-    def attributes(self) -> dict[str, str | int | float | bool]:
-        """Return everything as flat, named, scalar facts: for file attributes and JSON."""
-        found: dict[str, str | int | float | bool] = {
-            "source": "synthetic",
-            "method": str(self.recipe.method),
-            "n_modes": self.recipe.n_modes,
-            "condition_number": self.inversion.condition_number,
-            "n_truncated": self.inversion.n_truncated,
-            "single_pass": True,
-            "measured_illumination": self.measured_illumination,
-        }
-        prior = self.recipe.prior
-        if prior is None:
-            found["max_condition"] = self.recipe.max_condition
-        else:
-            found["prior_n_modes"] = len(prior.variance_m2)
-            found["prior_wavefront_m"] = float(np.sqrt(prior.variance_m2.sum()))
-            found["prior_slope_noise"] = float(np.sqrt(np.mean(np.square(prior.slope_noise))))
-        return found | self._registration() | self._reference()
-
-    def _registration(self) -> dict[str, str | int | float | bool]:
-        if self.alpha is None:
-            return {}
-        found: dict[str, str | int | float | bool] = dict(self.alpha.to_boundary())
-        if self.covariance is not None:
-            sigma = np.sqrt(np.diag(self.covariance)) * BOUNDARY_SCALE
-            found |= {
-                f"sigma_{name}": float(value) for name, value in zip(PARAMETERS, sigma, strict=True)
-            }
-        return found
-
-    def _reference(self) -> dict[str, str | int | float | bool]:
-        found: dict[str, str | int | float | bool] = {}
-        if self.reference_sha256 is not None:
-            found["reference_sha256"] = self.reference_sha256
-        if self.reference_passes is not None:
-            found["reference_passes"] = self.reference_passes
-        if self.gains is not None:
-            controlled = self.gains.measured[: self.recipe.n_modes]
-            found["n_gains_measured"] = int(controlled.sum())
-            found["n_gains_extended"] = int((~controlled).sum())
-        return found

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service import __version__
-from service.control.reconstructor import Provenance
+from service.control.gains import CalibrationGains
+from service.control.reconstructor import Inversion, Recipe
 from service.errors import MatrixError, shown
 from service.fit.matrix import Fit, Method
 from service.fit.methods import ScanStep
@@ -69,17 +70,16 @@ def document(report: FitReport) -> dict[str, Any]:
     ``verdict``, which begins with "accepted" or "refused".
     """
     fit = report.fit
-    sigma = np.sqrt(np.diag(fit.covariance)) * BOUNDARY_SCALE
     return {
         **fit.alpha.to_boundary(),
-        "sigma": _four(sigma),
+        "sigma": _four(np.sqrt(np.diag(fit.covariance))),
         "covariance": _plain(fit.covariance * COVARIANCE_SCALE),
         "gains": _plain(fit.gains),
         "residual_fraction": _plain(fit.residual_fraction),
         "condition_number": _plain(fit.condition_number),
         "n_modes_used": len(fit.modes),
         "orientation": orientation_words(fit.orientation, fit.order),
-        "subset_scatter": _four(fit.subset_scatter * BOUNDARY_SCALE),
+        "subset_scatter": _four(fit.subset_scatter),
         "converged": bool(fit.converged),
         "verdict": verdict_line(fit),
         "notes": list(report.notes),
@@ -107,7 +107,7 @@ def orientation_words(orientation: Orientation, order: SlopeOrder) -> dict[str, 
 
 
 def _four(values: NDArray[np.float64]) -> dict[str, float | None]:
-    return dict(zip(PARAMETERS, _plain(values), strict=True))
+    return dict(zip(PARAMETERS, _plain(values * BOUNDARY_SCALE), strict=True))
 
 
 def _plain(values: float | NDArray[np.float64]) -> Any:  # noqa: ANN401 - as nested as the array
@@ -311,6 +311,58 @@ class KnownFit:
     """Of the measured file; None: not in the file."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Provenance:
+    """What a reconstructor was made of: whoever finds it years later can make it again."""
+
+    recipe: Recipe
+    """How it was inverted."""
+
+    inversion: Inversion
+    """What came of it."""
+
+    fit: KnownFit
+    """The registration of its synthetic matrix, and the measured one that was fitted."""
+
+    gains: CalibrationGains | None
+    """Folded into the columns; None: the model's own."""
+
+    measured_illumination: bool
+    """Whether the model's pupil was lit as the flux map says."""
+
+    def attributes(self) -> dict[str, str | int | float | bool]:
+        """Return everything as flat, named, scalar facts: for file attributes and JSON."""
+        fit, prior = self.fit, self.recipe.prior
+        found: dict[str, str | int | float | bool] = {
+            "source": "synthetic",
+            "method": str(self.recipe.method),
+            "n_modes": self.recipe.n_modes,
+            "condition_number": self.inversion.condition_number,
+            "n_truncated": self.inversion.n_truncated,
+            "single_pass": True,
+            "measured_illumination": self.measured_illumination,
+            **fit.alpha.to_boundary(),
+        }
+        if prior is None:
+            found["max_condition"] = self.recipe.max_condition
+        else:
+            found["prior_n_modes"] = len(prior.variance_m2)
+            found["prior_wavefront_m"] = float(np.sqrt(prior.variance_m2.sum()))
+            found["prior_slope_noise"] = float(np.sqrt(np.mean(np.square(prior.slope_noise))))
+        if fit.covariance is not None:
+            sigma = np.sqrt(np.diag(fit.covariance)) * BOUNDARY_SCALE
+            found |= {f"sigma_{name}": float(s) for name, s in zip(PARAMETERS, sigma, strict=True)}
+        if fit.reference_sha256 is not None:
+            found["reference_sha256"] = fit.reference_sha256
+        if fit.double_pass is not None:
+            found["reference_passes"] = 1 + fit.double_pass
+        if self.gains is not None:
+            controlled = self.gains.measured[: self.recipe.n_modes]
+            found["n_gains_measured"] = int(controlled.sum())
+            found["n_gains_extended"] = int((~controlled).sum())
+        return found
+
+
 def read_fit(path: Path) -> KnownFit:
     """Return the fit in a file that ``pyrcal fit`` wrote: its JSON document, or its product.
 
@@ -391,8 +443,8 @@ def fill_reconstructor(
         ("interaction_matrix", interaction_matrix, "(n_slopes, n_modes), slope per metre OPD"),
     ):
         _put(file, name, np.ascontiguousarray(values, dtype="<f4"), f"{shape}, {described}")
-    if provenance.covariance is not None:
-        put_covariance(file, provenance.covariance)
+    if provenance.fit.covariance is not None:
+        put_covariance(file, provenance.fit.covariance)
     if provenance.gains is not None:
         n_modes = provenance.recipe.n_modes
         file["calibration_gains"] = provenance.gains.values[:n_modes]

@@ -10,12 +10,12 @@ import pytest
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import (
     Prior,
-    Provenance,
     Recipe,
     invert,
     invert_with_prior,
     reconstruct,
 )
+from service.files.report import KnownFit, Provenance
 from tests.numerics import N_CONTROLLED, N_MODES, SOMEWHERE, small_basis, small_linearisation
 
 MATRIX = small_linearisation().matrix
@@ -40,11 +40,13 @@ def test_the_provenance_of_a_tuned_synthetic_matrix_says_what_it_was_made_of():
     found = Provenance(
         recipe=BY_MAP,
         inversion=reconstruct(gains.tuned(MATRIX), BY_MAP),
-        alpha=SOMEWHERE,
-        covariance=np.diag([0.01, 0.02, np.deg2rad(0.1), 0.001]) ** 2,
+        fit=KnownFit(
+            alpha=SOMEWHERE,
+            covariance=np.diag([0.01, 0.02, np.deg2rad(0.1), 0.001]) ** 2,
+            reference_sha256="ab12",
+            double_pass=True,
+        ),
         gains=gains,
-        reference_sha256="ab12",
-        reference_passes=2,
         measured_illumination=True,
     ).attributes()
     assert found["method"] == "map"
@@ -59,8 +61,15 @@ def test_the_provenance_of_a_tuned_synthetic_matrix_says_what_it_was_made_of():
     assert json.loads(json.dumps(found)) == found
 
 
-def test_a_provenance_without_a_registration_claims_none():
+def test_the_provenance_of_a_registration_by_hand_claims_nothing_else():
     recipe = Recipe(n_modes=10)
-    found = Provenance(recipe=recipe, inversion=reconstruct(MATRIX, recipe)).attributes()
+    found = Provenance(
+        recipe=recipe,
+        inversion=reconstruct(MATRIX, recipe),
+        fit=KnownFit(alpha=SOMEWHERE),
+        gains=None,
+        measured_illumination=False,
+    ).attributes()
     assert found["max_condition"] == 100.0
-    assert not {"rotation_deg", "prior_n_modes", "n_gains_measured"} & set(found)
+    claims = {"sigma_rotation_deg", "prior_n_modes", "n_gains_measured", "reference_passes"}
+    assert not claims & set(found)

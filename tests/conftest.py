@@ -31,6 +31,7 @@ REAL_TIME = ("tests/system/test_demo.py", "tests/system/test_sim_rtc.py")
 
 LASTING = (
     "tests/system/test_faults.py",
+    "tests/system/test_page.py",
     "tests/system/test_replay.py",
     "tests/system/test_worker.py",
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import scipy
@@ -127,12 +128,19 @@ def instrument_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
     )
 
 
+@cache
+def gauss_legendre(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the ``n`` nodes and weights of Gauss and Legendre on -1 to 1; every model asks."""
+    nodes, weights = np.polynomial.legendre.leggauss(n)
+    return nodes, weights
+
+
 def _disc_fraction(
     coordinates: NDArray[np.float64], radius: float, sampling: int
 ) -> NDArray[np.float64]:
     """Fraction of each cell's area inside a centred disc: the integral of the chord over x."""
     half = 0.5 / sampling
-    nodes, weights = np.polynomial.legendre.leggauss(_EDGE_NODES)
+    nodes, weights = gauss_legendre(_EDGE_NODES)
     x = coordinates[:, None] + half * nodes
     chord = np.sqrt(np.maximum(radius**2 - x**2, 0.0))
     top = np.minimum(coordinates[:, None, None] + half, chord)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Pyramid
 from service.model.kinds import Normalisation, SignalKind
-from service.model.pupil import PupilGrid
+from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.turbulence import Halo
 
 Array = NDArray[Any]
@@ -42,7 +42,7 @@ class Nodes:
     @classmethod
     def area(cls, n: int) -> Nodes:
         """Return ``n`` Gauss-Legendre nodes: the light that falls on the subaperture."""
-        offsets, weights = np.polynomial.legendre.leggauss(n)
+        offsets, weights = gauss_legendre(n)
         return cls(offsets=offsets / 2, weights=weights / 2)
 
     @classmethod

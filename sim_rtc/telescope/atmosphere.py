@@ -11,6 +11,7 @@ phase of every step.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import scipy
@@ -81,7 +82,7 @@ class ExtrudedScreen:
         self._n_kept = max(n_kept, _FAR_ROWS[-1])
         stencil = _stencil(n_columns)
         self._offset = (stencil[:, 0] - 1) * n_columns + stencil[:, 1]
-        self._weights, self._noise = _conditional(stencil, n_columns, pitch_m, turbulence)
+        self._weights, self._noise = _conditional(n_columns, pitch_m, turbulence)
         capacity = 8 * self._n_kept
         self._rows = np.zeros((capacity, n_columns))
         self._newest = capacity - self._n_kept
@@ -112,10 +113,13 @@ def _stencil(n_columns: int) -> NDArray[np.intp]:
     return np.array(dense + far)
 
 
-def _conditional(
-    stencil: NDArray[np.intp], n_columns: int, pitch_m: float, turbulence: KarhunenLoeve
-) -> tuple[Array, Array]:
-    """Return A and B: the mean of a new row given the stencil, and its square-root covariance."""
+@lru_cache(maxsize=8)
+def _conditional(n_columns: int, pitch_m: float, turbulence: KarhunenLoeve) -> tuple[Array, Array]:
+    """Return A and B: the mean of a new row given the stencil, and its square-root covariance.
+
+    Layers as wide as each other, and nights of one telescope, share them.
+    """
+    stencil = _stencil(n_columns)
     row = np.column_stack([np.zeros(n_columns, dtype=np.intp), np.arange(n_columns)])
     seen = _covariance(stencil, stencil, pitch_m, turbulence)
     cross = _covariance(row, stencil, pitch_m, turbulence)

@@ -1,6 +1,7 @@
 """An RTC that breaks the contract, message by message: the service says so, and goes on."""
 
 import contextlib
+import json
 import time
 
 import httpx
@@ -8,6 +9,8 @@ import msgpack
 import numpy as np
 import pytest
 
+from service.wire import Keys
+from tests.system.fake_rtc import client_session
 from tests.system.night import a_night, wait_for
 from tests.system.pace import Deadline, patience
 from tests.system.stranger import Stranger, open_client, small_telescope
@@ -180,6 +183,32 @@ def test_an_rtc_that_is_not_there_is_waited_for(night):
     named(night, waits, "rtc", "no RTC is there", 5.0)
     wait_for(lambda: night.state["ready"], 5.0, "it is ready for one")
     wait_for(lambda: "telemetry: " in night.client.get("/readyz").text, 5.0, "and says it is not")
+
+
+def test_telemetry_that_makes_no_sense_is_counted_and_the_service_goes_on(night):
+    wait_for(lambda: night.state["rtc"] is None, 10.0, "no RTC")
+    keys = Keys("small")
+    before = night.metrics
+    with client_session(night.zenoh) as session:
+        session.put(keys.frames, b"\x00" * 100)
+        session.put(keys.frames, b"\x00" * 100, attachment=b"not msgpack")
+        session.put(keys.status, b"\xff\xff")
+        session.put(keys.acknowledgement, b"")
+        session.put(keys.status, b"\x80")
+
+        def moved():
+            now = night.metrics
+            return all(
+                now.get(f'pyrcal_messages_malformed_total{{kind="{kind}"}}', 0.0)
+                >= before.get(f'pyrcal_messages_malformed_total{{kind="{kind}"}}', 0.0) + count
+                for kind, count in (("frames", 2), ("status", 2), ("ack", 1))
+            )
+
+        wait_for(moved, 10.0, lambda: f"counters: {json.dumps(night.metrics, indent=1)}")
+    assert night.client.get("/healthz").status_code == 200
+    assert night.state["rtc"] is None
+    events = night.client.get("/v1/events").json()["log"]
+    assert any(event["name"] == "message.malformed" for event in events)
 
 
 @pytest.mark.long

@@ -238,32 +238,6 @@ class TestRefusedAtTheStart:
         assert "in use by another service" in line
 
 
-def test_telemetry_that_makes_no_sense_is_counted_and_the_service_goes_on(night):
-    night.service("hold")
-    keys = Keys("small")
-    before = night.metrics
-    with client_session(night.zenoh) as session:
-        session.put(keys.frames, b"\x00" * 100)
-        session.put(keys.frames, b"\x00" * 100, attachment=b"not msgpack")
-        session.put(keys.status, b"\xff\xff")
-        session.put(keys.acknowledgement, b"")
-        session.put(keys.status, b"\x80")
-
-        def moved():
-            now = night.metrics
-            return all(
-                now.get(f'pyrcal_messages_malformed_total{{kind="{kind}"}}', 0.0)
-                >= before.get(f'pyrcal_messages_malformed_total{{kind="{kind}"}}', 0.0) + count
-                for kind, count in (("frames", 2), ("status", 2), ("ack", 1))
-            )
-
-        wait_for(moved, 10.0, f"counters: {json.dumps(night.metrics, indent=1)}")
-    assert night.client.get("/healthz").status_code == 200
-    assert night.state["rtc"] is None
-    events = night.client.get("/v1/events").json()["log"]
-    assert any(event["name"] == "message.malformed" for event in events)
-
-
 @pytest.mark.long
 def test_a_stranger_on_the_network_cannot_stop_the_telemetry(night):
     night.service("hold")

@@ -44,7 +44,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(
     steps=STEPS,
     bad=st.sets(st.integers(900, 1400), max_size=20),

@@ -41,7 +41,7 @@ from tests.system.cable import Cable, free_port
 from tests.system.night import Process, wait_for
 from tests.system.pace import patience, slowness
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(180)]
 
 KEYS = Keys("flao-lbt")
 START_UP_S = 60.0
@@ -63,7 +63,6 @@ def open_router(port: int) -> zenoh.Session:
     return zenoh.open(config)
 
 
-@pytest.mark.long
 def test_a_second_of_linear_telemetry_costs_little_more_than_a_large_product():
     """Beside a product of 2000 x 2000: what else the machine does slows both."""
     assert measure_linear(4).in_products < 2.5
@@ -220,7 +219,6 @@ def rtc(running):
     return running
 
 
-@pytest.mark.long
 def test_a_connection_left_over_under_its_name_does_not_silence_it_for_ever(tmp_path):
     """What is left when both ends stood still and zenoh reconnected twice at once."""
     port = free_port()
@@ -503,7 +501,6 @@ def test_opening_the_loop_zeroes_the_integrator_and_begins_a_session(rtc):
     rtc.next_status(lambda status: status.loop == "closed")
 
 
-@pytest.mark.long
 def test_it_waits_for_the_service_outlives_it_and_ends_cleanly(tmp_path):
     port = free_port()
     with an_rtc(tmp_path, port, "--alpha", "-0.1,0.05,0.1,1.002", "--quiet") as process:

@@ -174,6 +174,7 @@ def interrupted(bench, tmp_path):
         yield play
 
 
+@pytest.mark.long
 def test_the_next_service_ends_tracking_where_the_mirror_is(interrupted):
     night = interrupted(AcquisitionStage.CONFIRMING, Mode.AUTO)
     assert not night.dome.moments[-1].closed

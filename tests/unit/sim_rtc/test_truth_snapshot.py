@@ -55,8 +55,8 @@ def test_without_matplotlib_it_says_what_to_install(telescope, tmp_path, monkeyp
         write_snapshot(telescope, tmp_path / "loop.png")
 
 
-@pytest.mark.usefixtures("seen_again")
-def test_a_file_that_cannot_be_written_is_named(telescope, tmp_path):
+def test_a_file_that_cannot_be_written_is_named(telescope, seen, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
+    monkeypatch.setattr(truth, "moments", lambda _telescope: iter(seen[:1]))
     with pytest.raises(ConfigurationError, match=r"--snapshot: cannot write .*no.such"):
         write_snapshot(telescope, tmp_path / "no/such/loop.png")

@@ -56,6 +56,8 @@ async def client(url: str, k: int, every_s: float, until_s: float) -> list[tuple
 async def measure(options: argparse.Namespace) -> tuple[list[tuple[str, float]], Any, Any]:
     """Return what all clients have seen, and the link before and after."""
     async with httpx.AsyncClient(base_url=options.url, timeout=10.0) as asking:
+        for page in PAGES:  # of its life the service has only one first answer of each kind
+            (await asking.get(page)).raise_for_status()
         before = (await asking.get("/v1/state")).json()["link"]
         until_s = time.monotonic() + options.seconds
         clients = [client(options.url, k, options.every, until_s) for k in range(options.clients)]

@@ -363,7 +363,8 @@ def main(options: argparse.Namespace) -> int:
             service, request, options
         )
     except RefusedError as error:
-        say(f"pyrcal: {request.name}: {error}")
+        told = str(error)  # many a refusal begins with the order's name already
+        say(f"pyrcal: {request.name}: {told.removeprefix(f'{request.name}: ')}")
         return NOT_DONE
     except UnreachableError as error:
         say(f"pyrcal: {error}")

@@ -18,7 +18,7 @@ from service.tracking.operator import order
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import thinned
-from service.tracking.state import Orders, Saved, TrackerState
+from service.tracking.state import Mode, Orders, Saved, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.validity import age, restore
 
@@ -63,7 +63,8 @@ def release(turn: Turn, command: cmd.Resume) -> None:
         If nothing is stopped.
     """
     if not turn.state.stopped_because:
-        raise CommandError("resume: nothing is stopped")
+        held = "; mode is hold: set another to go on" if turn.state.mode is Mode.HOLD else ""
+        raise CommandError(f"resume: nothing is stopped{held}")
     turn.state = replace(turn.state, stopped_because="")
     turn.calm(STOPPED)
     turn.log("resumed", command.signed)

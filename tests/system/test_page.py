@@ -18,6 +18,7 @@ DRIVER = shutil.which("chromedriver")
 DATA = Path(__file__).parents[1] / "data"
 AXE, TINY = DATA / "axe" / "axe.min.js", DATA / "tiny"
 WIDE, NARROW = (1440, 900), (390, 844)
+LAPTOP = (1280, 800)
 FIRST_LOAD_BYTES = 300_000
 
 pytestmark = [
@@ -158,9 +159,16 @@ def test_on_a_narrow_screen_all_fits_and_state_comes_first(page):
 def test_on_a_wide_screen_nothing_is_scrolled_for(page):
     page.open()
     proposal(page)
-    assert page.js("document.querySelector('header').offsetHeight") < 50, "one row"
-    assert page.js("document.documentElement.scrollHeight") <= WIDE[1]
-    assert page.js("document.querySelector('#events').getBoundingClientRect().bottom") <= WIDE[1]
+    says = "document.querySelector('#events tbody td:nth-child(4)')"
+    for width, height in (WIDE, LAPTOP):
+        page.resize((width, height))
+        page.until(f"innerWidth === {width}")
+        assert page.js("document.querySelector('header').offsetHeight") < 50, "one row"
+        assert page.js("document.documentElement.scrollWidth") <= width
+        assert page.js("document.documentElement.scrollHeight") <= height
+        bottom = page.js("document.querySelector('#events').getBoundingClientRect().bottom")
+        assert bottom <= height
+        assert page.js(f"{says}.offsetWidth") > 300, "a line of the log is read at one glance"
 
 
 def test_a_click_approves_and_the_answer_is_what_the_rtc_did(page):

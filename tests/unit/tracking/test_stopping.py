@@ -134,8 +134,12 @@ def test_released_it_goes_on_as_it_was_ordered_before():
 
 
 def test_only_what_is_stopped_is_released():
-    with pytest.raises(CommandError, match="nothing is stopped"):
-        idle().tell(cmd.Resume())
+    world = idle()
+    with pytest.raises(CommandError, match=r"nothing is stopped$"):
+        world.tell(cmd.Resume())
+    world.tell(cmd.SetMode(mode=Mode.HOLD))
+    with pytest.raises(CommandError, match="nothing is stopped; mode is hold: set another"):
+        world.tell(cmd.Resume())
 
 
 def test_who_stopped_it_first_is_remembered():

@@ -8,6 +8,7 @@ import tempfile
 
 import pytest
 import structlog
+from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling
 
 from tests.system.pace import patience
@@ -19,6 +20,9 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 os.environ.setdefault(
     "PYRCAL_SERVICE__CACHE_DIR", os.path.join(tempfile.gettempdir(), f"pyrcal-tests-{os.getuid()}")
 )
+# A property that others slow down still holds: the limits of time are those of every test.
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 # A shell's background job inherits SIGINT as ignored, and would hand it on to the programs that the
 # system tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -6,7 +6,7 @@ from functools import partial
 
 import msgpack
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -197,6 +197,7 @@ DECODERS = st.sampled_from(
 )
 
 
+@settings(max_examples=200)
 @given(decoder=DECODERS, data=st.binary(max_size=300) | MESSAGES | TREES.map(msgpack.packb))
 def test_no_bytes_do_more_than_raise_a_wire_error(decoder, data):
     try:

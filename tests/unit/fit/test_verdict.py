@@ -137,6 +137,11 @@ def test_scattered_gains_are_refused_unless_the_stroke_is_unknown():
     assert fit(scattered, replace(instrument(), mirror=mirror)).accepted
 
 
+def test_noise_alone_is_refused():
+    found = fit(RNG.normal(size=matrix().shape) * 1e6)
+    assert not found.accepted
+
+
 def test_as_much_noise_as_signal_is_refused_with_the_share_left_over():
     found = fit(matrix(noise=1.0))
     assert "of the signal unexplained" in found.verdict

@@ -174,7 +174,6 @@ def interrupted(bench, tmp_path):
         yield play
 
 
-@pytest.mark.long
 def test_the_next_service_ends_tracking_where_the_mirror_is(interrupted):
     night = interrupted(AcquisitionStage.CONFIRMING, Mode.AUTO)
     assert not night.dome.moments[-1].closed
@@ -194,3 +193,14 @@ def test_one_that_may_not_leaves_the_loop_open_and_asks_nothing_of_the_rtc(inter
     assert not night.dome.moments[-1].closed
     assert len(night.dome.orders) == n_orders
     assert "the mode is propose" in night.state.acquisition.text
+
+
+def test_one_whose_loop_had_just_been_closed_goes_on_from_there(interrupted):
+    night = interrupted(AcquisitionStage.WIDENING, Mode.AUTO)
+    matrix = night.dome.moments[-1].cm_id
+    night.advance(2.0)
+    assert night.dome.moments[-1].closed
+    assert night.state.acquisition.stage is AcquisitionStage.ABORTED
+    assert matrix in night.state.acquisition.text
+    error = night.state.registration.alpha.vector - night.dome.alpha.vector
+    assert (abs(error) < 5.0 * night.state.registration.sigma).all()

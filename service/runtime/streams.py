@@ -285,7 +285,7 @@ def with_dither(streams: Streams, dither: Dither | None, window_s: float) -> Str
     rtc = streams.rtc
     if dither is None or dither.start_seq is None or rtc is None:
         return replace(
-            _awake(streams), cutter=None, dither=None, dither_silent_s=0.0, meter=None, played=None
+            streams, cutter=None, dither=None, dither_silent_s=0.0, meter=None, played=None
         )
     dither = replace(dither, asked_ns_utc=0)
     if dither == streams.dither:
@@ -375,7 +375,7 @@ def taken(streams: Streams, *, told: bool = False) -> tuple[Streams, Passive | s
     a jump says so. Beside a dither some telemetry is left out, more where windows have ``told`` of
     α just now; None: that is why. A rest ends early when they no longer do.
     """
-    streams = streams if told else _awake(streams)
+    streams = streams if told and streams.cutter is not None else _awake(streams)
     rtc, sums = streams.rtc, streams.passive
     since_ns = 0 if streams.cutter is None or sums is None else sums.since_ns_utc
     if streams.heard_ns_utc - since_ns < LEAST_LOOK_S * 1e9 and since_ns:

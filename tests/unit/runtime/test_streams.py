@@ -498,7 +498,7 @@ class TestLooks:
         rest, first = taken(play(streams, 0, 40)[0], told=True)
         resting, _ = play(rest, 4000, 40)
         if how == "the dither ends":
-            resting = with_dither(resting, None, WINDOW_S)
+            resting, _ = taken(with_dither(resting, None, WINDOW_S), told=True)
         else:
             resting, sums = taken(resting)
             assert sums is None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import queue
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from typing_extensions import override
 from cacao_bridge.calibration import consent
 from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
-from service.commands.program import log_to_terminal, status_of, told_to_stop
+from service.commands.program import leave, log_to_terminal, status_of, told_to_stop
 from service.commands.terminal import print_lines
 from service.wire import FrameHeader, Keys, encode
 from service.wire.frames import encode_frames
@@ -179,4 +178,4 @@ class Bridge:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

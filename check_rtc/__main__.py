@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import signal
-import sys
 from collections.abc import Callable, Sequence
 
 from service.commands.arguments import OneLineParser, seconds
-from service.commands.program import imported_and_run
+from service.commands.program import imported_and_run, leave
 from service.commands.remote import add, words
 
 _EPILOG = """
@@ -70,4 +69,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

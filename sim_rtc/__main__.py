@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 import structlog
 from threadpoolctl import threadpool_limits
 
-from service.commands.program import log_to_terminal, status_of, told_to_stop
+from service.commands.program import leave, log_to_terminal, status_of, told_to_stop
 from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.files.recorder import RecordingWriter
@@ -179,4 +178,4 @@ def _check_writable(path: Path | None) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -235,7 +235,7 @@ def _check_shapes(arrays: list[tuple[NDArray[Any], tuple[int, ...]]]) -> None:
 
 def _check(known: Registration) -> None:
     """Refuse what no service has written: α and its bias must be a joint normal distribution."""
-    arrays = [(known.covariance, (4, 4)), (known.floor, (4,))]
+    arrays = [(known.covariance, (4, 4)), (known.floor, (4,)), (np.array(known.scatter), ())]
     bias = known.bias
     if bias is not None:
         arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, 4))]

@@ -28,7 +28,7 @@ JUMP_INFLATION = 10.0
 """After a jump each parameter may have moved by this many σ of the innovation."""
 
 SCATTER_LEARNING = 0.05
-"""Weight of the newest look in how much looks scatter: twenty are remembered."""
+"""Weight of the newest in how much windows, and looks, scatter: twenty are remembered."""
 
 _DITHERED = np.hstack([np.eye(4), np.zeros((4, 4))])
 _PASSIVE = np.hstack([np.eye(4), np.eye(4)])
@@ -154,9 +154,21 @@ def scattered(joint: Joint, innovation: float) -> Joint:
 
     In fast wind the bias swings from look to look, and looks scatter by more than they say.
     """
+    return replace(joint, scatter=learnt(joint.scatter, innovation))
+
+
+def learnt(scatter: float, innovation: float) -> float:
+    """Return how much more measurements scatter than they say, in variance, after one more.
+
+    Parameters
+    ----------
+    scatter
+        What those before have told; never less than 1.
+    innovation
+        Of the newest, squared and normalised with that much scatter allowed for: 4 is expected.
+    """
     seen = min(innovation, JUMP_THRESHOLD) / 4.0
-    learnt = joint.scatter * (1.0 + SCATTER_LEARNING * (seen - 1.0))
-    return replace(joint, scatter=max(learnt, 1.0))
+    return max(scatter * (1.0 + SCATTER_LEARNING * (seen - 1.0)), 1.0)
 
 
 def widened(prior: Joint, noise: Array) -> Joint:

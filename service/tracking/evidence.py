@@ -134,6 +134,7 @@ def enter(turn: Turn, measured: Measured) -> None:
         n_outlying = turn.state.windows_outlying + 1
         turn.state = replace(turn.state, windows_outlying=n_outlying)
         turn.warn("window.outlier", text)
+        known = replace(known, scatter=kalman.learnt(known.scatter, kalman.JUMP_THRESHOLD))
     if far.far:
         _put_aside(turn, known, measured, far)
         return
@@ -142,6 +143,7 @@ def enter(turn: Turn, measured: Measured) -> None:
         joint=kalman.with_dithered(prior, measured.alpha.vector, measured.covariance),
         n_windows=filtering.counted(turn, known, prior),
         innovation=_innovation(prior, measured),
+        scatter=kalman.learnt(known.scatter, far.innovation),
     )
     filtering.accept(turn, folded, measured)
 
@@ -188,6 +190,7 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
         joint=kalman.with_dithered(joint, measured.alpha.vector, measured.covariance),
         n_windows=2 if whole else 1,
         innovation=_innovation(prior, measured),
+        scatter=known.scatter,
         jumped=True,
     )
     validity.hold(turn, replace(known, passive_after_ns_utc=first.t_ns_utc))

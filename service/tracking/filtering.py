@@ -140,6 +140,9 @@ class Folded:
     innovation: float
     """Normalised innovation squared (4 degrees of freedom)."""
 
+    scatter: float = 1.0
+    """How much more windows scatter than they say, in variance, this one included."""
+
     jumped: bool = False
     """Whether it is of a new place, to which what was known before says nothing."""
 
@@ -216,6 +219,7 @@ def accept(turn: Turn, folded: Folded, measured: Measured, *, n_accepted: int = 
         t_ns_utc=when.ended_ns_utc,
         arrived_ns_utc=turn.now_ns,
         n_windows=folded.n_windows,
+        scatter=folded.scatter,
         window_ns_utc=turn.now_ns,
         window_began_ns_utc=when.began_ns_utc,
         optical_gain=measured.optical_gain,

@@ -89,7 +89,7 @@ def window_surprise(known: Registration, reading: Reading, policy: Policy) -> Di
     It is seen from after the last window and from before it: a jump in the middle of a window
     moves that one by half of it and the next by the other half, and neither half need be far out.
     """
-    return _farthest((last_of(known), known.earlier), reading, policy)
+    return _farthest((last_of(known), known.earlier), _scattering(known, reading), policy)
 
 
 def pair_surprise(known: Registration, reading: Reading, policy: Policy) -> Distance:
@@ -105,6 +105,8 @@ def pair_surprise(known: Registration, reading: Reading, policy: Policy) -> Dist
     seen_from = (last_of(known), before)
     if known.candidate is None and before is not None:
         seen_from = (before, before.earlier)
+    reading = _scattering(known, reading)
+    first = replace(first, covariance=known.scatter * first.covariance)
     alone = replace(
         reading, alpha=first.alpha, covariance=first.covariance, t_ns_utc=first.t_ns_utc
     )
@@ -164,6 +166,11 @@ def sum_of(known: Registration, joint: Joint) -> Earlier:
         t_ns_utc=known.t_ns_utc,
         pointing=known.pointing,
     )
+
+
+def _scattering(known: Registration, reading: Reading) -> Reading:
+    """Return a window that says of itself how much windows have scattered lately."""
+    return replace(reading, covariance=known.scatter * reading.covariance)
 
 
 def _together(first: Seen, reading: Reading) -> Reading:

@@ -149,6 +149,10 @@ class Registration:
     n_windows: int
     """Windows that entered the estimate since it began, jumped, went stale or was restored."""
 
+    scatter: float = 1.0
+    """How much more windows scatter than they say, in variance, one beside the other: in bad seeing
+    a pyramid's gains swing. Allowed for where a window is asked whether the mirror has jumped."""
+
     window_ns_utc: int = 0
     """When the last dithered window arrived, by the service's clock; 0: not known."""
 

@@ -29,8 +29,9 @@ FLAGS = ("registration.jump-suspected", "registration.jump", "registration.passi
 class Sky:
     """A mirror that drifts and jumps, windows and looks that average over their own time."""
 
-    def __init__(self, seed, *, jump=None, at_s=np.inf):
+    def __init__(self, seed, *, jump=None, at_s=np.inf, scatter=1.0):
         self.rng = np.random.default_rng(seed)
+        self.scatter = scatter
         self.jump, self.at_s = np.zeros(4) if jump is None else jump, at_s
         self.story = Story(Mode.HOLD, NIGHT).meet()
         self.begin_ns = self.story.now_ns
@@ -42,7 +43,7 @@ class Sky:
 
     def window(self, end_s):
         self.story.now_ns = self.begin_ns + round(end_s * SECOND)
-        read = self.mean(end_s, WINDOW_S) + WINDOW * self.rng.normal(size=4)
+        read = self.mean(end_s, WINDOW_S) + self.scatter * WINDOW * self.rng.normal(size=4)
         found = estimate(
             Misregistration.from_vector(read),
             t_ns=self.story.now_ns,
@@ -80,6 +81,20 @@ def test_a_drift_of_five_percent_a_minute_is_no_jump_however_it_is_watched():
         if k % 7 == 1:
             sparse.window(k * LOOK_S + 0.5)
     assert busy.flagged_s() == sparse.flagged_s() == np.inf
+
+
+def test_windows_that_scatter_by_more_than_they_say_are_no_jumps_once_that_is_learnt():
+    """By 1.8 σ instead of 1, as in bad seeing; a jump that stands out beyond it still is one."""
+    sky = Sky(3, scatter=1.8, jump=np.array([0.1, 0.0, 0.0, 0.0]), at_s=500.0)
+    for k in range(1, 211):
+        sky.window(k * WINDOW_S)
+    flagged = [
+        ((e.t_ns_utc - sky.begin_ns) / SECOND, e.name)
+        for e in sky.story.state.log
+        if e.name in FLAGS
+    ]
+    assert len([name for at_s, name in flagged if 50.0 < at_s <= 500.0]) <= 1, flagged
+    assert "registration.jump" in {name for at_s, name in flagged if at_s > 500.0}
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 
 import httpx
 import numpy as np
@@ -134,7 +135,9 @@ def test_a_recorded_night_gives_the_same_answers_every_time(tmp_path):
     path = tmp_path / "night.h5"
     with a_night(tmp_path) as night:
         night.service("auto")
-        rtc = night.rtc("--record", str(path), "--seconds", "16")
+        # near the nominal registration, about which a busy live worker may still linearise
+        alpha = "--alpha=0.01,-0.01,0.03,1.0005"
+        rtc = night.rtc("--record", str(path), "--seconds", "16", alpha)
         assert rtc.ended(60.0) == 0, rtc.log
         there = lived(night)
     first, second = replayed(path), replayed(path)
@@ -152,8 +155,16 @@ def test_a_recorded_night_gives_the_same_answers_every_time(tmp_path):
     same = sorted(set(there) & set(here))
     assert len(same) >= 6
     assert len(same) >= len(there) - 1  # the night's last window may have had no time to be fitted
-    # the live worker's linearisation may be another one: both are within 0.01 subaperture of α
-    assert_close([here[t] for t in same], [there[t] for t in same], 3e-4)
+    # a busy live worker has fitted some windows together with those before, which had waited
+    alone = [
+        t
+        for before, t in pairwise([0, *sorted(there)])
+        if t in here and not any(before < other < t for other in here)
+    ]
+    assert len(alone) >= 4
+    # its linearisation may be another one: both are within 0.01 subaperture of α; one window
+    # scatters by 0.0003 subapertures and 0.002 deg
+    assert_close([here[t] for t in alone], [there[t] for t in alone], 3e-4)
 
 
 def test_a_replay_over_zenoh_is_an_rtc_that_carries_out_nothing(tmp_path):

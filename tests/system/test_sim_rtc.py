@@ -44,6 +44,9 @@ from tests.system.pace import patience, slowness
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(180)]
 
 KEYS = Keys("flao-lbt")
+BLOCK = zenoh.CongestionControl.BLOCK
+"""As a service puts them: others are dropped where a busy machine does not take them at once."""
+
 START_UP_S = 60.0
 CHUNK_BYTES = 500_000
 _attempts = itertools.count()
@@ -158,12 +161,12 @@ class Listener:
         return manifest, np.frombuffer(data, "<f4").reshape(manifest.layout.shape)
 
     def commit(self, manifest: Manifest) -> None:
-        self.session.put(KEYS.commit(manifest.id), encode(manifest))
+        self.session.put(KEYS.commit(manifest.id), encode(manifest), congestion_control=BLOCK)
 
     def send_chunks(self, manifest: Manifest, matrix: np.ndarray, leave_out=()) -> None:
         for k, data in enumerate(split(matrix, manifest.layout.chunk_bytes)):
             if k not in leave_out:
-                self.session.put(KEYS.chunk(manifest.id, k), data)
+                self.session.put(KEYS.chunk(manifest.id, k), data, congestion_control=BLOCK)
 
     def offer_as_current(self, manifest: Manifest, matrix: np.ndarray) -> None:
         """Do what a service does: answer queries first, then say that it is alive."""

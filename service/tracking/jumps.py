@@ -7,6 +7,7 @@ than a minute it goes as time itself and not as its root, and what goes faster s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,7 @@ LITTLE = 0.3
 _ROTATION = 2
 
 Array = NDArray[np.float64]
+SeenT = TypeVar("SeenT", bound=Seen)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,7 +108,7 @@ def pair_surprise(known: Registration, reading: Reading, policy: Policy) -> Dist
     if known.candidate is None and before is not None:
         seen_from = (before, before.earlier)
     reading = _scattering(known, reading)
-    first = replace(first, covariance=known.scatter * first.covariance)
+    first = _scattering(known, first)
     alone = replace(
         reading, alpha=first.alpha, covariance=first.covariance, t_ns_utc=first.t_ns_utc
     )
@@ -168,9 +170,9 @@ def sum_of(known: Registration, joint: Joint) -> Earlier:
     )
 
 
-def _scattering(known: Registration, reading: Reading) -> Reading:
+def _scattering(known: Registration, window: SeenT) -> SeenT:
     """Return a window that says of itself how much windows have scattered lately."""
-    return replace(reading, covariance=known.scatter * reading.covariance)
+    return replace(window, covariance=known.scatter * window.covariance)
 
 
 def _together(first: Seen, reading: Reading) -> Reading:

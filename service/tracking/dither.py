@@ -129,7 +129,7 @@ def stop_by_operator(turn: Turn, _: cmd.StopDither) -> None:
 
 
 def tell_to_stop(turn: Turn) -> None:
-    """Ask the same of one that nobody wants."""
+    """Ask the RTC to end a dither that nobody wants, which is not followed."""
     turn.dithering = replace(turn.dithering, told_ns_utc=turn.now_ns)
     ask_to_stop(turn)
 

@@ -141,14 +141,19 @@ class Engine:
     def feed(self, blocks: Iterable[FrameBlock]) -> None:
         """Take in frames; windows that end in them are handed on to be fitted."""
         streams = self.lend()
-        if streams is not None:
-            self.give_back(*looked_at(streams, blocks))
+        if streams is None:
+            return
+        windows: list[Window] = []
+        try:
+            streams, windows = looked_at(streams, blocks)
+        finally:
+            self.give_back(streams, windows)
 
     def lend(self) -> Streams | None:
         """Return the estimators, to look at frames elsewhere; None: the model is being prepared.
 
         Until they are given back they follow nothing, and nobody may have sums of them, or teach
-        them a matrix.
+        them a matrix. A look that fails gives them back as they were.
         """
         self._lent = None if self.streams is None else (self.streams, self.state)
         return self.streams

@@ -27,7 +27,7 @@ from service.runtime.engine import Engine, looked_at
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.keeping import TelemetryKeeper
 from service.runtime.recording import Caller, Recorder, ids_of
-from service.runtime.streams import WATCH_INTERVAL_S
+from service.runtime.streams import WATCH_INTERVAL_S, Streams, Window
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
 from service.snapshot import Snapshot
@@ -278,13 +278,16 @@ class Supervisor:
             streams = self._engine.lend()
             if streams is None:
                 return
-            blocks = await loop.run_in_executor(self._eyes, self._bridge.drain)
-            self.newest_frames = blocks[-1] if blocks else self.newest_frames
-            for block in blocks:
-                self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
+            found: tuple[Streams, list[Window]] = streams, []
             with self._surviving("telemetry"):
-                found = await loop.run_in_executor(self._eyes, looked_at, streams, blocks)
-                self._engine.give_back(*found)
+                try:
+                    blocks = await loop.run_in_executor(self._eyes, self._bridge.drain)
+                    self.newest_frames = blocks[-1] if blocks else self.newest_frames
+                    for block in blocks:
+                        self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
+                    found = await loop.run_in_executor(self._eyes, looked_at, streams, blocks)
+                finally:
+                    self._engine.give_back(*found)
 
     @contextlib.contextmanager
     def _surviving(self, what: str) -> Iterator[None]:

@@ -669,3 +669,29 @@ def test_frames_wait_only_while_alpha_is_followed_and_nothing_else_happens():
         {"reconstructors": (foreign(), sent)},
     ):
         assert gathered_s(**changes) == 0.0
+
+
+def test_estimators_follow_the_rtc_again_after_a_look_that_fails(streams, monkeypatch):
+    class Driver:
+        def now_ns(self):
+            return START_NS
+
+        def stepped(self, before, event):
+            pass
+
+        def perform(self, effect):
+            pass
+
+        def swapped(self, in_use):
+            pass
+
+    def broken(streams, block):
+        raise ValueError("an inhomogeneous shape")
+
+    engine = Engine(replace(handmade.STATE, rtc=RTC), POLICY, Driver())
+    engine.streams = streams
+    monkeypatch.setattr("service.runtime.engine.fed", broken)
+    with pytest.raises(ValueError, match="inhomogeneous"):
+        engine.feed([block(0)])
+    engine.hear(replace(RTC, session="s2"))
+    assert engine.streams.rtc.session == "s2"

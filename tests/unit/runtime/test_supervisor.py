@@ -265,6 +265,20 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
         assert supervisor.snapshot().ready
 
 
+async def test_frames_that_the_link_cannot_hand_on_end_no_service(supervisor, bridge, monkeypatch):
+    def broken():
+        raise ValueError("a ring that is bent")
+
+    async with running(supervisor):
+        monkeypatch.setattr(bridge, "drain", broken)
+        await until(lambda: "internal.error" in [e.name for e in supervisor._engine.state.log])
+        monkeypatch.undo()
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
+        await until(lambda: supervisor._engine.streams.rtc is not None)
+        entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
+        assert "a ring that is bent" in entry.text
+
+
 async def test_an_order_is_carried_out_while_frames_are_looked_at(supervisor, bridge, monkeypatch):
     looking, go_on = threading.Event(), threading.Event()
 

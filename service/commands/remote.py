@@ -363,8 +363,7 @@ def main(options: argparse.Namespace) -> int:
             service, request, options
         )
     except RefusedError as error:
-        told = str(error)  # many a refusal begins with the order's name already
-        say(f"pyrcal: {request.name}: {told.removeprefix(f'{request.name}: ')}")
+        say(f"pyrcal: {request.name}: {error}")
         return NOT_DONE
     except UnreachableError as error:
         say(f"pyrcal: {error}")

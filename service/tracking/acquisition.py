@@ -57,7 +57,7 @@ def acquire_on_command(turn: Turn, _: cmd.Acquire) -> None:
     """
     reason = stages.why_not_now(turn.state, turn.policy)
     if turn.rtc is None or reason is not None:
-        raise CommandError(f"acquisition: {reason}")
+        raise CommandError(reason or "no RTC is there")
     allow(turn)
     _begin(turn, turn.rtc, "the operator asks", commanded=True)
 
@@ -72,7 +72,7 @@ def abort_on_command(turn: Turn, _: cmd.AbortAcquisition) -> None:
     """
     interrupted = turn.acquisition.stage is AcquisitionStage.INTERRUPTED
     if not turn.acquisition.under_way and not interrupted:
-        raise CommandError("acquisition: none is under way")
+        raise CommandError("no acquisition is under way")
     turn.calm(ACQUISITION)
     stages.abort(turn, "by the operator", held_off=True)
 

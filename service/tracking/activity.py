@@ -102,7 +102,7 @@ def refuse_if_occupied(state: TrackerState, event: Event, now_ns: int) -> None:
     for running in under_way(state, now_ns):
         opens = running.activity is Activity.RAMPING and _opens(event)
         if type(event) not in ALLOWS[running.activity] and not opens:
-            raise CommandError(f"{type(event).__name__}: {running.text}")
+            raise CommandError(running.text)
 
 
 def under_way(state: TrackerState, now_ns: int) -> tuple[Running, ...]:

@@ -296,14 +296,14 @@ def plan_random(
     amplitude_m = float(total_m / np.sqrt(len(modes)))
     if amplitude_m > rtc.max_dither_m:
         raise CommandError(
-            f"dither: found {1e9 * amplitude_m:.3g} nm on each of {len(modes)} modes, the RTC "
+            f"found {1e9 * amplitude_m:.3g} nm on each of {len(modes)} modes, the RTC "
             f"takes at most {1e9 * rtc.max_dither_m:.3g} nm"
         )
     least_s = max(policy.window_s, COMFORTABLE * FRAMES_PER_MODE * len(modes) / rtc.frame_rate_hz)
     n_windows = int(duration_s / least_s * (1.0 + 1e-9))
     if n_windows < 1:
         raise CommandError(
-            f"dither: found {duration_s:g} s; {len(modes)} modes need windows of {least_s:.3g} s"
+            f"found {duration_s:g} s; {len(modes)} modes need windows of {least_s:.3g} s"
         )
     request = DitherRequest(
         id=dither_id,
@@ -332,7 +332,7 @@ def random_plan(dither: Dither, rtc: Status, window_s: float) -> RandomPlan:
     )
 
 
-def check_modes(what: str, modes: tuple[int, ...], rtc: Status) -> None:
+def check_modes(modes: tuple[int, ...], rtc: Status) -> None:
     """Refuse modes that the RTC's basis does not have, or none.
 
     Raises
@@ -342,10 +342,10 @@ def check_modes(what: str, modes: tuple[int, ...], rtc: Status) -> None:
     """
     if not modes or max(modes) >= rtc.n_modes:
         found = max(modes, default=None)
-        raise CommandError(f"{what}: found mode {found}; expected 0 to {rtc.n_modes - 1}")
+        raise CommandError(f"found mode {found}; expected 0 to {rtc.n_modes - 1}")
 
 
-def cost_of(what: str, total_m: float, policy: Policy, *, over_budget: bool) -> str:
+def cost_of(total_m: float, policy: Policy, *, over_budget: bool) -> str:
     """Return in words what a dither costs, of the budget; beyond it only if that is meant.
 
     Raises
@@ -357,7 +357,7 @@ def cost_of(what: str, total_m: float, policy: Policy, *, over_budget: bool) -> 
     if total_m <= policy.dither_budget_m * (1.0 + 1e-9):
         return cost
     if not over_budget:
-        raise CommandError(f"{what}: {cost}; say over_budget if that is meant")
+        raise CommandError(f"{cost}; say over_budget if that is meant")
     return f"{cost}: over budget, as asked"
 
 
@@ -366,10 +366,10 @@ def _modes(asked: tuple[int, ...] | ModeSet, rtc: Status) -> tuple[int, ...]:
         modes = tuple(range(rtc.n_modes if asked is ModeSet.ALL else rtc.n_controlled))
     else:
         modes = asked
-    check_modes("dither", modes, rtc)
+    check_modes(modes, rtc)
     if len(modes) > rtc.max_dither_modes:
         raise CommandError(
-            f"dither: found {len(modes)} modes; the RTC dithers at most {rtc.max_dither_modes}"
+            f"found {len(modes)} modes; the RTC dithers at most {rtc.max_dither_modes}"
         )
     return modes
 

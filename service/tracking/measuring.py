@@ -66,11 +66,11 @@ def measure(turn: Turn, command: cmd.Measure) -> None:
     """
     rtc = turn.rtc
     if rtc is None:
-        raise CommandError("measure: no RTC is there")
+        raise CommandError("no RTC is there")
     if turn.state.measurement(command.id) is not None:
-        raise CommandError(f"measure: {command.id} was measured before; ids are never reused")
+        raise CommandError(f"{command.id} was measured before; ids are never reused")
     record = _planned(command, rtc, turn.policy, turn.now_ns)
-    check_modes("measure", record.modes, rtc)
+    check_modes(record.modes, rtc)
     _keep(turn, record)
     turn.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
     turn.ask(
@@ -250,13 +250,12 @@ def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
     """
     rtc = turn.rtc
     if rtc is None or rtc.loop == "open":
-        raise CommandError("noisy matrix: it needs an RTC with its loop closed")
+        raise CommandError("a noisy matrix needs an RTC with its loop closed")
     if turn.state.measurement(command.id) is not None:
-        text = f"{command.id} was measured before; ids are never reused"
-        raise CommandError(f"noisy matrix: {text}")
+        raise CommandError(f"{command.id} was measured before; ids are never reused")
     duration_s = command.duration_s or DURATION_S
     total = command.total_amplitude_m or min(RANDOM_TOTAL_M, turn.policy.dither_budget_m)
-    cost_of("noisy matrix", total, turn.policy, over_budget=command.over_budget)
+    cost_of(total, turn.policy, over_budget=command.over_budget)
     dither = plan_random(
         rtc,
         turn.policy,

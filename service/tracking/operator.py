@@ -99,7 +99,7 @@ def roll_back(turn: Turn, command: cmd.Rollback) -> None:
     """
     earlier = turn.state.previous
     if earlier is None:
-        raise CommandError("rollback: no earlier reconstructor has been in use")
+        raise CommandError("no earlier reconstructor has been in use")
     _copy(turn, earlier, f"the operator goes back to {earlier}", anyway=command.anyway)
 
 
@@ -113,12 +113,12 @@ def refit(turn: Turn, command: cmd.Refit) -> None:
     """
     rtc = turn.rtc
     if rtc is None:
-        raise CommandError("refit: no RTC is there")
+        raise CommandError("no RTC is there")
     if turn.known is None:
-        raise CommandError("refit: α is not known yet; start a dither and wait for a window")
+        raise CommandError("α is not known yet; start a dither and wait for a window")
     asked = command.n_modes or rtc.n_controlled
     if not 0 < asked <= rtc.n_modes:
-        raise CommandError(f"refit: found {asked} modes; expected 1 to {rtc.n_modes}")
+        raise CommandError(f"found {asked} modes; expected 1 to {rtc.n_modes}")
     reconstructors.make(turn, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
 
 
@@ -135,7 +135,7 @@ def start_dither(turn: Turn, command: cmd.StartDither) -> None:
         raise CommandError("a dither needs an RTC with its loop closed")
     dither = _planned(turn, rtc, command)
     total, over_budget = total_m(dither.request), command.over_budget
-    cost = cost_of("dither", total, turn.policy, over_budget=over_budget)
+    cost = cost_of(total, turn.policy, over_budget=over_budget)
     allow(turn)
     modes = dither.request.modes
     which = f"modes {modes}" if len(modes) < 10 else f"{len(modes)} modes"
@@ -172,10 +172,10 @@ def _planned(turn: Turn, rtc: Status, command: cmd.StartDither) -> Dither:
         frequency_hz=command.frequency_hz,
         duration_s=command.duration_s,
     )
-    check_modes("dither", dither.request.modes, rtc)
+    check_modes(dither.request.modes, rtc)
     reason = why_unusable(dither, rtc, policy)
     if reason is not None:
-        raise CommandError(f"dither: {reason}")
+        raise CommandError(reason)
     return dither
 
 
@@ -228,10 +228,10 @@ def set_loop(turn: Turn, command: cmd.SetLoop) -> None:
     CommandError
         If it makes no sense in this state.
     """
-    rtc = _there(turn, "loop")
+    rtc = _there(turn)
     n_controlled = command.n_controlled
     if n_controlled is not None and not 1 <= n_controlled <= rtc.n_modes:
-        raise CommandError(f"loop: found {n_controlled} modes; expected 1 to {rtc.n_modes}")
+        raise CommandError(f"found {n_controlled} modes; expected 1 to {rtc.n_modes}")
     groups, n_modes = command.gains, n_controlled or rtc.n_controlled
     gains = None if groups is None else _gains(rtc, groups, n_modes)
     if command.effective_gain is not None:
@@ -260,11 +260,11 @@ def ramp(turn: Turn, command: cmd.Ramp) -> None:
     CommandError
         If it makes no sense in this state.
     """
-    rtc = _there(turn, "ramp")
+    rtc = _there(turn)
     if rtc.loop == "open":
-        raise CommandError("ramp: found the loop open; expected it closed, to see its residual")
+        raise CommandError("found the loop open; expected it closed, to see its residual")
     groups = command.groups or _paper_groups(rtc.n_controlled)
-    ranges = _ranges("ramp", groups, rtc.n_controlled)
+    ranges = _ranges(groups, rtc.n_controlled)
     gains = command.gains or RAMP_GAINS
     n_frames = max(1, round((command.step_s or RAMP_STEP_S) * rtc.frame_rate_hz))
     lasts_s = len(ranges) * len(gains) * n_frames / rtc.frame_rate_hz
@@ -322,11 +322,11 @@ def _gains(rtc: Status, groups: tuple[GainGroup, ...], n_modes: int) -> tuple[fl
 
     The status of an open loop does not tell the gains it will close with.
     """
-    ranges = _ranges("loop", groups, n_modes)
+    ranges = _ranges(groups, n_modes)
     named = sum(last - first + 1 for first, last in ranges)
     if rtc.loop == "open" and named < n_modes:
         raise CommandError(
-            f"loop: found gains for {named} modes; expected all {n_modes} while the loop is open, "
+            f"found gains for {named} modes; expected all {n_modes} while the loop is open, "
             "for its status does not tell the others"
         )
     gains = list(extended_gains(rtc, n_modes))
@@ -340,7 +340,7 @@ def _compensated(turn: Turn, rtc: Status, in_effect: float, n_modes: int) -> tup
     known = turn.known
     if known is None or not known.optical_gains:
         raise CommandError(
-            "loop: found no measured optical gain; expected a dithered window before gains are "
+            "found no measured optical gain; expected a dithered window before gains are "
             "compensated for it"
         )
     gains = gain_table(known.optical_gains, n_modes).loop_gains(in_effect)
@@ -356,12 +356,12 @@ def _paper_groups(n_controlled: int) -> tuple[ModeGroup, ...]:
     )
 
 
-def _ranges(what: str, groups: tuple[ModeGroup, ...], n_modes: int) -> tuple[tuple[int, int], ...]:
+def _ranges(groups: tuple[ModeGroup, ...], n_modes: int) -> tuple[tuple[int, int], ...]:
     """Return first and last mode of each group, all of them modes of the loop."""
     for group in groups:
         if group.last >= n_modes:
             raise CommandError(
-                f"{what}: found modes {group.first} to {group.last}; expected a range within 0 to "
+                f"found modes {group.first} to {group.last}; expected a range within 0 to "
                 f"{n_modes - 1}"
             )
     return tuple((group.first, group.last) for group in groups)
@@ -399,7 +399,7 @@ def _ask_loop(
     turn.ask(ev.Ask(request=request, judged=judged))
 
 
-def _there(turn: Turn, what: str) -> Status:
+def _there(turn: Turn) -> Status:
     if turn.rtc is None:
-        raise CommandError(f"{what}: no RTC is there")
+        raise CommandError("no RTC is there")
     return turn.rtc

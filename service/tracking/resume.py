@@ -64,7 +64,7 @@ def release(turn: Turn, command: cmd.Resume) -> None:
     """
     if not turn.state.stopped_because:
         held = "; mode is hold: set another to go on" if turn.state.mode is Mode.HOLD else ""
-        raise CommandError(f"resume: nothing is stopped{held}")
+        raise CommandError(f"nothing is stopped{held}")
     turn.state = replace(turn.state, stopped_because="")
     turn.calm(STOPPED)
     turn.log("resumed", command.signed)

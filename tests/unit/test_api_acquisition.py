@@ -34,7 +34,7 @@ async def test_what_makes_no_sense_is_refused(client, service, body):
 
 
 async def test_one_that_cannot_begin_says_why(client, service):
-    service.refusal = CommandError("acquisition: no RTC is there")
+    service.refusal = CommandError("no RTC is there")
     response = await client.post("/v1/acquisition", json={"action": "start"})
     assert response.status_code == 409
     assert "no RTC is there" in response.json()["detail"]

@@ -115,7 +115,7 @@ async def test_a_request_that_cannot_be_meant_is_refused(client, service, body, 
 
 
 async def test_a_refusal_arrives_in_its_own_words(client, service):
-    service.refusal = CommandError("noisy matrix: 11 nm RMS in all, budget 8 nm")
+    service.refusal = CommandError("11 nm RMS in all, budget 8 nm")
     response = await client.post("/v1/noisy-matrix", json={})
     assert (response.status_code, response.json()["detail"]) == (409, str(service.refusal))
 

@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from service.commands.remote import REQUESTS
 from service.control.gate import GateVerdict
+from service.errors import CommandError
 from service.model.misregistration import Misregistration
 from service.telemetry.lockin import WindowEstimate
 from service.tracker import step
@@ -28,6 +30,7 @@ from service.wire import (
     Status,
 )
 
+ORDERS = {request.name for request in REQUESTS} | {"acquisition", "loop", "noisy matrix", "ramp"}
 SECOND = 1_000_000_000
 START_NS = 1_800_000_000 * SECOND
 N_MODES = 594
@@ -197,7 +200,13 @@ class Story:
     def tell(self, event, after_s=0.0):
         """Let time pass, then something happen; return what is to be done about it."""
         self.now_ns += round(after_s * SECOND)
-        self.state, effects = step(self.state, event, self.policy, self.now_ns)
+        try:
+            self.state, effects = step(self.state, event, self.policy, self.now_ns)
+        except CommandError as refusal:
+            first = str(refusal).partition(": ")[0]
+            if first in {type(event).__name__, *ORDERS}:
+                raise AssertionError(f"who is refused has said what: {refusal}") from refusal
+            raise
         self.effects += effects
         for effect in effects if self.shows else ():
             known = isinstance(effect, ev.FetchMatrix) and self.state.reconstructor(effect.id or "")

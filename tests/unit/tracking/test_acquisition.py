@@ -497,7 +497,7 @@ class TestOperator:
             story.tell(cmd.Acquire())
 
     def test_cannot_abort_what_is_not_there(self):
-        with pytest.raises(CommandError, match="none is under way"):
+        with pytest.raises(CommandError, match="no acquisition is under way"):
             Acquiring().tell(cmd.AbortAcquisition())
 
     def test_who_aborts_gets_a_healthy_loop_back_as_it_was(self):

@@ -96,8 +96,10 @@ def ask_for(turn: Turn, dither: Dither) -> None:
 
 
 def ask_to_stop(turn: Turn) -> None:
-    """Ask the RTC to play no dither."""
-    turn.ask(ev.Ask(request=DitherStop(id=f"stop-{turn.now_ns}")))
+    """Ask the RTC to play no dither; two reasons at once are one request."""
+    stop = ev.Ask(request=DitherStop(id=f"stop-{turn.now_ns}"))
+    if stop not in turn.effects:
+        turn.ask(stop)
 
 
 def drop(turn: Turn) -> None:

@@ -62,6 +62,12 @@ def test_a_dither_ends_at_once():
     assert stopped(own_dither()).pass_(1.0).playing is None
 
 
+@pytest.mark.parametrize("activity", ACTIVITIES, ids=lambda activity: activity.__name__)
+def test_the_rtc_is_asked_once_to_end_a_dither(activity):
+    effects = activity().tell(STOP)
+    assert len(of_kind(effects, DitherStop)) <= 1
+
+
 def test_an_acquisition_gives_back_the_loop_and_does_not_begin_again():
     world = acquiring()
     assert world.loop == "open"

@@ -31,7 +31,7 @@ from service.tracking.registration import HistoryEntry
 from service.tracking.resume import orders_of, resumed, saved_of, with_orders
 from service.tracking.state import Level, LogEntry, TrackerState
 from service.tracking.turn import logged
-from service.wire import DitherRequest, MeasureRequest, RampRequest
+from service.wire import DitherRequest, MeasureRequest, OffloadRequest, RampRequest
 
 RETRY_S = 2.0
 """Between two attempts while the disk refuses."""
@@ -129,6 +129,7 @@ class Recorder:
         self._lost = 0
         self._guard = threading.Lock()
         self._writing = threading.Lock()
+        self._saving = asyncio.Lock()
         self._news = asyncio.Event()
         self._trouble = ""
         self._log = structlog.get_logger()
@@ -196,14 +197,19 @@ class Recorder:
     async def before(self, effect: Effect) -> None:
         """Wait until what has led to an effect is on the disk.
 
+        A demand to move the mirror's image is there for the next service as well: nobody else can
+        tell it that the image may stand elsewhere.
+
         Raises
         ------
-        StorageError
+        ArchiveError
             If it cannot be: nothing is begun that cannot be recorded.
         """
-        begins = isinstance(effect, ev.Ask) and isinstance(effect.request, BEGINNINGS)
-        if begins or isinstance(effect, ev.SendMatrix):
+        request = effect.request if isinstance(effect, ev.Ask) else None
+        if isinstance(request, BEGINNINGS) or isinstance(effect, ev.SendMatrix):
             await self.flush()
+        if isinstance(request, OffloadRequest):
+            await self._save_now()
 
     async def flush(self) -> None:
         """Write what waits.
@@ -257,14 +263,26 @@ class Recorder:
                 continue
             next_s = time.monotonic() + SAVE_INTERVAL_S
             try:
-                await asyncio.to_thread(leave, self._archive, state, time.time_ns())
-                saved = state
+                saved = await self._save_now()
                 self._news.set()  # estimates are written as seldom as what the next service needs
             except StorageError as error:
                 self.failed(error)
                 await asyncio.sleep(RETRY_S)
             except ArchiveError as error:  # it has been put aside: the next attempt finds none
                 self._log.error("archive.failed", text=str(error))
+
+    async def _save_now(self) -> TrackerState:
+        """Keep what the next service needs, and return what was kept; one at a time.
+
+        Raises
+        ------
+        ArchiveError
+            As :func:`leave`.
+        """
+        async with self._saving:
+            state = self._state()
+            await asyncio.to_thread(leave, self._archive, state, time.time_ns())
+        return state
 
     async def keep_house(self, keeping: Keeping) -> None:
         """Look after the disk until cancelled, as the user has decided; in threads."""
@@ -299,7 +317,7 @@ class Recorder:
     async def keep_orders(self) -> None:
         """Keep what was ordered for the service after this one now, if the disk lets it."""
         try:
-            await asyncio.to_thread(leave, self._archive, self._state(), time.time_ns())
+            await self._save_now()
         except ArchiveError as error:  # :meth:`save` tries again, and raises the alarm
             self._log.error("archive.failed", text=str(error))
 

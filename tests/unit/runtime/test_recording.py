@@ -1,5 +1,7 @@
-"""Estimates on their way to the disk: batched, in their order, none twice."""
+"""Estimates on their way to the disk: batched, in their order, none twice; and what cannot wait."""
 
+import asyncio
+import threading
 from dataclasses import replace
 
 import pytest
@@ -7,8 +9,13 @@ import pytest
 from service.errors import StorageError
 from service.runtime import recording
 from service.runtime.recording import Recorder
+from service.tracking import events as ev
+from service.tracking.registration import MoveState
 from service.tracking.state import TrackerState
+from service.wire import OffloadRequest
+from tests.system.pace import patience
 from tests.unit.test_archive_nights import NOON, entry
+from tests.unit.tracking.test_offload import a_story
 
 EMPTY = TrackerState(system="small")
 
@@ -67,3 +74,49 @@ async def test_a_disk_that_refuses_for_long_loses_the_newest_and_says_how_many(
     assert kept(archive) == [0, 1, 2]
     assert recorder.waiting == 0
     assert archive.audit_trail()[-1].text.startswith("2 lines came while the disk refused")
+
+
+class TestDemandToMoveTheImage:
+    """A service killed before the answer must not leave the next one unaware."""
+
+    async def test_it_is_on_the_disk_before_it_is_asked(self, archive):
+        story = a_story()
+        recorder = Recorder(archive, lambda: story.state, lambda event: None)
+        (asked,) = story.asked(OffloadRequest)
+        await recorder.before(ev.Ask(request=asked))
+        move = archive.tracking.read().move
+        assert (move.id, move.state) == (asked.id, MoveState.ASKED)
+
+    async def test_it_is_not_asked_where_the_disk_refuses(self, archive, monkeypatch):
+        def refuse(*_):
+            raise StorageError("full")
+
+        story = a_story()
+        recorder = Recorder(archive, lambda: story.state, lambda event: None)
+        (asked,) = story.asked(OffloadRequest)
+        monkeypatch.setattr(archive.tracking, "write", refuse)
+        with pytest.raises(StorageError):
+            await recorder.before(ev.Ask(request=asked))
+
+    async def test_a_write_that_began_before_it_does_not_come_after_it(self, archive, monkeypatch):
+        story = a_story()
+        states = [replace(story.state, move=None), story.state]
+        (asked,) = story.asked(OffloadRequest)
+        writing, go_on, written = threading.Event(), threading.Event(), []
+
+        def slowly(_archive, state, _now_ns):
+            if state.move is None:
+                writing.set()
+                assert go_on.wait(patience(20.0))
+            written.append(state.move)
+
+        monkeypatch.setattr(recording, "leave", slowly)
+        recorder = Recorder(archive, lambda: states[0], lambda event: None)
+        first = asyncio.create_task(recorder.keep_orders())
+        await asyncio.to_thread(writing.wait, patience(20.0))
+        del states[0]
+        second = asyncio.create_task(recorder.before(ev.Ask(request=asked)))
+        await asyncio.wait({second}, timeout=0.2)
+        go_on.set()
+        await asyncio.gather(first, second)
+        assert written == [None, story.state.move]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,12 +23,8 @@ LEAP: Final = "leap"
 LEAP_S: Final = 10.0
 """Of frames: a longer leap of the sequence is believed only when more batches confirm it."""
 
-ROOM: Final = 1024
-"""Frames there is memory for while the reader keeps up; one that falls behind needs more."""
-
 CONFIRMATIONS: Final = 2
 """Batches that must go on where a leap has led."""
-
 
 Places = slice | NDArray[np.int64]
 """Where frames are; a slice, where they lie in a row, is much quicker."""
@@ -60,8 +57,7 @@ class FrameRing:
 
     The reader's cursor and the head (one past the newest frame) bound what is undelivered.
     A place between them is held, missing (it may still come) or void (it came, with a number
-    that is not finite). Numbers are kept modulo the room, which grows up to the capacity
-    and is given back when the reader has caught up.
+    that is not finite). Numbers stay in the batches they came in until the reader passes them.
     """
 
     def __init__(self, header: FrameHeader, capacity: int, counts: FrameCounts) -> None:
@@ -82,14 +78,9 @@ class FrameRing:
         self._counts = counts
         self._capacity = capacity
         self._cursor = self._head = header.seq0
-        self._least_room = min(capacity, ROOM)
-        self._allocate(self._least_room)
         self._state = np.zeros(capacity, np.int8)
         self._seq = np.full(capacity, -1, np.int64)
-        self._t_ns = np.zeros(capacity, np.int64)
-        self._dt_ns = np.zeros(capacity, np.int64)
-        self._has_dither = np.zeros(capacity, np.bool_)
-        self._cm_id = np.full(capacity, None, object)
+        self._batch = np.full(capacity, None, object)
         self._noticed_s = np.zeros(capacity)
         self._newest_ns = header.t0_ns
         self._leapt: list[FrameBatch] = []
@@ -152,7 +143,7 @@ class FrameRing:
             self._newest_ns = header.t0_ns + (header.n - 1) * header.dt_ns
         self._advance(header.seq0 + header.n, now_s)
         if follows:  # as nearly always: every place is free
-            self._fill(batch, np.arange(header.n), _span(header.seq0, header.n, self._capacity))
+            self._hold(batch)
             return
         slots = seq % self._capacity
         here = self._seq[slots] == seq
@@ -161,7 +152,10 @@ class FrameRing:
         counts.duplicate += duplicate
         counts.late += header.n - duplicate - int(np.count_nonzero(free))
         counts.recovered += int(np.count_nonzero(free[:older]))
-        self._fill(batch, np.flatnonzero(free), slots[free])
+        edges = np.flatnonzero(np.diff(free, prepend=False, append=False)).tolist()
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            # copied: a few frames must not keep the memory of all that came with them
+            self._hold(_part(batch, start, stop, copied=True))
 
     def take(self, now_s: float, patience_s: float, limit: int) -> list[FrameBlock]:
         """Return copies of at most ``limit`` frames that are due, and pass them.
@@ -174,15 +168,15 @@ class FrameRing:
         waiting = (self._state[slots] == MISSING) & (now_s - self._noticed_s[slots] < patience_s)
         if waiting.any():
             slots = slots[: int(np.argmax(waiting))]
-        blocks = [
-            self._block(slots[start:stop])
-            for start, stop in self._runs(slots)
-            if self._state[slots[start]] == HELD
-        ]
+        blocks: list[list[FrameBatch]] = []
+        for part in self._held(self._cursor, self._cursor + len(slots)):
+            if blocks and _goes_on(blocks[-1][-1].header, part.header):
+                blocks[-1].append(part)
+            else:
+                blocks.append([part])
         self._cursor += len(slots)
-        if self._cursor == self._head and self._room > self._least_room:
-            self._allocate(self._least_room)
-        return blocks
+        self._batch[slots] = None
+        return [_block(parts) for parts in blocks]
 
     def due(self, now_s: float, patience_s: float) -> bool:
         """Return whether the next place can be passed now."""
@@ -201,82 +195,83 @@ class FrameRing:
             passed = np.arange(self._cursor, min(cursor, self._head)) % self._capacity
             self._counts.overwritten += int(np.count_nonzero(self._state[passed] == HELD))
         self._counts.lost += head - self._head
-        self._make_room(cursor, head)
         self._cursor = cursor
         first = max(self._head, head - self._capacity)
         slots = _span(first, head - first, self._capacity)
         self._seq[slots] = np.arange(first, head)
         self._state[slots] = MISSING
+        self._batch[slots] = None
         self._noticed_s[slots] = now_s
         self._head = head
 
-    def _allocate(self, room: int) -> None:
-        """Take memory for the numbers of so many frames, in which there are none yet."""
-        self._room = room
-        self._slopes = np.empty((room, self.n_slopes), np.float32)
-        self._commands = np.empty((room, self.n_modes), np.float32)
-        self._dither = np.empty((room, self.n_modes), np.float32)
-
-    def _make_room(self, cursor: int, head: int) -> None:
-        """Have memory for the numbers of all places from the cursor to the head."""
-        if head - cursor <= self._room:
-            return
-        kept = np.arange(cursor, self._head)
-        before, old = kept % self._room, (self._slopes, self._commands, self._dither)
-        self._allocate(min(self._capacity, 2 * (head - cursor)))
-        for new, numbers in zip((self._slopes, self._commands, self._dither), old, strict=True):
-            new[kept % self._room] = numbers[before]
-
-    def _fill(self, batch: FrameBatch, rows: NDArray[np.intp], slots: Places) -> None:
-        """Put these rows of a batch into these places."""
-        header = batch.header
-        whole = len(rows) == header.n  # views instead of copies
-        chosen: slice | NDArray[np.intp] = slice(None) if whole else rows
-        finite = np.isfinite(batch.rows[chosen]).all(axis=1)
+    def _hold(self, batch: FrameBatch) -> None:
+        """Keep the frames of a batch, whose places are free."""
+        finite = _finite(batch.rows)
         n_finite = int(np.count_nonzero(finite))
-        self._state[slots] = np.where(finite, HELD, VOID)
-        self._counts.lost -= len(rows)
-        self._counts.nonfinite += len(rows) - n_finite
+        self._counts.lost -= len(finite)
+        self._counts.nonfinite += len(finite) - n_finite
         self._counts.received += n_finite
-        room = self._room
-        places = _span(header.seq0, header.n, room) if whole else (header.seq0 + rows) % room
-        self._slopes[places] = batch.slopes[chosen]
-        self._commands[places] = batch.commands_m[chosen]
-        dither = batch.dither_m
-        if dither is not None:
-            self._dither[places] = dither[chosen]
-        self._has_dither[slots] = header.dither
-        self._t_ns[slots] = header.t0_ns + rows * header.dt_ns
-        self._dt_ns[slots] = header.dt_ns
-        self._cm_id[slots] = header.cm_id
+        slots = _span(batch.header.seq0, batch.header.n, self._capacity)
+        self._state[slots] = np.where(finite, HELD, VOID)
+        self._batch[slots] = batch
 
-    def _runs(self, slots: NDArray[np.int64]) -> list[tuple[int, int]]:
-        """Return the bounds of rows that may share a block; runs of missing rows are among them."""
-        if not len(slots):
-            return []
-        held = self._state[slots] == HELD
-        t_ns, dt_ns = self._t_ns[slots], self._dt_ns[slots]
-        cm_id, has_dither = self._cm_id[slots], self._has_dither[slots]
-        step = np.abs(np.diff(t_ns) - dt_ns[:-1]) > 0.5 * dt_ns[:-1]
-        changed = (dt_ns[1:] != dt_ns[:-1]) | (has_dither[1:] != has_dither[:-1])
-        other_matrix = (cm_id[1:] != cm_id[:-1]).astype(np.bool_)
-        cut = ~(held[1:] & held[:-1]) | step | changed | other_matrix
-        bounds = [0, *(np.flatnonzero(cut) + 1).tolist(), len(slots)]
-        return list(pairwise(bounds))
+    def _held(self, seq: int, end: int) -> Iterator[FrameBatch]:
+        """Yield the frames held between two places, run by run, each of one batch."""
+        while seq < end:
+            batch = self._batch[seq % self._capacity]
+            if batch is None:
+                seq += 1
+                continue
+            first = batch.header.seq0
+            last = min(end, first + batch.header.n)
+            held = self._state[_span(seq, last - seq, self._capacity)] == HELD
+            n = len(held) if held.all() else int(np.argmin(held))
+            if n:
+                yield _part(batch, seq - first, seq - first + n)
+            seq += max(n, 1)
 
-    def _block(self, slots: NDArray[np.int64]) -> FrameBlock:
-        first = slots[0]
-        places = self._seq[slots] % self._room
-        return FrameBlock(
-            session=self.session,
-            first_seq=int(self._seq[first]),
-            t0_ns_utc=int(self._t_ns[first]),
-            dt_ns=int(self._dt_ns[first]),
-            slopes=self._slopes[places],
-            commands_m=self._commands[places],
-            dither_m=self._dither[places] if self._has_dither[first] else None,
-            cm_id=self._cm_id[first],
-        )
+
+def _part(batch: FrameBatch, start: int, stop: int, *, copied: bool = False) -> FrameBatch:
+    """Return these rows of a batch as one of their own."""
+    header = batch.header
+    if stop - start == header.n:
+        return batch
+    rows, t0_ns = batch.rows[start:stop], header.t0_ns + start * header.dt_ns
+    header = replace(header, seq0=header.seq0 + start, n=stop - start, t0_ns=t0_ns)
+    return FrameBatch(header=header, rows=rows.copy() if copied else rows)
+
+
+def _finite(rows: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return ``(n,)`` whether all numbers of a row are finite."""
+    if math.isfinite(np.vdot(rows, rows)):  # as nearly always, and quicker than to look at each
+        return np.ones(len(rows), np.bool_)
+    return np.asarray(np.isfinite(rows).all(axis=1))
+
+
+def _goes_on(before: FrameHeader, after: FrameHeader) -> bool:
+    """Return whether frames may share a block with those before them."""
+    late_ns = after.t0_ns - before.t0_ns - before.n * before.dt_ns
+    return (
+        after.seq0 == before.seq0 + before.n
+        and abs(late_ns) <= 0.5 * before.dt_ns
+        and (after.dt_ns, after.dither, after.cm_id) == (before.dt_ns, before.dither, before.cm_id)
+    )
+
+
+def _block(parts: list[FrameBatch]) -> FrameBlock:
+    """Return frames that go on one after the other as a block, copied."""
+    header = parts[0].header
+    together = FrameBatch(header=header, rows=np.concatenate([part.rows for part in parts]))
+    return FrameBlock(
+        session=header.session,
+        first_seq=header.seq0,
+        t0_ns_utc=header.t0_ns,
+        dt_ns=header.dt_ns,
+        slopes=together.slopes,
+        commands_m=together.commands_m,
+        dither_m=together.dither_m,
+        cm_id=header.cm_id,
+    )
 
 
 def _span(seq: int, n: int, size: int) -> Places:

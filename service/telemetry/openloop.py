@@ -20,7 +20,7 @@ from service.fit.solver import LONGEST_STEP, Columns
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.telemetry.lockin import MAX_LAG_FRAMES, Spectra, WindowEstimate, fit_window
-from service.telemetry.windows import ClosedLoop, WindowRefused
+from service.telemetry.windows import ClosedLoop, RefusalKind, WindowRefused
 
 Array = NDArray[Any]
 
@@ -37,9 +37,6 @@ FAINTEST = 5.0
 """σ of a line's gain from which on it is seen."""
 
 LARGEST_GAIN = 3.0
-
-NOT_FOUND = "registration not found"
-"""How the reason begins of a window that was good and led nowhere."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -108,7 +105,16 @@ def find(spectra: Spectra, search: FarSearch) -> FarEstimate | WindowRefused:
         if why_not is None:
             return found
         reason = why_not
-    return WindowRefused(reason=f"{NOT_FOUND}: {reason}", t_ns_utc=spectra.t_end_ns_utc)
+    return not_found(reason, spectra)
+
+
+def not_found(reason: str, spectra: Spectra) -> WindowRefused:
+    """Return the refusal of a window of an open loop that led nowhere."""
+    return WindowRefused(
+        reason=f"registration not found: {reason}",
+        t_ns_utc=spectra.t_end_ns_utc,
+        kind=RefusalKind.NOT_FOUND,
+    )
 
 
 def _columns(spectra: Spectra) -> tuple[Columns, Array]:

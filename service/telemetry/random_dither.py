@@ -21,7 +21,15 @@ from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import DitheredEstimate
 from service.telemetry.frames import FrameBlock
-from service.telemetry.windows import Telemetry, Window, WindowCutter, WindowPlan, WindowRefused
+from service.telemetry.windows import (
+    RefusalKind,
+    Telemetry,
+    Why,
+    Window,
+    WindowCutter,
+    WindowPlan,
+    WindowRefused,
+)
 
 Array = NDArray[Any]
 
@@ -317,7 +325,8 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     )
     lag_frames, trouble = _answers(window, measured, matrix, noise)
     if trouble is not None:
-        return WindowRefused(reason=trouble, t_ns_utc=window.t_end_ns_utc)
+        kind, reason = trouble
+        return WindowRefused(reason=reason, t_ns_utc=window.t_end_ns_utc, kind=kind)
     step = np.zeros(4)
     seen = measured.project(matrix, derivatives)
     for _ in range(N_STEPS):
@@ -348,7 +357,7 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
 
 def _answers(
     window: Correlated, measured: Columns, matrix: Array, noise: Array
-) -> tuple[float, str | None]:
+) -> tuple[float, Why | None]:
     """Return by how much of a frame the slopes answer late, and why that is no answer, or None.
 
     Answers in the dither's own row and in the next are compared, on a few of the modes. A loop of
@@ -369,16 +378,16 @@ def _answers(
     return min(lag, 1.0), _trouble(seen, late)
 
 
-def _trouble(seen: float, late: float) -> str | None:
+def _trouble(seen: float, late: float) -> Why | None:
     """Return why there is nothing to fit, from the significance of both answers, in σ."""
     if seen > SIGNIFICANT:
         return None
     if late > SIGNIFICANT:
-        return (
+        return RefusalKind.MISALIGNED, (
             f"columns misaligned: the slopes answer the dither one frame late ({late:.0f} sigma, "
             f"{seen:.0f} in the same row)"
         )
-    return (
+    return RefusalKind.OTHER, (
         f"the dither is not seen in the slopes ({seen:.1f} sigma): raise its amplitude or the "
         "window's length"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
@@ -105,6 +106,32 @@ class Telemetry:
         )
 
 
+class RefusalKind(StrEnum):
+    """Kinds of windows that give no estimate, as far as anything follows from it."""
+
+    OTHER = "other"
+    """It is counted, and no more."""
+
+    CUT_SHORT = "cut-short"
+    """Its reconstructor or its dither ended in it, which they do when all is well."""
+
+    MISALIGNED = "misaligned"
+    """The slopes of a row are not those that its commands were sent for."""
+
+    OUT_OF_REACH = "out-of-reach"
+    """The registration is too far from where the fit began."""
+
+    NOT_FOUND = "not-found"
+    """It was good, of an open loop, and no registration explains it."""
+
+    MISTOLD = "mistold"
+    """It shows that slopes or commands are not what the instrument file says."""
+
+
+Why = tuple[RefusalKind, str]
+"""Of what kind a refusal is, and what is said of it."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WindowRefused:
     """A window that gave no estimate."""
@@ -115,8 +142,7 @@ class WindowRefused:
     t_ns_utc: int
     """When it was given up."""
 
-    mistold: bool = False
-    """Whether it shows that slopes or commands are not what the instrument file says."""
+    kind: RefusalKind = RefusalKind.OTHER
 
 
 P = TypeVar("P", bound=WindowPlan)
@@ -169,24 +195,24 @@ class Window(Generic[S]):
             n_missing=self.n_missing + lost,
         )
 
-    def why_broken(self, block: FrameBlock, n_frames: int) -> str | None:
+    def why_broken(self, block: FrameBlock, n_frames: int) -> Why | None:
         """Return why a window of ``n_frames`` cannot take this block, or None."""
         expected_ns = self.next_t_ns + (block.first_seq - self.next_seq) * block.dt_ns
         if block.session != self.session:
-            return "the RTC started a new session inside the window"
+            return RefusalKind.OTHER, "the RTC started a new session inside the window"
         if block.cm_id != self.cm_id:
-            return f"the reconstructor changed inside the window: {self.cm_id} -> {block.cm_id}"
+            changed = f"{self.cm_id} -> {block.cm_id}"
+            return RefusalKind.CUT_SHORT, f"the reconstructor changed inside the window: {changed}"
         if block.dither_m is None:
-            return "the dither ended inside the window"
+            return RefusalKind.CUT_SHORT, "the dither ended inside the window"
         if abs(block.t0_ns_utc - expected_ns) > block.dt_ns / 2:
-            return "the RTC's clock stepped or it paused inside the window"
+            return RefusalKind.OTHER, "the RTC's clock stepped or it paused inside the window"
         end_seq = self.first_seq + n_frames
         missing = self.n_missing + min(block.first_seq, end_seq) - self.next_seq
         if missing > MAX_MISSING_FRACTION * n_frames:
-            return (
-                f"{missing} of {n_frames} frames missing, more than "
-                f"{MAX_MISSING_FRACTION:.0%}: check the link to the RTC"
-            )
+            share = f"more than {MAX_MISSING_FRACTION:.0%}"
+            text = f"{missing} of {n_frames} frames missing, {share}: check the link to the RTC"
+            return RefusalKind.OTHER, text
         return None
 
 
@@ -252,9 +278,10 @@ class WindowCutter(Generic[P, S, F]):
                 dt_ns=block.dt_ns,
                 sums=self.begin(block),
             )
-        reason = window.why_broken(block, n_frames)
-        if reason is not None:
-            return None, 0, WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
+        why = window.why_broken(block, n_frames)
+        if why is not None:
+            kind, reason = why
+            return None, 0, WindowRefused(reason=reason, t_ns_utc=window.next_t_ns, kind=kind)
         end_seq = window.first_seq + n_frames
         if block.first_seq >= end_seq:  # the window's last frames never came
             return None, 0, self.close(self._added(window).without_rest(n_frames))

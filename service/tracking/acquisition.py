@@ -18,7 +18,7 @@ from dataclasses import replace
 
 from service.control.gate import FORGIVING_LEAK
 from service.errors import CommandError
-from service.telemetry.openloop import NOT_FOUND
+from service.telemetry.windows import RefusalKind
 from service.tracking import acquisition_stages as stages
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -202,7 +202,7 @@ def _take_in(turn: Turn) -> None:
     match turn.event:
         case ev.FarFitted():
             stages.on_far(turn, turn.event)
-        case ev.WindowLost(refused=refused) if refused.reason.startswith(NOT_FOUND):
+        case ev.WindowLost(refused=refused) if refused.kind is RefusalKind.NOT_FOUND:
             stages.on_missed(turn, refused.reason)
         case ev.Answered(request=DitherRequest(), reply=Reply(accepted=False, reason=reason)):
             stages.on_missed(turn, f"the RTC refused the dither: {reason}")

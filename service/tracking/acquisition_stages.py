@@ -15,6 +15,7 @@ from service.control.dither import (
     lines_of,
     modes_of,
 )
+from service.telemetry.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import validity
@@ -54,9 +55,6 @@ MISSES_BEFORE = 3
 
 MISSES_DESPITE = 10
 """The same while α is known: what comes may only be bad telemetry, which opens no loop."""
-
-NOT_CAPTURED = ("the fit did not settle", "outside the capture range")
-"""How the reasons of such windows begin."""
 
 MOST_ATTEMPTS = 3
 """Times the loop is opened for one acquisition."""
@@ -186,9 +184,9 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
     return None
 
 
-def count_miss(turn: Turn, reason: str) -> None:
+def count_miss(turn: Turn, kind: RefusalKind) -> None:
     """Count a refused window, if α was out of its reach and no acquisition is under way."""
-    if not turn.acquisition.under_way and reason.startswith(NOT_CAPTURED):
+    if not turn.acquisition.under_way and kind is RefusalKind.OUT_OF_REACH:
         turn.acquisition = replace(turn.acquisition, misses=turn.acquisition.misses + 1)
 
 

@@ -18,6 +18,7 @@ from service.telemetry import kalman
 from service.telemetry.kalman import Joint
 from service.telemetry.passive import PassiveEstimate
 from service.telemetry.random_dither import RandomEstimate
+from service.telemetry.windows import RefusalKind
 from service.tracking import alarms, filtering, jumps, validity
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import count_miss
@@ -45,17 +46,15 @@ TOO_EARLY = (
     "can tell"
 )
 
-EXPECTED = ("the reconstructor changed", "the dither ended")
-"""What cuts a window short when all is well."""
-
 
 def on_window(turn: Turn, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
     when = validity.taken(event.began_ns_utc, estimate.t_ns_utc)
-    reason = filtering.why_no_window(turn, estimate, when)
-    if reason is not None:
-        refuse_window(turn, reason)
+    why = filtering.why_no_window(turn, estimate, when)
+    if why is not None:
+        kind, reason = why
+        refuse_window(turn, reason, kind)
         return
     if validity.tells_of(turn.state, alarms.DITHER_LOST, when):
         found_again(turn)
@@ -88,21 +87,18 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
 
 def on_lost(turn: Turn, event: ev.WindowLost) -> None:
     """Count a window that nothing could be made of."""
-    refuse_window(turn, event.refused.reason, mistold=event.refused.mistold)
+    refuse_window(turn, event.refused.reason, event.refused.kind)
 
 
-def refuse_window(turn: Turn, reason: str, *, mistold: bool = False) -> None:
-    """Count a window that gave nothing, and say why.
-
-    ``mistold``: because slopes or commands are not what the instrument file says.
-    """
+def refuse_window(turn: Turn, reason: str, kind: RefusalKind = RefusalKind.OTHER) -> None:
+    """Count a window that gave nothing, and say why."""
     _count_refused(turn)
-    count_miss(turn, reason)
-    if reason.startswith("columns misaligned"):
+    count_miss(turn, kind)
+    if kind is RefusalKind.MISALIGNED:
         turn.alarm(alarms.MISALIGNED, reason)
-    if mistold:
+    if kind is RefusalKind.MISTOLD:
         turn.alarm(alarms.WRONG_ANSWER, reason)
-    level = Level.INFO if reason.startswith(EXPECTED) else Level.WARNING
+    level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
     turn.log("window.refused", reason, level)
 
 

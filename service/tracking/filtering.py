@@ -14,6 +14,7 @@ from service.telemetry.estimate import DitheredEstimate, model_error
 from service.telemetry.kalman import Drift, Joint, begin_joint, predicted
 from service.telemetry.lockin import MAX_LAG_FRAMES
 from service.telemetry.random_dither import RandomEstimate
+from service.telemetry.windows import RefusalKind, Why
 from service.tracking import validity
 from service.tracking.alarms import DISAGREES, SUSPECTED, Act, forbidding
 from service.tracking.jumps import last_of
@@ -321,29 +322,33 @@ def gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
     return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
 
 
-def why_no_window(turn: Turn, estimate: DitheredEstimate, when: Taken) -> str | None:
+def why_no_window(turn: Turn, estimate: DitheredEstimate, when: Taken) -> Why | None:
     """Return why a window's estimate must not be used, or None."""
     if turn.rtc is None or estimate.session != turn.rtc.session:
-        return "the RTC has restarted since"
+        return RefusalKind.OTHER, "the RTC has restarted since"
     reason = why_no_measurement(turn.state, when)
     if reason is not None:
-        return reason
+        return RefusalKind.OTHER, reason
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
-        return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
+        late = f"slopes lag commands by {lag:+.2f} frame, 0 is expected"
+        return RefusalKind.MISALIGNED, f"columns misaligned: {late}"
     _, gains, _ = gains_of(estimate)
     if gains.min() < GAIN_RANGE[0] or gains.max() > GAIN_RANGE[1]:
-        return (
+        return RefusalKind.OTHER, (
             f"optical gains of {gains.min():.2f} to {gains.max():.2f}, expected {GAIN_RANGE[0]} "
             f"to {GAIN_RANGE[1]}: wrong instrument file, or the dither is not on the mirror"
         )
     sigma = np.sqrt(np.diag(estimate.covariance))
     if np.any(sigma > validity.USELESS_SIGMA):
-        return "too uncertain: raise the dither's amplitude or the window's length"
+        return (
+            RefusalKind.OTHER,
+            "too uncertain: raise the dither's amplitude or the window's length",
+        )
     near = turn.policy.start if turn.known is None else turn.known.alpha
     distance = np.abs(estimate.alpha.vector - near.vector)
     if np.any(distance > CAPTURE_RANGE):
-        return (
+        return RefusalKind.OUT_OF_REACH, (
             f"outside the capture range: {estimate.alpha.to_boundary()}, "
             f"the fit began at {near.to_boundary()}"
         )

@@ -28,9 +28,9 @@ from service.prepared import Prepared
 from service.telemetry import passive
 from service.telemetry.estimate import DitheredEstimate
 from service.telemetry.lockin import Spectra, WindowEstimate, fit_window
-from service.telemetry.openloop import NOT_FOUND, FarEstimate, FarSearch, find
+from service.telemetry.openloop import FarEstimate, FarSearch, find, not_found
 from service.telemetry.random_dither import Correlated, RandomEstimate, fit_random
-from service.telemetry.windows import ClosedLoop, WindowRefused
+from service.telemetry.windows import ClosedLoop, RefusalKind, WindowRefused
 from service.worker.records import (
     Compute,
     Conditions,
@@ -161,7 +161,9 @@ class OpticsWorker:
         answer = of_answer(spectra.slopes[:, 0], seen, turns, self._model.instrument)
         if not answer.wrong:
             return outcome
-        return WindowRefused(reason=answer.wrong, t_ns_utc=spectra.t_end_ns_utc, mistold=True)
+        return WindowRefused(
+            reason=answer.wrong, t_ns_utc=spectra.t_end_ns_utc, kind=RefusalKind.MISTOLD
+        )
 
     def _fitted(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
@@ -242,7 +244,7 @@ class OpticsWorker:
         try:
             return find(spectra, FarSearch(far=far, near=near, nominal=self._start, starts=starts))
         except np.linalg.LinAlgError as error:
-            return WindowRefused(reason=f"{NOT_FOUND}: {error}", t_ns_utc=spectra.t_end_ns_utc)
+            return not_found(str(error), spectra)
 
     def fit_random(
         self, window: Correlated, start: Misregistration | None
@@ -426,4 +428,5 @@ def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:
         reason="the fit did not settle: the mirror moved inside the window, the registration is "
         "outside the capture range, or the instrument file is another's",
         t_ns_utc=spectra.t_end_ns_utc,
+        kind=RefusalKind.OUT_OF_REACH,
     )

@@ -16,7 +16,7 @@ from service.runtime.streams import (
 from service.telemetry.frames import FrameBlock
 from service.telemetry.health import LOW_MODES, Actuators
 from service.telemetry.lockin import Spectra
-from service.telemetry.windows import WindowRefused
+from service.telemetry.windows import RefusalKind, WindowRefused
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.dither_request import Dither
@@ -145,6 +145,7 @@ def test_a_new_reconstructor_inside_a_window_cuts_it_short(streams):
     _, (refused, whole) = play(streams, 600, 6, cm_id="cm-1")
     assert isinstance(refused, WindowRefused)
     assert refused.reason.startswith("the reconstructor changed")
+    assert refused.kind is RefusalKind.CUT_SHORT
     assert (whole.first_seq, whole.cm_id) == (600, "cm-1")
 
 

@@ -10,7 +10,7 @@ from service.model.misregistration import Misregistration
 from service.telemetry import passive
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
-from service.telemetry.windows import ClosedLoop, WindowRefused
+from service.telemetry.windows import ClosedLoop, RefusalKind, WindowRefused
 from service.worker import OpticsWorker, run_job
 from tests.unit.runtime.small import (
     COMPUTE,
@@ -163,7 +163,8 @@ def test_noise_without_a_signal_is_refused_in_words(bench, aligned):
     if not isinstance(outcome, WindowRefused):
         assert np.any(np.sqrt(np.diag(outcome.covariance)) > 0.1)
     else:
-        assert "did not settle" in outcome.reason or "no fit" in outcome.reason
+        kinds = {"did not settle": RefusalKind.OUT_OF_REACH, "no fit": RefusalKind.OTHER}
+        assert [outcome.kind] == [kinds[text] for text in kinds if text in outcome.reason]
 
 
 def test_a_reconstructor_inverts_the_interaction_matrix_of_its_registration(bench):

@@ -15,6 +15,7 @@ from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
+from service.telemetry.windows import RefusalKind
 from service.worker import OpticsWorker
 from tests.unit.runtime.small import (
     COMPUTE,
@@ -147,7 +148,7 @@ def test_slopes_of_the_other_sign_are_named_by_the_answer_to_the_dither():
     rtc = Mistold(sign_x=-1, sign_y=-1)
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     refused = rtc.told.fit(window, open_loop(rtc.own), None)
-    assert refused.mistold
+    assert refused.kind is RefusalKind.MISTOLD
     assert "slopes have the other sign" in refused.reason
     assert "orientation.sign = -1" in refused.reason
 
@@ -156,7 +157,7 @@ def test_slopes_in_another_order_are_named_by_the_answer_to_the_dither():
     rtc = Mistold(order="interleaved")
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     refused = rtc.told.fit(window, open_loop(rtc.own), None)
-    assert refused.mistold
+    assert refused.kind is RefusalKind.MISTOLD
     assert 'slopes.order = "interleaved"' in refused.reason
 
 
@@ -166,7 +167,7 @@ def test_slopes_two_frames_late_are_not_taken_for_slopes_of_the_other_sign():
     turns = 2 * np.pi * np.array(window.plan.bins_hz) / window.plan.frame_rate_hz
     late = window.slopes * np.exp(-2j * turns)[:, :, None]
     outcome = rtc.told.fit(replace(window, slopes=late), open_loop(rtc.own), None)
-    assert not getattr(outcome, "mistold", False)
+    assert getattr(outcome, "kind", None) is not RefusalKind.MISTOLD
 
 
 def test_an_orientation_left_open_is_found_in_the_rtcs_own_matrix_and_taken_over():
@@ -202,7 +203,7 @@ def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():
     window = dithered_window(Sensor(rtc.seen), ALPHA_SMALL)
     in_nm = replace(window, commands=window.commands * 1e9, dither=window.dither * 1e9)
     refused = rtc.told.fit(in_nm, open_loop(rtc.own), None)
-    assert refused.mistold
+    assert refused.kind is RefusalKind.MISTOLD
     assert "nanometres" in refused.reason
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
-from service.telemetry.windows import WindowRefused
+from service.telemetry.windows import RefusalKind, WindowRefused
 
 PLAN = LockInPlan(
     modes=(0,),
@@ -40,6 +40,7 @@ def test_a_dither_that_ends_inside_a_window_costs_that_window_once():
     lock_in, ended = accumulate(lock_in, block(50, 50, dither=False))
     assert [type(window) for window in ended] == [WindowRefused]
     assert "the dither ended" in ended[0].reason
+    assert ended[0].kind is RefusalKind.CUT_SHORT
     _, ended = accumulate(lock_in, block(100, 50, dither=False))
     assert not ended
 

@@ -11,7 +11,7 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.telemetry.lockin import LockIn, LockInPlan, accumulate
 from service.telemetry.openloop import UNEXPLAINED, FarEstimate, FarSearch, find
-from service.telemetry.windows import WindowRefused
+from service.telemetry.windows import RefusalKind, WindowRefused
 from tests.numerics import (
     FRAME_RATE_HZ,
     N_MODES,
@@ -121,6 +121,7 @@ def test_another_mirrors_response_is_refused():
     found = look(replace(spectra, slopes=spectra.slopes[swapped]))
     assert isinstance(found, WindowRefused)
     assert found.reason.startswith("registration not found")
+    assert found.kind is RefusalKind.NOT_FOUND
 
 
 def test_a_dither_below_the_noise_is_refused():

@@ -20,7 +20,7 @@ from service.telemetry.random_dither import (
     joined,
     noisy_matrix,
 )
-from service.telemetry.windows import WindowRefused
+from service.telemetry.windows import RefusalKind, WindowRefused
 from tests.numerics import (
     N_MODES,
     SOMEWHERE,
@@ -199,6 +199,7 @@ def test_slopes_that_answer_one_frame_late_are_refused_as_misaligned():
     refused = fit_random(only_window(RandomDither(plan=plan()), late), near_somewhere())
     assert isinstance(refused, WindowRefused)
     assert refused.reason.startswith("columns misaligned")
+    assert refused.kind is RefusalKind.MISALIGNED
 
 
 def test_a_dither_that_never_reached_the_mirror_is_not_seen():
@@ -207,6 +208,7 @@ def test_a_dither_that_never_reached_the_mirror_is_not_seen():
     refused = fit_random(only_window(RandomDither(plan=plan()), pretended), near_somewhere())
     assert isinstance(refused, WindowRefused)
     assert refused.reason.startswith("the dither is not seen")
+    assert refused.kind is RefusalKind.OTHER
 
 
 def test_a_clipped_dither_is_refused_with_the_mode_and_both_amplitudes():

@@ -8,7 +8,7 @@ import pytest
 from service.errors import CommandError
 from service.model.misregistration import Misregistration
 from service.telemetry.openloop import FarEstimate
-from service.telemetry.windows import WindowRefused
+from service.telemetry.windows import RefusalKind, WindowRefused
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition import PATIENCE_S
@@ -99,8 +99,8 @@ class Acquiring(Story):
         self.still_open()
         return effects
 
-    def miss_afar(self, reason="registration not found: nothing fits"):
-        lost = WindowRefused(reason=reason, t_ns_utc=self.now_ns)
+    def miss_afar(self, reason="registration not found: nothing fits", kind=RefusalKind.NOT_FOUND):
+        lost = WindowRefused(reason=reason, t_ns_utc=self.now_ns, kind=kind)
         return self.tell(ev.WindowLost(refused=lost), 2.0)
 
     def close(self, n_modes):
@@ -220,31 +220,31 @@ class TestByItself:
     def test_it_begins_when_windows_find_no_registration(self):
         story = Acquiring()
         for _ in range(MISSES_BEFORE - 1):
-            story.miss_afar("the fit did not settle: it is far away")
+            story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
         assert story.stage is AcquisitionStage.IDLE
-        story.miss_afar("the fit did not settle: it is far away")
+        story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
         assert story.stage is AcquisitionStage.OPENING
 
     def test_with_alpha_known_bad_windows_must_go_on_for_longer(self):
         story = Acquiring()
         story.see(n_windows=3)
         for _ in range(MISSES_DESPITE - 1):
-            story.miss_afar("the fit did not settle: it is far away")
+            story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
         assert story.stage is AcquisitionStage.IDLE
-        story.miss_afar("the fit did not settle: it is far away")
+        story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
         assert story.stage is AcquisitionStage.OPENING
 
     def test_a_window_that_is_accepted_ends_the_counting(self):
         story = Acquiring()
         for _ in range(3):
-            story.miss_afar("the fit did not settle: it is far away")
+            story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
             story.see()
         assert story.stage is AcquisitionStage.IDLE
 
     def test_windows_refused_for_another_reason_do_not_count(self):
         story = Acquiring()
         for _ in range(2 * MISSES_BEFORE):
-            story.miss_afar("520 of 2000 frames missing")
+            story.miss_afar("520 of 2000 frames missing", RefusalKind.OTHER)
         assert story.stage is AcquisitionStage.IDLE
 
     def test_it_does_not_begin_again_after_it_has_failed(self):
@@ -414,7 +414,7 @@ class TestTrouble:
         story.tell(cmd.Acquire())
         story.open()
         for _ in range(2 * MOST_MISSES):
-            story.miss_afar("the worker is too slow for the telemetry: a window was given up")
+            story.miss_afar("the worker is too slow: a window was given up", RefusalKind.OTHER)
         assert story.state.acquisition.attempt == 1
 
     def test_a_stage_that_takes_too_long_begins_it_anew(self):

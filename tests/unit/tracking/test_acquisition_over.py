@@ -2,6 +2,7 @@
 
 import pytest
 
+from service.telemetry.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition import ENOUGH_WINDOWS
@@ -84,7 +85,7 @@ def test_windows_that_contradict_one_another_are_not_enough():
 def test_windows_that_find_nothing_leave_a_failure_as_it_is():
     story = Failed().close_on_their_own()
     for _ in range(2 * MISSES_DESPITE):
-        story.miss_afar("the fit did not settle: it is far away")
+        story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
     assert story.stage is AcquisitionStage.FAILED
     assert "acquisition" in story.alarms
 
@@ -141,7 +142,7 @@ def test_nor_when_windows_find_nothing():
     story = Ended()
     story.tell(CALM)
     for _ in range(MISSES_DESPITE):
-        story.miss_afar("the fit did not settle: it is far away")
+        story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
     assert story.began == 1
 
 

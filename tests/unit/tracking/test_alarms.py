@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError
-from service.telemetry.windows import WindowRefused
+from service.telemetry.windows import RefusalKind, WindowRefused
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -144,7 +144,9 @@ def test_no_dither_is_played_that_nothing_would_be_measured_with():
 def test_a_window_that_is_as_it_should_be_ends_the_alarm_of_one_that_was_not():
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=3)
-    wrong = WindowRefused(reason="slopes have the other sign", t_ns_utc=story.now_ns, mistold=True)
+    wrong = WindowRefused(
+        reason="slopes have the other sign", t_ns_utc=story.now_ns, kind=RefusalKind.MISTOLD
+    )
     story.tell(ev.WindowLost(refused=wrong))
     assert "response-mismatch" in story.alarms
     story.see(n_windows=1)

@@ -6,7 +6,7 @@ import pytest
 
 from service.model.misregistration import Misregistration
 from service.telemetry.estimate import MODEL_ERROR
-from service.telemetry.windows import WindowRefused
+from service.telemetry.windows import RefusalKind, WindowRefused
 from service.tracking import events as ev
 from service.tracking.filtering import HISTORY_LENGTH
 from service.tracking.state import Level, Mode
@@ -150,15 +150,12 @@ def test_telemetry_of_a_loop_out_of_hand_is_no_measurement(story, alarm, word):
 
 
 @pytest.mark.parametrize(
-    ("reason", "level"),
-    [
-        ("the reconstructor changed inside the window: a -> b", Level.INFO),
-        ("the dither ended inside the window", Level.INFO),
-        ("60 of 1000 frames missing, more than 5%: check the link to the RTC", Level.WARNING),
-    ],
+    ("kind", "level"),
+    [(RefusalKind.CUT_SHORT, Level.INFO), (RefusalKind.OTHER, Level.WARNING)],
 )
-def test_a_lost_window_is_a_warning_unless_the_service_itself_cut_it_short(story, reason, level):
-    story.tell(ev.WindowLost(refused=WindowRefused(reason=reason, t_ns_utc=START_NS)))
+def test_a_lost_window_is_a_warning_unless_the_service_itself_cut_it_short(story, kind, level):
+    lost = WindowRefused(reason="whatever is said of it", t_ns_utc=START_NS, kind=kind)
+    story.tell(ev.WindowLost(refused=lost))
     assert story.state.windows_refused == 1
     assert story.state.log[-1].level is level
 

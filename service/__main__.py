@@ -14,7 +14,7 @@ from service.commands.arguments import (
     command_line,
     with_negative_numbers,
 )
-from service.commands.program import INTERRUPTED, status_of
+from service.commands.program import INTERRUPTED, leave, status_of
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -52,7 +52,10 @@ def _carry_out(arguments: Sequence[str] | None) -> int:
         status: int = command.main(options)
         return status
 
-    return status_of(carry_out)
+    status = status_of(carry_out)
+    if arguments is None and options.command == "run":
+        leave(status)
+    return status
 
 
 def _leave_when_asked(status: int) -> None:
@@ -61,16 +64,7 @@ def _leave_when_asked(status: int) -> None:
     Holds for ``run`` until the service hears them itself.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: _leave(status))
-
-
-def _leave(status: int) -> None:
-    """End at once, and with it a worker that was started ahead: a stopped one would not notice."""
-    processes = sys.modules.get("multiprocessing")
-    if processes is not None:
-        for child in processes.active_children():
-            child.kill()
-    os._exit(status)
+        signal.signal(number, lambda *_: leave(status))
 
 
 if __name__ == "__main__":

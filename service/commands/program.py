@@ -71,13 +71,17 @@ def told_to_stop() -> threading.Event:
 
 
 def leave(status: int) -> NoReturn:
-    """End this process at once, when all it has opened is closed.
+    """End this process at once, when all it has opened is closed or must be left behind.
 
     Threads of zenoh let go of callbacks after their session is closed. One that wants the
-    interpreter while it is being taken down aborts the process (before Python 3.14).
+    interpreter while it is being taken down aborts the process (before Python 3.14). A process that
+    was started and still runs ends with it: one that is stopped would not notice.
     """
+    processes = sys.modules.get("multiprocessing")
+    for child in () if processes is None else processes.active_children():
+        child.kill()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError):  # nobody reads any more
+        with suppress(OSError, RuntimeError):  # nobody reads any more, or a signal met a write
             stream.flush()
     os._exit(status)
 

@@ -6,8 +6,6 @@ import asyncio
 import contextlib
 import ctypes
 import logging
-import multiprocessing
-import os
 import signal
 import socket
 import sys
@@ -22,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
 from service.archive import Archive
+from service.commands.program import leave
 from service.config import Settings, load_instrument, packaged_instrument
 from service.config.policy import keeping_of, policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
@@ -157,9 +156,7 @@ def _leave_behind() -> None:
     """End the process with what still holds it up; what is on the disk is whole at any moment."""
     held = [thread.name for thread in threading.enumerate() if not thread.daemon]
     structlog.get_logger().error("service.ended-late", threads=held)
-    for child in multiprocessing.active_children():
-        child.kill()
-    os._exit(1)
+    leave(1)
 
 
 def _listener(host: str, port: int) -> socket.socket:

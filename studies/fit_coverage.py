@@ -102,7 +102,7 @@ def fitted(
     error = fit.alpha.vector - alpha.vector
     return {
         "error": list(error * SHOWN),
-        "sigma": list(np.sqrt(np.diag(fit.covariance)) * SHOWN),
+        "sigma": list(fit.sigma * SHOWN),
         "chi2": float(error @ np.linalg.solve(fit.covariance, error)),
         "scatter": list(fit.subset_scatter * SHOWN),
         "residual": fit.residual_fraction,

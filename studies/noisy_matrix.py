@@ -166,7 +166,7 @@ def _row(outcome: RandomEstimate | WindowRefused, true: Misregistration) -> dict
     if isinstance(outcome, WindowRefused):
         return {"refused": outcome.reason}
     error = (outcome.alpha.vector - true.vector) * BOUNDARY_SCALE
-    sigma = np.sqrt(np.diag(outcome.covariance)) * BOUNDARY_SCALE
+    sigma = outcome.sigma * BOUNDARY_SCALE
     return {
         "error": error.tolist(),
         "sigma": sigma.tolist(),

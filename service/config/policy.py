@@ -14,7 +14,7 @@ from service.model.misregistration import BOUNDARY_SCALE
 from service.prepared import usual_folder
 from service.tracking.alarms import Act, Severity
 from service.tracking.policy import Offloading, Policy, Rule
-from service.worker import Compute
+from service.worker import Compute, Sampling
 
 FLAT = (0.004, 0.01, 0.001)
 """Shift in subapertures, rotation in degrees, magnification: where telemetry of a working pyramid
@@ -129,9 +129,7 @@ def compute_of(settings: Settings) -> Compute:
     return Compute(
         threads=table.threads,
         nice=table.nice,
-        pupil_sampling=table.pupil_sampling,
-        detector_nodes=table.detector_nodes,
-        working_point_modes=table.working_point_modes,
+        sampling=Sampling(table.pupil_sampling, table.detector_nodes, table.working_point_modes),
         method=InversionMethod(settings.control.method),
         max_condition=settings.control.max_condition,
         slope_noise=settings.control.slope_noise,

@@ -72,7 +72,7 @@ def document(report: FitReport) -> dict[str, Any]:
     fit = report.fit
     return {
         **fit.alpha.to_boundary(),
-        "sigma": _four(np.sqrt(np.diag(fit.covariance))),
+        "sigma": _four(fit.sigma),
         "covariance": _plain(fit.covariance * COVARIANCE_SCALE),
         "gains": _plain(fit.gains),
         "residual_fraction": _plain(fit.residual_fraction),
@@ -147,7 +147,7 @@ def table(report: FitReport) -> str:
 def _registration(fit: Fit) -> Iterator[str]:
     yield f"{'':15s}{'value':>11s}{'1 sigma':>11s}{'subsets':>11s}"
     values = fit.alpha.vector * BOUNDARY_SCALE
-    sigma = np.sqrt(np.diag(fit.covariance)) * BOUNDARY_SCALE
+    sigma = fit.sigma * BOUNDARY_SCALE
     scatter = fit.subset_scatter * BOUNDARY_SCALE
     for (name, unit, decimals), value, one, spread in zip(
         _ROWS, values, sigma, scatter, strict=True

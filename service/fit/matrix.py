@@ -29,7 +29,7 @@ from service.fit.verdict import SUSPICIOUS, Evidence, alternatives, judged, rema
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
 from service.model.kinds import SlopeOrder
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Determination, Misregistration
 from service.model.modes import Basis, modal_basis
 from service.model.pupil import Illumination
 from service.model.pyramid import Mapper
@@ -79,15 +79,11 @@ class FitOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fit:
-    """Where the mirror is, how sure that is, and whether to believe it."""
+class Fit(Determination):
+    """Where the mirror is, how sure that is, and whether to believe it.
 
-    alpha: Misregistration
-    """The registration found."""
-
-    covariance: NDArray[np.float64]
-    """``(4, 4)`` of ``alpha.vector`` (subaperture, subaperture, radian, ratio): noise, the
-    disagreement of subsets and the model-error floor."""
+    The covariance is of noise, the disagreement of subsets and the model-error floor.
+    """
 
     gains: NDArray[np.float64]
     """``(n_used,)`` size of each measured column over the model's, passes accounted for."""

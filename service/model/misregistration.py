@@ -102,6 +102,22 @@ class Misregistration:
         return at_boundary(self.vector)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Determination:
+    """A registration as something tells it, and how sure that is."""
+
+    alpha: Misregistration
+    """The registration."""
+
+    covariance: NDArray[np.float64]
+    """``(4, 4)`` of it, numeric units (subapertures, radians, ratio)."""
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """``(4,)`` 1 σ, numeric units."""
+        return np.sqrt(np.diag(self.covariance))
+
+
 def step_text(step: NDArray[np.float64]) -> str:
     """Return a change of α ``(4,)``, numeric units, for a person."""
     x, y, turned, size = step * BOUNDARY_SCALE

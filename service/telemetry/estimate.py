@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Determination
 
 MODEL_ERROR = 15.0
 """Variance of α per unit of misfit above 1, over that of its scatter: what the model leaves over is
@@ -22,12 +22,11 @@ diffractive telescope, two truths and two models (docs/results/night.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Estimate:
-    """What one look at telemetry says of the registration."""
+class Estimate(Determination):
+    """What one look at telemetry says of the registration.
 
-    alpha: Misregistration
-    covariance: NDArray[np.float64]
-    """``(4, 4)`` numeric units, from the scatter of the data; no model error in it."""
+    The covariance is of the scatter of the data; no model error is in it.
+    """
 
     optical_gain: NDArray[Any]
     """``(n,)`` gain of the sensor on each mode looked at, against the model; complex with a lag."""

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.errors import ModelError
 from service.fit.solver import Columns
@@ -169,6 +170,7 @@ class PassiveEstimate(Estimate):
         return np.asarray(np.diag(self.covariance) * BIAS_OVER_SCATTER**2)
 
     @property
+    @override
     def sigma(self) -> NDArray[np.float64]:
         """``(4,)`` 1 σ in numeric units where nothing is known of the bias."""
         return np.asarray(np.sqrt(np.diag(self.covariance) + BIAS_FLOOR**2 + self.bias_excess))

@@ -291,7 +291,7 @@ def entry_of(
     return HistoryEntry(
         t_ns_utc=measured.t_ns_utc,
         measured=measured.alpha,
-        measured_sigma=np.sqrt(np.diag(measured.covariance)),
+        measured_sigma=measured.sigma,
         filtered=registration.alpha,
         filtered_sigma=registration.sigma,
         innovation=innovation,
@@ -339,8 +339,7 @@ def why_no_window(turn: Turn, estimate: DitheredEstimate, when: Taken) -> Why | 
             f"optical gains of {gains.min():.2f} to {gains.max():.2f}, expected {GAIN_RANGE[0]} "
             f"to {GAIN_RANGE[1]}: wrong instrument file, or the dither is not on the mirror"
         )
-    sigma = np.sqrt(np.diag(estimate.covariance))
-    if np.any(sigma > validity.USELESS_SIGMA):
+    if np.any(estimate.sigma > validity.USELESS_SIGMA):
         return (
             RefusalKind.OTHER,
             "too uncertain: raise the dither's amplitude or the window's length",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.gains import ModeGain
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Determination, Misregistration
 from service.wire import Pointing
 
 Array = NDArray[np.float64]
@@ -58,12 +58,8 @@ class Standing:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seen:
+class Seen(Determination):
     """A dithered window as it was measured, whatever the filter made of it."""
-
-    alpha: Misregistration
-    covariance: Array
-    """``(4, 4)`` from its own data, numeric units."""
 
     t_ns_utc: int
     """End of the telemetry it is of, the RTC's clock."""

@@ -6,7 +6,7 @@ alone.
 
 from service.worker.optics_worker import OpticsWorker
 from service.worker.process import Done, run_job, start_worker
-from service.worker.records import Compute, Conditions, Description, Made
+from service.worker.records import Compute, Conditions, Description, Made, Sampling
 
 __all__ = [
     "Compute",
@@ -15,6 +15,7 @@ __all__ = [
     "Done",
     "Made",
     "OpticsWorker",
+    "Sampling",
     "run_job",
     "start_worker",
 ]

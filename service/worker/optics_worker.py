@@ -92,12 +92,9 @@ class OpticsWorker:
                 mapper=self._threads.map,
             )
 
-        sampling, nodes = compute.pupil_sampling, compute.detector_nodes
+        sampling, nodes, working_point_modes = compute.sampling
         self._sensor = Sensor(
-            lambda halo: model(sampling, nodes, halo),
-            instrument,
-            compute.working_point_modes,
-            sampling,
+            lambda halo: model(sampling, nodes, halo), instrument, working_point_modes, sampling
         )
         self._model = self._sensor.flat
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
@@ -127,16 +124,14 @@ class OpticsWorker:
 
     def _first(self) -> Linearisation:
         """Return the linearisation about the nominal registration, prepared once for all."""
-        compute, start = self._compute, self._start
+        sampling, start = self._compute.sampling, self._start
 
         def computed() -> dict[str, NDArray[np.float32]]:
             found = self._sensor.linearise(start)
             return {"matrix": found.matrix, "derivatives": found.derivatives}
 
-        what = (compute.pupil_sampling, compute.detector_nodes, compute.working_point_modes)
-        kept = self._prepared.arrays(
-            self._model.instrument, ("linearisation", *what, start.vector.tolist()), computed
-        )
+        what = ("linearisation", *sampling, start.vector.tolist())
+        kept = self._prepared.arrays(self._model.instrument, what, computed)
         return Linearisation(alpha=start, **kept)
 
     def fit(

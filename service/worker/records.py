@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,24 +16,34 @@ from service.errors import ModelError
 from service.model.instrument import Instrument, Mirror
 from service.model.interaction import RtcInteractionModel
 from service.model.kinds import Influence, SignalKind
-from service.model.misregistration import Misregistration
+from service.model.misregistration import Determination, Misregistration
 from service.model.modes import ModalBasis
 from service.telemetry.health import Actuators
 
 
+class Sampling(NamedTuple):
+    """How finely the optics are computed, and of which working point."""
+
+    pupil: int = 3
+    """Points of the pupil along a subaperture."""
+
+    detector: int = 3
+    """Quadrature nodes per detector pixel and axis."""
+
+    working_point_modes: int | None = None
+    """Telemetry is compared with the response of a loop that controls this many modes at the
+    instrument's r0; None: with that of a flat wavefront."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compute:
-    """What the worker may use and how finely it samples the optics."""
+    """What the worker may use, and how it computes."""
 
     threads: int = 2
     """Threads that share the rows of a product; BLAS itself keeps to one."""
 
     nice: int = 10
-    pupil_sampling: int = 3
-    detector_nodes: int = 3
-    working_point_modes: int | None = None
-    """Telemetry is compared with the response of a loop that controls this many modes at the
-    instrument's r0; None: with that of a flat wavefront."""
+    sampling: Sampling = field(default_factory=Sampling)
 
     method: InversionMethod = InversionMethod.SVD
     """How interaction matrices are inverted."""
@@ -77,12 +88,8 @@ class Description:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Conditions:
-    """What a reconstructor has to hold in."""
-
-    alpha: Misregistration
-    covariance: NDArray[np.float64]
-    """``(4, 4)`` of α, numeric units, model error included."""
+class Conditions(Determination):
+    """What a reconstructor has to hold in; the covariance includes the model's error."""
 
     loop: ControlLoop
     """As the gate is to see it."""

@@ -26,7 +26,7 @@ from service.model.kinds import SlopeOrder
 from service.model.slopes import Orientation, to_rtc
 from service.tracking.state import Mode
 from service.wire import LoopRequest, Status
-from service.worker import Compute, OpticsWorker
+from service.worker import Compute, OpticsWorker, Sampling
 from studies.campaign.observatory import Observatory
 from studies.campaign.rows import Row, RowFile
 from studies.campaign.strange_rtc import Dialect, StrangeDome, StrangeLink
@@ -155,7 +155,9 @@ def play(case: Case, given: argparse.Namespace) -> Row:
     begun = time.process_time()
     with threadpool_limits(1):
         working = settings.compute.working_point_modes if given.plant == "diffractive" else None
-        bench = OpticsWorker(pinned, Compute(threads=1, working_point_modes=working))
+        bench = OpticsWorker(
+            pinned, Compute(threads=1, sampling=Sampling(working_point_modes=working))
+        )
         night = Observatory(
             words,
             policy_of(settings),

@@ -20,7 +20,7 @@ from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.telemetry.lockin import Spectra, WindowEstimate
 from service.telemetry.random_dither import Correlated, RandomEstimate
 from service.telemetry.windows import ClosedLoop, WindowRefused
-from service.worker import Compute, OpticsWorker
+from service.worker import Compute, OpticsWorker, Sampling
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import Ahead
 from sim_rtc.options import parse_options
@@ -55,7 +55,7 @@ def play(night: Night, keep: Path | None = None) -> list[dict[str, Any]]:
         # of this night alone: it follows the seeing, and rows must not depend on other nights
         bench = OpticsWorker(
             load_instrument("flao-lbt"),
-            Compute(threads=1, working_point_modes=night.working_point_modes),
+            Compute(threads=1, sampling=Sampling(working_point_modes=night.working_point_modes)),
         )
         for k, seen in enumerate(_kept(night, keep)):
             outcome = _estimated(seen, known, bench)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cache
 
 from service.config import load_instrument
-from service.worker import Compute, OpticsWorker
+from service.worker import Compute, OpticsWorker, Sampling
 from studies.campaign.observatory import Latencies
 
 SMALL = "tests/system/small.toml"
@@ -35,7 +34,5 @@ def latencies_of(slower: float = 1.0) -> Latencies:
 @cache
 def bench_of(instrument: str, sampling: int | None = None) -> OpticsWorker:
     """Return the worker of an instrument, one per process; ``sampling`` None: the usual one."""
-    compute = Compute(threads=1)
-    if sampling is not None:
-        compute = replace(compute, pupil_sampling=sampling, detector_nodes=sampling)
-    return OpticsWorker(load_instrument(instrument), compute)
+    points = Sampling() if sampling is None else Sampling(sampling, sampling)
+    return OpticsWorker(load_instrument(instrument), Compute(threads=1, sampling=points))

@@ -21,7 +21,7 @@ from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.tracking.state import Mode
 from service.wire import DitherRequest
-from service.worker import Compute, OpticsWorker
+from service.worker import Compute, OpticsWorker, Sampling
 from studies.campaign.observatory import Observatory
 from studies.campaign.observatory_dome import replayed
 from studies.campaign.rows import Row, RowFile, floats, played, range_of, tell, words
@@ -56,7 +56,10 @@ def play(plan: Plan) -> Row:
         # of this night alone: at the working point it follows the seeing
         bench = OpticsWorker(
             load_instrument(plan.instrument),
-            Compute(threads=1, working_point_modes=settings.compute.working_point_modes),
+            Compute(
+                threads=1,
+                sampling=Sampling(working_point_modes=settings.compute.working_point_modes),
+            ),
         )
         begun = time.monotonic()
         night = Observatory(plan.words, policy_of(settings), Mode.AUTO, bench)

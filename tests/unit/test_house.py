@@ -20,10 +20,8 @@ HELD = ("service", "check_rtc")
 ALIKE = {
     "AboutTable and Instrument",
     "Acknowledgement and MeasurementRecord",
-    "Compute and ComputeTable",
     "DitherRequest and StartDither",
     "DitherRequest and MeasurementRecord",
-    "Estimate and NoisyFinding",
     "FitDocument and FourNumbers",
     "Instrument and InstrumentFile",
     "LoopRequest and SetLoop",

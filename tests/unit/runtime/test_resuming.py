@@ -152,8 +152,7 @@ class Restartable(Observatory):
 
 @pytest.fixture(scope="module")
 def bench():
-    compute = Compute(threads=1, pupil_sampling=3, detector_nodes=3)
-    return OpticsWorker(load_instrument(str(SMALL)), compute)
+    return OpticsWorker(load_instrument(str(SMALL)), Compute(threads=1))
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import inspect
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields
 from itertools import pairwise
 from typing import Any, Final
 
@@ -39,7 +38,7 @@ from service.wire import (
     StateMessage,
     Status,
 )
-from service.wire.codec import FourNumbers
+from service.wire.codec import FourNumbers, names_of
 from service.wire.matrices import MATRIX_LIMIT
 
 Row = tuple[str, str, str, str, str, str]
@@ -141,24 +140,24 @@ def _rows(name: str, record: type) -> Iterator[Row]:
     bases = reversed(record.__mro__[:-1])
     texts = {key: text for base in bases for key, text in described(base).items()}
     known = {field.name: field.type for field in _info(record)}
-    for field in fields(record):
-        kind = known[field.name]
-        if field.name == "request":
+    for key in names_of(record):
+        kind = known[key]
+        if key == "request":
             continue
-        if field.name == "layout":
+        if key == "layout":
             yield from _rows(name, MatrixLayout)
             yield _DTYPE
             continue
         nil = "yes" if _optional(kind) else "no"
-        if (name, field.name) in MAY_BE_ABSENT:
+        if (name, key) in MAY_BE_ABSENT:
             nil = "may be absent" if nil == "no" else "yes, or absent"
         yield (
-            f"`{field.name}`",
+            f"`{key}`",
             _type(kind),
-            next((unit for end, unit in _UNITS.items() if field.name.endswith(end)), ""),
+            next((unit for end, unit in _UNITS.items() if key.endswith(end)), ""),
             _range(kind),
             nil,
-            texts[field.name].replace("None", "nil").replace("``", "`"),
+            texts[key].replace("None", "nil").replace("``", "`"),
         )
 
 

@@ -18,7 +18,7 @@ from service.files import parse_alpha, parse_modes
 from service.files.uploads import FitAsked, FitJob, FitState
 from service.fit.matrix import FitOptions, Method
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.routes.views import ServiceDep, answer, known, picture, shows, view
+from service.routes.views import ServiceDep, answer, beside_the_four, known, picture, shows, view
 from service.runtime.uploads import FitQueue
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
@@ -123,19 +123,7 @@ class FitParameters(BaseModel):
 class FitDocument(BaseModel):
     """What a fit has found: the object that ``pyrcal fit --json`` prints."""
 
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    shift_x_subap: float | None
-    """Along sensor +x, subapertures."""
-
-    shift_y_subap: float | None
-    """Along sensor +y, subapertures."""
-
-    rotation_deg: float | None
-    """From sensor +x towards +y, degrees."""
-
-    magnification: float | None
-    """Ratio; 1 is nominal."""
+    model_config = ConfigDict(use_attribute_docstrings=True, json_schema_extra=beside_the_four)
 
     sigma: dict[str, float | None]
     """1 σ of the four, by name; noise, disagreement of subsets and model error together."""

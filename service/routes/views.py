@@ -282,6 +282,12 @@ _FOUR: Schema = {
 }
 
 
+def beside_the_four(schema: Schema) -> None:
+    """Add the four parameters of a registration to the keys they lie beside."""
+    schema["properties"] = _FOUR["properties"] | schema["properties"]
+    schema["required"] = [*PARAMETERS, *schema["required"]]
+
+
 def _schema(kind: Any, of: View | None, found: dict[str, Schema]) -> Schema:  # noqa: ANN401  a type
     """Return the schema of a type; those of alternatives that it holds are added to ``found``."""
     origin, inside = get_origin(kind), get_args(kind)

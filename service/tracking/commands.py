@@ -148,24 +148,26 @@ class StopDither(Instruction):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Approve(Instruction):
+class OfMatrix(Instruction):
+    """What is said of one matrix."""
+
+    id: str
+    """Of the matrix; one to come was never used before."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Approve(OfMatrix):
     """Publish a proposed reconstructor."""
 
-    id: str
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reject(Instruction):
+class Reject(OfMatrix):
     """Discard a proposed reconstructor; the reason is kept with it."""
 
-    id: str
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Publish(Instruction):
+class Publish(OfMatrix):
     """Send a known reconstructor again, under a new id, unless the gate refuses it now."""
-
-    id: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,14 +222,11 @@ class Measure(MeasureChoice):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GiveUp(Instruction):
+class GiveUp(OfMatrix):
     """Wait no longer for an interaction matrix.
 
     The wire has no way to stop the RTC's work; a noisy one ends, and its dither.
     """
-
-    id: str
-    """Of the matrix."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -309,13 +308,7 @@ class ModeGroup:
     """Of the last one; it belongs to the group."""
 
     def __post_init__(self) -> None:
-        """Refuse a range that is none.
-
-        Raises
-        ------
-        ValueError
-            If it ends before it begins.
-        """
+        """Refuse a range that ends before it begins."""
         if self.last < self.first:
             raise ValueError(f"first <= last: first {self.first}, last {self.last}")
 
@@ -329,24 +322,29 @@ class GainGroup(ModeGroup):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SetLoop(Instruction):
+class Gains(Instruction):
+    """Loop gains: of groups of modes, or such that they act alike on all."""
+
+    gains: Annotated[tuple[GainGroup, ...], Len(1, MOST_GROUPS)] | None = None
+    """Groups of modes, none twice; modes in no group keep their gain."""
+
+    effective_gain: Annotated[float, Gt(0.0), Le(2.0)] | None = None
+    """Gains that act as this on every mode, by the table of optical gains (``GET /v1/gains``);
+    the gate must accept the reconstructor in use with them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetLoop(Gains):
     """Change the loop; what is left out stays as it is."""
 
     loop: Literal["open", "closed"] | None = None
     """Opening zeroes the integrator, and the RTC begins a new session."""
-
-    gains: Annotated[tuple[GainGroup, ...], Len(1, MOST_GROUPS)] | None = None
-    """Groups of modes, none twice; modes in no group keep their gain."""
 
     leak: Annotated[float, Ge(0.0), Le(1.0)] | None = None
     """Per frame; 1 forgets nothing."""
 
     n_controlled: Count | None = None
     """Takes effect with the next reconstructor of that many modes."""
-
-    effective_gain: Annotated[float, Gt(0.0), Le(2.0)] | None = None
-    """Gains that act as this on every mode, by the table of optical gains (``GET /v1/gains``);
-    the gate must accept the reconstructor in use with them."""
 
     @override
     def __post_init__(self) -> None:

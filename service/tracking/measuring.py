@@ -5,7 +5,7 @@ Of a noisy one the sums are kept where the telemetry comes in; here is only how 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn
-from service.wire import DitherRequest, MeasureRequest, Pattern, Reply, Status
+from service.wire import DitherRequest, MatrixStrokes, MeasureRequest, Pattern, Reply, Status
 
 DURATION_S = 30.0
 """Where none is asked for: an element is worth its noise by then, on a bright star."""
@@ -73,17 +73,10 @@ def measure(turn: Turn, command: cmd.Measure) -> None:
     check_modes(record.modes, rtc)
     _keep(turn, record)
     turn.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
+    strokes = {field.name: getattr(record, field.name) for field in fields(MatrixStrokes)}
     turn.ask(
         ev.Ask(
-            request=MeasureRequest(
-                id=record.id,
-                pattern=command.pattern,
-                modes=record.modes,
-                amplitude_m=record.amplitude_m,
-                n_average=record.n_average,
-                frequency_hz=record.frequency_hz,
-                duration_s=record.duration_s,
-            )
+            request=MeasureRequest(pattern=command.pattern, n_average=record.n_average, **strokes)
         )
     )
 

@@ -232,10 +232,7 @@ def set_loop(turn: Turn, command: cmd.SetLoop) -> None:
     n_controlled = command.n_controlled
     if n_controlled is not None and not 1 <= n_controlled <= rtc.n_modes:
         raise CommandError(f"found {n_controlled} modes; expected 1 to {rtc.n_modes}")
-    groups, n_modes = command.gains, n_controlled or rtc.n_controlled
-    gains = None if groups is None else _gains(rtc, groups, n_modes)
-    if command.effective_gain is not None:
-        gains = _compensated(turn, rtc, command.effective_gain, n_modes)
+    gains = _gains_of(command, turn, rtc, n_controlled or rtc.n_controlled)
     if command.loop is not None:
         turn.state = replace(turn.state, close_since_ns_utc=None)
     _ask_loop(
@@ -315,6 +312,15 @@ def close_again(turn: Turn) -> None:
     if not closed and not recent:
         request = LoopRequest(id=f"loop-{turn.now_ns}", loop=Loop.CLOSED)
         _ask_loop(turn, request, "close again after a measurement given up")
+
+
+def _gains_of(
+    command: cmd.Gains, turn: Turn, rtc: Status, n_modes: int
+) -> tuple[float, ...] | None:
+    """Return a gain for each mode of the basis as they are asked for; None: they stay."""
+    if command.effective_gain is not None:
+        return _compensated(turn, rtc, command.effective_gain, n_modes)
+    return None if command.gains is None else _gains(rtc, command.gains, n_modes)
 
 
 def _gains(rtc: Status, groups: tuple[GainGroup, ...], n_modes: int) -> tuple[float, ...]:

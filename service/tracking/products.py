@@ -13,7 +13,15 @@ from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration, at_boundary
 from service.telemetry.probation import ProbationFinding
-from service.wire import Manifest, MatrixLayout, MeasuredManifest, Pattern, Status
+from service.wire import (
+    ControlLaw,
+    Manifest,
+    MatrixLayout,
+    MatrixStrokes,
+    MeasuredManifest,
+    Pattern,
+    Status,
+)
 
 
 class MatrixState(StrEnum):
@@ -54,17 +62,15 @@ _USED = (MatrixState.APPLIED, MatrixState.SUPERSEDED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Judged:
-    """What a verdict of the gate is of: of another loop, or of another α, it says nothing."""
+class Judged(ControlLaw):
+    """What a verdict of the gate is of: of another loop, or of another α, it says nothing.
+
+    The gains are those of the modes that the reconstructor commands.
+    """
 
     session: str
     """Of the RTC."""
 
-    gains: tuple[float, ...]
-    """Of the modes that the reconstructor commands."""
-
-    leak: float
-    delay_frames: float
     alpha: Misregistration
     sigma: NDArray[np.float64]
     """``(4,)`` 1 σ, floor included, numeric units."""
@@ -336,33 +342,18 @@ class NoisyFinding:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MeasurementRecord:
+class MeasurementRecord(MatrixStrokes):
     """All that is known of one measured interaction matrix but its numbers.
 
     Nothing of it can become a reconstructor: it is a measurement to fit a model to.
     """
 
-    id: str
-    """Never reused."""
-
     state: MeasureState
     pattern: Pattern | None
     """None: random signs on all modes at once, loop closed, summed by the service itself."""
 
-    modes: tuple[int, ...]
-    """0-based basis indices, one for each column."""
-
-    amplitude_m: tuple[float, ...]
-    """RMS of each mode's stroke, metres OPD."""
-
     n_average: int | None = None
     """Repetitions averaged; None: the pattern has none."""
-
-    frequency_hz: tuple[float, ...] | None = None
-    """Of each mode; None: not a sine, or asked for by somebody else."""
-
-    duration_s: float | None = None
-    """Of a sine, or of the telemetry with random signs; None as above."""
 
     window_s: float | None = None
     """Of the windows that random signs are summed from."""

@@ -123,6 +123,9 @@ class Form(Generic[_R]):
     """What a message is called in refusals."""
 
     _: KW_ONLY
+    first: tuple[str, ...] = ()
+    """Keys that travel before the others, which follow in the order of the fields."""
+
     extensions: tuple[str, ...] = ()
     """Keys that came after the contract: who does not know them need not send them."""
 
@@ -159,8 +162,7 @@ def encode(record: DataclassInstance) -> bytes:
         If the record breaks the contract.
     """
     form = _FORMS[type(record)]
-    keys = {field.name: getattr(record, field.name) for field in fields(record)}
-    data: bytes = msgpack.packb({"v": VERSION, **form.keys(keys)}, default=_plain)
+    data: bytes = msgpack.packb({"v": VERSION, **to_map(record)}, default=_plain)
     if form.held:
         decode(form.kind, data)
     return data
@@ -177,6 +179,12 @@ def decode(kind: type[_R], data: bytes) -> _R:
     form: Form[_R] = _FORMS[kind]
     values = (form.opened or unpack)(data, form.where)
     return of_map(kind, of_this_version(values, form.where), form.where)
+
+
+def to_map(record: DataclassInstance) -> Map:
+    """Return the map of a record, be it a message or a part of one."""
+    kind = type(record)
+    return _FORMS[kind].keys({name: getattr(record, name) for name in names_of(kind)})
 
 
 def of_map(kind: type[_R], values: Map, where: str) -> _R:
@@ -270,6 +278,13 @@ def get(values: Map, key: str, where: str) -> Any:  # noqa: ANN401  as msgpack m
     return values[key]
 
 
+@cache
+def names_of(kind: type[DataclassInstance]) -> tuple[str, ...]:
+    """Return the fields of a record in the order in which they travel."""
+    first = _FORMS[kind].first if kind in _FORMS else ()
+    return (*first, *(field.name for field in fields(kind) if field.name not in first))
+
+
 def read(values: Map, kind: type[_R], where: str, extensions: tuple[str, ...] = ()) -> _R:
     """Return the record of a map whose keys are named like the fields.
 
@@ -289,7 +304,7 @@ def read(values: Map, kind: type[_R], where: str, extensions: tuple[str, ...] = 
     WireError
         If a key is missing or its value is not what the field's type says.
     """
-    for name in _names(kind):
+    for name in names_of(kind):
         if name not in values and name not in extensions:
             get(values, name, where)
     try:
@@ -369,11 +384,6 @@ def _refused(text: str, values: Any, kind: type[DataclassInstance], where: str) 
     if _words(at) == ID_EXPECTED:
         checked_id(values, f"key {key!r} in {where}")
     return refusal(key, values, _words(at), where)
-
-
-@cache
-def _names(kind: type[DataclassInstance]) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(kind))
 
 
 @cache

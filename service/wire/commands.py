@@ -89,20 +89,26 @@ class Pattern(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DitherRequest:
-    """Start a dither."""
+class Strokes:
+    """Modes of the mirror that are moved, and how far."""
 
     id: Id
-    """Of the command: repeated with the same id it is carried out once."""
-
-    kind: DitherKind
-    """Sines, or random signs."""
+    """Of the command, and of a matrix that follows: repeated with the same id it is carried out
+    once."""
 
     modes: tuple[Count, ...]
     """0-based basis indices."""
 
     amplitude_m: tuple[Positive, ...]
     """RMS of each mode, metres OPD."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DitherRequest(Strokes):
+    """Start a dither."""
+
+    kind: DitherKind
+    """Sines, or random signs."""
 
     frequency_hz: tuple[Positive, ...] | None = None
     """Of each mode, below half the frame rate; None: binary."""
@@ -143,29 +149,25 @@ class LoopRequest:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MeasureRequest:
-    """Measure an interaction matrix."""
+class MatrixStrokes(Strokes):
+    """Strokes that an interaction matrix is measured with."""
 
-    id: Id
-    """Of the command, and of the matrix that follows."""
+    frequency_hz: tuple[Positive, ...] | None = None
+    """Of each mode; None unless it is a sine."""
+
+    duration_s: _Duration | None = None
+    """How long it is to last; None: as long as the pattern takes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasureRequest(MatrixStrokes):
+    """Measure an interaction matrix."""
 
     pattern: Pattern
     """How; the first is mandatory, the others are optional."""
 
-    modes: tuple[Count, ...]
-    """0-based basis indices."""
-
-    amplitude_m: tuple[Positive, ...]
-    """RMS of each mode's stroke, metres OPD."""
-
     n_average: Annotated[int, integer(1, AVERAGE_LIMIT)] | None = None
     """Repetitions; None: the pattern has none."""
-
-    frequency_hz: tuple[Positive, ...] | None = None
-    """Of each mode; None unless the pattern is a sine."""
-
-    duration_s: _Duration | None = None
-    """None unless the pattern is a sine."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,7 +285,7 @@ def _check_measurement(command: MeasureRequest, where: str) -> None:
     _check_modes(command, where)
 
 
-def _check_modes(command: DitherRequest | MeasureRequest, where: str) -> None:
+def _check_modes(command: Strokes, where: str) -> None:
     """Refuse modes that are none or twice the same, and what is not one for each of them."""
     modes = command.modes
     if not modes or len(set(modes)) != len(modes):
@@ -308,6 +310,7 @@ travels(
     Form(
         DitherRequest,
         "a dither command",
+        first=("id", "kind"),
         keys=lambda keys: {**keys, "action": _START},
         fields=_starts,
         check=_check_dither,
@@ -315,7 +318,14 @@ travels(
 )
 travels(Form(DitherStop, "a dither command", keys=lambda keys: {**keys, "action": _STOP}))
 travels(Form(LoopRequest, "a loop command"))
-travels(Form(MeasureRequest, "a measure command", check=_check_measurement))
+travels(
+    Form(
+        MeasureRequest,
+        "a measure command",
+        first=("id", "pattern", "modes", "amplitude_m", "n_average"),
+        check=_check_measurement,
+    )
+)
 travels(Form(RampRequest, "a ramp command", check=_check_ramp))
 travels(Form(OffloadRequest, "an offload command"))
 travels(Form(Reply, "a reply", fields=reason_or_none))

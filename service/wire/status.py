@@ -32,6 +32,7 @@ from service.wire.codec import (
     read_four,
     reason_or_none,
     refusal,
+    to_map,
     travels,
     unpack,
 )
@@ -79,7 +80,21 @@ class Pointing:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Status:
+class ControlLaw:
+    """The integrator of the loop: ``c[k+d] = leak * c[k+d-1] - gain * R s[k]``."""
+
+    delay_frames: Annotated[float, number(0.0, 100.0)]
+    """End to end, from exposure to the command that answers it."""
+
+    gains: tuple[Annotated[float, number(0.0)], ...]
+    """One per mode of the basis, 0 where uncontrolled."""
+
+    leak: Annotated[float, number(0.0, 1.0)]
+    """Per frame; 1 forgets nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Status(ControlLaw):
     """The RTC's own account of its loop, a few times a second."""
 
     session: Opaque
@@ -96,15 +111,6 @@ class Status:
 
     frame_rate_hz: Annotated[float, above(0.0, 1e6)]
     """Frames a second, nominal or measured."""
-
-    delay_frames: Annotated[float, number(0.0, 100.0)]
-    """End to end, from exposure to the command that answers it."""
-
-    gains: tuple[Annotated[float, number(0.0)], ...]
-    """One per mode of the basis, 0 where uncontrolled."""
-
-    leak: Annotated[float, number(0.0, 1.0)]
-    """Per frame; 1 forgets nothing."""
 
     n_slopes: Annotated[int, integer(1)]
     """Slopes of a frame."""
@@ -285,8 +291,7 @@ def _status_keys(keys: Map) -> Map:
         del keys["trouble"]
     if playing is None:
         return keys
-    action = {"action": "start", "start_seq": playing.start_seq}
-    return {**keys, "dither": {**asdict(playing.request), **action}}
+    return {**keys, "dither": {**to_map(playing.request), "start_seq": playing.start_seq}}
 
 
 def _status_fields(values: Map, where: str) -> Map:
@@ -326,6 +331,7 @@ travels(
     Form(
         Status,
         WHERE,
+        first=("session", "seq", "t_ns", "loop", "frame_rate_hz"),
         extensions=("pointing", "trouble"),
         opened=_opened,
         keys=_status_keys,

@@ -19,19 +19,9 @@ HELD = ("service", "check_rtc")
 
 ALIKE = {
     "AboutTable and Instrument",
-    "Acknowledgement and MeasurementRecord",
-    "DitherRequest and StartDither",
-    "DitherRequest and MeasurementRecord",
-    "FitDocument and FourNumbers",
     "Instrument and InstrumentFile",
-    "LoopRequest and SetLoop",
-    "LoopRequest and Status",
-    "MeasureChoice and MeasureRequest",
-    "MeasureChoice and MeasurementRecord",
-    "MeasureRequest and MeasurementRecord",
     "Mirror and MirrorTable",
     "Pyramid and WfsTable",
-    "SetLoop and Status",
 }
 """Pairs of records of which one has most of the other's fields."""
 

@@ -127,6 +127,12 @@ def lived(night):
     return {e["t_ns_utc"]: [e["measured"][name] for name in PARAMETERS] for e in entries}
 
 
+def spanned_s(night):
+    """From the end of the first window that was measured to that of the last."""
+    ends_ns = lived(night)
+    return (max(ends_ns) - min(ends_ns)) * 1e-9 if ends_ns else 0.0
+
+
 def assert_close(here, there, tolerance):
     np.testing.assert_allclose(here, there, rtol=0.0, atol=tolerance)
 
@@ -174,7 +180,7 @@ def test_a_replay_over_zenoh_is_an_rtc_that_carries_out_nothing(tmp_path):
         night.service("auto")
         rtc = night.rtc("--record", str(path))
         night.wait_for_modes(N_TARGET)
-        time.sleep(8.0)  # what is done to the replay afterwards takes some of it
+        time.sleep(patience(8.0))  # what is done to the replay afterwards takes some of it
         rtc.send(signal.SIGTERM)
         assert rtc.ended(60.0) == 0, rtc.log
         session = night.state["link"]["session"]
@@ -184,7 +190,8 @@ def test_a_replay_over_zenoh_is_an_rtc_that_carries_out_nothing(tmp_path):
         service = night.service("hold")
         words = ["sim_rtc", "--connect", night.zenoh, "--replay", str(path)]
         replay = night.start("replay", words)
-        wait_for(lambda: night.state["windows_accepted"] >= 4, 60.0, "replayed windows")
+        # a busy worker fits some of them together
+        wait_for(lambda: spanned_s(night) > 2.9, 60.0, "replayed windows of four seconds")
         state = night.state
         assert state["link"]["session"] == session
         assert state["registration"]["alpha"]["shift_x_subap"] == pytest.approx(

@@ -4,6 +4,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import structlog
 
 from service.__main__ import main
 from service.commands import fit
@@ -18,6 +19,16 @@ TINY, MATRIX = str(DATA / "tiny.toml"), str(DATA / "tiny.h5")
 @pytest.fixture(autouse=True)
 def empty_folder(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(autouse=True)
+def nobody_elses_log():
+    """Leave out what a thread that an earlier test has left behind may still log."""
+
+    def dropped(*_):
+        raise structlog.DropEvent
+
+    structlog.configure(processors=[dropped])
 
 
 FITTED = {}

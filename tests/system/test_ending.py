@@ -15,7 +15,8 @@ from tests.system.stranger import Stranger, small_telescope
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(120)]
 
-BOTH = [signal.SIGINT, signal.SIGTERM]
+BOTH = SIGINT, SIGTERM = signal.SIGINT, signal.SIGTERM
+"""One handler hears both: a moment is tried with one, and the next one with the other."""
 
 
 @pytest.fixture
@@ -57,17 +58,23 @@ def workers_of(service):
     return [member for member in others if "_multiarray_umath" in maps_of(member)]
 
 
-@pytest.mark.parametrize("number", BOTH)
-@pytest.mark.parametrize("library", ["_struct", "_multiarray_umath", "pydantic_core", "zenoh"])
-def test_while_it_imports(night, number, library):
+@pytest.mark.parametrize(
+    ("library", "number"),
+    [
+        ("_struct", SIGINT),
+        ("_multiarray_umath", SIGTERM),
+        ("pydantic_core", SIGINT),
+        ("zenoh", SIGTERM),
+    ],
+)
+def test_while_it_imports(night, library, number):
     service = night.service(wait=False)
     wait_for(lambda: library in maps_of(service.popen.pid), 20.0, f"{library} is imported")
     check_end(night, service, number)
 
 
-@pytest.mark.parametrize("number", BOTH)
-@pytest.mark.parametrize("after_s", [0.0, 0.4, 1.5])
-def test_while_the_model_is_prepared(night, number, after_s):
+@pytest.mark.parametrize(("after_s", "number"), [(0.0, SIGINT), (0.4, SIGTERM), (1.5, SIGINT)])
+def test_while_the_model_is_prepared(night, after_s, number):
     service = night.service(instrument="flao-lbt", wait=False)
     wait_for(lambda: "api.listening" in service.log, 20.0, "the first line")
     time.sleep(after_s)
@@ -77,15 +84,7 @@ def test_while_the_model_is_prepared(night, number, after_s):
 def test_ctrl_c_in_a_terminal_while_the_worker_still_imports(night):
     service = night.service(instrument="flao-lbt", wait=False)
     wait_for(lambda: len(session_members(service.popen.pid)) > 2, 20.0, "the worker is started")
-    check_end(night, service, signal.SIGINT, group=True)
-
-
-@pytest.mark.parametrize("number", BOTH)
-def test_while_it_tracks(night, number):
-    service = night.service("auto")
-    with stranger(night):
-        wait_for(lambda: night.state["windows_accepted"] > 1, 40.0, "it tracks")
-        check_end(night, service, number)
+    check_end(night, service, SIGINT, group=True)
 
 
 def test_while_its_worker_is_stopped(night):
@@ -95,7 +94,7 @@ def test_while_its_worker_is_stopped(night):
         (worker,) = workers_of(service)
         os.kill(worker, signal.SIGSTOP)
         time.sleep(3.0)  # a window waits for it by now
-        check_end(night, service, signal.SIGTERM)
+        check_end(night, service, SIGTERM)
 
 
 def test_while_its_worker_is_stopped_before_it_has_begun(night):
@@ -103,7 +102,7 @@ def test_while_its_worker_is_stopped_before_it_has_begun(night):
     (worker,) = wait_for(lambda: workers_of(service), 20.0, "a worker")
     os.kill(worker, signal.SIGSTOP)
     time.sleep(0.5)
-    check_end(night, service, signal.SIGINT)
+    check_end(night, service, SIGINT)
 
 
 def test_while_an_upload_dribbles_in(night):
@@ -112,7 +111,7 @@ def test_while_an_upload_dribbles_in(night):
         line.sendall(b"POST /v1/fits HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 100000\r\n\r\n")
         line.sendall(b"\x89HDF\r\n\x1a\n")
         wait_for(lambda: list(night.directory.rglob("upload*")), 10.0, "the upload has begun")
-        check_end(night, service, signal.SIGTERM)
+        check_end(night, service, SIGTERM)
 
 
 def test_while_an_upload_is_fitted(night):
@@ -121,7 +120,7 @@ def test_while_an_upload_is_fitted(night):
     answer = night.client.post("/v1/fits", content=matrix.read_bytes())
     assert answer.is_success, answer.text
     time.sleep(0.5)
-    check_end(night, service, signal.SIGINT)
+    check_end(night, service, SIGINT)
 
 
 def test_while_somebody_reads_a_matrix_slowly(night):
@@ -133,7 +132,7 @@ def test_while_somebody_reads_a_matrix_slowly(night):
             line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
             line.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
             assert line.recv(12).startswith(b"HTTP/1.1 200")
-            check_end(night, service, signal.SIGTERM)
+            check_end(night, service, SIGTERM)
 
 
 def test_while_the_rtc_answers_nothing(night):
@@ -143,7 +142,7 @@ def test_while_the_rtc_answers_nothing(night):
     rtc.on_command = lambda *_: time.sleep(20.0)
     with rtc:
         wait_for(lambda: rtc.commands, 40.0, "a question")
-        check_end(night, service, signal.SIGINT)
+        check_end(night, service, SIGINT)
         rtc.on_command = None
 
 
@@ -155,14 +154,14 @@ def test_asked_again_and_again(night):
     def insist():
         while not stop.wait(0.02):
             try:
-                os.killpg(service.popen.pid, signal.SIGINT)
+                os.killpg(service.popen.pid, SIGINT)
             except ProcessLookupError:
                 return
 
     hand = threading.Thread(target=insist)
     hand.start()
     try:
-        check_end(night, service, signal.SIGINT)
+        check_end(night, service, SIGINT)
     finally:
         stop.set()
         hand.join()
@@ -174,7 +173,7 @@ def test_a_hundred_times_at_any_moment(night):
     """From the first milliseconds to tracking, each time a little later."""
     first = night.service("auto", INSTRUMENT)  # a zenoh client needs someone there to open
     with stranger(night):
-        check_end(night, first, signal.SIGINT)
+        check_end(night, first, SIGINT)
         for k in range(100):
             service = night.service("auto", INSTRUMENT, wait=False)
             wait_for(lambda pid=service.popen.pid: "_struct" in maps_of(pid), 20.0, "it imports")

@@ -44,12 +44,17 @@ def test_slopes_of_the_other_sign_are_named_and_no_matrix_is_sent(night):
 
 
 def test_an_orientation_left_open_is_found_adopted_and_the_matrix_sent_holds(night):
+    """The RTC is made from the wire contract alone, and is calibrated like our own."""
     night.service("auto")
     response, variance_m2 = small_telescope(**ALPHA)
     assumed, _ = small_telescope()
     order = np.arange(len(response)).reshape(2, -1).T.ravel()
     with Stranger(night.zenoh, -response[order], variance_m2, assumed=-assumed[order]) as rtc:
         wait_for(lambda: rtc.applied, 40.0, lambda: f"a matrix applied; {night.alarms}")
+        known = night.state["registration"]
+        for name, truth in ALPHA.items():
+            error = known["alpha"][name] - truth
+            assert abs(error) < 4 * known["sigma"][name], (name, error, known["sigma"][name])
         n_batches = len(rtc.residuals)
         wait_for(lambda: len(rtc.residuals) > n_batches + 100, 10.0, "two seconds more")
         after = np.median([value for _, value in rtc.residuals[n_batches:]])

@@ -42,6 +42,9 @@ REQUESTS_WITHIN_S = 2
 """Requests under way when the service is asked to stop may take this long: an upload would take
 longer."""
 
+TICK_S = 0.9
+"""From one look of the server's whether it is over to the next, besides uvicorn's own 0.1 s."""
+
 _DESCRIPTION = """
 Calibration service of an adaptive telescope with a pyramid wavefront sensor.
 
@@ -81,7 +84,11 @@ class _Server(uvicorn.Server):
 
     @override
     async def on_tick(self, counter: int) -> bool:
-        return self.over.is_set() or await super().on_tick(counter)
+        over = await super().on_tick(0)  # the date of answers is told anew
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(TICK_S):
+                await self.over.wait()
+        return over or self.over.is_set()
 
 
 def create_app(

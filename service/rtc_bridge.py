@@ -126,14 +126,15 @@ class Bridge:
         """Refuse frames of any other basis or sensor configuration; None: adopt the first seen."""
         self._intake.expect(basis_id, config_id)
 
-    def set_wakeup(self, callback: Callable[[], object] | None) -> None:
+    def set_wakeup(self, callback: Callable[[], object] | None, *, for_frames: bool = True) -> None:
         """Call ``callback`` from zenoh's threads when something new has come.
 
         It rings once until the next :meth:`drain` or :meth:`events`, so look at both; give it
-        something like ``lambda: loop.call_soon_threadsafe(event.set)``. Frames held back for the
-        sake of a hole ring no bell when their time is up: look at least a few times a second.
+        something like ``lambda: loop.call_soon_threadsafe(event.set)``. Whoever looks at intervals
+        needs no bell ``for_frames``. Frames held back for the sake of a hole ring none when their
+        time is up: look at least a few times a second.
         """
-        self._intake.set_wakeup(callback)
+        self._intake.set_wakeup(callback, for_frames=for_frames)
 
     def drain(self) -> list[FrameBlock]:
         """Return the frames that have come since the last call, as copies, in order.

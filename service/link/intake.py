@@ -71,6 +71,7 @@ class Intake:
         self._events: deque[LinkEvent] = deque(maxlen=QUEUE_LENGTH)
         self._callback: Callable[[], object] | None = None
         self._rung = False
+        self._rings_for_frames = True
         self._complained_s: dict[str, float] = {}
         self._sessions = SessionWatch()
         self._ring: FrameRing | None = None
@@ -95,9 +96,9 @@ class Intake:
         with self._lock:
             self._basis_id, self._config_id = basis_id, config_id
 
-    def set_wakeup(self, callback: Callable[[], object] | None) -> None:
+    def set_wakeup(self, callback: Callable[[], object] | None, *, for_frames: bool = True) -> None:
         """Call ``callback``, from zenoh's threads, when something new is there."""
-        self._callback, self._rung = callback, False
+        self._callback, self._rung, self._rings_for_frames = callback, False, for_frames
 
     def _wake(self) -> None:
         """Say that something new is there, at most once between two visits of the consumer."""
@@ -140,7 +141,8 @@ class Intake:
                 self._latency_s.append(latency_s)
             if self._belongs(batch.header, now_s):
                 self._store(batch, now_s)
-        self._wake()
+        if self._rings_for_frames:
+            self._wake()
 
     def status(self, data: bytes) -> None:
         """Take the RTC's account of its loop; of a flood of them as many as are of use.

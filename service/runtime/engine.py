@@ -45,8 +45,9 @@ from service.worker import Description
 TOLD_S = 8.0
 """A window that was accepted since then has told where the mirror is."""
 
-STEADY_GATHER_S = 0.45
-"""Of frames, while nothing happens: windows last four times as long, and alarms have a second."""
+STEADY_GATHER_S = 0.55
+"""Of frames, while nothing happens: windows last four times as long, and alarms have a second. Most
+often a status, which is heard at once, ends the wait before."""
 
 Step = Callable[[TrackerState, Event, Policy, int], tuple[TrackerState, tuple[Effect, ...]]]
 

@@ -46,11 +46,8 @@ from service.tracking.turn import new_lines
 from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, OpticsWorker
 
-POLL_S = 0.1
-"""Longest time telemetry waits to be taken in: frames held for a hole ring no bell."""
-
 GATHER_S = 0.16
-"""Between two visits to the link: each costs two milliseconds, whatever there is."""
+"""Between two visits to the link at the least: each costs two milliseconds, whatever there is."""
 
 DESCRIBE_ATTEMPTS = 3
 """Workers that may die while the model is prepared before the service gives up."""
@@ -251,25 +248,21 @@ class Supervisor:
         """Take in what the link has: events first, for frames mean nothing without them."""
         rung = asyncio.Event()
         loop = asyncio.get_running_loop()
-        self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set))
-        fed_s = 0.0
+        self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set), for_frames=False)
         while True:
+            await asyncio.sleep(GATHER_S)
             # asyncio.wait_for of Python 3.11 swallows a cancel that meets the bell
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(POLL_S):
+                async with asyncio.timeout(self._engine.gather_s - GATHER_S):
                     await rung.wait()
             rung.clear()
-            events = self._bridge.events()
-            for heard in events:
+            for heard in self._bridge.events():
                 if isinstance(heard, MeasuredMatrix):
                     self._start(self._keep_measured(heard))
                     continue
                 with self._surviving("an event of the link"):
                     self._engine.hear(heard)
-            if events or time.monotonic() - fed_s >= self._engine.gather_s:
-                await self._feed()
-                fed_s = time.monotonic()
-            await asyncio.sleep(GATHER_S)
+            await self._feed()
 
     async def _feed(self) -> None:
         """Take in frames, in a thread: who asks something meanwhile has an answer."""

@@ -18,6 +18,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from typing_extensions import override
 
@@ -37,6 +38,9 @@ N_TAPS = 11
 CORNER = 0.08
 """Of the frame rate. Above 0.1 a bright star leaves too little signal; below 0.06 a wind of 20 m/s
 is let in."""
+
+BAND_FRAMES = 32
+"""Filtered in one product: more are mostly products with nothing, fewer mostly calls."""
 
 LEAST_DELAY_FRAMES = 2
 """With less the instrument may not look ahead, and a tenth of the signal is left."""
@@ -103,19 +107,21 @@ class HighPass:
     ahead: int
     """Frames after k that z_k depends on: their commands do not know the noise of frame k."""
 
+    band: NDArray[np.float32]
+    """``(BAND_FRAMES, BAND_FRAMES + n_taps - 1)`` the taps, a column further in each row."""
+
     def __call__(self, commands: Array) -> Array:
         """Return ``(n_rows - n_taps + 1, n_modes)`` of contiguous commands ``(n_rows, n_modes)``.
 
         Row i belongs to frame ``i + behind``.
         """
-        newest = len(self.taps) - 1
-        n_rows = len(commands) - newest
-        out = self.taps[0] * commands[newest : newest + n_rows]
-        part = np.empty_like(out)
-        for j in range(1, len(self.taps)):
-            np.multiply(commands[newest - j : newest - j + n_rows], self.taps[j], out=part)
-            out += part
-        return np.asarray(out)
+        reach = len(self.taps) - 1
+        out = np.empty((len(commands) - reach, commands.shape[1]), np.float32)
+        for start in range(0, len(out), BAND_FRAMES):
+            part = out[start : start + BAND_FRAMES]
+            n = len(part)
+            np.matmul(self.band[:n, : n + reach], commands[start : start + n + reach], out=part)
+        return out
 
     @property
     def behind(self) -> int:
@@ -153,7 +159,10 @@ def high_pass(delay_frames: float) -> HighPass:
     noise = ((shifted * power * (1.0 + turbulence)) @ shifted.conj().T).real / len(turns)
     taps = np.linalg.solve(noise, signal)
     taps -= taps.mean()
-    return HighPass(taps=(taps / np.abs(taps).max()).astype(np.float32), ahead=ahead)
+    taps = (taps / np.abs(taps).max()).astype(np.float32)
+    none = np.zeros(BAND_FRAMES - 1, np.float32)
+    band = scipy.linalg.toeplitz([taps[-1], *none], [*taps[::-1], *none])
+    return HighPass(taps=taps, ahead=ahead, band=band)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -307,7 +316,7 @@ def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     if len(others):
         moving = np.hstack([commands[now][:, others], commands[before][:, others]])
         shapes, size, _ = np.linalg.svd(moving.astype(float), full_matrices=False)
-        known = shapes[:, size > _RANK * size[0]]
+        known = shapes[:, size > _RANK * size[0]].astype(np.float32)
         filtered -= known @ (known.T @ filtered)
     weight = np.ones((n, 1), np.float32)
     rise = np.sin(np.pi / 2 * (np.arange(TAPER_FRAMES) + 0.5) / TAPER_FRAMES)[:, None] ** 2

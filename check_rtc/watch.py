@@ -14,9 +14,10 @@ from check_rtc.ear import Heard, Topic
 from service.errors import WireError
 from service.link.intake import Intake
 from service.link.session import Endpoint
-from service.telemetry import loopcheck
+from service.telemetry import loopcheck, looplaw
 from service.telemetry.frames import FrameBlock
-from service.telemetry.loopcheck import FoundLaw, LoopCheck, LoopLaw, Obedience
+from service.telemetry.loopcheck import LoopCheck, Obedience
+from service.telemetry.looplaw import FoundLaw, LoopLaw
 from service.telemetry.windows import ClosedLoop
 from service.tracking.loop import closed_loop, last_seq, same_loop
 from service.wire import (
@@ -196,7 +197,7 @@ class LoopWatch:
         if block.slopes.shape[1] != terms.reconstructor.shape[1]:
             return
         self._check = loopcheck.observe(self._check, block, terms)
-        self._law = loopcheck.follow(self._law, block, terms)
+        self._law = looplaw.follow(self._law, block, terms)
 
     def _terms(self, cm_id: str | None) -> ClosedLoop | None:
         status, matrix = self._status, self.matrix
@@ -214,7 +215,7 @@ class LoopWatch:
                 self.obediences.append(obeyed)
         if self._law.cm_id != terms.cm_id:
             return
-        self._law, found = loopcheck.judged(self._law, terms, seq)
+        self._law, found = looplaw.judged(self._law, terms, seq)
         if found is not None:
             self.laws.append(found)
 

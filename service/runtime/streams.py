@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.telemetry import loopcheck, passive, probation
+from service.telemetry import loopcheck, looplaw, passive, probation
 from service.telemetry.frames import FrameBlock
 from service.telemetry.health import (
     EdgeHealth,
@@ -20,13 +20,8 @@ from service.telemetry.health import (
     observe_edge,
 )
 from service.telemetry.lockin import LockIn, Spectra
-from service.telemetry.loopcheck import (
-    ENOUGH_SAMPLES,
-    SAMPLES_PER_S,
-    LoopCheck,
-    LoopLaw,
-    Obedience,
-)
+from service.telemetry.loopcheck import ENOUGH_SAMPLES, SAMPLES_PER_S, LoopCheck, Obedience
+from service.telemetry.looplaw import LoopLaw
 from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, measured
 from service.telemetry.probation import Comparison
@@ -250,7 +245,7 @@ def _lawful(streams: Streams, before: Status | None, rtc: Status) -> Streams:
     terms = _terms(streams, rtc.cm_id)
     if terms is None or streams.law.cm_id != rtc.cm_id:
         return streams
-    law, found = loopcheck.judged(streams.law, terms, last_seq(rtc))
+    law, found = looplaw.judged(streams.law, terms, last_seq(rtc))
     if found is None:
         return replace(streams, law=law)
     if found.wrong:
@@ -315,7 +310,7 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
         return streams, []
     terms, check, law = _terms(streams, block.cm_id), streams.check, streams.law
     if terms is not None:
-        check, law = loopcheck.observe(check, block, terms), loopcheck.follow(law, block, terms)
+        check, law = loopcheck.observe(check, block, terms), looplaw.follow(law, block, terms)
     vibrations, sums, edge = streams.vibrations, streams.passive, streams.edge
     lines = () if streams.dither is None else streams.dither.frequency_hz
     if vibrations is not None and sums is not None and len(streams.in_loop):

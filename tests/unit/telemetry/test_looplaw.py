@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.telemetry.loopcheck import KEPT_FRAMES, LoopLaw, follow, judged
+from service.telemetry.looplaw import KEPT_FRAMES, LoopLaw, follow, judged
 from tests.unit.telemetry.test_loopcheck import GAINS, INVERSE, blocks, closed_loop, terms
 
 
@@ -131,3 +131,16 @@ def test_a_verdict_is_given_on_new_frames_only():
     law, first = judged(law, told, 2499)
     assert first is not None
     assert judged(law, told, 2499)[1] is None
+
+
+def test_frames_that_no_verdict_will_look_at_are_left_out_and_it_is_the_same():
+    told, every, some, left_out = terms(), LoopLaw(), LoopLaw(), 0
+    for block in blocks(closed_loop()):
+        every, before = follow(every, block, told), some
+        some = follow(some, block, told)
+        left_out += block.n_frames if some is before else 0
+        if block.first_seq < 600:
+            some = replace(some, judged_seq=1900)
+    assert left_out > 700
+    every = replace(every, judged_seq=1900)
+    assert judged(some, told, 10**9)[1] == judged(every, told, 10**9)[1]

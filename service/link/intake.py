@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Final
 
@@ -35,6 +36,9 @@ LATENCIES: Final = 1024
 TAKE_FRAMES: Final = 512
 """Frames copied under one hold of the lock, so that ingest never waits for long."""
 
+LEFT_AS_THEY_CAME: Final = 32
+"""Batches that nobody has looked at; each is done many times as quickly right after another one."""
+
 STATUS_INTERVAL_S: Final = 0.45
 """Between two statuses that say the same: of more, the latest is taken when it is over."""
 
@@ -50,6 +54,17 @@ PLACED: Final = {
     "nonfinite": "a slope or a command is not finite",
 }
 """What becomes of frames in the sequence besides being used, and what is then wrong with them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Arrived:
+    """A batch of telemetry that nobody has looked at."""
+
+    payload: bytes
+    attachment: bytes | None
+    recoverable: bool
+    latency_s: float | None
+    at_s: float
 
 
 class Intake:
@@ -72,6 +87,7 @@ class Intake:
         self._callback: Callable[[], object] | None = None
         self._rung = False
         self._rings_for_frames = True
+        self._arrived: deque[_Arrived] = deque()
         self._complained_s: dict[str, float] = {}
         self._sessions = SessionWatch()
         self._ring: FrameRing | None = None
@@ -93,7 +109,7 @@ class Intake:
 
     def expect(self, basis_id: str | None, config_id: str | None) -> None:
         """Use only what names these; None: adopt the first one seen."""
-        with self._lock:
+        with self._up_to_date():
             self._basis_id, self._config_id = basis_id, config_id
 
     def set_wakeup(self, callback: Callable[[], object] | None, *, for_frames: bool = True) -> None:
@@ -115,7 +131,7 @@ class Intake:
         recoverable: bool = False,
         latency_s: float | None = None,
     ) -> None:
-        """Take a batch of telemetry.
+        """Take a batch of telemetry; whether it is sound is seen when somebody asks what has come.
 
         Parameters
         ----------
@@ -125,24 +141,42 @@ class Intake:
             Whether zenoh may still bring what is missing before these frames.
         latency_s
             Put-to-callback, None when the publisher does not stamp its messages.
-
-        Raises
-        ------
-        WireError
-            If they break the contract.
         """
-        batch = wire.decode_frames(payload, attachment)
-        now_s = self._clock()
-        with self._lock:
-            self._patience_s = (
-                self._endpoint.recovery_s if recoverable else self._endpoint.reorder_s
+        self._arrived.append(
+            _Arrived(
+                payload=payload,
+                attachment=attachment,
+                recoverable=recoverable,
+                latency_s=latency_s,
+                at_s=self._clock(),
             )
-            if latency_s is not None:
-                self._latency_s.append(latency_s)
-            if self._belongs(batch.header, now_s):
-                self._store(batch, now_s)
+        )
+        if len(self._arrived) >= LEFT_AS_THEY_CAME:
+            with self._up_to_date():
+                pass
         if self._rings_for_frames:
             self._wake()
+
+    @contextlib.contextmanager
+    def _up_to_date(self) -> Iterator[None]:
+        """Hold the lock, all frames that have come in their places."""
+        with self._lock:
+            while self._arrived:
+                arrived = self._arrived.popleft()
+                try:
+                    self._take_frames(arrived)
+                except WireError as error:
+                    self._complain("frames", error, arrived.at_s)
+            yield
+
+    def _take_frames(self, arrived: _Arrived) -> None:
+        batch = wire.decode_frames(arrived.payload, arrived.attachment)
+        endpoint = self._endpoint
+        self._patience_s = endpoint.recovery_s if arrived.recoverable else endpoint.reorder_s
+        if arrived.latency_s is not None:
+            self._latency_s.append(arrived.latency_s)
+        if self._belongs(batch.header, arrived.at_s):
+            self._store(batch, arrived.at_s)
 
     def status(self, data: bytes) -> None:
         """Take the RTC's account of its loop; of a flood of them as many as are of use.
@@ -177,7 +211,7 @@ class Intake:
     def _take_status(self, data: bytes, found: tuple[object, ...]) -> None:
         status = wire.decode(wire.Status, data)
         now_s = self._clock()
-        with self._lock:
+        with self._up_to_date():
             if not self._admit("status", status.session, 1, now_s):
                 return
             self._tally.add("status", USED, 1, now_s)
@@ -191,7 +225,7 @@ class Intake:
         """Take the RTC's word on a reconstructor."""
         self._take_spared(at_once=True)
         now_s = self._clock()
-        with self._lock:
+        with self._up_to_date():
             self._counted["unknown"] += not known
             if self._admit("ack", acknowledgement.session, 1, now_s):
                 self._tally.add("ack", USED, 1, now_s)
@@ -201,7 +235,7 @@ class Intake:
     def liveliness(self, *, alive: bool) -> None:
         """Take the appearance or disappearance of the RTC's token."""
         self._take_spared(at_once=True)
-        with self._lock:
+        with self._up_to_date():
             self._rtc_alive = alive
             if not alive:
                 self._sessions.leave()
@@ -210,13 +244,15 @@ class Intake:
 
     def malformed(self, kind: str, error: WireError) -> None:
         """Count a message that was not used, and report the first of a burst."""
-        now_s = self._clock()
-        with self._lock:
-            self._tally.add(kind, MALFORMED, 1, now_s, str(error))
-            due = self._is_news(f"malformed {kind}", now_s)
-        if due:
+        with self._up_to_date():
+            self._complain(kind, error, self._clock())
+        self._wake()
+
+    def _complain(self, kind: str, error: WireError, now_s: float) -> None:
+        self._tally.add(kind, MALFORMED, 1, now_s, str(error))
+        if self._is_news(f"malformed {kind}", now_s):
             text = f"{kind}: {error}"
-            self.event(ev.Noted(name="message.malformed", text=text, level=Level.WARNING))
+            self._put(ev.Noted(name="message.malformed", text=text, level=Level.WARNING))
 
     def failed(self, kind: str) -> bool:
         """Count a fault of the service itself; return whether it is the first of a burst."""
@@ -227,7 +263,7 @@ class Intake:
     def event(self, event: LinkEvent) -> None:
         """Queue an event and wake the consumer."""
         self._take_spared(at_once=True)
-        with self._lock:
+        with self._up_to_date():
             self._put(event)
         self._wake()
 
@@ -248,7 +284,7 @@ class Intake:
         self._rung = False
         blocks: list[FrameBlock] = []
         while True:
-            with self._lock:
+            with self._up_to_date():
                 if self._ring is None:
                     return blocks
                 more = self._ring.take(self._clock(), self._patience_s, TAKE_FRAMES)
@@ -261,7 +297,7 @@ class Intake:
         """Return what has happened since the last call, oldest first."""
         self._rung = False
         self._take_spared()
-        with self._lock:
+        with self._up_to_date():
             events = list(self._events)
             self._events.clear()
         return events
@@ -285,12 +321,12 @@ class Intake:
     @property
     def other_session(self) -> str | None:
         """A session that spoke after the last word of the one that counts, or None."""
-        with self._lock:
+        with self._up_to_date():
             return self._sessions.other
 
     def statistics(self) -> LinkStatistics:
         """Return all counters as they are now."""
-        with self._lock:
+        with self._up_to_date():
             now_s, tally = self._clock(), self._tally
             malformed = {k: n for (k, fate), n in tally.totals.items() if fate == MALFORMED}
             return LinkStatistics(

@@ -271,16 +271,20 @@ class Supervisor:
             streams = self._engine.lend()
             if streams is None:
                 return
+            blocks: list[FrameBlock] = []
             found: tuple[Streams, list[Window]] = streams, []
             with self._surviving("telemetry"):
                 try:
-                    blocks = await loop.run_in_executor(self._eyes, self._bridge.drain)
-                    self.newest_frames = blocks[-1] if blocks else self.newest_frames
-                    for block in blocks:
-                        self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
-                    found = await loop.run_in_executor(self._eyes, looked_at, streams, blocks)
+                    blocks, found = await loop.run_in_executor(self._eyes, self._taken_in, streams)
                 finally:
                     self._engine.give_back(*found)
+            self.newest_frames = blocks[-1] if blocks else self.newest_frames
+            for block in blocks:
+                self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
+
+    def _taken_in(self, streams: Streams) -> tuple[list[FrameBlock], tuple[Streams, list[Window]]]:
+        blocks = self._bridge.drain()
+        return blocks, looked_at(streams, blocks)
 
     @contextlib.contextmanager
     def _surviving(self, what: str) -> Iterator[None]:
@@ -313,15 +317,16 @@ class Supervisor:
         alarms: frozenset[tuple[str, str]] = frozenset()
         told, revival = Told(), Revival()
         while True:
-            if revival.due(self._bridge.statistics(), time.monotonic()):
+            link = self._bridge.statistics()
+            if revival.due(link, time.monotonic()):
                 await self._reopen_link()
+                link = self._bridge.statistics()
             with self._surviving("a tick"):
                 self._post(ev.Tick())
             self._meter.look()
             for trouble in self._meter.news(self._engine.state):
                 self._post(trouble)
             now_ns = time.time_ns()
-            link = self._bridge.statistics()
             for event in news_of_link(link, self._engine.state, now_ns):
                 self._post(event)
             waiting = self._waiting(link)

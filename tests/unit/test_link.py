@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import UnknownIdError, WireError
-from service.link.intake import QUEUE_LENGTH, Intake
+from service.link.intake import LEFT_AS_THEY_CAME, QUEUE_LENGTH, Intake
 from service.link.matrices import OFFERS, MeasuredIntake, Offer, Outbox
 from service.link.rivals import Order, SessionWatch
 from service.link.session import Endpoint
@@ -569,9 +569,27 @@ def test_messages_are_kept_as_long_as_frames_of_theirs_wait_and_no_longer(clock)
     intake = Intake(Endpoint(system="bench", ring_seconds=5.0), clock)
     for k in range(500):
         send(intake, 10 * k)
+    assert intake.statistics().frames_received == 5000
     ring = intake._ring
     assert len(set(map(id, ring._batch))) == 500
     assert sum(block.n_frames for block in intake.drain()) == 5000
     assert set(ring._batch) == {None}
     send(intake, 5000)
     assert [block.first_seq for block in intake.drain()] == [5000]
+
+
+def test_batches_do_not_pile_up_where_nobody_asks_for_them(clock):
+    intake = Intake(Endpoint(system="bench", ring_seconds=5.0), clock)
+    for k in range(100):
+        send(intake, 10 * k)
+        assert len(intake._arrived) < LEFT_AS_THEY_CAME
+    assert sum(block.n_frames for block in intake.drain()) == 1000
+
+
+def test_a_batch_is_judged_by_what_was_expected_when_it_came(clock):
+    intake = Intake(Endpoint(system="bench"), clock)
+    send(intake, 0)
+    intake.expect("another", "c")
+    send(intake, 10)
+    assert spans(intake.drain()) == [("s1", 0, 10)]
+    assert intake.statistics().frames_refused == {"basis": 10}

@@ -144,7 +144,7 @@ def _measured(night: Night, end_s: float, rng: np.random.Generator, policy: Poli
         misfit=1.0,
         t_ns_utc=when.ended_ns_utc,
         pointing=None,
-        when=when,
+        began_ns_utc=when.began_ns_utc,
         source=Source.LOCK_IN,
         optical_gain=0.6,
         optical_gains=(),

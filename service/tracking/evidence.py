@@ -3,6 +3,7 @@
 One window far out may be a jump or a mistake. It is held, nothing is made from α meanwhile, and
 the next window decides: one that agrees with it makes it a jump, one that agrees with all before
 makes it an outlier. A jump that one window alone cannot tell from noise is told by two together.
+Where windows scatter by more than they say, they must agree for longer than turbulence is alike.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
         covariance=estimate.covariance,
         t_ns_utc=estimate.t_ns_utc,
         pointing=validity.pointing_at(turn.state, estimate.t_ns_utc),
-        when=when,
+        began_ns_utc=when.began_ns_utc,
         source=Source.RANDOM if random else Source.LOCK_IN,
         optical_gain=float(gains.mean()),
         optical_gains=filtering.followed_gains(
@@ -110,8 +111,12 @@ def enter(turn: Turn, measured: Measured) -> None:
         filtering.accept(turn, Folded(joint=joint, n_windows=1, innovation=0.0), measured)
         return
     first = jumps.window_before(known)
-    if first is not None and jumps.pair_surprise(known, measured, turn.policy).far:
-        _jump(turn, known, first, measured)
+    both = jumps.pair_surprise(known, measured, turn.policy)
+    if first is not None and both.far:
+        if jumps.lasts(known, first, measured, both):
+            _jump(turn, known, first, measured)
+        else:
+            _put_aside(turn, known, measured, both, first)
         return
     far = jumps.window_surprise(known, measured, turn.policy)
     if (
@@ -144,8 +149,13 @@ def enter(turn: Turn, measured: Measured) -> None:
     filtering.accept(turn, folded, measured)
 
 
-def _put_aside(turn: Turn, known: Registration, measured: Measured, far: Distance) -> None:
-    """Put a window that is far out aside, and doubt α until another one has come."""
+def _put_aside(
+    turn: Turn, known: Registration, measured: Measured, far: Distance, first: Seen | None = None
+) -> None:
+    """Put a window that is far out aside, and doubt α until another one has come.
+
+    ``first``: the one before, which tells the same place; together they are so ``far``.
+    """
     innovation = far.innovation
     text = (
         f"a window lies {_away(measured, known)} from α (innovation {innovation:.0f}, expected 4, "
@@ -157,11 +167,13 @@ def _put_aside(turn: Turn, known: Registration, measured: Measured, far: Distanc
         covariance=measured.covariance,
         t_ns_utc=measured.t_ns_utc,
         held_ns_utc=turn.now_ns,
+        began_ns_utc=(first or measured).began_ns_utc,
     )
     doubt = "a jump is suspected"
     validity.hold(turn, replace(_doubted(known, doubt, measured.t_ns_utc), candidate=candidate))
     filtering.remember(turn, filtering.entry_of(measured, known, innovation, entered=False))
-    turn.warn("registration.jump-suspected", text)
+    if first is None or known.candidate is None:
+        turn.warn("registration.jump-suspected", text)
     turn.alarm(alarms.SUSPECTED, text)
     validity.want_window(turn, doubt)
     validity.age(turn)

@@ -115,7 +115,6 @@ HISTORY_LENGTH = 5000
 class Measured(Reading):
     """What one dithered window says of α, and of what it was made."""
 
-    when: Taken
     source: Source
     optical_gain: float
     """Mean modulus of the gains of the dithered modes."""
@@ -128,6 +127,11 @@ class Measured(Reading):
 
     misfit: float
     """Residual power over what noise explains; 1: the model explains the window."""
+
+    @property
+    def when(self) -> Taken:
+        """The telemetry it is of."""
+        return Taken(began_ns_utc=self.began_ns_utc, ended_ns_utc=self.t_ns_utc)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

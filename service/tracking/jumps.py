@@ -39,6 +39,18 @@ LOOK_LIMIT = 26.9
 that both are normalised by is itself learnt, from some forty looks (four times F of 4 and 156, at
 half of that)."""
 
+SCATTERED = 1.5
+"""How much more windows scatter than they say, in variance, that is no chance: twenty windows that
+tell it scatter by 0.1 themselves, and one that was put aside adds a quarter."""
+
+ALIKE_S = 10.0
+"""For so long what turbulence does to windows may be alike: where a loop slips out of the pyramid's
+range they lie to one side of α for four to six seconds, then to the other."""
+
+FARTHEST = 12.0
+"""Times what two windows together hardly exceed by chance that is beyond all turbulence: it has led
+them as far as 6."""
+
 LITTLE = 0.3
 """Share of a jump by which a window may fall short of it and still be of the new place."""
 
@@ -124,6 +136,17 @@ def window_before(known: Registration) -> Seen | None:
     if known.candidate is not None:
         return known.candidate
     return None if known.earlier is None else known.earlier.then
+
+
+def lasts(known: Registration, first: Seen, reading: Reading, both: Distance) -> bool:
+    """Return whether windows have told of a new place, ``both`` so far, for long enough.
+
+    Two suffice where windows scatter by what they say and are independent. Where they scatter by
+    more, neighbours are wrong together, and they must agree for longer than that lasts.
+    """
+    if known.scatter < SCATTERED or both.excess > FARTHEST:
+        return True
+    return (reading.t_ns_utc - first.began_ns_utc) / SECOND_NS >= ALIKE_S
 
 
 def wholly_after(first: Seen, reading: Reading, old: Misregistration, policy: Policy) -> bool:

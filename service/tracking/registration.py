@@ -64,6 +64,9 @@ class Seen(Determination):
     t_ns_utc: int
     """End of the telemetry it is of, the RTC's clock."""
 
+    began_ns_utc: int = 0
+    """Begin of that telemetry; 0: not kept."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reading(Seen):
@@ -115,7 +118,10 @@ class PassiveBias:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Candidate(Seen):
-    """A window far from all before, held until the next one says which of them was right."""
+    """A window far from all before, held until the next one says which of them was right.
+
+    Where those before it have told the same place, it began with the first of them.
+    """
 
     held_ns_utc: int
     """When it was put aside, by the service's clock."""

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.archive.index import Index
 from service.archive.records import from_json, to_json
 from service.archive.store import DAMAGE, Provenance, Store
 from service.control.gains import gain_table
@@ -42,15 +40,13 @@ _ALIVE = {
 class ReconstructorArchive(Store[ReconstructorRecord]):
     """Reconstructors, and beside each what has become of it, for the day when the index is lost."""
 
+    kind = ReconstructorRecord
+    noun = dataset = "reconstructor"
+    described = "(n_modes, n_slopes), metres OPD per slope"
     lost_with_it = "it cannot be sent, nor gone back to; what is known of it is in the index"
 
-    def __init__(self, directory: Path, index: Index) -> None:
-        description = "(n_modes, n_slopes), metres OPD per slope"
-        super().__init__(
-            directory, index, ReconstructorRecord, "reconstructor", description, "reconstructor"
-        )
-        self.largest_bytes = PROBE_BYTES
-        """Of all matrices so far: what must fit on the disk."""
+    largest_bytes = PROBE_BYTES
+    """Of all matrices so far: what must fit on the disk."""
 
     @override
     def kept(self, records: Iterable[ReconstructorRecord]) -> dict[str, str]:
@@ -151,9 +147,9 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
 class MeasuredArchive(Store[MeasurementRecord]):
     """Interaction matrices the RTC has measured."""
 
-    def __init__(self, directory: Path, index: Index) -> None:
-        description = "(n_slopes, n_modes), slope per metre OPD"
-        super().__init__(directory, index, MeasurementRecord, "measurement", description)
+    kind = MeasurementRecord
+    noun = "measurement"
+    described = "(n_slopes, n_modes), slope per metre OPD"
 
     def store(
         self, record: MeasurementRecord, matrix: NDArray[np.float32], instrument: str
@@ -223,12 +219,12 @@ class NoisyNumbers:
 class NoisyArchive(Store[MeasurementRecord]):
     """Noisy interaction matrices: nothing that publishes a reconstructor can find one."""
 
-    def __init__(self, directory: Path, index: Index) -> None:
-        description = (
-            "(n_slopes, n_modes), slope per metre OPD, optical gain included: a measurement to fit "
-            "a model to, never one to control with"
-        )
-        super().__init__(directory, index, MeasurementRecord, "noisy matrix", description)
+    kind = MeasurementRecord
+    noun = "noisy matrix"
+    described = (
+        f"{MeasuredArchive.described}, optical gain included: a measurement to fit a model to, "
+        "never one to control with"
+    )
 
     def store(self, record: MeasurementRecord, numbers: NoisyNumbers, instrument: str) -> None:
         """Write one for good.

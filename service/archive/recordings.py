@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -48,11 +47,9 @@ class Recordings(Folder):
     They are kept until somebody removes them, and are no part of what ``keep_gb`` limits.
     """
 
+    noun = "recording"
     counted = False
     lost_with_it = "it cannot be replayed, nor exported"
-
-    def __init__(self, directory: Path) -> None:
-        super().__init__(directory, "recording")
 
     def stored(self) -> frozenset[str]:
         """Return the ids of those that lie here."""

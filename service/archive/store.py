@@ -29,15 +29,10 @@ Record = TypeVar("Record", bound=Product)
 
 
 class Folder:
-    """A folder with a file for each of what is kept, and beside it, as JSON, what is to be known.
+    """A file for each of what is kept, and beside it, as JSON, what is to be known."""
 
-    Parameters
-    ----------
-    directory
-        Of the files.
-    noun
-        What one of them is called.
-    """
+    noun: str
+    """What one of them is called in messages."""
 
     counted = True
     """Whether they count in ``keep_gb``."""
@@ -45,10 +40,8 @@ class Folder:
     lost_with_it = "it cannot be fitted or compared any more; what is known of it is in the index"
     """What it means that one is damaged."""
 
-    def __init__(self, directory: Path, noun: str) -> None:
+    def __init__(self, directory: Path) -> None:
         self.directory = directory
-        self.noun = noun
-        """What one of them is called."""
 
     def path_of(self, product_id: str) -> Path:
         """Return where the file of one is, or would be."""
@@ -96,38 +89,21 @@ class Store(Folder, Generic[Record]):
 
     The file of each holds its matrix, a checksum and its record. What a call has written is on the
     disk when it returns. Belongs to an :class:`~service.archive.Archive`, which opens it.
-
-    Parameters
-    ----------
-    directory
-        The folder.
-    index
-        Of all kinds.
-    kind
-        Of the record.
-    noun
-        What one of them is called in messages; the table's name, too.
-    description
-        Axes and unit of the matrix.
-    dataset
-        Name of the matrix in a file.
     """
 
-    def __init__(
-        self,
-        directory: Path,
-        index: Index,
-        kind: type[Record],
-        noun: str,
-        description: str,
-        dataset: str = "interaction_matrix",
-    ) -> None:
-        super().__init__(directory, noun)
+    kind: type[Record]
+    """Of their records."""
+
+    described: str
+    """Axes and unit of the matrix."""
+
+    dataset = "interaction_matrix"
+    """Name of the matrix in a file."""
+
+    def __init__(self, directory: Path, index: Index) -> None:
+        super().__init__(directory)
         self._index = index
-        self._kind = kind
-        self._table = noun.replace(" ", "_")
-        self._description = description
-        self._dataset = dataset
+        self._table = self.noun.replace(" ", "_")
         self._unsound: dict[str, str] = {}
         self._stand_ins: dict[str, Record] = {}
 
@@ -166,7 +142,7 @@ class Store(Folder, Generic[Record]):
                 else:
                     became = self._became(record, anew=anew)
                     self._index.add(self._table, became, checksum(matrix))
-        _, wrong = self._index.records(self._table, self._kind)
+        _, wrong = self._index.records(self._table, self.kind)
         self._unsound = self._damaged(sorted(known.keys() - wrong.keys()))
         self._stand_ins.clear()
         for name in wrong:
@@ -179,7 +155,7 @@ class Store(Folder, Generic[Record]):
 
         Of a record that is not understood the one in the product is told.
         """
-        understood, wrong = self._index.records(self._table, self._kind)
+        understood, wrong = self._index.records(self._table, self.kind)
         known = [*understood, *(r for name, r in self._stand_ins.items() if name in wrong)]
         return tuple(sorted(known, key=begun_ns_utc))
 
@@ -245,8 +221,8 @@ class Store(Folder, Generic[Record]):
             raise taken
 
         def whole(file: h5py.File) -> None:
-            file[self._dataset] = np.asarray(matrix, "<f4")
-            file[self._dataset].attrs["description"] = self._description
+            file[self.dataset] = np.asarray(matrix, "<f4")
+            file[self.dataset].attrs["description"] = self.described
             fill(file)
             file.attrs["id"] = record.id
             file.attrs["sha256"] = found
@@ -270,7 +246,7 @@ class Store(Folder, Generic[Record]):
         """Return the record in a file, as it was when the file was made."""
         path = self.path_of(product_id)
         with _opened(path) as file:
-            record = from_json(file.attrs["record"], self._kind)
+            record = from_json(file.attrs["record"], self.kind)
         if record.id != product_id:
             text = f"found {self.noun} {record.id} in it, expected {product_id}"
             raise ArchiveError(f"{path}: {text}")
@@ -280,7 +256,7 @@ class Store(Folder, Generic[Record]):
         """Return the matrix in a file, which must have this checksum, or else that in the file."""
         path = self.path_of(product_id)
         with _opened(path) as file:
-            matrix = np.asarray(file[self._dataset][()], np.float32)
+            matrix = np.asarray(file[self.dataset][()], np.float32)
             expected = sha256 or file.attrs["sha256"]
         found = checksum(matrix)
         if found != expected:
@@ -293,7 +269,7 @@ class Store(Folder, Generic[Record]):
         for name in product_ids:
             try:
                 with _opened(self.path_of(name)) as file:
-                    len(file[self._dataset])
+                    len(file[self.dataset])
             except ArchiveError as error:
                 wrong[name] = str(error)
         return wrong

@@ -8,14 +8,14 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from statistics import median
 from typing import Final
 
 from service import wire
 from service.errors import WireError
 from service.link.matrices import LinkEvent
-from service.link.ring import LEAP, FrameCounts, FrameRing
+from service.link.ring import COUNTED, LEAP, FrameRing
 from service.link.rivals import SessionWatch
 from service.link.session import Endpoint
 from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
@@ -95,7 +95,7 @@ class Intake:
         self._basis_id: str | None = None
         self._config_id: str | None = None
         self._shape: tuple[int, int] | None = None
-        self._counts = FrameCounts()
+        self._counts: Counter[str] = Counter()
         self._counted: Counter[str] = Counter()
         self._tally = Tally()
         self._rtc_alive = False
@@ -335,7 +335,7 @@ class Intake:
                 basis_id=self._basis_id,
                 config_id=self._config_id,
                 batches_received=self._counted["batches"],
-                **{f"frames_{name}": n for name, n in asdict(self._counts).items()},
+                **{f"frames_{name}": self._counts[name] for name in COUNTED},
                 frames_refused=tally.of("frames", but=(USED, MALFORMED, *PLACED)),
                 messages_malformed=malformed,
                 statuses_received=sum(tally.of("status", but=(MALFORMED,)).values()),
@@ -377,7 +377,7 @@ class Intake:
         self._last_frame_s = now_s
         if self._ring is None or not self._ring.fits(header):
             if self._ring is not None:
-                self._counts.overwritten += self._ring.undelivered
+                self._counts["overwritten"] += self._ring.undelivered
             self._ring = FrameRing(header, self._capacity(header), self._counts)
         batches, wrong = [batch], self._ring.why_not(header)
         if wrong is not None:
@@ -391,11 +391,11 @@ class Intake:
     def _place(self, ring: FrameRing, batch: wire.FrameBatch, now_s: float) -> None:
         """Put frames in their places, and count what became of them."""
         counts = self._counts
-        received, before = counts.received, [getattr(counts, name) for name in PLACED]
+        before = counts.copy()
         ring.store(batch, now_s)
-        self._tally.add("frames", USED, counts.received - received, now_s)
-        for (name, text), n_before in zip(PLACED.items(), before, strict=True):
-            self._tally.add("frames", name, getattr(counts, name) - n_before, now_s, text)
+        self._tally.add("frames", USED, counts["received"] - before["received"], now_s)
+        for name, text in PLACED.items():
+            self._tally.add("frames", name, counts[name] - before[name], now_s, text)
 
     def _capacity(self, header: wire.FrameHeader) -> int:
         row_bytes = 4 * (header.n_slopes + 2 * header.n_modes)

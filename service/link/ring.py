@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -29,27 +30,8 @@ CONFIRMATIONS: Final = 2
 Places = slice | NDArray[np.int64]
 """Where frames are; a slice, where they lie in a row, is much quicker."""
 
-
-@dataclass(slots=True)
-class FrameCounts:
-    """What has become of the frames of all sessions so far."""
-
-    received: int = 0
-    """Frames stored, recovered ones included."""
-
-    lost: int = 0
-    """Sequence numbers that have not come (yet): a recovered frame is taken off again."""
-
-    recovered: int = 0
-    """Frames that came after later ones and still found their place."""
-
-    duplicate: int = 0
-    late: int = 0
-    """Frames that came when their place had been passed; they stay among the lost."""
-
-    nonfinite: int = 0
-    overwritten: int = 0
-    """Frames nobody drained in time, or that a new session made void."""
+COUNTED: Final = ("received", "lost", "recovered", "duplicate", "late", "nonfinite", "overwritten")
+"""What becomes of frames; :class:`~service.link.statistics.LinkStatistics` says what each means."""
 
 
 class FrameRing:
@@ -60,7 +42,7 @@ class FrameRing:
     that is not finite). Numbers stay in the batches they came in until the reader passes them.
     """
 
-    def __init__(self, header: FrameHeader, capacity: int, counts: FrameCounts) -> None:
+    def __init__(self, header: FrameHeader, capacity: int, counts: Counter[str]) -> None:
         """Allocate the ring.
 
         Parameters
@@ -149,9 +131,9 @@ class FrameRing:
         here = self._seq[slots] == seq
         free = here & (self._state[slots] == MISSING) & (seq >= self._cursor)
         duplicate = int(np.count_nonzero(here & (self._state[slots] != MISSING)))
-        counts.duplicate += duplicate
-        counts.late += header.n - duplicate - int(np.count_nonzero(free))
-        counts.recovered += int(np.count_nonzero(free[:older]))
+        counts["duplicate"] += duplicate
+        counts["late"] += header.n - duplicate - int(np.count_nonzero(free))
+        counts["recovered"] += int(np.count_nonzero(free[:older]))
         edges = np.flatnonzero(np.diff(free, prepend=False, append=False)).tolist()
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
             # copied: a few frames must not keep the memory of all that came with them
@@ -193,8 +175,8 @@ class FrameRing:
         cursor = max(self._cursor, head - self._capacity)
         if cursor > self._cursor:
             passed = np.arange(self._cursor, min(cursor, self._head)) % self._capacity
-            self._counts.overwritten += int(np.count_nonzero(self._state[passed] == HELD))
-        self._counts.lost += head - self._head
+            self._counts["overwritten"] += int(np.count_nonzero(self._state[passed] == HELD))
+        self._counts["lost"] += head - self._head
         self._cursor = cursor
         first = max(self._head, head - self._capacity)
         slots = _span(first, head - first, self._capacity)
@@ -208,9 +190,9 @@ class FrameRing:
         """Keep the frames of a batch, whose places are free."""
         finite = _finite(batch.rows)
         n_finite = int(np.count_nonzero(finite))
-        self._counts.lost -= len(finite)
-        self._counts.nonfinite += len(finite) - n_finite
-        self._counts.received += n_finite
+        self._counts["lost"] -= len(finite)
+        self._counts["nonfinite"] += len(finite) - n_finite
+        self._counts["received"] += n_finite
         slots = _span(batch.header.seq0, batch.header.n, self._capacity)
         self._state[slots] = np.where(finite, HELD, VOID)
         self._batch[slots] = batch

@@ -8,7 +8,9 @@ import { Registration } from "./registration.js";
 import { choose, scheme } from "./scheme.js";
 import { Session } from "./session.js";
 import { Service } from "./stream.js";
+import { lay } from "./words.js";
 
+lay(document);
 const service = new Service();
 new Session(service);
 const orders = new Orders(service);
@@ -30,6 +32,7 @@ async function fetched(name) {
   if (!answer.ok) throw new Error(`${name}: ${answer.status}`);
   const { body } = new DOMParser().parseFromString(await answer.text(), "text/html");
   const root = $(`#${name}`);
+  lay(body);
   root.replaceChildren(...body.children);
   return PAGES[name](root);
 }

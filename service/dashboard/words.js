@@ -115,3 +115,13 @@ export function make(tag, { className = "", text = "", ...rest } = {}, ...childr
   element.append(...children);
   return element;
 }
+
+// A table for each list that a page names the columns of, in a frame that scrolls and the keyboard reaches.
+export function lay(page) {
+  for (const frame of page.querySelectorAll("[data-columns]")) {
+    const heads = frame.dataset.columns.split("|").map((text) => make("th", { scope: "col", text }));
+    frame.tabIndex = 0;
+    frame.setAttribute("role", "region");
+    frame.append(make("table", {}, make("thead", {}, make("tr", {}, ...heads)), make("tbody")));
+  }
+}

@@ -6,12 +6,12 @@ What the program calls methods, data sets and limits stands here as text; a test
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 from typing_extensions import override
 
@@ -19,6 +19,11 @@ from service import __version__
 from service.commands.remote import add, declare, words
 from service.errors import ConfigurationError
 from service.files import kind_of, parse_alpha, parse_arms, parse_modes
+
+_Read = TypeVar("_Read")
+
+_ENDPOINT = re.compile(r"[\w-]+/\S+")
+"""Of zenoh: a protocol and an address."""
 
 OTHER_PROGRAMS = {
     "demo": ("studies.demo", "the main job, end to end, on a simulated telescope"),
@@ -225,55 +230,28 @@ def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
     )
 
 
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number above 0")
-    return int(text)
+def _such(
+    read: Callable[[str], _Read], holds: Callable[[_Read], object], expected: str
+) -> Callable[[str], _Read]:
+    """Return a function that reads a text and refuses what is no number, or not as expected."""
+
+    def reading(text: str) -> _Read:
+        with suppress(ValueError):
+            if holds(found := read(text)):
+                return found
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
+
+    return reading
 
 
-def seconds(text: str) -> float:
-    """Return a time of up to an hour, seconds.
-
-    Raises
-    ------
-    ArgumentTypeError
-        If the text says something else.
-    """
-    try:
-        found = float(text)
-    except ValueError:
-        found = math.nan
-    if not 0.0 < found <= 3600.0:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected seconds above 0 and up to 3600")
-    return found
+def _whole(text: str) -> int:
+    return int(text) if text.isdecimal() else -1
 
 
-def port(text: str) -> int:
-    """Return a TCP port; 0: any free one.
-
-    Raises
-    ------
-    ArgumentTypeError
-        If the text says something else.
-    """
-    if not (text.isdecimal() and len(text) < 6 and int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a port, 0 to 65535")
-    return int(text)
-
-
-def endpoint(text: str) -> str:
-    """Return an endpoint of zenoh: a protocol and an address.
-
-    Raises
-    ------
-    ArgumentTypeError
-        If the text says something else.
-    """
-    if not re.fullmatch(r"[\w-]+/\S+", text):
-        raise argparse.ArgumentTypeError(
-            f"found {text!r}, expected an endpoint like tcp/127.0.0.1:7447"
-        )
-    return text
+_count = _such(_whole, lambda n: n > 0, "a whole number above 0")
+port = _such(_whole, lambda n: 0 <= n <= 65535, "a port, 0 to 65535")
+seconds = _such(float, lambda s: 0.0 < s <= 3600.0, "seconds above 0 and up to 3600")
+endpoint = _such(str, _ENDPOINT.fullmatch, "an endpoint like tcp/127.0.0.1:7447")
 
 
 def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:

@@ -30,8 +30,11 @@ JUMP_INFLATION = 10.0
 SCATTER_LEARNING = 0.05
 """Weight of the newest in how much windows, and looks, scatter: twenty are remembered."""
 
-_DITHERED = np.hstack([np.eye(4), np.zeros((4, 4))])
-_PASSIVE = np.hstack([np.eye(4), np.eye(4)])
+DITHERED = np.hstack([np.eye(4), np.zeros((4, 4))])
+"""What a dithered window sees of the mean, ``(4, 8)``: α."""
+
+PASSIVE = np.hstack([np.eye(4), np.eye(4)])
+"""What a look at ordinary telemetry sees: α and the bias together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -129,24 +132,24 @@ def predicted(joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | Non
     return replace(joint, mean=keep * joint.mean, covariance=covariance, excess=excess)
 
 
-def dithered_innovation(prior: Joint, measured: Array, noise: Array) -> float:
-    """Return how far a dithered window lies from the prior: squared, normalised, expected 4."""
-    return _innovation(prior, measured, noise, _DITHERED)
+def innovation(prior: Joint, measured: Array, noise: Array, sees: Array = DITHERED) -> float:
+    """Return how far a measurement lies from the prior: squared, normalised, expected 4."""
+    difference = measured - sees @ prior.mean
+    total = sees @ prior.covariance @ sees.T + noise
+    return float(difference @ np.linalg.solve(total, difference))
 
 
-def passive_innovation(prior: Joint, measured: Array, noise: Array) -> float:
-    """Return the same of a passive estimate, the bias allowed for."""
-    return _innovation(prior, measured, noise, _PASSIVE)
-
-
-def with_dithered(prior: Joint, measured: Array, noise: Array) -> Joint:
-    """Fold in a dithered window ``(4,)`` with its covariance ``(4, 4)``."""
-    return _corrected(prior, measured, noise, _DITHERED)
-
-
-def with_passive(prior: Joint, measured: Array, noise: Array) -> Joint:
-    """Fold in a passive estimate ``(4,)`` with the covariance of its scatter ``(4, 4)``."""
-    return _corrected(prior, measured, noise, _PASSIVE)
+def corrected(prior: Joint, measured: Array, noise: Array, sees: Array = DITHERED) -> Joint:
+    """Fold in a measurement ``(4,)`` with the covariance ``(4, 4)`` of its own scatter."""
+    total = sees @ prior.covariance @ sees.T + noise
+    gain = np.linalg.solve(total, sees @ prior.covariance).T
+    keep = np.eye(8) - gain @ sees
+    posterior = keep @ prior.covariance @ keep.T + gain @ noise @ gain.T
+    return replace(
+        prior,
+        mean=prior.mean + gain @ (measured - sees @ prior.mean),
+        covariance=(posterior + posterior.T) / 2,
+    )
 
 
 def scattered(joint: Joint, innovation: float) -> Joint:
@@ -179,21 +182,3 @@ def widened(prior: Joint, noise: Array) -> Joint:
     moved = np.zeros(8)
     moved[:4] = np.diag(prior.covariance)[:4] + np.diag(noise)
     return replace(prior, covariance=prior.covariance + JUMP_INFLATION**2 * np.diag(moved))
-
-
-def _innovation(prior: Joint, measured: Array, noise: Array, sees: Array) -> float:
-    difference = measured - sees @ prior.mean
-    total = sees @ prior.covariance @ sees.T + noise
-    return float(difference @ np.linalg.solve(total, difference))
-
-
-def _corrected(prior: Joint, measured: Array, noise: Array, sees: Array) -> Joint:
-    total = sees @ prior.covariance @ sees.T + noise
-    gain = np.linalg.solve(total, sees @ prior.covariance).T
-    keep = np.eye(8) - gain @ sees
-    posterior = keep @ prior.covariance @ keep.T + gain @ noise @ gain.T
-    return replace(
-        prior,
-        mean=prior.mean + gain @ (measured - sees @ prior.mean),
-        covariance=(posterior + posterior.T) / 2,
-    )

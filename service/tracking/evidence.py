@@ -141,7 +141,7 @@ def enter(turn: Turn, measured: Measured) -> None:
         return
     prior = filtering.brought_forward(turn, known, measured.t_ns_utc)
     folded = Folded(
-        joint=kalman.with_dithered(prior, measured.alpha.vector, measured.covariance),
+        joint=kalman.corrected(prior, measured.alpha.vector, measured.covariance),
         n_windows=filtering.counted(turn, known, prior),
         innovation=_innovation(prior, measured),
         scatter=kalman.learnt(known.scatter, far.innovation),
@@ -193,9 +193,9 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
         noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
     joint = kalman.widened(prior, noise)
     if whole:
-        joint = kalman.with_dithered(joint, first.alpha.vector, noise)
+        joint = kalman.corrected(joint, first.alpha.vector, noise)
     folded = Folded(
-        joint=kalman.with_dithered(joint, measured.alpha.vector, measured.covariance),
+        joint=kalman.corrected(joint, measured.alpha.vector, measured.covariance),
         n_windows=2 if whole else 1,
         innovation=_innovation(prior, measured),
         scatter=known.scatter,
@@ -218,7 +218,7 @@ def _doubted(known: Registration, doubt: str, since_ns_utc: int) -> Registration
 
 
 def _innovation(prior: Joint, measured: Measured) -> float:
-    return kalman.dithered_innovation(prior, measured.alpha.vector, measured.covariance)
+    return kalman.innovation(prior, measured.alpha.vector, measured.covariance)
 
 
 def _away(seen: Seen, known: Registration) -> str:
@@ -257,7 +257,9 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
     if far > jumps.LOOK_LIMIT:
         _doubt_by_look(turn, known, event, prior, far)
         return
-    joint = kalman.scattered(kalman.with_passive(prior, measured, estimate.covariance), far)
+    joint = kalman.scattered(
+        kalman.corrected(prior, measured, estimate.covariance, kalman.PASSIVE), far
+    )
     registration = _after_look(turn, known, joint, event)
     validity.hold(turn, registration)
     validity.age(turn)
@@ -268,7 +270,7 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
         measured_sigma=sigma,
         filtered=registration.alpha,
         filtered_sigma=registration.sigma,
-        innovation=kalman.passive_innovation(prior, measured, estimate.covariance),
+        innovation=kalman.innovation(prior, measured, estimate.covariance, kalman.PASSIVE),
         misfit=estimate.misfit,
         source=Source.PASSIVE,
     )

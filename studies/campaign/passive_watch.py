@@ -14,13 +14,13 @@ from service.model.misregistration import Misregistration
 from service.runtime.streams import PASSIVE_MEMORY_S
 from service.telemetry import lockin
 from service.telemetry.kalman import (
+    PASSIVE,
     Drift,
     Joint,
     allowing,
     begin_joint,
+    corrected,
     predicted,
-    with_dithered,
-    with_passive,
 )
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.passive import Passive, accumulate
@@ -145,7 +145,7 @@ class Watch:
         measured, noise = found.alpha.vector, found.covariance
         prior = self._forward(t_s)
         self._joint = (
-            begin_joint(measured, noise) if prior is None else with_dithered(prior, measured, noise)
+            begin_joint(measured, noise) if prior is None else corrected(prior, measured, noise)
         )
         self._near = found.alpha
         yield Look(
@@ -168,7 +168,7 @@ class Watch:
         prior = self._forward(t_s)
         if prior is not None:
             prior = allowing(prior, found.bias_excess)
-            self._joint = with_passive(prior, found.alpha.vector, found.covariance)
+            self._joint = corrected(prior, found.alpha.vector, found.covariance, PASSIVE)
             measured["followed"] = self._joint.alpha
             own = np.diag(self._joint.alpha_covariance)
             sigma["followed"] = np.sqrt(own + self._floor**2)

@@ -76,7 +76,9 @@ def test_the_filters_covariance_stays_symmetric_and_positive(mean, prior, measur
     found = kalman.begin_joint(mean, prior)
     for measured, noise in measurements:
         found = kalman.predicted(found, drift, 1.0)
-        found = kalman.with_passive(kalman.with_dithered(found, measured, noise), measured, noise)
+        found = kalman.corrected(
+            kalman.corrected(found, measured, noise), measured, noise, kalman.PASSIVE
+        )
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     power = np.linalg.eigvalsh(found.covariance)
     assert power[0] > -1e-9 * power[-1]
@@ -85,7 +87,7 @@ def test_the_filters_covariance_stays_symmetric_and_positive(mean, prior, measur
 @given(vectors, covariances, vectors, covariances)
 def test_a_measurement_never_adds_uncertainty(mean, prior, measured, noise):
     begun = kalman.begin_joint(mean, prior)
-    found = kalman.with_dithered(begun, measured, noise).alpha_covariance
+    found = kalman.corrected(begun, measured, noise).alpha_covariance
     slack = 1e-9 * np.trace(prior + noise)
     assert np.linalg.eigvalsh(prior - found)[0] > -slack
     assert np.linalg.eigvalsh(noise - found)[0] > -slack
@@ -98,14 +100,14 @@ def test_the_innovation_does_not_depend_on_the_units(mean, prior, measured, nois
     scaled = kalman.begin_joint(units @ mean, units @ prior @ units)
     there, noisier = units @ measured, units @ noise @ units
     np.testing.assert_allclose(
-        kalman.dithered_innovation(scaled, there, noisier),
-        kalman.dithered_innovation(plain, measured, noise),
+        kalman.innovation(scaled, there, noisier),
+        kalman.innovation(plain, measured, noise),
         rtol=1e-6,
         atol=1e-12,
     )
     np.testing.assert_allclose(
-        kalman.with_dithered(scaled, there, noisier).alpha,
-        units @ kalman.with_dithered(plain, measured, noise).alpha,
+        kalman.corrected(scaled, there, noisier).alpha,
+        units @ kalman.corrected(plain, measured, noise).alpha,
         rtol=1e-5,
         atol=1e-6,
     )

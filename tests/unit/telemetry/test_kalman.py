@@ -9,17 +9,16 @@ import pytest
 
 from service.telemetry.kalman import (
     JUMP_THRESHOLD,
+    PASSIVE,
     Drift,
     Joint,
     allowing,
     begin_joint,
-    dithered_innovation,
+    corrected,
     forgotten,
-    passive_innovation,
+    innovation,
     predicted,
     widened,
-    with_dithered,
-    with_passive,
 )
 from service.telemetry.passive import BIAS_FLOOR, BIAS_OVER_SCATTER
 
@@ -49,10 +48,10 @@ class TestWindows:
         """The arithmetic mean, and half the variance; the innovation is 4 x 1/2."""
         noise = np.diag(SIGMA**2)
         begun = begin_joint(np.zeros(4), noise)
-        found = with_dithered(begun, SIGMA, noise)
+        found = corrected(begun, SIGMA, noise)
         np.testing.assert_allclose(found.alpha, SIGMA / 2)
         np.testing.assert_allclose(found.alpha_covariance, noise / 2)
-        assert dithered_innovation(begun, SIGMA, noise) == pytest.approx(2.0)
+        assert innovation(begun, SIGMA, noise) == pytest.approx(2.0)
 
     def test_the_random_walk_widens_with_the_square_root_of_time(self):
         drift = Drift(alpha_rate=np.array([0.01, 0.02, 0.001, 0.0003]))
@@ -82,13 +81,13 @@ class TestWindows:
         for _ in range(100):
             prior = predicted(joint, walk, 1.0)
             read = SIGMA * rng.normal(size=4)
-            assert dithered_innovation(prior, read, noise) < JUMP_THRESHOLD
-            joint = with_dithered(prior, read, noise)
+            assert innovation(prior, read, noise) < JUMP_THRESHOLD
+            joint = corrected(prior, read, noise)
         assert np.all(np.abs(joint.alpha) < 4 * np.sqrt(np.diag(joint.alpha_covariance)))
         measured = joint.alpha + jump
         prior = predicted(joint, walk, 1.0)
-        assert dithered_innovation(prior, measured, noise) > JUMP_THRESHOLD
-        found = with_dithered(widened(prior, noise), measured, noise)
+        assert innovation(prior, measured, noise) > JUMP_THRESHOLD
+        found = corrected(widened(prior, noise), measured, noise)
         assert np.all(np.abs(found.alpha - measured) < 0.02 * np.abs(jump).max())
         assert np.all(np.diag(found.alpha_covariance) > 0.9 * SIGMA**2)
 
@@ -99,7 +98,7 @@ class TestWindows:
 
     def test_the_inputs_are_left_alone(self):
         begun, measured, noise = begin_joint(NOWHERE, DITHERED), away(0.1, 0, 0, 0), SCATTER.copy()
-        with_dithered(predicted(begun, DRIFT, 5.0), measured, noise)
+        corrected(predicted(begun, DRIFT, 5.0), measured, noise)
         np.testing.assert_array_equal(begun.alpha_covariance, DITHERED)
         np.testing.assert_array_equal(noise, SCATTER)
         np.testing.assert_array_equal(measured, away(0.1, 0, 0, 0))
@@ -112,34 +111,34 @@ class TestBias:
         """Prior of α: 1 subaperture. A bias does not average out, of no parameter."""
         joint = begin_joint(NOWHERE, np.diag([1.0, 1.0, 0.01, 0.01]))
         for _ in range(50):
-            joint = with_passive(joint, NOWHERE, SCATTER)
+            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE)
         assert np.all(np.sqrt(np.diag(joint.alpha_covariance)) > 0.99 * BIAS_FLOOR)
 
     def test_the_bias_is_the_difference_of_the_two_readings(self):
         """Both many times: to a tenth of a percent of a subaperture."""
         joint = begin_joint(NOWHERE, DITHERED)
         for _ in range(400):
-            joint = with_dithered(joint, NOWHERE, DITHERED)
-            joint = with_passive(joint, away(0.06, -0.03, 3e-4, 0.0), SCATTER)
+            joint = corrected(joint, NOWHERE, DITHERED)
+            joint = corrected(joint, away(0.06, -0.03, 3e-4, 0.0), SCATTER, PASSIVE)
         np.testing.assert_allclose(joint.bias, [0.06, -0.03, 3e-4, 0.0], atol=1e-3)
         np.testing.assert_allclose(joint.alpha, NOWHERE, atol=1e-3)
 
     def test_once_the_bias_is_learnt_a_passive_reading_moves_the_registration(self):
         joint = begin_joint(NOWHERE, DITHERED)
         for _ in range(100):
-            joint = with_dithered(joint, NOWHERE, DITHERED)
-            joint = with_passive(joint, away(0.06, 0, 0, 0), SCATTER)
+            joint = corrected(joint, NOWHERE, DITHERED)
+            joint = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE)
         later = predicted(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
-        found = with_passive(later, away(0.08, 0, 0, 0), SCATTER)
+        found = corrected(later, away(0.08, 0, 0, 0), SCATTER, PASSIVE)
         assert found.alpha[0] == pytest.approx(0.02, abs=0.003)
         assert np.sqrt(found.covariance[0, 0]) < 0.005
 
     def test_a_change_of_wind_is_far_out_and_what_is_forgotten_is_the_bias_alone(self):
         joint = begin_joint(NOWHERE, DITHERED)
         for _ in range(20):
-            joint = with_dithered(joint, NOWHERE, DITHERED)
-            joint = with_passive(joint, NOWHERE, SCATTER)
-        assert passive_innovation(joint, away(0.12, 0, 0, 0), SCATTER) > JUMP_THRESHOLD
+            joint = corrected(joint, NOWHERE, DITHERED)
+            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE)
+        assert innovation(joint, away(0.12, 0, 0, 0), SCATTER, PASSIVE) > JUMP_THRESHOLD
         gone = forgotten(joint)
         np.testing.assert_array_equal(gone.alpha, joint.alpha)
         np.testing.assert_array_equal(gone.alpha_covariance, joint.alpha_covariance)
@@ -148,9 +147,9 @@ class TestBias:
     def test_a_jump_seen_by_the_dither_keeps_the_bias(self):
         joint = begin_joint(NOWHERE, DITHERED)
         for _ in range(50):
-            joint = with_dithered(joint, NOWHERE, DITHERED)
-            joint = with_passive(joint, away(0.05, 0, 0, 0), SCATTER)
-        moved = with_dithered(widened(joint, DITHERED), away(0.1, 0, 0, 0), DITHERED)
+            joint = corrected(joint, NOWHERE, DITHERED)
+            joint = corrected(joint, away(0.05, 0, 0, 0), SCATTER, PASSIVE)
+        moved = corrected(widened(joint, DITHERED), away(0.1, 0, 0, 0), DITHERED)
         assert moved.alpha[0] == pytest.approx(0.1, abs=0.005)
         assert moved.bias[0] == pytest.approx(0.05, abs=0.01)
 
@@ -177,8 +176,8 @@ class TestExcess:
         excess = np.array([0.1, 0.1, 0.0, 0.0]) ** 2
         joint = begin_joint(NOWHERE, DITHERED)
         for _ in range(50):
-            joint = with_dithered(joint, NOWHERE, DITHERED)
-            joint = with_passive(allowing(joint, excess), away(0.15, 0, 0, 0), SCATTER)
+            joint = corrected(joint, NOWHERE, DITHERED)
+            joint = corrected(allowing(joint, excess), away(0.15, 0, 0, 0), SCATTER, PASSIVE)
         again = allowing(joint, excess)
         np.testing.assert_array_equal(again.covariance, joint.covariance)
         assert np.sqrt(again.covariance[4, 4]) < 0.002
@@ -188,12 +187,12 @@ class TestExcess:
         """The bias may have changed with the wind: 1 % of a subaperture of drift, a step of 6 %."""
         joint = begin_joint(NOWHERE, DITHERED)
         for _ in range(50):
-            joint = with_dithered(joint, NOWHERE, DITHERED)
-            joint = with_passive(joint, NOWHERE, SCATTER)
+            joint = corrected(joint, NOWHERE, DITHERED)
+            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE)
         joint = predicted(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
-        calm = with_passive(joint, away(0.06, 0, 0, 0), SCATTER)
+        calm = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE)
         windy = allowing(joint, np.array([0.12, 0.12, 0.0, 0.0]) ** 2)
-        stormy = with_passive(windy, away(0.06, 0, 0, 0), 16 * SCATTER)
+        stormy = corrected(windy, away(0.06, 0, 0, 0), 16 * SCATTER, PASSIVE)
         assert calm.alpha[0] > 0.04
         assert stormy.alpha[0] < 0.001
         assert stormy.bias[0] > 0.05
@@ -239,9 +238,9 @@ def windy_night(seed: int, scatters: tuple[np.ndarray, np.ndarray]) -> np.ndarra
         joint = predicted(joint, drift, 6.0)
         if t in {120, 180}:
             read = true + np.sqrt(np.diag(DITHERED)) * rng.normal(size=4)
-            joint = with_dithered(joint, read, DITHERED)
+            joint = corrected(joint, read, DITHERED)
         read = true + bias + scatter * rng.normal(size=4)
-        joint = with_passive(allowing(joint, excess), read, np.diag(scatter**2))
+        joint = corrected(allowing(joint, excess), read, np.diag(scatter**2), PASSIVE)
         error, covariance = joint.alpha - true, joint.alpha_covariance
         square = error @ np.linalg.solve(covariance, error)
         found.append([*error / np.sqrt(np.diag(covariance)), square])
@@ -277,10 +276,10 @@ def night(seed: int, dither_every_s: float) -> tuple[np.ndarray, np.ndarray]:
         if t % dither_every_s == 0.0:
             read = true + np.sqrt(np.diag(DITHERED)) * rng.normal(size=4)
             begun = begin_joint(read, DITHERED)
-            joint = begun if joint is None else with_dithered(joint, read, DITHERED)
+            joint = begun if joint is None else corrected(joint, read, DITHERED)
         assert joint is not None
         read = true + bias + np.sqrt(np.diag(SCATTER)) * rng.normal(size=4)
-        joint = with_passive(joint, read, SCATTER)
+        joint = corrected(joint, read, SCATTER, PASSIVE)
         if t > 600.0:
             error = joint.alpha - true
             errors.append(error)

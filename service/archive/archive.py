@@ -54,7 +54,7 @@ class Archive:
         )
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
-        self.nights = Nights(self._index.reading, noon_utc_h)
+        self.nights = Nights(self._index.asked, noon_utc_h)
         """Every estimate of α, and what happened beside it."""
         self._lock: IO[str] | None = None
         self.wrong: tuple[str, ...] = ()

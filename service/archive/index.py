@@ -8,9 +8,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from service.archive import nights
+from service.archive.nights import Values
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, shown
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
@@ -224,12 +225,11 @@ class Index:
             connection.executemany(nights.INSERT, nights.rows_of(estimates))
             connection.execute("COMMIT")
 
-    @contextmanager
-    def reading(self) -> Iterator[sqlite3.Connection]:
-        """Open a connection that only reads: a long question holds up nobody who writes."""
+    def asked(self, question: str, values: Values) -> list[Any]:
+        """Return the rows there are, on a connection that only reads: nobody who writes waits."""
         name = f"{self._path.absolute().as_uri()}?mode=ro"
         with self._explained(), closing(sqlite3.connect(name, uri=True)) as connection:
-            yield connection
+            return connection.execute(question, values).fetchall()
 
     def forget_numbers(self, table: str, product_id: str) -> None:
         """Keep what is known of a product, and no longer that its numbers are there."""

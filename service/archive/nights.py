@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import sqlite3
 from collections import Counter
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -19,6 +17,9 @@ from service.errors import TooLargeError
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.tracking.alarms import ALARMS
 from service.tracking.registration import HistoryEntry, Source
+
+Values = Sequence[object] | Mapping[str, object]
+"""What stands for the marks in a question."""
 
 _FOURS = ("measured", "measured_sigma", "filtered", "filtered_sigma")
 _FILTERED = tuple(f"filtered_{parameter}" for parameter in PARAMETERS)
@@ -114,38 +115,29 @@ class Night:
 class Nights:
     """Reads what the nights have left; never waits for a writer, nor has one wait.
 
+    A question that the disk does not answer raises StorageError.
+
     Parameters
     ----------
-    reading
-        Opens a connection that only reads.
+    asked
+        Returns the rows that a question to the index finds.
     noon_utc_h
         UTC hour of local noon, where one night ends and the next begins.
     """
 
-    def __init__(
-        self,
-        reading: Callable[[], AbstractContextManager[sqlite3.Connection]],
-        noon_utc_h: int = 12,
-    ) -> None:
-        self._reading = reading
+    def __init__(self, asked: Callable[[str, Values], list[Any]], noon_utc_h: int = 12) -> None:
+        self._asked = asked
         self._noon_ns = noon_utc_h * HOUR_NS
 
     def estimates(
         self, first_ns: int, last_ns: int, n_most: int, *, newest: bool = True
     ) -> tuple[HistoryEntry, ...]:
-        """Return the newest or the oldest estimates of a time, which has both ends; oldest first.
-
-        Raises
-        ------
-        StorageError
-            If they cannot be read.
-        """
-        with self._reading() as connection:
-            rows = connection.execute(
-                f"SELECT {_COLUMNS} FROM estimate WHERE t_ns_utc BETWEEN ? AND ?"
-                f" ORDER BY t_ns_utc {'DESC' if newest else 'ASC'} LIMIT ?",
-                (first_ns, last_ns, n_most),
-            ).fetchall()
+        """Return the newest or the oldest estimates, both ends of the time included; in order."""
+        rows = self._asked(
+            f"SELECT {_COLUMNS} FROM estimate WHERE t_ns_utc BETWEEN ? AND ?"
+            f" ORDER BY t_ns_utc {'DESC' if newest else 'ASC'} LIMIT ?",
+            (first_ns, last_ns, n_most),
+        )
         return tuple(map(_entry, reversed(rows) if newest else rows))
 
     def thinned(self, first_ns: int, last_ns: int, n_points: int) -> tuple[HistoryEntry, ...]:
@@ -157,81 +149,59 @@ class Nights:
         ------
         TooLargeError
             If there are more than ``MOST_THINNED``.
-        StorageError
-            If they cannot be read.
         """
         within = "WHERE t_ns_utc BETWEEN :first AND :last"
-        with self._reading() as connection:
-            begin_ns, end_ns, n_there = connection.execute(
-                f"SELECT min(t_ns_utc), max(t_ns_utc), count(*) FROM estimate {within}",
-                {"first": first_ns, "last": last_ns},
-            ).fetchone()
-            if n_there > MOST_THINNED:
-                raise TooLargeError(
-                    f"found {n_there} estimates in this time, expected at most {MOST_THINNED}: "
-                    "ask for less of it"
-                )
-            if n_there <= n_points:
-                return self.estimates(first_ns, last_ns, n_points)
-            n_parts = n_points // (2 * len(PARAMETERS))
-            # of the row that has it, where there is one min or max: https://sqlite.org/lang_select.html
-            extremes = " UNION ".join(
-                f"SELECT id FROM (SELECT rowid AS id, {end}({name}) FROM estimate {within}"
-                " GROUP BY (t_ns_utc - :begin) / :width)"
-                for name in _FILTERED
-                for end in ("min", "max")
+        times = {"first": first_ns, "last": last_ns}
+        ((begin_ns, end_ns, n_there),) = self._asked(
+            f"SELECT min(t_ns_utc), max(t_ns_utc), count(*) FROM estimate {within}", times
+        )
+        if n_there > MOST_THINNED:
+            raise TooLargeError(
+                f"found {n_there} estimates in this time, expected at most {MOST_THINNED}: "
+                "ask for less of it"
             )
-            rows = connection.execute(
-                f"SELECT {_COLUMNS} FROM estimate WHERE rowid IN ({extremes}) ORDER BY t_ns_utc",
-                {
-                    "first": first_ns,
-                    "last": last_ns,
-                    "begin": begin_ns,
-                    "width": (end_ns - begin_ns) // n_parts + 1,
-                },
-            ).fetchall()
+        if n_there <= n_points:
+            return self.estimates(first_ns, last_ns, n_points)
+        n_parts = n_points // (2 * len(PARAMETERS))
+        # of the row that has it, where there is one min or max: https://sqlite.org/lang_select.html
+        extremes = " UNION ".join(
+            f"SELECT id FROM (SELECT rowid AS id, {end}({name}) FROM estimate {within}"
+            " GROUP BY (t_ns_utc - :begin) / :width)"
+            for name in _FILTERED
+            for end in ("min", "max")
+        )
+        rows = self._asked(
+            f"SELECT {_COLUMNS} FROM estimate WHERE rowid IN ({extremes}) ORDER BY t_ns_utc",
+            times | {"begin": begin_ns, "width": (end_ns - begin_ns) // n_parts + 1},
+        )
         return tuple(map(_entry, rows))
 
     def marks(self, first_ns: int, last_ns: int, n_most: int) -> tuple[Mark, ...]:
-        """Return the newest marks of a time, which has both ends; oldest first.
-
-        Raises
-        ------
-        StorageError
-            If they cannot be read.
-        """
-        with self._reading() as connection:
-            rows = connection.execute(
-                f"SELECT t_ns_utc, name, text FROM audit WHERE {_OF_KINDS}"
-                " AND t_ns_utc BETWEEN ? AND ? ORDER BY t_ns_utc DESC LIMIT ?",
-                (first_ns, last_ns, n_most),
-            ).fetchall()
+        """Return the newest marks of a time, which has both ends; oldest first."""
+        rows = self._asked(
+            f"SELECT t_ns_utc, name, text FROM audit WHERE {_OF_KINDS}"
+            " AND t_ns_utc BETWEEN ? AND ? ORDER BY t_ns_utc DESC LIMIT ?",
+            (first_ns, last_ns, n_most),
+        )
         return tuple(
             Mark(t_ns_utc=t_ns, kind=_kind(name, text), name=name, text=text)
             for t_ns, name, text in reversed(rows)
         )
 
     def between(self, first_ns: int, last_ns: int) -> tuple[Night, ...]:
-        """Return the nights of which something is there, as far as they lie in a time.
-
-        Raises
-        ------
-        StorageError
-            If they cannot be read.
-        """
+        """Return the nights of which something is there, as far as they lie in a time."""
         night = f"(t_ns_utc - {self._noon_ns}) / {DAY_NS}"
         time = (first_ns, last_ns)
-        with self._reading() as connection:
-            measured = connection.execute(
-                f"SELECT {night}, count(*), max(t_ns_utc) - min(t_ns_utc) FROM estimate"
-                " WHERE t_ns_utc BETWEEN ? AND ? GROUP BY 1",
-                time,
-            ).fetchall()
-            marks = connection.execute(
-                f"SELECT {night}, name, text LIKE '%: over', count(*) FROM audit"
-                f" WHERE {_OF_KINDS} AND t_ns_utc BETWEEN ? AND ? GROUP BY 1, 2, 3",
-                time,
-            ).fetchall()
+        measured = self._asked(
+            f"SELECT {night}, count(*), max(t_ns_utc) - min(t_ns_utc) FROM estimate"
+            " WHERE t_ns_utc BETWEEN ? AND ? GROUP BY 1",
+            time,
+        )
+        marks = self._asked(
+            f"SELECT {night}, name, text LIKE '%: over', count(*) FROM audit"
+            f" WHERE {_OF_KINDS} AND t_ns_utc BETWEEN ? AND ? GROUP BY 1, 2, 3",
+            time,
+        )
         counts: Counter[tuple[int, MarkKind]] = Counter()
         for day, name, over, n_times in marks:
             counts[day, MarkKind.OVER if over else _KINDS[name]] += n_times

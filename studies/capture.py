@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,12 @@ from service.config import load_instrument
 from service.fit.matrix import Fit, FitOptions, fit_matrix
 from service.fit.methods import SAME, land
 from service.fit.models import FitModels
-from service.fit.reference import Reference, Target, oriented, target_of
+from service.fit.reference import Reference, Target, target_of
 from service.model.instrument import Instrument
-from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pyramid import Mapper
-from service.model.slopes import Orientation
+from service.model.slopes import Orientation, SlopeRecipe
 from sim_rtc.telescope.imperfections import SETS
 from studies.fit_coverage import FIRST_SEED, N_MODES, measured
 
@@ -108,7 +107,8 @@ def main() -> int:
     parser.add_argument("--matrices", type=int, default=4)
     parser.add_argument("--truth", choices=sorted(SETS), default="realistic")
     given = parser.parse_args()
-    instrument = oriented(load_instrument("flao-lbt"), SlopeOrder.XY, Orientation())
+    slopes = SlopeRecipe(orientation=Orientation())
+    instrument = replace(load_instrument("flao-lbt"), slopes=slopes)
     basis = karhunen_loeve_basis(instrument).subset(np.arange(N_MODES))
     each = given.starts // given.matrices
     sys.stdout.write(f"{'seed':>6s}{'starts':>8s}{'right':>7s}{'refused':>9s}{'false':>7s}")

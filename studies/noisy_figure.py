@@ -86,7 +86,7 @@ class Pair:
         recipe = instrument.slopes
 
         def listed(matrix: Array) -> Array:
-            return to_conventions(matrix, recipe.order, recipe.assumed_orientation, mask)
+            return to_conventions(matrix, recipe, mask)
 
         return cls(
             measured=listed(values["interaction_matrix"]),

@@ -247,5 +247,5 @@ def _as_listed(values: NDArray[np.float32], instrument: Instrument) -> NDArray[n
     """Return what the RTC lists as ``(n, n_slopes)``, in our order: ``(n, 2, n_valid)``, or 4."""
     recipe = instrument.slopes
     mask = rtc_valid_subapertures(instrument)
-    ours = to_conventions(values.T, recipe.order, recipe.assumed_orientation, mask)
+    ours = to_conventions(values.T, recipe, mask)
     return np.ascontiguousarray(ours.T).reshape(len(values), recipe.kind.n_planes, -1)

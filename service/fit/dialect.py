@@ -21,7 +21,6 @@ from service.fit.orientation import (
     LEAST_CORRELATION,
     LEAST_LEAD,
     Pose,
-    Setting,
     poses_of,
     setting_written,
     settings_of,
@@ -33,7 +32,7 @@ from service.model.interaction import rtc_valid_subapertures
 from service.model.misregistration import Misregistration, unit_like, wrapped
 from service.model.modes import Basis
 from service.model.pyramid import Mapper
-from service.model.slopes import to_conventions, turned_mask
+from service.model.slopes import SlopeRecipe, to_conventions, turned_mask
 
 Array = NDArray[Any]
 
@@ -69,7 +68,7 @@ class Dialect:
     wrong: str = ""
     """What was found, what was told, and what to write; empty: they are as told."""
 
-    found: Setting | None = None
+    found: SlopeRecipe | None = None
     """Order and orientation of the slopes where they could be told."""
 
     adopted: bool = False
@@ -104,7 +103,7 @@ def of_reconstructor(
             instrument,
             Reference(matrix=measured, modes=used),
             basis.subset(used),
-            list(settings_of(instrument.slopes.kind.orders)),
+            list(settings_of(instrument.slopes, instrument.slopes.kind.orders)),
             mapper=mapper,
         )
     except MatrixError as error:
@@ -137,7 +136,7 @@ def of_answer(slopes: Array, expected: Array, turns_rad: Array, instrument: Inst
         unit = f"slopes answer commands {ratio:.2g} times as the model does: {_unit_named(ratio)}"
     every = {
         setting: _resemblance(_planes(slopes, setting, mask), model)
-        for setting in settings_of(told[0].kind.orders)
+        for setting in settings_of(told, told.kind.orders)
     }
     best = max(every.values())
     if best < RESEMBLANCE or as_told * ADVANTAGE > best or lagging > best:
@@ -160,12 +159,12 @@ def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Dial
         return Dialect(wrong="" if stated else text)
     alike = [pose for pose in poses if pose.correlation > best.correlation - LEAST_LEAD]
     near = [pose for pose in alike if abs(wrapped(pose.rotation_rad - start_rad)) <= REACH_RAD]
-    settings = [pose.setting for pose in near]
+    settings = [pose.slopes for pose in near]
     if told in settings:
         return Dialect(found=told)
     if not near:
         turned_deg = np.rad2deg(
-            min(alike, key=lambda pose: _n_changes(pose.setting, told)).rotation_rad
+            min(alike, key=lambda pose: _n_changes(pose.slopes, told)).rotation_rad
         )
         return Dialect(
             wrong=f"by the RTC's own matrix the mirror is turned by {turned_deg:.0f} deg, "
@@ -177,41 +176,37 @@ def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Dial
     return Dialect(wrong=_axes_named("the RTC's own matrix", found, told), found=found)
 
 
-def _told(instrument: Instrument) -> Setting:
-    return instrument.slopes.order, instrument.slopes.assumed_orientation
+def _told(instrument: Instrument) -> SlopeRecipe:
+    return replace(instrument.slopes, orientation=instrument.slopes.assumed_orientation)
 
 
-def _n_changes(setting: Setting, told: Setting) -> int:
+def _n_changes(setting: SlopeRecipe, told: SlopeRecipe) -> int:
     """Return how much of what was told a setting contradicts."""
-    (order, axes), (told_order, told_axes) = setting, told
+    axes, told_axes = setting.assumed_orientation, told.assumed_orientation
     names = (*FLIPS, "sign_x", "sign_y")
     changed = sum(bool(getattr(axes, name) != getattr(told_axes, name)) for name in names)
     both_signs = axes.sign_x != told_axes.sign_x and axes.sign_y != told_axes.sign_y
     # light counted the other way round turns both signs: one thing
-    return changed - both_signs + (order != told_order)
+    return changed - both_signs + (setting.order != told.order)
 
 
-def _axes_named(witness: str, found: Setting, told: Setting) -> str:
+def _axes_named(witness: str, found: SlopeRecipe, told: SlopeRecipe) -> str:
     """Return which of the axes, signs and orders are others than told, and what to write."""
-    (order, axes), (told_order, told_axes) = found, told
+    axes, told_axes = found.assumed_orientation, told.assumed_orientation
     differ = []
-    if order != told_order:
-        differ.append(f'slopes.order = "{order}" ("{told_order}" told)')
+    if found.order != told.order:
+        differ.append(f'slopes.order = "{found.order}" ("{told.order}" told)')
     flips = [name for name in FLIPS if getattr(axes, name) != getattr(told_axes, name)]
     differ += [f"orientation.{name} = {str(getattr(axes, name)).lower()}" for name in flips]
     if (axes.sign_x, axes.sign_y) != (told_axes.sign_x, told_axes.sign_y):
         differ.append(f"orientation.{sign_written(axes)} ({sign_written(told_axes)} told)")
-    other = "slopes have the other sign" if _only_the_sign(found, told) else "slopes lie otherwise"
+    turned = replace(told_axes, sign_x=-told_axes.sign_x, sign_y=-told_axes.sign_y)
+    only_the_sign = found == replace(told, orientation=turned)
+    other = "slopes have the other sign" if only_the_sign else "slopes lie otherwise"
     return (
         f"{other} than the instrument file says: {', '.join(differ)} by {witness}. Write "
         f"[slopes] {setting_written(found)}, and start the service again"
     )
-
-
-def _only_the_sign(found: Setting, told: Setting) -> bool:
-    (order, axes), (told_order, told_axes) = found, told
-    turned = replace(told_axes, sign_x=-told_axes.sign_x, sign_y=-told_axes.sign_y)
-    return order == told_order and axes == turned
 
 
 def _unit_of_matrix(ratio: float, *, double_pass: bool) -> str:
@@ -240,16 +235,16 @@ def _unit_named(ratio: float) -> str:
     return "commands are in another unit than metres of OPD, or decoded wrongly"
 
 
-def _planes(rows: Array, setting: Setting, mask: NDArray[np.bool_]) -> Array:
+def _planes(rows: Array, slopes: SlopeRecipe, mask: NDArray[np.bool_]) -> Array:
     """Return slopes ``(n_lines, n_slopes)`` as maps ``(n_planes, n, n, n_lines)``.
 
     Of the sensor's axes; ``mask`` ``(n, n)`` [y, x] are the valid subapertures in the RTC's own.
     """
-    order, axes = setting
-    listed = to_conventions(rows.T, order, axes, mask)
-    n_planes = order.kind.n_planes
+    listed = to_conventions(rows.T, slopes, mask)
+    n_planes = slopes.kind.n_planes
     planes = np.zeros((n_planes, *mask.shape, len(rows)), dtype=listed.dtype)
-    planes[:, turned_mask(mask, axes)] = listed.reshape(n_planes, -1, len(rows))
+    seen = turned_mask(mask, slopes.assumed_orientation)
+    planes[:, seen] = listed.reshape(n_planes, -1, len(rows))
     return planes
 
 

@@ -22,7 +22,7 @@ from service.fit.methods import (
 )
 from service.fit.models import FitModels
 from service.fit.orientation import LEAST_CORRELATION, find_orientation
-from service.fit.reference import Reference, Target, checked, oriented, target_of
+from service.fit.reference import Reference, Target, checked, target_of
 from service.fit.solver import Nuisances, Solution, nuisances_of
 from service.fit.uncertainty import pupil_regions, uncertainty
 from service.fit.verdict import SUSPICIOUS, Evidence, alternatives, judged, remarks
@@ -33,7 +33,7 @@ from service.model.misregistration import Determination, Misregistration
 from service.model.modes import Basis, modal_basis
 from service.model.pupil import Illumination
 from service.model.pyramid import Mapper
-from service.model.slopes import Orientation
+from service.model.slopes import Orientation, SlopeRecipe
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -199,7 +199,7 @@ def fit_matrix(
     tell("orientation")
     instrument, told = _masked(instrument), instrument.slopes.order
     axes = _axes(instrument, usable, used, options, mapper)
-    instrument = oriented(instrument, axes.order, axes.orientation)
+    instrument = replace(instrument, slopes=axes.slopes)
     target = target_of(usable, instrument)
     models = FitModels(
         instrument=instrument, basis=used, illumination=options.illumination, mapper=mapper
@@ -251,8 +251,7 @@ def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference
 class _Axes:
     """Order, axes and signs of the slopes, and the rough rotation that came with them."""
 
-    order: SlopeOrder
-    orientation: Orientation
+    slopes: SlopeRecipe
     rotation_rad: float | None
     """None: not looked for."""
 
@@ -268,16 +267,14 @@ def _axes(
     The search also tells the rotation, so it is spared only when a start is given too.
     """
     stated = options.orientation or instrument.slopes.orientation
-    order = instrument.slopes.order
+    slopes = replace(instrument.slopes, orientation=stated)
     if stated is not None and options.start is not None:
-        return _Axes(order=order, orientation=stated, rotation_rad=None)
-    known = replace(instrument, slopes=replace(instrument.slopes, orientation=stated))
-    search = find_orientation(known, usable, basis, mapper=mapper)
+        return _Axes(slopes=slopes, rotation_rad=None)
+    search = find_orientation(replace(instrument, slopes=slopes), usable, basis, mapper=mapper)
     best = search.best
     sure = best.correlation >= LEAST_CORRELATION
     return _Axes(
-        order=best.order,
-        orientation=best.orientation,
+        slopes=best.slopes,
         rotation_rad=best.rotation_rad if sure else None,
         refusal=search.refusal if stated is None else "",
     )
@@ -323,7 +320,7 @@ def _answer(
     solution, target = found.solution, found.target
     seen = solution.projection
     values = np.concatenate([np.zeros(4), solution.nuisances])
-    regions = pupil_regions(target.valid, axes.order.kind.n_planes)[target.rows]
+    regions = pupil_regions(target.valid, axes.slopes.kind.n_planes)[target.rows]
     by_mode = np.sqrt(
         np.sum(seen.residual**2, axis=0) / np.sum(target.matrix[target.rows] ** 2, axis=0)
     )
@@ -361,13 +358,13 @@ def _answer(
         residual_by_mode=by_mode,
         condition_number=_condition_number(solution.matrix),
         modes=target.modes,
-        orientation=axes.orientation,
-        order=axes.order,
+        orientation=axes.slopes.assumed_orientation,
+        order=axes.slopes.order,
         subset_scatter=sure.subset_scatter,
         accepted=accepted,
         converged=solution.converged,
         verdict=verdict,
-        remarks=remarks(evidence, solution, target, told=told, found=axes.order),
+        remarks=remarks(evidence, solution, target, told=told, found=axes.slopes.order),
         left_out=usable.left_out + _rows_left_out(target),
         n_evaluations=models.counter.n,
         synthetic=solution.matrix,

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.fit.models import LowOrder, low_order_of
-from service.fit.reference import Reference, Target, oriented, target_of
+from service.fit.reference import Reference, Target, target_of
 from service.fit.solver import vertex
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, rtc_valid_subapertures
@@ -28,10 +28,9 @@ from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration, rotation, wrapped
 from service.model.modes import Basis
 from service.model.pyramid import Mapper
-from service.model.slopes import Orientation, turned_mask
+from service.model.slopes import Orientation, SlopeRecipe, turned_mask
 
 Array = NDArray[np.float64]
-Setting = tuple[SlopeOrder, Orientation]
 
 FLIPS = ("swap_xy", "flip_x", "flip_y")
 
@@ -52,8 +51,7 @@ LEAST_CORRELATION = 0.4
 class Pose:
     """One orientation of the slopes with the rotation at which it explains them best."""
 
-    order: SlopeOrder
-    orientation: Orientation
+    slopes: SlopeRecipe
     rotation_rad: float
     correlation: float
     """Mean correlation of the lowest orders with the model, one sign for all, -1..1."""
@@ -61,30 +59,26 @@ class Pose:
     @property
     def turned_class(self) -> tuple[SlopeOrder, int, int, bool]:
         """What remains of it when quarter turns of everything do not count."""
-        axes = self.orientation
+        axes = self.slopes.assumed_orientation
         mirrored = axes.flip_x ^ axes.flip_y ^ axes.swap_xy
-        return self.order, axes.sign_x, axes.sign_y, mirrored
+        return self.slopes.order, axes.sign_x, axes.sign_y, mirrored
 
     @property
     def n_changes(self) -> int:
         """Flips and swaps of the axes."""
-        return self.orientation.flip_x + self.orientation.flip_y + self.orientation.swap_xy
-
-    @property
-    def setting(self) -> Setting:
-        """Order and orientation of the slopes."""
-        return self.order, self.orientation
+        return sum(getattr(self.slopes.assumed_orientation, name) for name in FLIPS)
 
     def told(self) -> str:
         """Return it in the words of the instrument file."""
-        return f"{setting_written(self.setting)} at {np.rad2deg(self.rotation_rad):.0f} deg"
+        return f"{setting_written(self.slopes)} at {np.rad2deg(self.rotation_rad):.0f} deg"
 
 
-def setting_written(setting: Setting) -> str:
-    """Return an order and an orientation as the instrument file says them."""
-    order, axes = setting
+def setting_written(slopes: SlopeRecipe) -> str:
+    """Return order and orientation of slopes as the instrument file says them."""
+    axes = slopes.assumed_orientation
     flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
-    return f'order = "{order}", orientation = {{ {", ".join([*flags, sign_written(axes)])} }}'
+    words = ", ".join([*flags, sign_written(axes)])
+    return f'order = "{slopes.order}", orientation = {{ {words} }}'
 
 
 def sign_written(axes: Orientation) -> str:
@@ -129,10 +123,7 @@ def find_orientation(
     the lowest orders hardly feel them.
     """
     stated = instrument.slopes
-    if stated.orientation is None:
-        settings = list(_settings(stated.order))
-    else:
-        settings = [(stated.order, stated.orientation)]
+    settings = [stated] if stated.orientation is not None else list(_settings(stated))
     poses = poses_of(instrument, reference, basis, settings, mapper=mapper)
     return _judged(poses, instrument.mirror.nominal_rotation_rad)
 
@@ -141,7 +132,7 @@ def poses_of(
     instrument: Instrument,
     reference: Reference,
     basis: Basis,
-    settings: Sequence[Setting],
+    settings: Sequence[SlopeRecipe],
     *,
     mapper: Mapper = map,
 ) -> list[Pose]:
@@ -154,8 +145,8 @@ def poses_of(
         noise=None,
     )
     return [
-        turned.pose(target_of(low, oriented(instrument, order, orientation)), order, orientation)
-        for order, orientation in settings
+        turned.pose(target_of(low, replace(instrument, slopes=slopes)), slopes)
+        for slopes in settings
     ]
 
 
@@ -169,29 +160,29 @@ def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> Inte
     ]
     every = replace(instrument.wfs, valid_subapertures=np.any(turned, axis=0))
     order = instrument.slopes.kind.orders[0]
-    plain = oriented(replace(instrument, wfs=every), order, Orientation())
+    plain = replace(instrument.slopes, order=order, orientation=Orientation())
+    seen = replace(instrument, wfs=every, slopes=plain)
     return InteractionModel(
-        plain, basis, pupil_sampling=SAMPLING, detector_nodes=SAMPLING, mapper=mapper
+        seen, basis, pupil_sampling=SAMPLING, detector_nodes=SAMPLING, mapper=mapper
     )
 
 
-def _settings(order: SlopeOrder) -> Iterator[Setting]:
+def _settings(told: SlopeRecipe) -> Iterator[SlopeRecipe]:
     """Yield every orientation, and the components exchanged where the order can say that."""
+    order = told.order
     plain, exchanged = order.kind.orders[:2]
     others = {plain: [exchanged], exchanged: [plain]}
-    yield from settings_of([order, *others.get(order, [])])
+    yield from settings_of(told, [order, *others.get(order, [])])
 
 
-def settings_of(orders: Iterable[SlopeOrder]) -> Iterator[Setting]:
+def settings_of(told: SlopeRecipe, orders: Iterable[SlopeOrder]) -> Iterator[SlopeRecipe]:
     """Yield every orientation and pair of signs in each of these orders."""
     flags = (False, True)
     for listed, swap, flip_x, flip_y, sign_x, sign_y in product(
         orders, flags, flags, flags, (1, -1), (1, -1)
     ):
-        yield (
-            listed,
-            Orientation(swap_xy=swap, flip_x=flip_x, flip_y=flip_y, sign_x=sign_x, sign_y=sign_y),
-        )
+        axes = Orientation(swap_xy=swap, flip_x=flip_x, flip_y=flip_y, sign_x=sign_x, sign_y=sign_y)
+        yield replace(told, order=listed, orientation=axes)
 
 
 def _judged(poses: list[Pose], nominal_rad: float | None) -> Search:
@@ -239,10 +230,10 @@ class _Turned:
         columns = np.ascontiguousarray(turned.transpose(2, 0, 1))
         return cls(lowest=lowest, columns=columns, valid=model.valid)
 
-    def pose(self, target: Target, order: SlopeOrder, orientation: Orientation) -> Pose:
+    def pose(self, target: Target, slopes: SlopeRecipe) -> Pose:
         """Return the rotation at which the model explains these columns best."""
         low = target.matrix / np.linalg.norm(target.matrix, axis=0)
-        seen = np.tile(target.valid[self.valid], order.kind.n_planes)
+        seen = np.tile(target.valid[self.valid], slopes.kind.n_planes)
         columns = self.columns if seen.all() else self.columns[:, :, seen]
         along = np.matmul(columns, low.T[:, :, None])[:, :, 0]
         norm = np.sqrt(np.einsum("las,las->la", columns, columns))
@@ -251,9 +242,4 @@ class _Turned:
         before, at, after = np.take(correlation, [best - 1, best, best + 1], mode="wrap")
         step = vertex(before, at, after)
         angle = ANGLES_RAD[best] + step * (ANGLES_RAD[1] - ANGLES_RAD[0])
-        return Pose(
-            order=order,
-            orientation=orientation,
-            rotation_rad=wrapped(float(angle)),
-            correlation=float(at),
-        )
+        return Pose(slopes=slopes, rotation_rad=wrapped(float(angle)), correlation=float(at))

@@ -12,9 +12,8 @@ from service.errors import MatrixError
 from service.fit.solver import Columns
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
-from service.model.kinds import SlopeOrder
 from service.model.misregistration import unit_like
-from service.model.slopes import Orientation, likely_kind, to_conventions
+from service.model.slopes import likely_kind, to_conventions
 
 Array = NDArray[Any]
 
@@ -207,12 +206,6 @@ class Target(Columns):
         return replace(self, rows=self.rows & ~rows)
 
 
-def oriented(instrument: Instrument, order: SlopeOrder, orientation: Orientation) -> Instrument:
-    """Return the instrument whose slopes are listed in this order and orientation."""
-    recipe = replace(instrument.slopes, order=order, orientation=orientation)
-    return replace(instrument, slopes=recipe)
-
-
 def target_of(reference: Reference, instrument: Instrument) -> Target:
     """Return what to fit, for an instrument whose orientation is settled.
 
@@ -224,13 +217,9 @@ def target_of(reference: Reference, instrument: Instrument) -> Target:
     MatrixError
         If hardly any slope answers the mirror.
     """
-    recipe = instrument.slopes
-    matrix = to_conventions(
-        np.asarray(reference.matrix, dtype=np.float64) / reference.passes,
-        recipe.order,
-        recipe.assumed_orientation,
-        rtc_valid_subapertures(instrument),
-    )
+    single_pass = np.asarray(reference.matrix, dtype=np.float64) / reference.passes
+    mask = rtc_valid_subapertures(instrument)
+    matrix = to_conventions(single_pass, instrument.slopes, mask)
     rows = np.any(matrix != 0.0, axis=1)
     if rows.sum() < len(rows) // 2:
         raise MatrixError(

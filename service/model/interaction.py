@@ -397,4 +397,4 @@ class RtcInteractionModel(InteractionModel):
     def _listed(self, rows: Array) -> Array:
         recipe = self.instrument.slopes
         mask = rtc_mask(self.valid, recipe.assumed_orientation)
-        return to_rtc(rows, recipe.order, recipe.assumed_orientation, mask)
+        return to_rtc(rows, recipe, mask)

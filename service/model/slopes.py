@@ -100,10 +100,7 @@ class SlopeRecipe:
 
 
 def to_conventions(
-    values: NDArray[Scalar],
-    order: SlopeOrder,
-    orientation: Orientation,
-    mask: NDArray[np.bool_],
+    values: NDArray[Scalar], recipe: SlopeRecipe, mask: NDArray[np.bool_]
 ) -> NDArray[Scalar]:
     """Return RTC signals in the order, axes and signs of conventions.md.
 
@@ -111,26 +108,23 @@ def to_conventions(
     ----------
     values
         ``(n_slopes, ...)`` signals, or a matrix of them, as the RTC lists them.
-    order, orientation
-        The RTC's.
+    recipe
+        How it lists them.
     mask
         ``(n, n)`` [y, x] valid subapertures in the RTC's own axes. The result is listed by
-        ``turned_mask(mask, orientation)``.
+        ``turned_mask(mask, recipe.assumed_orientation)``.
 
     Raises
     ------
     ModelError
         If there are not two slopes for every valid subaperture.
     """
-    index, sign = _listing(values, order, orientation, mask)
+    index, sign = _listing(values, recipe, mask)
     return np.asarray(values[index] * _as_column(sign, values))
 
 
 def to_rtc(
-    values: NDArray[Scalar],
-    order: SlopeOrder,
-    orientation: Orientation,
-    mask: NDArray[np.bool_],
+    values: NDArray[Scalar], recipe: SlopeRecipe, mask: NDArray[np.bool_]
 ) -> NDArray[Scalar]:
     """Return signals of conventions.md as the RTC lists them: the inverse of ``to_conventions``.
 
@@ -141,7 +135,7 @@ def to_rtc(
     ModelError
         If there are not two slopes for every valid subaperture.
     """
-    index, sign = _listing(values, order, orientation, mask)
+    index, sign = _listing(values, recipe, mask)
     listed = np.empty_like(values)
     listed[index] = values * _as_column(sign, values)
     return listed
@@ -163,9 +157,10 @@ def _flipped(plane: NDArray[Scalar], orientation: Orientation) -> NDArray[Scalar
 
 
 def _listing(
-    values: NDArray[Any], order: SlopeOrder, orientation: Orientation, mask: NDArray[np.bool_]
+    values: NDArray[Any], recipe: SlopeRecipe, mask: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
     """Return for every signal of conventions.md its place in the RTC's list, and its sign."""
+    order, orientation = recipe.order, recipe.assumed_orientation
     n_valid, n_planes = int(mask.sum()), order.kind.n_planes
     if len(values) != n_planes * n_valid:
         raise ModelError(

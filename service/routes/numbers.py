@@ -273,7 +273,7 @@ class SlopesShown:
 def _maps(block: FrameBlock, instrument: Instrument) -> SlopeMaps:
     valid = rtc_valid_subapertures(instrument)
     recipe, orientation = instrument.slopes, instrument.slopes.assumed_orientation
-    ours = slopes_of(to_conventions(block.slopes.T, recipe.order, orientation, valid), recipe.kind)
+    ours = slopes_of(to_conventions(block.slopes.T, recipe, valid), recipe.kind)
     rms = np.sqrt(np.mean(np.square(ours, dtype=np.float64), axis=-1)).reshape(-1)
     maps = np.round(as_maps(rms, turned_mask(valid, orientation)), 4)
     return SlopeMaps(

@@ -18,11 +18,10 @@ from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.fit.dialect import LIKELY, Dialect, of_answer, of_reconstructor
 from service.fit.light import far_starts
-from service.fit.orientation import Setting
-from service.fit.reference import oriented
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
+from service.model.slopes import SlopeRecipe
 from service.model.turbulence import Halo
 from service.prepared import Prepared
 from service.telemetry import passive
@@ -193,11 +192,11 @@ class OpticsWorker:
         self.adopt(dialect.found)
         return replace(dialect, adopted=True)
 
-    def adopt(self, setting: Setting) -> None:
+    def adopt(self, slopes: SlopeRecipe) -> None:
         """List slopes in this order and orientation from now on."""
-        recipe = self._model.instrument.slopes
-        if (recipe.order, recipe.assumed_orientation) != setting:
-            self._equip(oriented(self._model.instrument, *setting))
+        now = self._model.instrument.slopes
+        if replace(now, orientation=now.assumed_orientation) != slopes:
+            self._equip(replace(self._model.instrument, slopes=slopes))
 
     def _settled_fit(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration

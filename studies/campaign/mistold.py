@@ -20,10 +20,9 @@ from typing_extensions import override
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.fit.reference import oriented
 from service.model.interaction import rtc_valid_subapertures
 from service.model.kinds import SlopeOrder
-from service.model.slopes import Orientation, to_rtc
+from service.model.slopes import Orientation, SlopeRecipe, to_rtc
 from service.tracking.state import Mode
 from service.wire import LoopRequest, Status
 from service.worker import Compute, OpticsWorker, Sampling
@@ -124,12 +123,11 @@ class MistoldDome(StrangeDome):
 
 def _dialect(case: Case, dome: StrangeDome) -> Dialect:
     """Return how this RTC lists what the simulator has in the conventions' order."""
-    spoken = oriented(dome.instrument, case.order, case.orientation)
+    recipe = SlopeRecipe(order=case.order, orientation=case.orientation)
+    spoken = replace(dome.instrument, slopes=recipe)
     n_slopes = 2 * int(rtc_valid_subapertures(spoken).sum())
     # numbers from 1 on, so that a sign shows
-    listed = to_rtc(
-        np.arange(1, n_slopes + 1), case.order, case.orientation, rtc_valid_subapertures(spoken)
-    )
+    listed = to_rtc(np.arange(1, n_slopes + 1), recipe, rtc_valid_subapertures(spoken))
     return Dialect(
         index=np.abs(listed) - 1, sign=np.sign(listed).astype(np.float32), unit=case.unit
     )

@@ -9,7 +9,14 @@ from hypothesis.extra import numpy as arrays
 
 from service.model.kinds import SlopeOrder, Stop
 from service.model.misregistration import Misregistration, rotation
-from service.model.slopes import Orientation, rtc_mask, to_conventions, to_rtc, turned_mask
+from service.model.slopes import (
+    Orientation,
+    SlopeRecipe,
+    rtc_mask,
+    to_conventions,
+    to_rtc,
+    turned_mask,
+)
 from tests.numerics import small_linearisation, small_model
 
 registrations = st.builds(
@@ -79,9 +86,11 @@ masks = arrays.arrays(bool, st.tuples(st.integers(1, 6), st.integers(1, 6)))
 def test_an_rtcs_list_of_slopes_is_a_permutation_with_signs(mask, orientation, order):
     """Every slope is there once, its sign is 1 or -1, and the way back undoes the way there."""
     listed = np.arange(1.0, order.kind.n_planes * mask.sum() + 1)
-    there = to_conventions(listed, order, orientation, mask)
+    there = to_conventions(listed, SlopeRecipe(order=order, orientation=orientation), mask)
     np.testing.assert_array_equal(np.sort(np.abs(there)), listed)
-    np.testing.assert_array_equal(to_rtc(there, order, orientation, mask), listed)
+    np.testing.assert_array_equal(
+        to_rtc(there, SlopeRecipe(order=order, orientation=orientation), mask), listed
+    )
     turned = turned_mask(mask, orientation)
     assert turned.sum() == mask.sum()
     np.testing.assert_array_equal(rtc_mask(turned, orientation), mask)

@@ -18,7 +18,7 @@ from service.model.interaction import valid_subapertures
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
-from service.model.slopes import Orientation, rtc_mask, to_rtc
+from service.model.slopes import Orientation, SlopeRecipe, rtc_mask, to_rtc
 from sim_rtc.telescope.diffractive import DiffractivePlant
 
 HERE = Path(__file__).parent
@@ -63,7 +63,7 @@ def main() -> None:
     alpha = Misregistration.from_boundary(ALPHA)
     once = push_pull(instrument, alpha, N_MODES, NOISE / 2.0, SEED)
     mask = rtc_mask(valid_subapertures(instrument), ORIENTATION)
-    matrix = to_rtc(2.0 * once, SlopeOrder.YX, ORIENTATION, mask)
+    matrix = to_rtc(2.0 * once, SlopeRecipe(order=SlopeOrder.YX, orientation=ORIENTATION), mask)
     with h5py.File(HERE / "tiny.h5", "w") as file:
         file["interaction_matrix"] = matrix.astype("<f4")
         file["interaction_matrix"].attrs["description"] = "(n_slopes, n_modes), slope per metre OPD"

@@ -10,8 +10,7 @@ from check_rtc.ear import Heard, Topic
 from check_rtc.examine import Examination, examine
 from service.errors import LinkError, WireError
 from service.fit.dialect import Dialect
-from service.model.kinds import SlopeOrder
-from service.model.slopes import Orientation
+from service.model.slopes import Orientation, SlopeRecipe
 from tests.unit.check_rtc.pretend import Pretend
 from tests.vectors import PAGE, anchors_of
 
@@ -221,7 +220,7 @@ def test_what_the_instrument_file_says_of_the_matrix_is_one_line():
     checks = checked(Pretend(), dialect=lambda matrix: turned)
     assert checks["orientation"].found == turned.wrong
     assert checks["orientation"].outcome is Outcome.WRONG
-    found = Dialect(found=(SlopeOrder.XY, Orientation(sign_x=-1, sign_y=-1)), adopted=True)
+    found = Dialect(found=SlopeRecipe(orientation=Orientation(sign_x=-1, sign_y=-1)), adopted=True)
     checks = checked(Pretend(), dialect=lambda matrix: found)
     assert "sign = -1 }: the instrument file leaves it open" in checks["orientation"].found
     pinned = checked(Pretend(), basis_id="kl-9")

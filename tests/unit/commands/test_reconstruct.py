@@ -15,7 +15,7 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from service.model.slopes import Orientation, rtc_mask, to_conventions
+from service.model.slopes import Orientation, SlopeRecipe, rtc_mask, to_conventions
 from tests.unit.files.made import a_fit, a_report
 
 TINY = Path(__file__).parents[2] / "data" / "tiny" / "tiny.toml"
@@ -89,7 +89,7 @@ def test_slopes_are_listed_as_the_fit_found_the_rtc_to_list_them():
     with made(kept(a_tiny_report()), "--no-gains") as file:
         found = file["interaction_matrix"][()]
     mask = rtc_mask(model.valid, orientation)
-    back = to_conventions(found, SlopeOrder.YX, orientation, mask)
+    back = to_conventions(found, SlopeRecipe(order=SlopeOrder.YX, orientation=orientation), mask)
     np.testing.assert_allclose(back, expected[:, :50], rtol=1e-5, atol=1.0)
 
 

@@ -125,7 +125,7 @@ def test_what_is_written_is_read_back_with_aotpy_bit_for_bit(as_configured, caps
     (sensor,), (mirror,) = system.wavefront_sensors, system.wavefront_correctors
     mask = rtc_valid_subapertures(INSTRUMENT)
     recipe = INSTRUMENT.slopes
-    slopes = to_conventions(ROWS[:, :N_SLOPES].T, recipe.order, recipe.assumed_orientation, mask)
+    slopes = to_conventions(ROWS[:, :N_SLOPES].T, recipe, mask)
     found = sensor.measurements.data
     assert found.dtype.itemsize == 4
     np.testing.assert_array_equal(found, slopes.reshape(2, -1, N_FRAMES).transpose(2, 0, 1))
@@ -172,7 +172,9 @@ def test_the_rtcs_own_listing_is_told_in_our_axes():
     recipe = SlopeRecipe(order=SlopeOrder.INTERLEAVED, orientation=turned)
     instrument = replace(INSTRUMENT, slopes=recipe)
     mask = rtc_valid_subapertures(instrument)
-    ours = to_conventions(ROWS[:, :N_SLOPES].T, recipe.order, turned, mask).T
+    ours = to_conventions(
+        ROWS[:, :N_SLOPES].T, SlopeRecipe(order=recipe.order, orientation=turned), mask
+    ).T
     found = _as_listed(ROWS[:, :N_SLOPES], instrument)
     np.testing.assert_array_equal(found.reshape(N_FRAMES, -1), ours)
 

@@ -56,7 +56,7 @@ def _exact(alpha: Misregistration, about: Instrument, basis: Basis, **model) -> 
 def listed(values: np.ndarray, order: SlopeOrder, orientation: Orientation) -> np.ndarray:
     """The same slopes as such an RTC lists them."""
     mask = rtc_valid_subapertures(instrument(orientation))
-    return to_rtc(values, order, orientation, mask)
+    return to_rtc(values, SlopeRecipe(order=order, orientation=orientation), mask)
 
 
 def fit(

@@ -14,7 +14,7 @@ from service.fit.reference import Reference
 from service.fit.solver import nuisances_of
 from service.model.interaction import valid_subapertures
 from service.model.kinds import SignalKind, SlopeOrder
-from service.model.slopes import Orientation, slopes_of
+from service.model.slopes import Orientation, SlopeRecipe, slopes_of
 from tests.numerics import small_basis
 from tests.unit.fit.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, listed, matrix
 
@@ -48,7 +48,9 @@ def test_how_the_images_lie_is_found_where_it_is_not_told(order):
     told = SlopeOrder.IMAGES if order is SlopeOrder.IMAGES_YX else order
     search = find_orientation(instrument(None, told), Reference(matrix=rows), small_basis())
     assert search.refusal == ""
-    expected = Pose(order=order, orientation=ODD, rotation_rad=0.0, correlation=1.0)
+    expected = Pose(
+        slopes=SlopeRecipe(order=order, orientation=ODD), rotation_rad=0.0, correlation=1.0
+    )
     assert search.best.turned_class == expected.turned_class
     assert search.best.correlation > 0.9
 

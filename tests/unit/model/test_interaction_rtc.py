@@ -35,7 +35,9 @@ def test_matrix_and_derivatives_are_the_models_as_the_rtc_lists_its_slopes():
     mask, ours, theirs = models()
 
     def back(matrix):
-        return to_conventions(matrix, SlopeOrder.INTERLEAVED, ORIENTATION, mask)
+        return to_conventions(
+            matrix, SlopeRecipe(order=SlopeOrder.INTERLEAVED, orientation=ORIENTATION), mask
+        )
 
     found, expected = theirs.linearise(SOMEWHERE), ours.linearise(SOMEWHERE)
     np.testing.assert_array_equal(back(found.matrix), expected.matrix)
@@ -65,6 +67,11 @@ def test_slopes_near_unknown_surface_are_listed_alike():
     basis = Partly(**{name: getattr(small_basis(), name) for name in small_basis().__slots__})
     ours.basis = theirs.basis = basis
     rows = theirs.unknown_rows(SOMEWHERE).astype(float)
-    back = to_conventions(rows, SlopeOrder.INTERLEAVED, ORIENTATION, mask) != 0
+    back = (
+        to_conventions(
+            rows, SlopeRecipe(order=SlopeOrder.INTERLEAVED, orientation=ORIENTATION), mask
+        )
+        != 0
+    )
     np.testing.assert_array_equal(back, ours.unknown_rows(SOMEWHERE))
     assert 0 < back.sum() < len(back)

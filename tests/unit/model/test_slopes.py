@@ -63,7 +63,7 @@ def seen_by_the_rtc(plane, orientation, mask):
 def test_a_wavefront_seen_in_the_rtcs_axes_comes_out_in_ours(orientation):
     plane = (0.7, -1.1, 0.31, 0.17)
     listed = np.concatenate(seen_by_the_rtc(plane, orientation, MASK))
-    found = to_conventions(listed, SlopeOrder.XY, orientation, MASK)
+    found = to_conventions(listed, SlopeRecipe(order=SlopeOrder.XY, orientation=orientation), MASK)
     expected = np.concatenate(gradients(positions(turned_mask(MASK, orientation)), plane))
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
@@ -87,7 +87,9 @@ def test_images_seen_in_the_rtcs_axes_come_out_in_ours(orientation):
     for side_y, side_x in product((-1, 1), (-1, 1)):
         side = to_ours @ [side_x * orientation.sign_x, side_y * orientation.sign_y]
         listed.append(light(positions(MASK) @ to_ours.T, *side, plane))
-    found = to_conventions(np.concatenate(listed), SlopeOrder.IMAGES, orientation, MASK)
+    found = to_conventions(
+        np.concatenate(listed), SlopeRecipe(order=SlopeOrder.IMAGES, orientation=orientation), MASK
+    )
     ours = positions(turned_mask(MASK, orientation))
     expected = [light(ours, x, y, plane) for y, x in product((-1, 1), (-1, 1))]
     np.testing.assert_allclose(found, np.concatenate(expected), rtol=1e-12)
@@ -109,7 +111,7 @@ def test_the_orders_of_pixels_are_what_their_names_say():
         (SlopeOrder.PIXELS, np.array(images).T.ravel()),
         (SlopeOrder.DETECTOR, detector[seen]),
     ):
-        found = to_conventions(listed, order, Orientation(), mask)
+        found = to_conventions(listed, SlopeRecipe(order=order, orientation=Orientation()), mask)
         np.testing.assert_array_equal(found, np.concatenate(images), str(order))
 
 
@@ -126,12 +128,12 @@ def test_there_and_back_is_the_same_list_for_vectors_and_matrices(order):
     rng, n = np.random.default_rng(1), order.kind.n_planes * N
     both = rng.normal(size=n), rng.normal(size=(n, 3)).astype(np.float32)
     for orientation, values in product(ORIENTATIONS, both):
-        there = to_conventions(values, order, orientation, MASK)
+        there = to_conventions(values, SlopeRecipe(order=order, orientation=orientation), MASK)
         assert there.dtype == values.dtype
-        back = to_rtc(values, order, orientation, MASK)
+        back = to_rtc(values, SlopeRecipe(order=order, orientation=orientation), MASK)
         for found in (
-            to_rtc(there, order, orientation, MASK),
-            to_conventions(back, order, orientation, MASK),
+            to_rtc(there, SlopeRecipe(order=order, orientation=orientation), MASK),
+            to_conventions(back, SlopeRecipe(order=order, orientation=orientation), MASK),
         ):
             np.testing.assert_array_equal(found, values, err_msg=repr(orientation))
 
@@ -150,13 +152,17 @@ def test_the_orders_are_what_their_names_say():
         (SlopeOrder.YX, np.concatenate([sy, sx])),
         (SlopeOrder.INTERLEAVED, np.column_stack([sx, sy]).ravel()),
     ):
-        np.testing.assert_array_equal(to_conventions(listed, order, same, MASK), expected)
+        np.testing.assert_array_equal(
+            to_conventions(listed, SlopeRecipe(order=order, orientation=same), MASK), expected
+        )
 
 
 def test_by_hand_a_flip_of_x_reverses_a_row_and_negates_sx_only():
     row = np.ones((1, 3), bool)
     listed = np.array([1.0, 2, 3, 4, 5, 6])
-    flipped = to_conventions(listed, SlopeOrder.XY, Orientation(flip_x=True), row)
+    flipped = to_conventions(
+        listed, SlopeRecipe(order=SlopeOrder.XY, orientation=Orientation(flip_x=True)), row
+    )
     np.testing.assert_array_equal(flipped, [-3, -2, -1, 6, 5, 4])
 
 
@@ -165,7 +171,9 @@ def test_by_hand_a_swap_exchanges_the_components_and_transposes_the_grid():
     assert column.shape == (3, 1)
     listed = np.array([1.0, 2, 3, 4, 5, 6])
     swapped = to_conventions(
-        listed, SlopeOrder.XY, Orientation(swap_xy=True, sign_x=-1), np.ones((1, 3), bool)
+        listed,
+        SlopeRecipe(order=SlopeOrder.XY, orientation=Orientation(swap_xy=True, sign_x=-1)),
+        np.ones((1, 3), bool),
     )
     np.testing.assert_array_equal(swapped, [4, 5, 6, -1, -2, -3])
 
@@ -177,7 +185,9 @@ def test_an_unknown_orientation_is_taken_for_the_conventions_own():
 
 def test_a_list_that_does_not_fit_the_mask_is_refused():
     with pytest.raises(ModelError, match=rf"found 5 of them; expected {2 * N}, 2 for each"):
-        to_conventions(np.zeros(5), SlopeOrder.XY, Orientation(), MASK)
+        to_conventions(
+            np.zeros(5), SlopeRecipe(order=SlopeOrder.XY, orientation=Orientation()), MASK
+        )
 
 
 def test_a_sign_other_than_one_is_refused():

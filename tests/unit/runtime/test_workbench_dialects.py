@@ -59,7 +59,7 @@ def seen(instrument):
     model = InteractionModel(instrument, modal_basis(instrument))
     matrix = model.interaction_matrix(ALPHA)
     mask = rtc_valid_subapertures(instrument)
-    return to_rtc(matrix, RECIPE.order, RECIPE.orientation, mask)
+    return to_rtc(matrix, RECIPE, mask)
 
 
 class Sensor:
@@ -111,10 +111,10 @@ class Mistold:
     """A workbench whose instrument file tells another listing of the slopes than the RTC's."""
 
     def __init__(self, order="xy", **axes):
-        self.setting = SlopeOrder(order), Orientation(**axes)
+        self.setting = SlopeRecipe(order=SlopeOrder(order), orientation=Orientation(**axes))
         mask = rtc_valid_subapertures(small_instrument())
-        self.seen = to_rtc(matrix_at(ALPHA_SMALL), *self.setting, mask)
-        at_rest = to_rtc(matrix_at(Misregistration()), *self.setting, mask)
+        self.seen = to_rtc(matrix_at(ALPHA_SMALL), self.setting, mask)
+        at_rest = to_rtc(matrix_at(Misregistration()), self.setting, mask)
         self.own = np.linalg.pinv(at_rest[:, :N_CONTROLLED]).astype(np.float32)
 
     @cached_property

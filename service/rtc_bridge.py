@@ -202,7 +202,7 @@ class Bridge:
         Parameters
         ----------
         manifest
-            With the layout of the matrix in parts of the endpoint's ``chunk_bytes``.
+            With the layout of the matrix in parts.
         matrix
             ``(n_controlled, n_slopes)``, metres per slope; the loop gain is not in it.
 

@@ -69,9 +69,10 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
     """Open everything, run until asked to stop or the service fails, close everything."""
     system = settings.service.system or instrument.name
     archive = Archive(settings.service.data_dir, settings.archive.noon_utc_h)
+    endpoint = Endpoint(system=system, listen=settings.zenoh.listen, connect=settings.zenoh.connect)
     with _listener(settings.api.host, settings.api.port) as listener:
         archive.open()
-        with archive, Bridge(_endpoint(settings, system)) as bridge:
+        with archive, Bridge(endpoint) as bridge:
             bridge.expect(instrument.basis_id, instrument.config_id)
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
             desk = _desk(settings, instrument)
@@ -231,15 +232,6 @@ def _desk(settings: Settings, instrument: Instrument) -> FitQueue:
             memory_mb=settings.fits.memory_limit_mb,
         ),
         clock_ns=time.time_ns,
-    )
-
-
-def _endpoint(settings: Settings, system: str) -> Endpoint:
-    return Endpoint(
-        system=system,
-        listen=settings.zenoh.listen,
-        connect=settings.zenoh.connect,
-        chunk_bytes=settings.zenoh.chunk_bytes,
     )
 
 

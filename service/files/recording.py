@@ -93,11 +93,6 @@ class Recording:
         return str(self._file.attrs["system"])
 
     @property
-    def created_ns_utc(self) -> int:
-        """When it began, by the sender's clock."""
-        return int(self._file.attrs["created_ns"])
-
-    @property
     def n_dropped(self) -> int:
         """Messages that are not in it although they were sent."""
         return int(self._file["dropped"][0])

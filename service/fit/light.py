@@ -79,12 +79,6 @@ class PupilPosition:
     sigma_y_subap: float
     """1 σ of y."""
 
-    residual: float
-    """RMS of what the pupil and smooth light leave unexplained, over the mean light."""
-
-    n_bad_pixels: int
-    """Pixels that disagree with the same place of the other images; left out."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CannotTell:
@@ -105,7 +99,7 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
     ModelError
         If the counts are not four images of the instrument's size.
     """
-    images, bad = repaired(counts, instrument)
+    images, _ = repaired(counts, instrument)
     light = float(images.mean())
     if not light > 0.0:
         return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
@@ -134,8 +128,6 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
         y_subap=float(position[1]),
         sigma_x_subap=float(sigma[0]),
         sigma_y_subap=float(sigma[1]),
-        residual=residual,
-        n_bad_pixels=int(bad.sum()),
     )
 
 

@@ -324,7 +324,6 @@ def _answer(
     by_mode = np.sqrt(
         np.sum(seen.residual**2, axis=0) / np.sum(target.matrix[target.rows] ** 2, axis=0)
     )
-    alpha = Misregistration.from_vector(solution.vector)
     residual_fraction = float(np.sqrt(np.mean(by_mode**2)))
     sure = uncertainty(
         seen,
@@ -335,10 +334,8 @@ def _answer(
         residual_fraction=residual_fraction,
     )
     evidence = Evidence(
-        alpha=alpha,
-        converged=solution.converged,
+        solution=solution,
         residual_fraction=residual_fraction,
-        gains=seen.gains,
         uncertainty=sure,
         landing=found.landing,
         others=alternatives(models, target, solution, found.nuisances)
@@ -350,7 +347,7 @@ def _answer(
     )
     accepted, verdict = judged(evidence)
     return Fit(
-        alpha=alpha,
+        alpha=Misregistration.from_vector(solution.vector),
         covariance=sure.covariance,
         gains=seen.gains,
         residual_fraction=residual_fraction,
@@ -364,7 +361,7 @@ def _answer(
         accepted=accepted,
         converged=solution.converged,
         verdict=verdict,
-        remarks=remarks(evidence, solution, target, told=told, found=axes.slopes.order),
+        remarks=remarks(evidence, target, told=told, found=axes.slopes.order),
         left_out=usable.left_out + _rows_left_out(target),
         n_evaluations=models.counter.n,
         synthetic=solution.matrix,

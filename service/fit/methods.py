@@ -112,8 +112,6 @@ class Landing:
     rivals: tuple[Approach, ...]
     """Other minima nearly as good."""
 
-    n_starts: int
-
 
 def land(models: FitModels, target: Target, start: Array) -> Landing:
     """Return where a start leads; if that explains little, where the best of many leads."""
@@ -135,7 +133,7 @@ def land(models: FitModels, target: Target, start: Array) -> Landing:
         and one.misfit < NEARLY_AS_GOOD * best.misfit
         and np.any(np.abs(one.vector - best.vector) > SAME)
     ]
-    return Landing(best=best, rivals=tuple(rivals), n_starts=len(found))
+    return Landing(best=best, rivals=tuple(rivals))
 
 
 def settle(

@@ -71,12 +71,8 @@ _UNIT = 1e3
 class Evidence:
     """All that a verdict rests on."""
 
-    alpha: Misregistration
-    converged: bool
+    solution: Solution
     residual_fraction: float
-    gains: Array
-    """``(n_modes,)``."""
-
     uncertainty: Uncertainty
     landing: Landing | None
     """Where the starts led; None for methods that do not search."""
@@ -121,7 +117,7 @@ def _quality(evidence: Evidence) -> str:
 
 
 def _unsettled(evidence: Evidence) -> str:
-    if evidence.converged:
+    if evidence.solution.converged:
         return ""
     return (
         "the steps did not come to rest: the start is outside the capture range, or the instrument "
@@ -186,7 +182,7 @@ def _distance(moved: Array, evidence: Evidence) -> float:
 
 
 def _another_basis(evidence: Evidence) -> str:
-    gains = evidence.gains
+    gains = evidence.solution.projection.gains
     middle = float(np.median(gains))
     scatter = float(np.median(np.abs(gains - middle)) / abs(middle)) * 1.4826
     negative = int(np.sum(gains <= 0.0))
@@ -206,7 +202,7 @@ def _another_basis(evidence: Evidence) -> str:
 def _another_unit(evidence: Evidence) -> str:
     if not evidence.stroke_known:
         return ""
-    gains = evidence.gains
+    gains = evidence.solution.projection.gains
     middle = float(np.median(gains))
     if not 1.0 / _UNIT < middle < _UNIT:
         return (
@@ -232,7 +228,7 @@ def factor_of_passes(evidence: Evidence) -> float | None:
 
     Half the slopes after one pass are what the sky leaves of them.
     """
-    middle = float(np.median(evidence.gains))
+    middle = float(np.median(evidence.solution.projection.gains))
     if not evidence.stroke_known:
         return None
     for factor in (2.0,) if evidence.passes == 1 else (2.0, 0.5):
@@ -302,13 +298,13 @@ def alternatives(
 
 
 def remarks(
-    evidence: Evidence, solution: Solution, target: Target, *, told: SlopeOrder, found: SlopeOrder
+    evidence: Evidence, target: Target, *, told: SlopeOrder, found: SlopeOrder
 ) -> tuple[str, ...]:
     """Return what should be known, one sentence each.
 
     Parameters
     ----------
-    evidence, solution, target
+    evidence, target
         Of the fit.
     told, found
         Order of the slopes, as the instrument file says it and as the matrix lists them.
@@ -317,7 +313,7 @@ def remarks(
         *_order(told, found),
         *_rival(evidence),
         *_passes(evidence),
-        *_columns(solution, target),
+        *_columns(evidence.solution, target),
     )
 
 
@@ -347,8 +343,9 @@ def _passes(evidence: Evidence) -> Iterator[str]:
         (2, 2.0): 'per metre of surface? Then divide it by two, or write modes_kind = "surface"',
         (2, 0.5): "double_pass = false if the light meets the mirror once",
     }[evidence.passes, factor]
+    middle = float(np.median(evidence.solution.projection.gains))
     yield (
-        f"the gains' median is {float(np.median(evidence.gains)):.2f} with {passes}: "
+        f"the gains' median is {middle:.2f} with {passes}: "
         f"{'twice' if factor > 1.0 else 'half'} what was expected; {cause}"
     )
 

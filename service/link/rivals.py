@@ -43,9 +43,6 @@ class Admitted:
     accepted: bool
     """Whether it belongs to the session that counts."""
 
-    previous: str | None = None
-    """The session it replaces."""
-
     changed: bool = False
     """Whether it starts a session."""
 
@@ -97,7 +94,7 @@ class SessionWatch:
         self._heard_s = self._since_s = now_s
         self._left, self.other = False, None
         self._rivals.clear()
-        return Admitted(accepted=True, previous=self._previous, changed=True)
+        return Admitted(accepted=True, changed=True)
 
     def _rival(self, now_s: float) -> str | None:
         """Return a session heard so long ago that this message is no straggler; forget it."""

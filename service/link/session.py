@@ -58,9 +58,6 @@ class Endpoint:
     connect: tuple[str, ...] = ()
     """Endpoints of an observatory's own routers, of which the service becomes a client."""
 
-    chunk_bytes: int = wire.CHUNK_LIMIT
-    """Size of the parts of a reconstructor: a default zenoh-pico drops more than 4096."""
-
     lease_s: float = 2.0
     """Silence after which the other side counts as gone."""
 

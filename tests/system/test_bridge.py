@@ -49,7 +49,7 @@ SYSTEM = "bench"
 
 @pytest.fixture
 def endpoint():
-    return Endpoint(system=SYSTEM, listen=(f"tcp/127.0.0.1:{free_port()}",), chunk_bytes=64)
+    return Endpoint(system=SYSTEM, listen=(f"tcp/127.0.0.1:{free_port()}",))
 
 
 @pytest.fixture
@@ -445,7 +445,7 @@ def drives(bridge, rtc, name):
 
 def test_a_later_service_stands_by_and_takes_over_when_the_first_has_gone(endpoint):
     router = Bridge(replace(endpoint, system="router"))
-    client = Endpoint(system=SYSTEM, connect=endpoint.listen, chunk_bytes=64)
+    client = Endpoint(system=SYSTEM, connect=endpoint.listen)
     with router, FakeRtc(endpoint.listen[0]) as rtc:
         first, second = Bridge(client), Bridge(client)
         with second:

@@ -19,8 +19,6 @@ def at(x: float = 0.0, y: float = 0.0) -> PupilPosition:
         y_subap=y,
         sigma_x_subap=0.02,
         sigma_y_subap=0.02,
-        residual=0.0,
-        n_bad_pixels=0,
     )
 
 

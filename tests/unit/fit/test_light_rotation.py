@@ -110,8 +110,6 @@ def test_the_position_is_taken_into_account():
         y_subap=-1.5,
         sigma_x_subap=0.1,
         sigma_y_subap=0.1,
-        residual=0.0,
-        n_bad_pixels=0,
     )
     wrong = find_rotation(light, known, wrong_place, arms(TRIPOD), within_rad=0.5)
     assert isinstance(right, LightRotation)

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument
 from service.model.instrument import Mirror
 from service.model.modes import karhunen_loeve_basis
-from service.telemetry import lockin, loopcheck, passive, random_dither
+from service.telemetry import comb, loopcheck, passive
 from service.telemetry.frames import FrameBlock
 from service.telemetry.health import (
     Actuators,
@@ -122,7 +122,7 @@ def _parts() -> Iterator[Part]:
             first_seq=0,
         )
     )
-    yield Part(name=TOGETHER[0], begin=lock_in, feed=lambda s, b: lockin.accumulate(s, b)[0])
+    yield Part(name=TOGETHER[0], begin=lock_in, feed=lambda s, b: s.accumulate(b)[0])
     yield Part(name=TOGETHER[1], begin=_random(DITHERED), feed=_random_fed)
     watched = Passive(n_modes=N_CONTROLLED, memory_frames=1e4)
     yield Part(name=TOGETHER[2], begin=watched, feed=passive.accumulate)
@@ -138,7 +138,7 @@ def _random(modes: tuple[int, ...]) -> RandomDither:
 
 
 def _random_fed(state: RandomDither, block: FrameBlock) -> RandomDither:
-    return random_dither.accumulate(state, block)[0]
+    return state.accumulate(block)[0]
 
 
 def _watchers() -> Iterator[Part]:
@@ -188,7 +188,7 @@ def _edge_watch(mirror: object, strokes: Array, variance: Array) -> EdgeWatch:
 
 def _plain() -> Iterator[Part]:
     """Yield the sums of the estimators as one would first write them: a frame at a time."""
-    bins_hz = (np.array(LINES_HZ)[:, None] + np.append(lockin.SIDE_OFFSETS_HZ, 0.0)).ravel()
+    bins_hz = (np.array(LINES_HZ)[:, None] + np.append(comb.SIDE_OFFSETS_HZ, 0.0)).ravel()
     sums = np.zeros((len(bins_hz), N_SLOPES + 2 * N_MODES), np.complex64)
 
     def demodulate(_: None, block: FrameBlock) -> None:

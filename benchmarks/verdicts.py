@@ -28,7 +28,8 @@ from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.prepared import usual_folder
-from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan, Spectra, fit_window
+from service.telemetry.comb import SIDE_OFFSETS_HZ
+from service.telemetry.lockin import LockInPlan, Spectra, fit_window
 from service.telemetry.windows import ClosedLoop
 from service.tracking.state import Mode
 from service.tracking.updates import JUDGE_INTERVAL_S

@@ -30,8 +30,8 @@ from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
 from service.model.slopes import likely_kind
 from service.prepared import Prepared, usual_folder
-from service.telemetry.lockin import Spectra, WindowEstimate, WindowRefused
-from service.telemetry.windows import ClosedLoop
+from service.telemetry.lockin import Spectra, WindowEstimate
+from service.telemetry.windows import ClosedLoop, WindowRefused
 
 if TYPE_CHECKING:
     from service.worker import OpticsWorker

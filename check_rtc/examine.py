@@ -26,7 +26,7 @@ from check_rtc.offload import STEP, Registered, offload
 from check_rtc.talk import TOTAL_M, Talk, dither, dithered_modes, replies
 from service.errors import LinkError, WireError
 from service.fit.dialect import Dialect
-from service.telemetry.lockin import WindowRefused
+from service.telemetry.windows import WindowRefused
 from service.wire import Status
 
 _SWAPS: Final = ("commit", "chunks", "rejection")

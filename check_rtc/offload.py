@@ -16,8 +16,8 @@ from service.errors import LinkError, WireError
 from service.model.misregistration import BOUNDARY_SCALE
 from service.telemetry.estimate import Estimate
 from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra, WindowRefused
-from service.telemetry.windows import ClosedLoop
+from service.telemetry.lockin import LockIn, LockInPlan, Spectra
+from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.tracking.loop import closed_loop
 from service.wire import (
     CommandKind,

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.control.gate import edge_motion_m
-from service.control.loop import pole_radius
+from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
 from service.files import parse_alpha
 from service.model.instrument import Instrument
@@ -102,7 +102,8 @@ def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, f
     eigenvalues = np.linalg.eigvals(gains[:, None] * coupling)
     actuators = actuators_of(model.instrument)
     outer = actuators.strokes[actuators.outer]
-    motion = edge_motion_m(matrix, coupling, gains, outer, leak=case.leak, delay_frames=2.0)
+    loop = ControlLoop(gains=gains, leak=case.leak, delay_frames=2.0, frame_rate_hz=1.0)
+    motion = edge_motion_m(matrix, coupling, gains, outer, loop)
     return float(pole_radius(eigenvalues, leak=case.leak).max()), motion
 
 

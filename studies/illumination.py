@@ -57,7 +57,7 @@ def main() -> None:
             if isinstance(position, CannotTell):
                 sys.stdout.write(f"| {seed} | {position.reason} | | | | | |\n")
                 continue
-            start = Misregistration(shift_x_subap=position.x_subap, shift_y_subap=position.y_subap)
+            start = Misregistration(shift_x_subap=position.at[0], shift_y_subap=position.at[1])
             _tell(f"{seed} | images alone", None, 0.0, start, optics.alpha)
             read = np.abs(measured).sum(axis=1) > 0.0
             noise = noise_share(measured, telescope.detector.sigma, given.averages)

@@ -22,7 +22,6 @@ from service.archive import Archive
 from service.config import load_instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.estimates import work_out
-from service.telemetry import random_dither
 from service.telemetry.random_dither import (
     Correlated,
     RandomDither,
@@ -130,7 +129,7 @@ def _windows(
             if batches[0].seq0 >= state.plan.first_seq:
                 errors_nm += error.rms_nm(batches)
             for block in blocks_of(batches, telescope):
-                state, ended = random_dither.accumulate(state, block)
+                state, ended = state.accumulate(block)
                 for window in ended:
                     n_done += 1
                     yield window, float(np.sqrt(np.mean(np.square(errors_nm))))

@@ -97,14 +97,7 @@ def judge(
     stable = _verdict(worst, aligned, bound, 1 + 2 * len(steps))
     if loop.outer is None or not stable.accepted:
         return stable
-    motion_m = loop.noise * edge_motion_m(
-        reconstructor,
-        centre,
-        gains.astype(float),
-        loop.outer,
-        leak=loop.leak,
-        delay_frames=loop.delay_frames,
-    )
+    motion_m = edge_motion_m(reconstructor, centre, gains.astype(float), loop.outer, loop)
     slippery = why_slippery(motion_m, loop.leak, holds=holds)
     return replace(
         stable,
@@ -244,9 +237,7 @@ def edge_motion_m(
     coupling: NDArray[np.float32],
     gains: Array,
     outer: Array,
-    *,
-    leak: float,
-    delay_frames: float,
+    loop: ControlLoop,
 ) -> float:
     """Return the largest RMS motion of an outer actuator for white slope noise of 1, metres.
 
@@ -265,12 +256,12 @@ def edge_motion_m(
         driven = np.linalg.solve(vectors, np.linalg.solve(vectors, driven).conj().T)
         seen = seen @ vectors
     turns = np.pi * (np.arange(_N_FREQUENCIES) + 0.5) / _N_FREQUENCIES
-    delayed = np.exp(-1j * turns * delay_frames)[:, None]
-    response = delayed / (1.0 - leak * np.exp(-1j * turns)[:, None] + eigenvalues * delayed)
+    delayed = np.exp(-1j * turns * loop.delay_frames)[:, None]
+    response = delayed / (1.0 - loop.leak * np.exp(-1j * turns)[:, None] + eigenvalues * delayed)
     # conjugate pairs of eigenvalues make the other half of the circle the conjugate of this one
     covariance = driven * (response.T @ response.conj() / _N_FREQUENCIES)
     power = np.einsum("ai,ai->a", seen @ covariance, seen.conj()).real
-    return float(np.sqrt(power.max()))
+    return loop.noise * float(np.sqrt(power.max()))
 
 
 def why_slippery(motion_m: float, leak: float, *, holds: bool = False) -> str | None:

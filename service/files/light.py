@@ -44,11 +44,11 @@ class Light:
     @property
     def note(self) -> str:
         """What somebody who fits should know of it, one sentence."""
-        at = self.position
+        (x, y), (sigma_x, sigma_y) = self.position.at, self.position.sigma
         return (
             f"the model is lit as the flux map says; by its light alone the pupil images lie at "
-            f"x = {at.x_subap:.2f} ± {at.sigma_x_subap:.2f}, y = {at.y_subap:.2f} ± "
-            f"{at.sigma_y_subap:.2f} subapertures{self._turn_note}"
+            f"x = {x:.2f} ± {sigma_x:.2f}, y = {y:.2f} ± {sigma_y:.2f} subapertures"
+            f"{self._turn_note}"
         )
 
     @property

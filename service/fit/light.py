@@ -67,17 +67,11 @@ _FLOOR_SUBAP = 0.02
 class PupilPosition:
     """Where the pupil images lie, all four alike."""
 
-    x_subap: float
-    """Of their centre, from the centre of the sensor's grid along +x."""
+    at: tuple[float, float]
+    """x and y of their centre from that of the sensor's grid, subapertures."""
 
-    y_subap: float
-    """The same along +y."""
-
-    sigma_x_subap: float
-    """1 σ of x: noise, and what the four images disagree by."""
-
-    sigma_y_subap: float
-    """1 σ of y."""
+    sigma: tuple[float, float]
+    """1 σ of both: noise, and what the four images disagree by."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,12 +117,7 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
             reason=f"the four images disagree by {scatter.max() * 2:.1f} subapertures; "
             "check that each is cut out of the frame at its own place"
         )
-    return PupilPosition(
-        x_subap=float(position[0]),
-        y_subap=float(position[1]),
-        sigma_x_subap=float(sigma[0]),
-        sigma_y_subap=float(sigma[1]),
-    )
+    return PupilPosition(at=_pair(position), sigma=_pair(sigma))
 
 
 def even_optics(instrument: Instrument, sampling: int = _SAMPLING) -> PyramidOptics:
@@ -292,7 +281,7 @@ def measured_illumination(
     images, _ = repaired(counts, instrument)
     if not images.mean() > 0.0:
         raise ModelError("illumination: found no light; expected the mean counts of the images")
-    shown = even_images(even_optics(instrument), (position.x_subap, position.y_subap))
+    shown = even_images(even_optics(instrument), position.at)
     lit = shown.sum(axis=0) > _LIT * np.percentile(shown.sum(axis=0), 75.0)
     return _beam(_filled(_excess(images, shown, lit), lit), position)
 
@@ -310,7 +299,7 @@ def relative_light(
         If the counts are not four images of the instrument's size.
     """
     images, _ = repaired(counts, instrument)
-    even = even_images(even_optics(instrument), (position.x_subap, position.y_subap)).sum(axis=0)
+    even = even_images(even_optics(instrument), position.at).sum(axis=0)
     lit = even > _LIT * np.percentile(even, 75.0)
     share = images.sum(axis=0) / np.where(lit, even, 1.0)
     return np.where(lit, share / share[lit].mean(), 1.0), lit
@@ -350,7 +339,7 @@ def _filled(share: Array, lit: NDArray[np.bool_]) -> Array:
 def _beam(smooth: Array, position: PupilPosition) -> Illumination:
     """Return the map with the beam's centre in its middle."""
     rows, columns = np.indices(smooth.shape, dtype=np.float64)
-    places = [rows + position.y_subap, columns + position.x_subap]
+    places = [rows + position.at[1], columns + position.at[0]]
     centred = scipy.ndimage.map_coordinates(smooth, places, order=3, mode="nearest")
     coordinates = np.arange(len(centred), dtype=np.float64) - (len(centred) - 1) / 2
     return Illumination(coordinates=coordinates, intensity=np.maximum(centred, 0.0))
@@ -388,6 +377,6 @@ def _lit_start(
         return None
     if not isinstance(seen, PupilPosition):
         return None
-    if max(abs(seen.x_subap), abs(seen.y_subap)) > FARTHEST_SUBAP:
+    if max(map(abs, seen.at)) > FARTHEST_SUBAP:
         return None
-    return replace(nominal, shift_x_subap=seen.x_subap, shift_y_subap=seen.y_subap)
+    return replace(nominal, shift_x_subap=seen.at[0], shift_y_subap=seen.at[1])

@@ -174,8 +174,8 @@ def _turned(
     """Return the reference, turned and moved to ``position``, on the known subapertures."""
     n, middle = len(known), (len(reference) - 1) / 2
     rows, columns = np.nonzero(known)
-    x = columns - (n - 1) / 2 - position.x_subap
-    y = rows - (n - 1) / 2 - position.y_subap
+    x = columns - (n - 1) / 2 - position.at[0]
+    y = rows - (n - 1) / 2 - position.at[1]
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     places = [middle + cosine * y - sine * x, middle + cosine * x + sine * y]
     return np.asarray(scipy.ndimage.map_coordinates(reference, places, order=1, mode="nearest"))

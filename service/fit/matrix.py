@@ -198,8 +198,8 @@ def fit_matrix(
     used = basis.subset(usable.columns)
     tell("orientation")
     instrument, told = _masked(instrument), instrument.slopes.order
-    axes = _axes(instrument, usable, used, options, mapper)
-    instrument = replace(instrument, slopes=axes.slopes)
+    slopes, rotation_rad, untold = _axes(instrument, usable, used, options, mapper)
+    instrument = replace(instrument, slopes=slopes)
     target = target_of(usable, instrument)
     models = FitModels(
         instrument=instrument, basis=used, illumination=options.illumination, mapper=mapper
@@ -209,10 +209,10 @@ def fit_matrix(
         start = options.start.vector
     else:
         start = instrument.start.vector
-        start[2] = axes.rotation_rad if axes.rotation_rad is not None else start[2]
+        start[2] = rotation_rad if rotation_rad is not None else start[2]
     found = _found(models, target, start, options)
     tell("verdict")
-    return _answer(models, found, usable, axes, told)
+    return _answer(models, found, usable, untold, told)
 
 
 def _masked(instrument: Instrument) -> Instrument:
@@ -247,37 +247,22 @@ def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Axes:
-    """Order, axes and signs of the slopes, and the rough rotation that came with them."""
-
-    slopes: SlopeRecipe
-    rotation_rad: float | None
-    """None: not looked for."""
-
-    refusal: str = ""
-    """Why they cannot be told."""
-
-
 def _axes(
     instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
-) -> _Axes:
-    """Return the axes that are stated, or found where they are not.
+) -> tuple[SlopeRecipe, float | None, str]:
+    """Return how slopes are listed, as stated or found, the rotation found, why it is not sure.
 
     The search also tells the rotation, so it is spared only when a start is given too.
     """
     stated = options.orientation or instrument.slopes.orientation
     slopes = replace(instrument.slopes, orientation=stated)
     if stated is not None and options.start is not None:
-        return _Axes(slopes=slopes, rotation_rad=None)
+        return slopes, None, ""
     search = find_orientation(replace(instrument, slopes=slopes), usable, basis, mapper=mapper)
     best = search.best
     sure = best.correlation >= LEAST_CORRELATION
-    return _Axes(
-        slopes=best.slopes,
-        rotation_rad=best.rotation_rad if sure else None,
-        refusal=search.refusal if stated is None else "",
-    )
+    rotation_rad = best.rotation_rad if sure else None
+    return best.slopes, rotation_rad, search.refusal if stated is None else ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -315,12 +300,12 @@ def _found(models: FitModels, target: Target, start: Array, options: FitOptions)
 
 
 def _answer(
-    models: FitModels, found: _Found, usable: Reference, axes: _Axes, told: SlopeOrder
+    models: FitModels, found: _Found, usable: Reference, untold: str, told: SlopeOrder
 ) -> Fit:
-    solution, target = found.solution, found.target
+    solution, target, slopes = found.solution, found.target, models.instrument.slopes
     seen = solution.projection
     values = np.concatenate([np.zeros(4), solution.nuisances])
-    regions = pupil_regions(target.valid, axes.slopes.kind.n_planes)[target.rows]
+    regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
     by_mode = np.sqrt(
         np.sum(seen.residual**2, axis=0) / np.sum(target.matrix[target.rows] ** 2, axis=0)
     )
@@ -341,7 +326,7 @@ def _answer(
         others=alternatives(models, target, solution, found.nuisances)
         if residual_fraction > SUSPICIOUS
         else (),
-        axes=axes.refusal,
+        axes=untold,
         passes=usable.passes,
         stroke_known=models.instrument.mirror.stroke_known,
     )
@@ -355,13 +340,13 @@ def _answer(
         residual_by_mode=by_mode,
         condition_number=_condition_number(solution.matrix),
         modes=target.modes,
-        orientation=axes.slopes.assumed_orientation,
-        order=axes.slopes.order,
+        orientation=slopes.assumed_orientation,
+        order=slopes.order,
         subset_scatter=sure.subset_scatter,
         accepted=accepted,
         converged=solution.converged,
         verdict=verdict,
-        remarks=remarks(evidence, target, told=told, found=axes.slopes.order),
+        remarks=remarks(evidence, target, told=told, found=slopes.order),
         left_out=usable.left_out + _rows_left_out(target),
         n_evaluations=models.counter.n,
         synthetic=solution.matrix,

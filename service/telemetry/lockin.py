@@ -18,8 +18,7 @@ from typing_extensions import override
 from service.errors import ModelError
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
-from service.telemetry.comb import SIDE_OFFSETS_HZ as SIDE_OFFSETS_HZ
-from service.telemetry.comb import Comb
+from service.telemetry.comb import SIDE_OFFSETS_HZ, Comb
 from service.telemetry.estimate import DitheredEstimate
 from service.telemetry.frames import FrameBlock
 from service.telemetry.windows import (
@@ -28,8 +27,8 @@ from service.telemetry.windows import (
     Window,
     WindowCutter,
     WindowPlan,
+    WindowRefused,
 )
-from service.telemetry.windows import WindowRefused as WindowRefused
 
 Array = NDArray[Any]
 
@@ -169,9 +168,6 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
             dither=dither,
             **window.telemetry,
         )
-
-
-accumulate = LockIn.accumulate
 
 
 def joined(one: Spectra, other: Spectra) -> Spectra | None:

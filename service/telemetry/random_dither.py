@@ -174,9 +174,6 @@ class RandomDither(WindowCutter[RandomPlan, Correlations | None, Correlated]):
         return replace(done, n_pairs=done.n_pairs + len(fresh))
 
 
-accumulate = RandomDither.accumulate
-
-
 def joined(one: Correlated, other: Correlated) -> Correlated:
     """Return two windows of the same dither as one.
 

@@ -15,7 +15,8 @@ from service.control.dither import (
     most_telling,
 )
 from service.errors import CommandError, ModelError
-from service.telemetry.lockin import SIDE_OFFSETS_HZ, LockInPlan
+from service.telemetry.comb import SIDE_OFFSETS_HZ
+from service.telemetry.lockin import LockInPlan
 from service.telemetry.played import Asked
 from service.telemetry.random_dither import FRAMES_PER_MODE, RandomPlan
 from service.tracking.policy import Policy

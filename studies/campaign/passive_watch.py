@@ -12,7 +12,6 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import Misregistration
 from service.runtime.streams import PASSIVE_MEMORY_S
-from service.telemetry import lockin
 from service.telemetry.kalman import (
     PASSIVE,
     Drift,
@@ -104,7 +103,7 @@ class Watch:
                     continue
                 self._passive = accumulate(self._passive, block)
                 if self._lock_in is not None:
-                    self._lock_in, ended = lockin.accumulate(self._lock_in, block)
+                    self._lock_in, ended = self._lock_in.accumulate(block)
                     for window in ended:
                         yield from self._window(window, seq / self._rate_hz)
             if seq >= next_look:

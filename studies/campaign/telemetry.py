@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from service.telemetry import lockin, random_dither
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.random_dither import Correlated, RandomDither, RandomPlan
@@ -46,12 +45,10 @@ class Arriving:
     def windows(self, plan: Plan) -> Iterator[Window]:
         """Yield the windows of this plan, without end."""
         sums: Any = RandomDither(plan=plan) if isinstance(plan, RandomPlan) else LockIn(plan=plan)
-        random = isinstance(plan, RandomPlan)
-        accumulate: Any = random_dither.accumulate if random else lockin.accumulate
         waited, strikes_at = 0, float(plan.first_seq + plan.n_frames / 2)
         for blocks in self._blocks(plan.first_seq):
             for block in blocks:
-                sums, ended = accumulate(sums, block)
+                sums, ended = sums.accumulate(block)
                 yield from ended
                 waited = 0 if ended or sums.window is not None else waited + block.n_frames
             if waited > 2 * plan.n_frames:

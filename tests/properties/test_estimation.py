@@ -33,10 +33,10 @@ def telemetry(n_frames: int = 250):
 def test_no_split_into_blocks_changes_what_the_lock_in_sums(cuts):
     """1e-4: float32 sums in another order."""
     block = telemetry()
-    _, whole = lockin.accumulate(lockin.LockIn(plan=PLAN), block)
+    _, whole = lockin.LockIn(plan=PLAN).accumulate(block)
     state, pieces = lockin.LockIn(plan=PLAN), []
     for start, stop in pairwise(cuts):
-        state, ended = lockin.accumulate(state, part(block, start, stop))
+        state, ended = state.accumulate(part(block, start, stop))
         pieces += ended
     assert len(pieces) == len(whole) == 2
     for one, other in zip(whole, pieces, strict=True):
@@ -49,8 +49,8 @@ def test_no_split_into_blocks_changes_what_the_lock_in_sums(cuts):
 def test_every_gap_ends_in_one_verdict_for_each_window_that_began_before_it(start, length):
     """Up to 5 % of a window is taken, more is refused; either way the next window comes."""
     block = telemetry(500)
-    state, _ = lockin.accumulate(lockin.LockIn(plan=PLAN), part(block, 0, start))
-    _, ended = lockin.accumulate(state, part(block, start + length, 500))
+    state, _ = lockin.LockIn(plan=PLAN).accumulate(part(block, 0, start))
+    _, ended = state.accumulate(part(block, start + length, 500))
     lost = min(start + length, 113) - start
     first = ended[0]
     assert isinstance(first, lockin.Spectra if lost <= 5 else lockin.WindowRefused)

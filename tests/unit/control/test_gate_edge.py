@@ -14,6 +14,7 @@ from service.control.gate import (
     edge_motion_m,
     why_slippery,
 )
+from service.control.loop import ControlLoop
 
 N = 6
 
@@ -47,18 +48,17 @@ def simulated(coupling, gain, ring, leak, delay) -> float:
     return float((command[SETTLED:] @ ring.T).std(axis=(0, 1)).max())
 
 
+def loop_of(n, leak, delay):
+    return ControlLoop(gains=np.ones(n), leak=leak, delay_frames=float(delay), frame_rate_hz=1000.0)
+
+
 @pytest.mark.parametrize(("leak", "delay"), [(0.999, 2), (0.95, 1), (1.0, 3)])
 def test_the_motion_is_that_of_a_loop_played_in_time(leak, delay):
     """1.5 %: the scatter of a variance over 250 000 correlated frames, and 256 frequencies."""
     matrix, ring, gain = reconstructor(), outer(), 0.3
     coupling = np.eye(N) + 0.15 * np.random.default_rng(5).normal(size=(N, N))
     found = edge_motion_m(
-        matrix,
-        coupling.astype(np.float32),
-        np.full(N, gain),
-        ring,
-        leak=leak,
-        delay_frames=float(delay),
+        matrix, coupling.astype(np.float32), np.full(N, gain), ring, loop_of(N, leak, delay)
     )
     played = simulated(coupling, gain, ring, leak, delay)
     assert found == pytest.approx(played, rel=0.015)
@@ -67,14 +67,8 @@ def test_the_motion_is_that_of_a_loop_played_in_time(leak, delay):
 def test_one_aligned_mode_without_delay_to_speak_of_has_the_textbook_variance():
     """One frame of delay, no leak: variance of the command is g / (2 - g) times that of R n."""
     matrix = np.full((1, 1), 1e-7, np.float32)
-    found = edge_motion_m(
-        matrix,
-        np.eye(1, dtype=np.float32),
-        np.array([0.5]),
-        np.ones((1, 1)),
-        leak=1.0,
-        delay_frames=1.0,
-    )
+    one = np.eye(1, dtype=np.float32)
+    found = edge_motion_m(matrix, one, np.array([0.5]), np.ones((1, 1)), loop_of(1, 1.0, 1))
     assert found == pytest.approx(1e-7 * np.sqrt(0.5 / 1.5), rel=1e-4)
 
 

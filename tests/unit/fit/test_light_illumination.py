@@ -14,12 +14,7 @@ from tests.unit.fit.lamps import beam, counts_of, flao, fringes, gaussian, small
 
 
 def at(x: float = 0.0, y: float = 0.0) -> PupilPosition:
-    return PupilPosition(
-        x_subap=x,
-        y_subap=y,
-        sigma_x_subap=0.02,
-        sigma_y_subap=0.02,
-    )
+    return PupilPosition(at=(x, y), sigma=(0.02, 0.02))
 
 
 def inside(illumination, function, radius: float = 13.0):

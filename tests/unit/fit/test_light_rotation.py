@@ -105,12 +105,7 @@ def test_the_position_is_taken_into_account():
     """Turned about the wrong point, arms do not fit."""
     light, known = seen_through(shaded(TRIPOD, 0.0))
     right = find_rotation(light, known, HERE, arms(TRIPOD), within_rad=0.5)
-    wrong_place = PupilPosition(
-        x_subap=1.5,
-        y_subap=-1.5,
-        sigma_x_subap=0.1,
-        sigma_y_subap=0.1,
-    )
+    wrong_place = PupilPosition(at=(1.5, -1.5), sigma=(0.1, 0.1))
     wrong = find_rotation(light, known, wrong_place, arms(TRIPOD), within_rad=0.5)
     assert isinstance(right, LightRotation)
     assert isinstance(wrong, CannotTell) or wrong.correlation < 0.9 * right.correlation

@@ -11,7 +11,7 @@ from service.model.misregistration import Misregistration
 from service.runtime.actions import Actions, Publishing
 from service.runtime.estimates import NoisySums
 from service.telemetry.frames import FrameBlock
-from service.telemetry.random_dither import RandomDither, RandomPlan, accumulate
+from service.telemetry.random_dither import RandomDither, RandomPlan
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.products import MeasurementRecord, MeasureState
@@ -84,7 +84,7 @@ def windows(workers, n=2, *, gain=0.6, noise=3e-3, modes=MODES, session="s1"):
     plan = RandomPlan(
         modes=modes, amplitude_m=(amplitude_m,) * len(modes), n_frames=N_FRAMES, first_seq=0
     )
-    _, found = accumulate(RandomDither(plan=plan), block)
+    _, found = RandomDither(plan=plan).accumulate(block)
     return found
 
 

@@ -9,7 +9,7 @@ from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.telemetry import passive
 from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
+from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.windows import ClosedLoop, RefusalKind, WindowRefused
 from service.worker import OpticsWorker, run_job
 from tests.unit.runtime.small import (
@@ -68,7 +68,7 @@ def dithered_window(bench, alpha, *, gain=1.0, noise=1e-4, seed=1):
         n_frames=1000,
         first_seq=0,
     )
-    _, (window,) = accumulate(LockIn(plan=plan), block)
+    _, (window,) = LockIn(plan=plan).accumulate(block)
     assert isinstance(window, Spectra)
     return window
 

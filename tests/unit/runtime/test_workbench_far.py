@@ -6,7 +6,7 @@ import pytest
 from service.control.dither import FINER, SMOOTH, lines_of, modes_of
 from service.model.misregistration import Misregistration
 from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn, LockInPlan, accumulate
+from service.telemetry.lockin import LockIn, LockInPlan
 from service.telemetry.openloop import FarEstimate
 from service.telemetry.windows import WindowRefused
 from service.worker import OpticsWorker
@@ -51,7 +51,7 @@ def window(bench, reach=SMOOTH, *, seed=1, noise=1e-3):
         dither_m=dither,
         cm_id=None,
     )
-    _, (spectra,) = accumulate(LockIn(plan=plan), block)
+    _, (spectra,) = LockIn(plan=plan).accumulate(block)
     return spectra
 
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
+from service.telemetry.comb import SIDE_OFFSETS_HZ
 from service.telemetry.frames import FrameBlock
 from service.telemetry.lockin import (
-    SIDE_OFFSETS_HZ,
     LockIn,
     LockInPlan,
     Spectra,
-    accumulate,
     joined,
 )
 from service.telemetry.windows import WindowRefused
@@ -44,7 +43,7 @@ def telemetry(n_frames: int = 2500, plan: LockInPlan = PLAN) -> FrameBlock:
 def run(*blocks: FrameBlock, plan: LockInPlan = PLAN) -> list[Spectra | WindowRefused]:
     lock_in, ended = LockIn(plan=plan), []
     for block in blocks:
-        lock_in, more = accumulate(lock_in, block)
+        lock_in, more = lock_in.accumulate(block)
         ended += more
     return ended
 

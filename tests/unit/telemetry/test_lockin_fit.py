@@ -17,7 +17,6 @@ from service.telemetry.lockin import (
     LockInPlan,
     Spectra,
     WindowEstimate,
-    accumulate,
     closed_loop_responses,
     fit_window,
 )
@@ -93,7 +92,7 @@ def windows(case: Case, number: int) -> list[Spectra]:
 
 
 def demodulated(case: Case, block) -> list[Spectra]:
-    _, ended = accumulate(LockIn(plan=case.plan), block)
+    _, ended = LockIn(plan=case.plan).accumulate(block)
     assert all(isinstance(window, Spectra) for window in ended)
     return ended
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra, accumulate
+from service.telemetry.lockin import LockIn, LockInPlan, Spectra
 from service.telemetry.windows import RefusalKind, WindowRefused
 
 PLAN = LockInPlan(
@@ -35,19 +35,19 @@ def block(first_seq, n_frames, *, dither):
 
 @pytest.mark.timeout(10)
 def test_a_dither_that_ends_inside_a_window_costs_that_window_once():
-    lock_in, ended = accumulate(LockIn(plan=PLAN), block(0, 50, dither=True))
+    lock_in, ended = LockIn(plan=PLAN).accumulate(block(0, 50, dither=True))
     assert not ended
-    lock_in, ended = accumulate(lock_in, block(50, 50, dither=False))
+    lock_in, ended = lock_in.accumulate(block(50, 50, dither=False))
     assert [type(window) for window in ended] == [WindowRefused]
     assert "the dither ended" in ended[0].reason
     assert ended[0].kind is RefusalKind.CUT_SHORT
-    _, ended = accumulate(lock_in, block(100, 50, dither=False))
+    _, ended = lock_in.accumulate(block(100, 50, dither=False))
     assert not ended
 
 
 @pytest.mark.timeout(10)
 def test_no_window_opens_before_the_dither_is_there():
-    lock_in, ended = accumulate(LockIn(plan=PLAN), block(0, 70, dither=False))
+    lock_in, ended = LockIn(plan=PLAN).accumulate(block(0, 70, dither=False))
     assert not ended
-    _, ended = accumulate(lock_in, block(70, 100, dither=True))
+    _, ended = lock_in.accumulate(block(70, 100, dither=True))
     assert [(type(window), window.first_seq) for window in ended] == [(Spectra, 70)]

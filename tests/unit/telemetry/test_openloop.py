@@ -9,7 +9,7 @@ import pytest
 from service.control.dither import FINER, SMOOTH, lines_of, modes_of
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.telemetry.lockin import LockIn, LockInPlan, accumulate
+from service.telemetry.lockin import LockIn, LockInPlan
 from service.telemetry.openloop import UNEXPLAINED, FarEstimate, FarSearch, find
 from service.telemetry.windows import RefusalKind, WindowRefused
 from tests.numerics import (
@@ -54,7 +54,7 @@ def window(alpha, what=None, *, late_frames=0, **sky):
     block = closed_loop(small_loop(gain=0.0), Sky(alpha=alpha, **sky), sines(what, 1000))
     if late_frames:
         block = replace(block, slopes=np.roll(block.slopes, late_frames, axis=0))
-    _, (spectra,) = accumulate(LockIn(plan=what), block)
+    _, (spectra,) = LockIn(plan=what).accumulate(block)
     return spectra
 
 

@@ -15,7 +15,6 @@ from service.telemetry.random_dither import (
     RandomDither,
     RandomEstimate,
     RandomPlan,
-    accumulate,
     fit_random,
     joined,
     noisy_matrix,
@@ -67,7 +66,7 @@ def near_somewhere() -> Linearisation:
 def only_window(state: RandomDither, *blocks) -> Correlated | WindowRefused:
     found = []
     for block in blocks:
-        state, ended = accumulate(state, block)
+        state, ended = state.accumulate(block)
         found += ended
     assert len(found) == 1
     return found[0]
@@ -165,7 +164,7 @@ def test_a_slope_that_answers_in_its_own_row_has_no_lag():
 def test_two_windows_joined_are_as_good_as_one_of_twice_the_length(modes):
     """A pair of frames is lost at the seam, and ρ is that of two halves: a fifth of σ."""
     near, block = near_somewhere(), looped(4001, 6, modes=modes)
-    _, halves = accumulate(RandomDither(plan=plan(modes, 2000)), block)
+    _, halves = RandomDither(plan=plan(modes, 2000)).accumulate(block)
     whole = fit_random(only_window(RandomDither(plan=plan(modes, 4000)), block), near)
     both = fit_random(joined(*halves), near)
     sigma = np.sqrt(np.diag(whole.covariance))
@@ -186,7 +185,7 @@ def test_the_noise_of_the_elements_is_what_they_scatter_by():
     The turbulence on the slopes has some ten degrees of freedom, 40 columns of it are known to
     3.5 %: twice that. The signal-to-noise ratio of the whole is sqrt(2) times that of a half.
     """
-    _, halves = accumulate(RandomDither(plan=plan(EVERY, 8000)), looped(16001, 9, modes=EVERY))
+    _, halves = RandomDither(plan=plan(EVERY, 8000)).accumulate(looped(16001, 9, modes=EVERY))
     one, other = (noisy_matrix(half) for half in halves)
     difference = (one.matrix - other.matrix) / np.hypot(one.noise, other.noise)
     assert np.sqrt(np.mean(difference**2)) == pytest.approx(1.0, abs=0.07)

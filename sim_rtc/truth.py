@@ -316,7 +316,7 @@ def _moment(telescope: Telescope, batch: Batch, frame: int) -> Moment:
     n = len(plant.valid)
     share = light.sum(axis=(0, 2))[plant.valid].mean() / 4
     maps = np.full((2, n, n), np.nan)
-    maps[:, plant.valid] = slopes_of(batch.slopes[0], plant.slope_errors.kind)
+    maps[:, plant.valid] = slopes_of(batch.slopes[0], plant.slope_errors.recipe.kind)
     left_nm = (opd_m - plant.weights @ opd_m) * 1e9
     return Moment(
         frame=frame,

@@ -119,7 +119,7 @@ def main() -> None:
             user = replace(instrument, slopes=recipe)
             cut = slopes_from_frames(user, frames.change.reshape(-1, side, side), flux_frame)
             valid = rtc_valid_subapertures(user)
-            whole = slopes_per_unit(direct.rest, direct.change, valid, normalisation)
+            whole = slopes_per_unit(direct.rest, direct.change, valid, recipe)
             error = np.linalg.norm(cut - whole, axis=0) / np.linalg.norm(whole, axis=0)
             print(
                 f"{normalisation}: slopes of a mode off by {error.min():.2%} to {error.max():.2%}"

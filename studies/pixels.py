@@ -66,7 +66,8 @@ def measured(
             for sign in (np.float32(1), np.float32(-1))
         )
         for kind in SignalKind:
-            up, down = (reference_slopes(one, plant.valid, kind=kind)[0] for one in (push, pull))
+            recipe = SlopeRecipe(order=kind.orders[0])
+            up, down = (reference_slopes(one, plant.valid, recipe)[0] for one in (push, pull))
             columns[kind].append((up - down) / (2 * STROKE_M))
     return alpha, {kind: np.array(found).T for kind, found in columns.items()}
 

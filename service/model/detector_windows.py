@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures, signals_of
-from service.model.kinds import Normalisation, SignalKind
+from service.model.slopes import SlopeRecipe
 
 Array = NDArray[np.float64]
 
@@ -144,11 +144,7 @@ def slopes_from_frames(
     rest = windows.cut(flux_frame)
     slopes = [
         slopes_per_unit(
-            rest,
-            windows.cut(frames[start : start + _AT_ONCE]),
-            valid,
-            instrument.slopes.normalisation,
-            instrument.slopes.kind,
+            rest, windows.cut(frames[start : start + _AT_ONCE]), valid, instrument.slopes
         )
         for start in range(0, len(frames), _AT_ONCE)
     ]
@@ -156,11 +152,7 @@ def slopes_from_frames(
 
 
 def slopes_per_unit(
-    rest: Array,
-    images: Array,
-    valid: NDArray[np.bool_],
-    normalisation: Normalisation,
-    kind: SignalKind = SignalKind.XY,
+    rest: Array, images: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe
 ) -> Array:
     """Return what the signals do ``(n_slopes, n_modes)`` when the light changes.
 
@@ -174,8 +166,8 @@ def slopes_per_unit(
     ModelError
         If a valid subaperture, or all of them together, sees no light.
     """
-    signals, flux = signals_of(rest, valid, normalisation, kind)
-    changes, flux_changes = signals_of(images, valid, normalisation, kind)
+    signals, flux = signals_of(rest, valid, recipe)
+    changes, flux_changes = signals_of(images, valid, recipe)
     if flux.min() <= 0.0:
         raise ModelError(
             f"flux frame: found {flux.min():g} counts in a valid subaperture, expected light in all"

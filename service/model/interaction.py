@@ -23,7 +23,7 @@ from service.model.misregistration import Misregistration, rotation
 from service.model.modes import Basis
 from service.model.pupil import Illumination, annular_pupil, instrument_pupil
 from service.model.pyramid import Mapper, Nodes, PyramidOptics, Response, enough_modulation_points
-from service.model.slopes import rtc_mask, to_rtc, turned_mask
+from service.model.slopes import PLAIN, SlopeRecipe, rtc_mask, to_rtc, turned_mask
 from service.model.turbulence import Halo
 
 Array = NDArray[Any]
@@ -91,8 +91,7 @@ class InteractionModel:
             n_modulation=n_modulation or enough_modulation_points(instrument.wfs),
             dtype=dtype,
             halo=halo,
-            normalisation=instrument.slopes.normalisation,
-            kind=instrument.slopes.kind,
+            recipe=instrument.slopes,
         )
         self.valid = valid_subapertures(instrument)
         self._map = mapper
@@ -107,7 +106,7 @@ class InteractionModel:
     @property
     def n_slopes(self) -> int:
         """Signals of a frame: two or four for each valid subaperture."""
-        return self.optics.kind.n_planes * int(self.valid.sum())
+        return self.optics.recipe.kind.n_planes * int(self.valid.sum())
 
     def interaction_matrix(self, alpha: Misregistration) -> Array:
         """Return D(α), ``(n_slopes, n_modes)``, slope per metre of OPD.
@@ -160,7 +159,7 @@ class InteractionModel:
         centre = (len(self.valid) - 1) / 2
         seen = np.column_stack([x, y]) - centre - self._image_shift(alpha)
         distance, _ = scipy.spatial.cKDTree(self.pupil.points[unknown]).query(seen, p=np.inf)
-        return np.tile(distance <= 0.5 + UNKNOWN_REACH_SUBAP, self.optics.kind.n_planes)
+        return np.tile(distance <= 0.5 + UNKNOWN_REACH_SUBAP, self.optics.recipe.kind.n_planes)
 
     def _at_rest(self, shift: tuple[float, float]) -> Response:
         """Return the sensor's response with the images at ``shift``; derivatives use it again."""
@@ -289,22 +288,17 @@ def _light_per_subaperture(n: int, diameter_subap: float, obscuration_ratio: flo
 
 
 def reference_slopes(
-    images: Array,
-    valid: NDArray[np.bool_],
-    normalisation: Normalisation = Normalisation.GLOBAL,
-    kind: SignalKind = SignalKind.XY,
+    images: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe = PLAIN
 ) -> tuple[Array, float]:
     """Return the signals ``(n_slopes,)`` of four images and the mean flux per valid subaperture.
 
     Signs of conventions.md. ``images`` is ``(2, n, 2, n)``.
     """
-    signals, flux = signals_of(images, valid, normalisation, kind)
+    signals, flux = signals_of(images, valid, recipe)
     return signals / flux, float(flux.mean())
 
 
-def signals_of(
-    images: Array, valid: NDArray[np.bool_], normalisation: Normalisation, kind: SignalKind
-) -> tuple[Array, Array]:
+def signals_of(images: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> tuple[Array, Array]:
     """Return the signals of four images ``(..., 2, n, 2, n)``, and what normalises them.
 
     The signals are ``(..., n_slopes)``: x, then y differences, or the images. The flux is
@@ -312,15 +306,15 @@ def signals_of(
     """
     by_x, by_y = images.sum(axis=-4), images.sum(axis=-2)
     flux = by_y.sum(axis=-3)[..., valid]
-    if kind is SignalKind.INTENSITY:
+    if recipe.kind is SignalKind.INTENSITY:
         sides = images.swapaxes(-3, -2)[..., valid]
         signals = sides.reshape(*flux.shape[:-1], -1)
     else:
         x = (by_x[..., 0, :] - by_x[..., 1, :])[..., valid]
         y = (by_y[..., 0, :, :] - by_y[..., 1, :, :])[..., valid]
         signals = np.concatenate([x, y], axis=-1)
-    if normalisation is Normalisation.LOCAL:
-        return signals, np.concatenate([flux] * kind.n_planes, axis=-1)
+    if recipe.normalisation is Normalisation.LOCAL:
+        return signals, np.concatenate([flux] * recipe.kind.n_planes, axis=-1)
     return signals, flux.mean(axis=-1, keepdims=True)
 
 
@@ -329,7 +323,7 @@ def normalised_jacobian(response: Response, valid: NDArray[np.bool_]) -> Array:
 
     Of a response to shapes: their signals, ``(n_slopes, n_shapes)``.
     """
-    signals, flux = signals_of(response.images, valid, response.normalisation, response.kind)
+    signals, flux = signals_of(response.images, valid, response.recipe)
     jacobian = response.gradient - _times(signals / flux, response.flux_gradient)
     jacobian /= flux[:, None].astype(jacobian.dtype)
     return np.asarray(jacobian)
@@ -337,9 +331,8 @@ def normalised_jacobian(response: Response, valid: NDArray[np.bool_]) -> Array:
 
 def normalised_derivative(at_rest: Response, moving: Response, valid: NDArray[np.bool_]) -> Array:
     """Return the rate of ``normalised_jacobian`` when the images move, by the product rule."""
-    recipe = (at_rest.normalisation, at_rest.kind)
-    signals, flux = signals_of(at_rest.images, valid, *recipe)
-    signal_rate, flux_rate = signals_of(moving.images, valid, *recipe)
+    signals, flux = signals_of(at_rest.images, valid, at_rest.recipe)
+    signal_rate, flux_rate = signals_of(moving.images, valid, moving.recipe)
     slopes = signals / flux
     slope_rate = (signal_rate - slopes * flux_rate) / flux
     rate = moving.gradient - _times(slopes, moving.flux_gradient)

@@ -17,6 +17,7 @@ from service.errors import ModelError
 from service.model.instrument import Pyramid
 from service.model.kinds import Normalisation, SignalKind
 from service.model.pupil import PupilGrid, gauss_legendre
+from service.model.slopes import PLAIN, SlopeRecipe
 from service.model.turbulence import Halo
 
 Array = NDArray[Any]
@@ -66,11 +67,8 @@ class Response:
     """Gradient of what normalises them: ``(n_points,)`` of the mean flux per valid subaperture;
     ``(n_valid, n_points)`` of each one's own flux with local normalisation."""
 
-    normalisation: Normalisation = Normalisation.GLOBAL
-    """What normalises the signals."""
-
-    kind: SignalKind = SignalKind.XY
-    """What the signals are."""
+    recipe: SlopeRecipe
+    """What the signals are, and what normalises them."""
 
     def to(self, shapes: Array, product: Callable[[Array, Array], Array]) -> Response:
         """Return the response to combinations of points, ``shapes`` ``(n_points, n_shapes)``.
@@ -113,11 +111,8 @@ class PyramidOptics:
     halo: Halo | None = None
     """What residual turbulence makes of the star; None: a flat wavefront."""
 
-    normalisation: Normalisation = Normalisation.GLOBAL
-    """Whose flux a response has the gradient of."""
-
-    kind: SignalKind = SignalKind.XY
-    """Which signals a response has the gradient of."""
+    recipe: SlopeRecipe = PLAIN
+    """Which signals, and whose flux, a response has the gradient of."""
 
     def __post_init__(self) -> None:
         """Refuse a modulation that the formulas cannot fold.
@@ -162,12 +157,12 @@ class PyramidOptics:
                 (int(row) for row in rows),
             )
         )
+        n_planes = self.recipe.kind.n_planes
         return Response(
             images=self._images(fields, roof_y, roof_x),
-            gradient=np.concatenate([b[k] for k in range(self.kind.n_planes) for b in blocks]),
+            gradient=np.concatenate([b[k] for k in range(n_planes) for b in blocks]),
             flux_gradient=self._flux_gradient([b[-1] for b in blocks], int(valid.sum())),
-            normalisation=self.normalisation,
-            kind=self.kind,
+            recipe=self.recipe,
         )
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
@@ -177,7 +172,7 @@ class PyramidOptics:
         return self._images(self._fields(roof_y, roof_x), roof_y, roof_x)
 
     def _flux_gradient(self, by_row: list[Array], n_valid: int) -> Array:
-        match self.normalisation:
+        match self.recipe.normalisation:
             case Normalisation.GLOBAL:
                 return np.asarray(np.sum(by_row, axis=(0, 1)) / n_valid)
             case Normalisation.LOCAL:
@@ -277,8 +272,8 @@ class PyramidOptics:
             len(along_y), 2, len(columns), 2 * len(roof_y.weights), -1
         )
         by_image_x = np.matmul(left, modulated_x[:, :, columns])
-        local = self.normalisation is Normalisation.LOCAL
-        if self.kind is SignalKind.INTENSITY:
+        local = self.recipe.normalisation is Normalisation.LOCAL
+        if self.recipe.kind is SignalKind.INTENSITY:
             n = len(roof_y.weights)
             images = [
                 self._fold(

@@ -99,6 +99,10 @@ class SlopeRecipe:
         return self.orientation or Orientation()
 
 
+PLAIN = SlopeRecipe()
+"""All Sx, then all Sy, over the mean flux."""
+
+
 def to_conventions(
     values: NDArray[Scalar], recipe: SlopeRecipe, mask: NDArray[np.bool_]
 ) -> NDArray[Scalar]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
 from service.model.interaction import signals_of
-from service.model.kinds import Normalisation, SignalKind
+from service.model.kinds import SignalKind
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -83,7 +83,7 @@ class Detector:
         if kind is SignalKind.XY:
             lights, n_pixels = np.tile(own, 2), 4
         else:
-            pixels, _ = signals_of(images, valid, Normalisation.GLOBAL, kind)
+            pixels, _ = signals_of(images, valid, instrument.slopes)
             lights, n_pixels = pixels * self.electrons_per_frame, 1
         variance = camera.excess_noise * lights + n_pixels * camera.read_noise_electrons**2
         variance /= own.mean() ** 2

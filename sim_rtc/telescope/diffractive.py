@@ -117,7 +117,7 @@ class DiffractiveOptics(Optics):
         light = self.light(opd_m)
         if detector is not None:
             light = detector.read(light / np.float32(self.light_at_rest), rng)
-        slopes, _ = reference_slopes(light, self.valid, kind=self.errors.kind)
+        slopes, _ = reference_slopes(light, self.valid, self.errors.recipe)
         return self.errors.applied((slopes - self.slopes_at_rest).astype(np.float32, copy=False))
 
 
@@ -190,7 +190,7 @@ def _at_rest(
     light = sensor.images(np.zeros(n_points, dtype=np.float32))
     total = float(light.sum())
     light = errors.read(light)
-    slopes, _ = reference_slopes(light, valid, kind=errors.kind)
+    slopes, _ = reference_slopes(light, valid, errors.recipe)
     return {
         "images": light.astype(np.float64) / total,
         "light_at_rest": total,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from service.model.instrument import Pyramid
 from service.model.kinds import SignalKind
-from service.model.slopes import signals_of_slopes, slopes_of
+from service.model.slopes import PLAIN, SlopeRecipe, signals_of_slopes, slopes_of
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -92,9 +92,9 @@ class SlopeErrors:
         valid: NDArray[np.bool_],
         imperfections: Imperfections,
         rng: np.random.Generator,
-        kind: SignalKind = SignalKind.XY,
+        recipe: SlopeRecipe = PLAIN,
     ) -> None:
-        self.kind = kind
+        self.recipe = recipe
         """What the sensor makes of the light."""
         n_valid = int(valid.sum())
         angle = np.deg2rad(imperfections.slope_rotation_deg)
@@ -124,18 +124,18 @@ class SlopeErrors:
         """Return what is read instead of ``slopes``, whose first axis is ``n_slopes``."""
         if self.absent:
             return slopes
-        along_x, along_y = before = slopes_of(slopes, self.kind)
+        along_x, along_y = before = slopes_of(slopes, self.recipe.kind)
         turned = np.stack(
             [
                 self._cosine * along_x - self._sine * along_y,
                 self._sine * along_x + self._cosine * along_y,
             ]
         )
-        if self.kind is SignalKind.XY:
+        if self.recipe.kind is SignalKind.XY:
             read = turned.reshape(slopes.shape)
         else:
-            read = slopes + signals_of_slopes(turned - before, self.kind)
-        read[np.tile(self.silent, self.kind.n_planes)] = 0.0
+            read = slopes + signals_of_slopes(turned - before, self.recipe.kind)
+        read[np.tile(self.silent, self.recipe.kind.n_planes)] = 0.0
         return np.asarray(read)
 
 

@@ -84,7 +84,7 @@ class LinearPlant(Plant):
             pupil=self._pupil,
             n_nodes=_NODES,
             n_modulation=_modulation_points(self._wfs.modulation_lambda_over_d),
-            kind=instrument.slopes.kind,
+            recipe=instrument.slopes,
         )
         imperfections = made.get("imperfections") or Imperfections()
         self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)

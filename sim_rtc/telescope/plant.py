@@ -114,9 +114,7 @@ class Plant(ABC):
         """``(n_points,)`` share of the pupil's area at each point; sums to 1."""
         self.valid: NDArray[np.bool_] = valid_subapertures(instrument)
         """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
-        self.slope_errors = SlopeErrors(
-            self.valid, imperfections, pixel_rng, instrument.slopes.kind
-        )
+        self.slope_errors = SlopeErrors(self.valid, imperfections, pixel_rng, instrument.slopes)
         """What the sensor makes of correct light and slopes."""
         self.sensor_opd_m: Array32 = non_common_path(
             self._points, self.weights, imperfections, path_rng

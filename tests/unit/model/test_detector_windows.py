@@ -17,6 +17,7 @@ from service.model.detector_windows import (
 )
 from service.model.instrument import FrameWindows
 from service.model.kinds import Normalisation
+from service.model.slopes import SlopeRecipe
 from tests.numerics import small_instrument
 
 RECTANGLE = np.array([[14.0, 15.0], [14.0, 45.0], [44.0, 15.0], [44.0, 45.0]])
@@ -122,7 +123,7 @@ def test_slopes_are_the_derivative_of_what_the_light_gives(normalisation):
 
     step = 1e-6
     expected = (slopes(rest + step * change) - slopes(rest - step * change)) / (2 * step)
-    found = slopes_per_unit(rest, change[None], valid, normalisation)
+    found = slopes_per_unit(rest, change[None], valid, SlopeRecipe(normalisation=normalisation))
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-6)
 
 
@@ -131,8 +132,8 @@ def test_a_dark_subaperture_is_refused_where_each_is_divided_by_its_own_light():
     rest[:, 1, :, 1] = 0.0
     valid = np.ones((3, 3), bool)
     with pytest.raises(ModelError, match="found 0 counts in a valid subaperture"):
-        slopes_per_unit(rest, rest[None], valid, Normalisation.LOCAL)
-    slopes_per_unit(rest, rest[None], valid, Normalisation.GLOBAL)
+        slopes_per_unit(rest, rest[None], valid, SlopeRecipe(normalisation=Normalisation.LOCAL))
+    slopes_per_unit(rest, rest[None], valid, SlopeRecipe())
 
 
 def discs(centres, diameter, shape=(200, 210), fringes=0.0):

@@ -37,12 +37,13 @@ class Archive:
 
     def __init__(self, directory: Path, noon_utc_h: int = 12) -> None:
         self.directory = directory
-        self._index = Index(directory / "index.sqlite")
-        self.reconstructors = ReconstructorArchive(directory / "reconstructors", self._index)
+        self.index = Index(directory / "index.sqlite")
+        """Where each product is on its way, and who did what."""
+        self.reconstructors = ReconstructorArchive(directory / "reconstructors", self.index)
         """Those that were made here or read back from the RTC, and what became of each."""
-        self.measured = MeasuredArchive(directory / "interaction_matrices", self._index)
+        self.measured = MeasuredArchive(directory / "interaction_matrices", self.index)
         """Interaction matrices the RTC has measured."""
-        self.noisy = NoisyArchive(directory / "noisy_matrices", self._index)
+        self.noisy = NoisyArchive(directory / "noisy_matrices", self.index)
         """Noisy interaction matrices of random dithers."""
         self.recordings = Recordings(directory / "recordings")
         """Telemetry that somebody has asked for."""
@@ -54,7 +55,7 @@ class Archive:
         )
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
-        self.nights = Nights(self._index.asked, noon_utc_h)
+        self.nights = Nights(self.index.asked, noon_utc_h)
         """Every estimate of α, and what happened beside it."""
         self._lock: IO[str] | None = None
         self.wrong: tuple[str, ...] = ()
@@ -94,7 +95,7 @@ class Archive:
             self.close()
             raise ArchiveError(f"{self.directory}: cannot be used: {error}") from error
         try:
-            anew = self._index.open()
+            anew = self.index.open()
             for folder in self.stores:
                 told += folder.adopt(anew=anew)
         except ArchiveError:
@@ -119,11 +120,7 @@ class Archive:
             raise ArchiveError(
                 f"{self.directory}: found no index.sqlite, expected the data_dir of a service"
             )
-        self._index.look()
-
-    def index_fault(self) -> str:
-        """Return what SQLite finds wrong with the index; empty: nothing."""
-        return self._index.fault()
+        self.index.look()
 
     def pin(self, pin: Pin) -> None:
         """Keep a product for ever.
@@ -137,7 +134,7 @@ class Archive:
         """
         if not any(pin.id in store.stored() for store in self.stores):
             raise UnknownIdError(f"{pin.id}: no such product in the archive")
-        self._index.pin(pin)
+        self.index.pin(pin)
 
     def unpin(self, product_id: str) -> None:
         """Let a product go when its time has come.
@@ -149,16 +146,12 @@ class Archive:
         StorageError
             If the disk refuses.
         """
-        if not self._index.unpin(product_id):
+        if not self.index.unpin(product_id):
             raise UnknownIdError(f"{product_id}: it is not pinned")
-
-    def pins(self) -> tuple[Pin, ...]:
-        """Return what is kept for ever by order."""
-        return self._index.pins()
 
     def close(self) -> None:
         """Close the index and let another service use the directory."""
-        self._index.close()
+        self.index.close()
         if self._lock is not None:
             self._lock.close()
             self._lock = None
@@ -178,7 +171,7 @@ class Archive:
         """
         for record in records:
             self.reconstructors.write_fate(record)
-        self._index.record(records, entries, estimates)
+        self.index.record(records, entries, estimates)
 
     def measurements(self) -> tuple[MeasurementRecord, ...]:
         """Return what is known of each measured interaction matrix, oldest first."""
@@ -206,7 +199,7 @@ class Archive:
 
     def audit_trail(self, part: Range | None = None) -> tuple[AuditEntry, ...]:
         """Return the entries of a part of the audit trail, oldest first; None: the last ones."""
-        return self._index.audit_trail(part or Range())
+        return self.index.audit_trail(part or Range())
 
 
 def _locked(path: Path) -> IO[str]:

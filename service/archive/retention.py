@@ -21,6 +21,8 @@ NEWEST_KEPT = 10
 
 GIGABYTE = 1_000_000_000
 
+_IN_USE = "the RTC has it, and goes on; it could not be sent again to one that restarts"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Keeping:
@@ -86,7 +88,7 @@ def items(archive: Archive, in_use: Collection[str] = ()) -> tuple[Item, ...]:
     ArchiveError
         If the index cannot be read.
     """
-    found, pins = [], archive.pins()
+    found, pins = [], archive.index.pins()
     for store in archive.stores:
         records = {record.id: record for record in store.records()}
         there = [_item(store, one, records) for one in store.stored()]
@@ -148,7 +150,7 @@ def remove(archive: Archive, item: Item, why: str) -> AuditEntry | None:
     ArchiveError
         If the disk refuses.
     """
-    if any(pin.id == item.id for pin in archive.pins()):
+    if any(pin.id == item.id for pin in archive.index.pins()):
         return None
     next(store for store in archive.stores if store.noun == item.kind).remove(item.id)
     return AuditEntry(
@@ -163,26 +165,22 @@ def verify(archive: Archive, which: Collection[Item]) -> Iterator[Damage | None]
     """Read every product and yield what is wrong with it, or None where it is as it was stored."""
     of_kind = {store.noun: store for store in archive.stores}
     for item in which:
+        store = of_kind[item.kind]
         try:
-            of_kind[item.kind].matrix(item.id)
+            store.matrix(item.id)
         except ArchiveError as error:
-            yield _damage(item, of_kind[item.kind], str(error))
+            path = str(store.path_of(item.id))
+            yield Damage(
+                id=item.id,
+                kind=item.kind,
+                path=path,
+                found=str(error).removeprefix(f"{path}: "),
+                means=_IN_USE if item.state == MatrixState.APPLIED else store.lost_with_it,
+                do="put it back from a backup; else move it aside, and have another made or "
+                "measured",
+            )
         else:
             yield None
-
-
-def _damage(item: Item, store: Folder, found: str) -> Damage:
-    path, means = store.path_of(item.id), store.lost_with_it
-    if item.state == MatrixState.APPLIED:
-        means = "the RTC has it, and goes on; it could not be sent again to one that restarts"
-    return Damage(
-        id=item.id,
-        kind=item.kind,
-        path=str(path),
-        found=found.removeprefix(f"{path}: "),
-        means=means,
-        do="put it back from a backup; else move it aside, and have another made or measured",
-    )
 
 
 def low_on_space(directory: Path, keeping: Keeping, *, low: bool) -> str | None:

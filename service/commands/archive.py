@@ -111,7 +111,7 @@ def _verify(archive: Archive, every: tuple[Item, ...], *, as_json: bool) -> int:
         show_progress(f"{k} of {len(every)}")
         if damage is not None:
             wrong.append(damage)
-    fault = archive.index_fault()
+    fault = archive.index.fault()
     if as_json:
         told = {"n_products": len(every), "index": fault, "damaged": [asdict(one) for one in wrong]}
         print(json.dumps(told, indent=2))

@@ -75,7 +75,6 @@ def main(options: argparse.Namespace) -> int:
     inversion, slopes = provenance.inversion, instrument.slopes
     fill = partial(
         fill_reconstructor,
-        reconstructor=inversion.matrix,
         interaction_matrix=inverted[:, : options.modes],
         provenance=provenance,
         circumstances={

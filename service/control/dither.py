@@ -348,11 +348,6 @@ def lines_of(frame_rate_hz: float, window_s: float, most: int) -> tuple[float, .
     return ()
 
 
-def first_closed(goal: int) -> int:
-    """Return with how many modes a loop is first closed, on its way to ``goal``."""
-    return min(goal, FIRST_CLOSED)
-
-
 TABLE_MAGNITUDES = np.array([7.0, 10.0, 12.5])
 
 TABLE = (

@@ -1,7 +1,7 @@
 // The four parameters over time: four charts on one time axis, each with its band, tolerance and marks.
 
 /* global uPlot */
-import { PARAMETERS, DASH, clock, day, make, present, put, rounded } from "./words.js";
+import { PARAMETERS, DASH, clock, day, lay, make, present, put, rounded } from "./words.js";
 import { colour } from "./scheme.js";
 
 const GAP_S = 120; // longer than any pause between two sittings
@@ -21,12 +21,19 @@ export function markOf(line) {
 export class Charts {
   #charts = [];
   #shown = null; // what is drawn now
+  #numbers; // the newest of it as a table
 
   // chosen: told the two ends, seconds, of what was drawn over in a chart.
   constructor(root, chosen = null) {
     this.root = root;
     this.chosen = chosen;
     this.rows = PARAMETERS.map((parameter) => this.#row(parameter));
+    const columns = ["UTC", ...PARAMETERS.map((p) => `${p.label}${p.short && `, ${p.short}`}`), "from"].join("|");
+    this.#numbers = make("details", {}, make("summary", { text: "the last 30 as a table" }),
+      make("div", { className: "scrolls", aria_label: "Registration, as a table", data_columns: columns }));
+    lay(this.#numbers);
+    this.#numbers.addEventListener("toggle", () => this.#list());
+    root.parentElement.append(this.#numbers);
     new ResizeObserver(() => this.#resize()).observe(root);
   }
 
@@ -53,6 +60,7 @@ export class Charts {
   // ahead: by how much to draw telemetry later, seconds; last: what is known at the end, or null.
   show({ entries, marks, from, to, tolerance = () => [null, null], ahead = 0, last = null }) {
     this.#shown = { entries, marks, from, to, tolerance, ahead, last };
+    this.#list();
     if (document.hidden || !this.root.clientWidth) return;
     this.rows.forEach((row, k) => {
       const data = this.#data(row.parameter);
@@ -63,6 +71,11 @@ export class Charts {
         chart.setScale("x", { min: from, max: to });
       });
     });
+  }
+
+  #list() {
+    if (this.#shown && this.#numbers.open)
+      this.#numbers.querySelector("tbody").replaceChildren(...tableOf(this.#shown.entries));
   }
 
   // x, lower and upper edge of the band, the estimate, single measurements, tolerance.
@@ -176,7 +189,7 @@ export class Charts {
 }
 
 // The last of the entries as rows of a table, newest first.
-export function tableOf(entries, most = 30) {
+function tableOf(entries, most = 30) {
   return entries.slice(-most).reverse().map((entry) => {
     const cells = PARAMETERS.map((p) => {
       const { value, sigma } = rounded(entry.filtered[p.key], entry.filtered_sigma[p.key], p);

@@ -1,6 +1,6 @@
 // Any night: α with its marks, what was in use and what was wrong for how long, who ordered what.
 
-import { Charts, tableOf } from "./charts.js";
+import { Charts } from "./charts.js";
 import { DASH, clock, day, make, milliseconds, number, put, registrationOf, span, verdict } from "./words.js";
 
 const DRAWN = new Set(["swap", "jump", "alarm"]);
@@ -26,7 +26,6 @@ export class History {
     this.times.forEach((time) => time.addEventListener("change", () => this.#typed()));
     for (const [name, act] of Object.entries({ earlier: () => this.#turn(1), later: () => this.#turn(-1), whole: () => this.#whole(), more: () => this.#readLines() }))
       root.querySelector(`button[name=${name}]`).addEventListener("click", act);
-    root.querySelector("details").addEventListener("toggle", () => this.#table());
     root.querySelector("input[type=search]").addEventListener("input", () => this.#showLines());
     document.addEventListener("scheme", () => this.#draw());
   }
@@ -135,12 +134,6 @@ export class History {
     const night = this.#chosen;
     const what = night ? `${night.n_estimates} measurements that night, ${night.n_swaps} swaps, ${night.n_jumps} jumps, ${night.n_alarms} alarms` : "";
     put(this.root.querySelector(".read"), `${day(this.#from)} ${clock(this.#from)} to ${day(this.#to)} ${clock(this.#to)} UTC; ${what}; beside the charts the last of this time`);
-    this.#table();
-  }
-
-  #table() {
-    if (this.#past && this.root.querySelector("details").open)
-      this.root.querySelector("tbody").replaceChildren(...tableOf(this.#past.entries));
   }
 
   // --- what lasted

@@ -1,6 +1,6 @@
 // The registration now and over the last time: what is read, when, and how much of it is kept.
 
-import { Charts, markOf, tableOf } from "./charts.js";
+import { Charts, markOf } from "./charts.js";
 import { DASH, ago, clock, milliseconds, put } from "./words.js";
 
 const RANGES = { 1: 600, 2: 3600, 3: 43_200 }; // seconds: ten minutes, an hour, a night
@@ -34,7 +34,6 @@ export class Registration {
       this.#begin();
     });
     document.addEventListener("scheme", () => this.#draw());
-    root.querySelector("details").addEventListener("toggle", () => this.#table());
   }
 
   choose(range) {
@@ -136,7 +135,6 @@ export class Registration {
     const first = this.#entries[0];
     const span = first ? `${this.#entries.length} measurements since ${clock(first.t_ns_utc / 1e6)} UTC` : "no measurement in this time";
     put(this.root.querySelector(".span"), span);
-    this.#table();
   }
 
   // How far α may go from what the matrix in use was made for.
@@ -146,10 +144,5 @@ export class Registration {
     if (!made || !this.#mirror) return [null, null];
     const reach = this.#mirror.tolerance[key];
     return [(made[key] - reach) * scale, (made[key] + reach) * scale];
-  }
-
-  #table() {
-    if (this.root.querySelector("details").open)
-      this.root.querySelector("tbody").replaceChildren(...tableOf(this.#entries));
   }
 }

@@ -417,7 +417,6 @@ def _of_product(file: h5py.File, path: Path) -> KnownFit:
 
 def fill_reconstructor(
     file: h5py.File,
-    reconstructor: NDArray[np.float32],
     interaction_matrix: NDArray[np.float32],
     provenance: Provenance,
     circumstances: Mapping[str, str | int | float | bool],
@@ -428,18 +427,16 @@ def fill_reconstructor(
     ----------
     file
         To be filled.
-    reconstructor
-        ``(n_modes, n_slopes)`` metres OPD per slope, slopes as the RTC lists them.
     interaction_matrix
         ``(n_slopes, n_modes)`` what it inverts, slopes as the RTC lists them.
     provenance
-        How it was made.
+        How it was made, and what came of it.
     circumstances
         Instrument, model, orientation: further attributes.
     """
     described = "slopes as the RTC lists them, single pass"
     for name, values, shape in (
-        ("reconstructor", reconstructor, "(n_modes, n_slopes), metres OPD per slope"),
+        ("reconstructor", provenance.inversion.matrix, "(n_modes, n_slopes), metres OPD per slope"),
         ("interaction_matrix", interaction_matrix, "(n_slopes, n_modes), slope per metre OPD"),
     ):
         _put(file, name, np.ascontiguousarray(values, dtype="<f4"), f"{shape}, {described}")

@@ -23,7 +23,7 @@ SPIE 8447 (identification by sensitivity matrices at the VLT's AOF).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -40,8 +40,8 @@ from service.fit.solver import (
     Solution,
     approach,
     refine,
-    stand,
     vertex,
+    within_limits,
 )
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 
@@ -157,7 +157,8 @@ def settle_at(
 ) -> tuple[Solution, Target]:
     """Return the model as it stands at a registration that another method has found."""
     seen = _known(models, target, vector)
-    return stand(models, seen, vector, nuisances), seen
+    there = refine(models, seen, vector, nuisances, most_steps=0)
+    return replace(there, converged=within_limits(vector)), seen
 
 
 def project_on_sensitivities(

@@ -22,7 +22,7 @@ Kaufman 1975, BIT 15, 49; Golub & Pereyra 2003, Inverse Problems 19, R1.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -346,12 +346,6 @@ def refine(
         projection=seen,
         converged=converged,
     )
-
-
-def stand(models: FitModels, columns: Columns, vector: Array, nuisances: Nuisances) -> Solution:
-    """Return the fine model at a registration that was found otherwise: no step is taken."""
-    there = refine(models, columns, vector, nuisances, most_steps=0)
-    return replace(there, converged=within_limits(vector))
 
 
 def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances) -> Array:

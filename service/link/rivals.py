@@ -223,7 +223,7 @@ class Standby:
             link.announce(session, keys.rank(name)),
             link.watch(session, keys.all_ranks, guarded("alive", self._on_token)),
             link.watch(session, contract, guarded("alive", self._on_token)),
-            link.subscribe_others(session, keys.state, guarded("state", self._on_state)),
+            link.subscribe(session, keys.state, guarded("state", self._on_state)),
         ]
         if wait:
             time.sleep(UNDER_WAY_S)

@@ -146,13 +146,6 @@ def subscribe_frames(
 
 
 def subscribe(session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None]) -> object:
-    """Call ``callback``, on a thread of its own, for each message."""
-    return session.declare_subscriber(key, callback)
-
-
-def subscribe_others(
-    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None]
-) -> object:
     """Call ``callback``, on a thread of its own, for each message that is not this session's."""
     return session.declare_subscriber(key, callback, allowed_origin=zenoh.Locality.REMOTE)
 

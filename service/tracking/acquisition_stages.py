@@ -9,9 +9,9 @@ import numpy as np
 from service.control.dither import (
     FEWEST_LINES,
     FINER,
+    FIRST_CLOSED,
     SMOOTH,
     Band,
-    first_closed,
     lines_of,
     modes_of,
 )
@@ -156,7 +156,7 @@ def begin(turn: Turn, rtc: Status, *, why: str, commanded: bool) -> None:
         commanded=commanded,
         attempt=1,
         found=found,
-        n_modes=first_closed(found.n_controlled),
+        n_modes=min(found.n_controlled, FIRST_CLOSED),
         sent=left is not None and left.sent,
     )
     validity.void(turn, "the acquisition had not begun")

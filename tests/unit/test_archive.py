@@ -341,7 +341,7 @@ def test_a_product_that_is_there_again_is_what_it_was(archive, tmp_path):
 def test_a_record_nobody_understands_is_taken_from_its_product(archive):
     archive.reconstructors.store(record_of(), MATRIX, None, {})
     archive.reconstructors.store(record_of("cm-2", created_ns_utc=2_000), MATRIX, None, {})
-    archive._index._connection.execute("UPDATE reconstructor SET record = '{' WHERE id = 'cm-1'")
+    archive.index._connection.execute("UPDATE reconstructor SET record = '{' WHERE id = 'cm-1'")
     (told,) = begun_anew(archive)
     assert "record of reconstructor cm-1 not understood" in told
     assert [record.id for record in archive.reconstructors.records()] == ["cm-1", "cm-2"]
@@ -350,7 +350,7 @@ def test_a_record_nobody_understands_is_taken_from_its_product(archive):
 def test_a_record_nobody_understands_and_without_a_product_is_left_out_and_told(archive):
     archive.record((record_of(),), ())
     archive.reconstructors.store(record_of("cm-2"), MATRIX, None, {})
-    archive._index._connection.execute("UPDATE reconstructor SET record = '{' WHERE id = 'cm-1'")
+    archive.index._connection.execute("UPDATE reconstructor SET record = '{' WHERE id = 'cm-1'")
     (told,) = begun_anew(archive)
     assert "record of reconstructor cm-1 not understood" in told
     assert [record.id for record in archive.reconstructors.records()] == ["cm-2"]
@@ -405,7 +405,7 @@ def test_of_a_matrix_whose_fate_is_lost_with_the_index_it_is_said(archive):
 
 
 def test_a_measurement_nobody_understands_does_not_refuse_the_start(archive):
-    archive._index._connection.execute("INSERT INTO measurement VALUES ('im-1', 1, '{', 'x')")
+    archive.index._connection.execute("INSERT INTO measurement VALUES ('im-1', 1, '{', 'x')")
     (told,) = begun_anew(archive)
     assert "record of measurement im-1 not understood" in told
     assert archive.measured.records() == ()
@@ -454,7 +454,7 @@ def test_nothing_in_it_acts_on_a_terminal(archive):
 def test_the_audit_trail_only_grows(archive, statement):
     note(archive, 1, "auto")
     with pytest.raises(sqlite3.IntegrityError, match="only grows"):
-        archive._index._connection.execute(statement)
+        archive.index._connection.execute(statement)
     assert len(archive.audit_trail()) == 1
 
 
@@ -557,7 +557,7 @@ def test_a_product_that_did_not_reach_the_index_is_taken_in_at_the_next_start(tm
     archive.open()
     with archive:
         archive.reconstructors.store(record_of(), MATRIX, None, {})
-        archive._index._connection.execute("DELETE FROM reconstructor")
+        archive.index._connection.execute("DELETE FROM reconstructor")
         (product(archive).parent / "cm-2.h5.part").write_bytes(b"half")
     assert archive.open() == ()
     with archive:

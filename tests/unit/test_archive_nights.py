@@ -152,14 +152,14 @@ def test_a_night_is_told_with_what_happened_in_it(archive):
 
 def test_who_reads_is_not_kept_waiting_by_who_writes_nor_the_other_way_round(archive):
     archive.record((), (), [entry(NOON)])
-    with archive._index._lock:
+    with archive.index._lock:
         assert len(archive.nights.estimates(0, 2 * NOON, 10)) == 1
     with closing(sqlite3.connect(archive.directory / "index.sqlite")) as reader:
         reader.execute("BEGIN")
         reader.execute("SELECT * FROM estimate").fetchone()
         archive.record((), (line(NOON, "note"),))
     with pytest.raises(StorageError, match="readonly"):
-        archive._index.asked("DELETE FROM estimate", ())
+        archive.index.asked("DELETE FROM estimate", ())
 
 
 def test_an_index_that_has_gone_or_is_damaged_is_named(archive, tmp_path):

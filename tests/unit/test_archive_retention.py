@@ -80,7 +80,7 @@ def test_as_much_goes_as_is_too_much_the_oldest_first(archive):
 
 def test_what_somebody_has_to_look_at_stays_until_then(archive):
     product(archive, "cm-00").unlink()
-    with archive._index._use() as connection:
+    with archive.index._use() as connection:
         connection.execute("UPDATE reconstructor SET record = 'x' WHERE id = 'cm-01'")
     assert going(archive, keep_days=26.5) == ["cm-02"]
     because = {item.id: item.kept_because for item in items(archive)}
@@ -105,7 +105,7 @@ def test_what_is_known_of_one_stays_when_its_numbers_go_also_after_a_restart(arc
 
 
 def test_one_killed_between_index_and_disk_has_lost_nothing(archive):
-    archive._index.forget_numbers("reconstructor", "cm-00")
+    archive.index.forget_numbers("reconstructor", "cm-00")
     archive.close()
     assert archive.open() == ()
     np.testing.assert_array_equal(archive.reconstructors.matrix("cm-00"), MATRIX)
@@ -191,7 +191,7 @@ async def test_who_pins_a_matrix_and_why_is_kept_and_told(archive):
         ("Ada", "archive.pinned", "cm-04"),
         ("Eve", "archive.unpinned", "cm-04"),
     ]
-    assert archive.pins() == ()
+    assert archive.index.pins() == ()
 
 
 # --- from the command line, beside a service that runs and without one

@@ -12,7 +12,6 @@ from service.control.dither import (
     LINE_BAND,
     MOST_LINES,
     SMOOTH,
-    first_closed,
     lines_of,
     modes_of,
 )
@@ -59,11 +58,6 @@ def test_a_slow_camera_has_fewer_lines_and_a_very_slow_one_none():
 def test_an_rtc_that_plays_few_modes_gets_few():
     assert len(lines_of(1000.0, 2.0, 4)) == 4
     assert lines_of(1000.0, 2.0, 2) == ()
-
-
-def test_a_loop_is_first_closed_on_no_more_modes_than_its_goal():
-    assert first_closed(594) == 150
-    assert first_closed(30) == 30
 
 
 def test_finer_modes_are_the_more_precise_ones():

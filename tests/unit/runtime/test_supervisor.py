@@ -324,7 +324,7 @@ async def test_estimators_that_break_whatever_is_posted_begin_anew(supervisor, m
 @contextlib.contextmanager
 def full_disk(archive):
     """SQLite may grow no further, and no file may become longer than it is."""
-    index = archive._index
+    index = archive.index
     connection = index._connection
     with index._lock:  # the supervisor's recorder writes through the same connection
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")

@@ -28,7 +28,6 @@ OBEYED_WITHIN_S = 30.0
 LARGEST = 100_000_000
 """Bytes of a document; the longest history has a third of that."""
 
-_CHUNK = 1 << 20
 _SAYS_PYRCAL = "urn:pyrcal:problem:"
 
 
@@ -238,7 +237,7 @@ def chunks(response: http.client.HTTPResponse) -> Iterator[bytes]:
     HTTPException
         If it ends too early.
     """
-    while chunk := response.read(_CHUNK):
+    while chunk := response.read(1 << 20):
         yield chunk
     if response.length:
         raise http.client.IncompleteRead(b"", response.length)

@@ -213,9 +213,6 @@ def _coincides(frequency: float, chosen: list[float], within_hz: float) -> bool:
 SPAN = 100
 """Modes above the controlled ones that are looked at: further up, models of mirrors differ more."""
 
-_BLIND = 1e-12
-_GAINFUL = 1e-6
-
 
 def information(linearisation: Linearisation) -> Array:
     """Return what each mode tells of α, ``(n_modes, 4, 4)``, per metre² of dither and unit noise.
@@ -258,7 +255,7 @@ def most_telling(information: Array, candidates: range, n: int, wanted: Array) -
             others = [mode for mode in pool if mode not in kept]
             costs = _worst(scaled[kept].sum(axis=0) + scaled[others])
             best = int(np.argmin(costs))
-            if costs[best] < cost * (1.0 - _GAINFUL):
+            if costs[best] < cost * (1.0 - 1e-6):
                 chosen, cost, improving = [*kept, others[best]], float(costs[best]), True
     return tuple(sorted(chosen))
 
@@ -270,7 +267,7 @@ def _worst(scaled: Array) -> Array:
     """
     power = np.diagonal(scaled, axis1=-2, axis2=-1)
     unit = np.sqrt(power[..., :, None] * power[..., None, :])
-    correlation = scaled / unit + _BLIND * np.eye(scaled.shape[-1])
+    correlation = scaled / unit + 1e-12 * np.eye(scaled.shape[-1])
     variances = np.diagonal(np.linalg.inv(correlation), axis1=-2, axis2=-1) / power
     return np.asarray(variances.max(axis=-1))
 

@@ -213,9 +213,7 @@ def _rows(shown: Sized, across: int) -> int:
 
 def _mode(triple: NDArray[Any], fit: Fit, column: int) -> None:
     """Draw one mode into three axes."""
-    synthetic = as_maps(fit.synthetic[:, column] * fit.gains[column], fit.valid)
-    measured = as_maps(fit.measured[:, column], fit.valid)
-    limit = 3.0 * float(np.nanstd(measured))
+    measured, synthetic, limit = _of_mode(fit, column)
     for axes, values in zip(triple, (synthetic, measured, measured - synthetic), strict=True):
         axes.imshow(values, origin="lower", cmap="RdBu_r", vmin=-limit, vmax=limit)
         axes.set(xticks=[], yticks=[])
@@ -304,11 +302,16 @@ def side_by_side(maps: Array) -> Array:
     return np.vstack([np.hstack(list(maps[k : k + 2])) for k in range(0, len(maps), 2)])
 
 
-def _columns(fit: Fit, column: int) -> dict[str, Any]:
-    """Return one mode's slopes as maps of one scale, measured and synthetic."""
+def _of_mode(fit: Fit, column: int) -> tuple[Array, Array, float]:
+    """Return one mode's slopes as maps, measured and synthetic, and the scale of both."""
     measured = as_maps(fit.measured[:, column], fit.valid)
     synthetic = as_maps(fit.synthetic[:, column] * fit.gains[column], fit.valid)
-    limit = 3.0 * float(np.nanstd(measured)) or 1.0
+    return measured, synthetic, 3.0 * float(np.nanstd(measured)) or 1.0
+
+
+def _columns(fit: Fit, column: int) -> dict[str, Any]:
+    """Return one mode's slopes in per cent of their scale."""
+    measured, synthetic, limit = _of_mode(fit, column)
     return {
         "mode": int(fit.modes[column]),
         "measured": _percent(np.clip(measured / limit, -1.0, 1.0)),

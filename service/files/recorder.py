@@ -27,9 +27,6 @@ FLUSH_S: Final = 0.5
 BACKLOG_BYTES: Final = 64_000_000
 """What may wait for the disk; beyond it messages are dropped and counted."""
 
-_BYTES_CHUNK = 1 << 20
-_ROWS_CHUNK = 4096
-
 _ROW: Final = np.dtype(
     [
         ("time_s", "<f8"),
@@ -79,8 +76,8 @@ class RecordingWriter:
         self._file.attrs.update(
             format=FORMAT, version=VERSION, system=self._system, created_ns=time.time_ns()
         )
-        self._bytes = _growing(self._file, "bytes", np.dtype("u1"), _BYTES_CHUNK)
-        self._rows = _growing(self._file, "messages", _ROW, _ROWS_CHUNK)
+        self._bytes = _growing(self._file, "bytes", np.dtype("u1"), 1 << 20)
+        self._rows = _growing(self._file, "messages", _ROW, 4096)
         self._dropped = self._file.create_dataset("dropped", data=np.zeros(1, np.int64))
         self._file.swmr_mode = True
         self._thread.start()

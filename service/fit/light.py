@@ -32,7 +32,6 @@ from service.model.slopes import Orientation
 
 Array = NDArray[np.float64]
 
-_SAMPLING = 2
 _ORDER = 3
 """Of the polynomial that stands for uneven light."""
 
@@ -40,8 +39,6 @@ _FIRST_STEPS = np.arange(-3.0, 3.1, 1.0)
 """Positions tried first on either axis, subapertures."""
 
 _PROBE_SUBAP = 0.05
-_SETTLED_SUBAP = 1e-3
-_MOST_STEPS = 10
 _LARGEST_STEP_SUBAP = 0.7
 _HUBER = 2.0
 """Residuals beyond so many robust σ count less."""
@@ -120,7 +117,7 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
     return PupilPosition(at=_pair(position), sigma=_pair(sigma))
 
 
-def even_optics(instrument: Instrument, sampling: int = _SAMPLING) -> PyramidOptics:
+def even_optics(instrument: Instrument, sampling: int = 2) -> PyramidOptics:
     """Return the sensor with an evenly lit pupil, as finely as light needs it."""
     return PyramidOptics(
         wfs=instrument.wfs,
@@ -169,11 +166,11 @@ def _settled(
     images: Array, optics: PyramidOptics, position: Array
 ) -> tuple[Array, Array, Array, float]:
     """Return position, the four images' own departures and their formal σ, and the residual."""
-    for _ in range(_MOST_STEPS):
+    for _ in range(10):
         steps, formal, residual = _departures(images, optics, position)
         step = np.clip(steps.mean(axis=0), -_LARGEST_STEP_SUBAP, _LARGEST_STEP_SUBAP)
         position = position + step
-        if np.abs(step).max() < _SETTLED_SUBAP:
+        if np.abs(step).max() < 1e-3:
             break
     return position, steps, formal, residual
 

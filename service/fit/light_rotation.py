@@ -33,7 +33,6 @@ _APART_DEG = 10.0
 
 _LARGEST_SIGMA_DEG = 2.0
 _SHADOW_SAMPLES = 5
-_SMOOTH_ORDER = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +110,7 @@ def find_rotation(
     limit = min(np.rad2deg(within_rad), 180.0 + _APART_DEG / 2)
     angles = np.arange(-limit, limit + _STEP_DEG / 2, _STEP_DEG)
     if isinstance(reference, Arms):
-        template, smooth = reference.light(len(light) + 2), _smooth_shapes(known, _SMOOTH_ORDER)
+        template, smooth = reference.light(len(light) + 2), _smooth_shapes(known, 3)
     else:
         template, smooth = reference.intensity, _smooth_shapes(known, 0)
     seen = _without(light[known], smooth)

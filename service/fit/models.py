@@ -38,8 +38,6 @@ FEWEST = 3
 
 MOST_SINGLE = 20
 
-_RIDGE = 1e-3
-
 
 @dataclass(slots=True)
 class Counter:
@@ -160,7 +158,7 @@ def low_order_of(model: InteractionModel) -> LowOrder:
     modes -= root * (root.T @ modes) / np.sum(root**2)
     smooth = _smooth(points, root)
     gram = modes.T @ modes
-    held = gram + _RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
+    held = gram + 1e-3 * np.trace(gram) / len(gram) * np.eye(len(gram))
     combined = np.linalg.solve(held, modes.T @ smooth)
     _, size, axes = np.linalg.svd(modes @ combined, full_matrices=False)
     kept = size > REPRESENTED

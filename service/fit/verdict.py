@@ -62,9 +62,8 @@ OWN = 0.35
 """... unless its own model explains more than this of it."""
 
 _NAMED = 12
-_PASS_TOLERANCE = 0.12
-_PASS_SCATTER = 0.12
-_UNIT = 1e3
+_PASSES = 0.12
+"""By which gains are off a factor of two, and scatter, that is forgotten in all of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -204,13 +203,13 @@ def _another_unit(evidence: Evidence) -> str:
         return ""
     gains = evidence.solution.projection.gains
     middle = float(np.median(gains))
-    if not 1.0 / _UNIT < middle < _UNIT:
+    if not 1e-3 < middle < 1e3:
         return (
             f"the measured slopes are {middle:.1e} times the model's: the matrix is in another "
             "unit than slope per metre of OPD (per nanometre would be 1e-09)"
         )
     factor = factor_of_passes(evidence)
-    if factor is None or float(np.std(gains) / middle) >= _PASS_SCATTER:
+    if factor is None or float(np.std(gains) / middle) >= _PASSES:
         return ""
     words = "twice" if factor > 1.0 else "half"
     cause = (
@@ -232,7 +231,7 @@ def factor_of_passes(evidence: Evidence) -> float | None:
     if not evidence.stroke_known:
         return None
     for factor in (2.0,) if evidence.passes == 1 else (2.0, 0.5):
-        if abs(middle / factor - 1.0) < _PASS_TOLERANCE:
+        if abs(middle / factor - 1.0) < _PASSES:
             return factor
     return None
 

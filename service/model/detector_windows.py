@@ -20,18 +20,14 @@ from service.model.slopes import SlopeRecipe
 
 Array = NDArray[np.float64]
 
-_SPLINE_DEGREE = 5
 _REACH_PX = 16
 """Pixels around a window that its spline is made of: further ones weigh less than 1e-5."""
 
 _AT_ONCE = 32
 """Frames that are cut together: more only need memory."""
 
-_DARK = 0.25
-_LIT = 0.75
+_DARK, _LIT = 0.25, 0.75
 """Shares of the typical light between which a pixel counts in part when images are looked for."""
-
-_DIAMETER_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -212,7 +208,7 @@ def found_centres(flux_frame: Array, diameter_px: float) -> Array:
             middle = [axis @ np.arange(len(axis)) for axis in _profiles(disc)]
             centres[y, x] = np.add(middle, [y * row, x * column])
             found_px = float(np.sqrt(4 / np.pi * disc.sum()))
-            if abs(found_px / diameter_px - 1.0) > _DIAMETER_TOLERANCE:
+            if abs(found_px / diameter_px - 1.0) > 0.05:
                 raise ModelError(
                     f"flux frame: found a lit area as large as a disc of {found_px:.1f} pixels "
                     f"near row {centres[y, x, 0]:.0f}, column {centres[y, x, 1]:.0f}; expected "
@@ -255,7 +251,5 @@ def _axis(centre_px: float, n: int, pixels: int, length: int, name: str) -> tupl
     first = max(int(np.floor(edges[0])) - _REACH_PX, 0)
     last = min(int(np.ceil(edges[-1])) + _REACH_PX, length)
     running = np.tri(last - first + 1, last - first, -1)
-    spline = scipy.interpolate.make_interp_spline(
-        np.arange(first, last + 1), running, k=_SPLINE_DEGREE
-    )
+    spline = scipy.interpolate.make_interp_spline(np.arange(first, last + 1), running, k=5)
     return slice(first, last), np.diff(spline(np.clip(edges, first, last)), axis=0)

@@ -128,7 +128,6 @@ def _bending_kernel(dx: Array, dy: Array) -> Array:
 
 Indices = Sequence[int] | NDArray[np.integer]
 
-_NORM_SAMPLING = 4
 _PISTON_RATIO = 1e-9
 _DEGENERATE = 1e-3
 """The square grid splits pairs that the mirror's symmetry makes equal by less than this."""
@@ -275,7 +274,7 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
     strokes, variance = _diagonalise(
         gram, covariance, _parity_sectors(mirror.positions_m), turbulence.n_modes
     )
-    strokes = _unit_rms(strokes, surface, influence, instrument_pupil(instrument, _NORM_SAMPLING))
+    strokes = _unit_rms(strokes, surface, influence, instrument_pupil(instrument, 4))
     strokes = _tilts_along_axes(strokes, mirror.positions_m)
     strokes = _fix_signs(strokes, mirror.positions_m)
     return ModalBasis(

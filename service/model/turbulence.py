@@ -25,8 +25,6 @@ Array = NDArray[np.float64]
 REFERENCE_WAVELENGTH_M = 500e-9
 """Wavelength at which r0 is quoted, metres."""
 
-_COVARIANCE_SAMPLING = 3
-
 
 def von_karman_covariance(separation_m: Array, turbulence: KarhunenLoeve) -> Array:
     """Return the phase covariance of von Karman turbulence, in metres² of OPD.
@@ -66,7 +64,7 @@ def pupil_statistics(
     a convolution of every weighted shape with B(r), done exactly on a padded grid: the dense
     n_points² matrix is never formed.
     """
-    pupil = instrument_pupil(instrument, _COVARIANCE_SAMPLING)
+    pupil = instrument_pupil(instrument, 3)
     weights = pupil.weights
     shapes = piston_free(render(pupil.points), weights)
     weighted = shapes * weights[:, None]

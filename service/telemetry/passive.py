@@ -93,9 +93,6 @@ _REACH = N_TAPS - 1
 _RANK = 1e-6
 """Of the largest singular value: what is smaller is rounding."""
 
-_RIDGE = 1e-6
-_STILL_RIDGE = 1e-9
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HighPass:
@@ -363,7 +360,7 @@ def passive_matrix(state: Passive) -> PassiveMatrix | None:
         return None
     # relative to each mode's own power, or the strongest would drown the weakest, with just
     # enough of the mean for a mode that never moves
-    ridge = np.diag(_RIDGE * own + _STILL_RIDGE * own.mean())
+    ridge = np.diag(1e-6 * own + 1e-9 * own.mean())
     inverse = np.linalg.inv(state.moved.astype(np.float64) + ridge)
     return PassiveMatrix(
         matrix=state.cross.astype(np.float64) @ inverse,

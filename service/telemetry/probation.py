@@ -82,7 +82,6 @@ _SPARSE = 7
 rate may be 0 in all of them."""
 
 _SLOPES, _OUTER, _INNER = -3, -2, -1
-_OTHERS = 3
 
 
 class Verdict(StrEnum):
@@ -288,7 +287,7 @@ def _part(
 ) -> Part:
     """Return the sums of one block; sines of these frequencies, cycles per frame, are left out."""
     n_frames = float(len(steps))
-    power = np.zeros(block.commands_m.shape[1] + _OTHERS)
+    power = np.zeros(block.commands_m.shape[1] + 3)
     moved = np.einsum("km,km->m", steps, steps)
     if lines:
         sines = _sines(len(steps), lines)

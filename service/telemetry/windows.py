@@ -33,8 +33,7 @@ ENOUGH_FRAMES = 256
 MAX_MISSING_FRACTION = 0.05
 """A window with more frames missing than this is refused."""
 
-MIN_AMPLITUDE_RATIO = 0.5
-MAX_AMPLITUDE_RATIO = 1.5
+AMPLITUDE_RATIO = (0.5, 1.5)
 """A dither weaker or stronger than these shares of its request was not applied as asked."""
 
 
@@ -60,8 +59,8 @@ class WindowPlan:
         None: it is. ``lines`` says of every mode where in frequency it was looked for.
         """
         ratio = applied_m / np.array(self.amplitude_m)
-        weak = ratio.min() < MIN_AMPLITUDE_RATIO
-        if not weak and ratio.max() <= MAX_AMPLITUDE_RATIO:
+        weak = ratio.min() < AMPLITUDE_RATIO[0]
+        if not weak and ratio.max() <= AMPLITUDE_RATIO[1]:
             return None
         worst = int(ratio.argmin() if weak else ratio.argmax())
         see = "see whether the RTC clips it" if weak else "see the RTC's units"

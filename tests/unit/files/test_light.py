@@ -69,8 +69,8 @@ def test_a_flux_map_is_turned_with_its_images(light, instrument):
 
 def test_the_light_alone_puts_the_pupil_within_a_tenth_of_a_subaperture(path, instrument):
     found = read_light(path, instrument)
-    assert abs(found.position.x_subap - ALPHA["shift_x_subap"]) < 0.1
-    assert abs(found.position.y_subap - ALPHA["shift_y_subap"]) < 0.1
+    assert abs(found.position.at[0] - ALPHA["shift_x_subap"]) < 0.1
+    assert abs(found.position.at[1] - ALPHA["shift_y_subap"]) < 0.1
     assert "x = -0." in found.note
 
 

@@ -47,4 +47,4 @@ def test_slopes_made_of_the_pixels_are_the_slopes(plant_of, small_instrument, sm
     np.testing.assert_array_equal(silent, 0.0)
     names = [identity_of(one, plant.valid).config_id for one in (pixels, small_instrument)]
     assert names[0] != names[1]
-    assert beside.slope_errors.kind is SignalKind.XY
+    assert beside.slope_errors.recipe.kind is SignalKind.XY

@@ -230,15 +230,7 @@ class Bridge:
         return await asyncio.to_thread(self._command, command)
 
     async def fetch_applied(self) -> tuple[wire.Manifest, NDArray[np.float32]]:
-        """Return the reconstructor the RTC uses, checked against its manifest.
-
-        Raises
-        ------
-        WireError
-            If what comes breaks the contract or the checksum differs.
-        LinkError
-            If the RTC does not answer or has none.
-        """
+        """Return the reconstructor the RTC uses, as :func:`service.link.session.fetch_applied`."""
         return await asyncio.to_thread(link.fetch_applied, self._opened(), self._keys)
 
     def publish_state(self, message: wire.StateMessage) -> None:

@@ -106,12 +106,10 @@ def expected_gain(
     moving = np.flatnonzero(loop.gains if loop.gains.any() else loop.gains == 0.0)
     order = np.concatenate([moving, np.setdiff1d(np.arange(len(sky.variance_m2)), moving)])
     seen = (interaction_matrix * np.asarray(loop.optical_gain, np.float32))[:, order]
-    spectra = _Spectra(loop, sky, order)
-    loop = replace(loop, gains=loop.gains[moving])
-    sky = replace(sky, variance_m2=sky.variance_m2[order])
-    now_m2, radius = _left(in_use[moving], seen, loop, sky, spectra)
-    then_m2, fresh_radius = _left(fresh[moving], seen, loop, sky, spectra)
-    rest_m2 = float(sky.variance_m2[len(moving) :].sum()) + sky.beyond_m2
+    work = _Work(replace(loop, gains=loop.gains[moving]), sky, order)
+    now_m2, radius = _left(in_use[moving], seen, work)
+    then_m2, fresh_radius = _left(fresh[moving], seen, work)
+    rest_m2 = float(np.sum(work.variance_m2[len(moving) :])) + sky.beyond_m2
     wavefront = float(np.sqrt(then_m2 + rest_m2))
     loss = float(np.sqrt(now_m2 + rest_m2)) - wavefront
     if max(radius, fresh_radius) >= 1.0:
@@ -135,10 +133,12 @@ def explained_by_noise(loss_m: float, step: Array, covariance: Array) -> float:
     return loss_m * len(step) / distance2
 
 
-class _Spectra:
-    """Frequencies of a frame, their weights, and the temporal spectrum of groups of modes."""
+class _Work:
+    """A loop, and what it works against: frequencies, and the spectra of groups of modes."""
 
     def __init__(self, loop: ControlLoop, sky: Sky, order: NDArray[np.intp]) -> None:
+        self.loop, self.slope_noise = loop, sky.slope_noise
+        self.variance_m2 = sky.variance_m2[order]
         edges = np.geomspace(1e-3, 0.5, N_FREQUENCIES + 1)
         per_frame = np.sqrt(edges[1:] * edges[:-1])
         z: Complex = np.exp(-2j * np.pi * per_frame)
@@ -163,32 +163,28 @@ def radial_order(n_modes: int) -> Array:
 
 
 def _left(
-    reconstructor: NDArray[np.float32],
-    seen: NDArray[np.float32],
-    loop: ControlLoop,
-    sky: Sky,
-    spectra: _Spectra,
+    reconstructor: NDArray[np.float32], seen: NDArray[np.float32], work: _Work
 ) -> tuple[float, float]:
     """Return the variance left on the controlled modes, metres², and the largest pole radius."""
     n = len(reconstructor)
-    gains = loop.gains[:, None]
+    gains = work.loop.gains[:, None]
     coupling = gains * (reconstructor @ seen).astype(float)
     eigenvalues, vectors = loop_modes(coupling[:, :n])
-    radius = loop.pole_radius(eigenvalues).max()
-    rejected = 1.0 / (1.0 + spectra.integrator[:, None] * eigenvalues)
-    passed = spectra.integrator[:, None] * rejected
+    radius = work.loop.pole_radius(eigenvalues).max()
+    rejected = 1.0 / (1.0 + work.integrator[:, None] * eigenvalues)
+    passed = work.integrator[:, None] * rejected
     basis = _Separate() if vectors is None else _Mixed(vectors)
-    scale, total = np.sqrt(sky.variance_m2), 0.0
-    for k, shape in enumerate(spectra.shapes):
-        own, other = spectra.group[:n] == k, n + np.flatnonzero(spectra.group[n:] == k)
+    scale, total = np.sqrt(work.variance_m2), 0.0
+    for k, shape in enumerate(work.shapes):
+        own, other = work.group[:n] == k, n + np.flatnonzero(work.group[n:] == k)
         if own.any():
             total += basis.left(np.diag(scale[:n])[:, own], rejected, shape)
         if len(other):
             total += basis.left(coupling[:, other] * scale[other], passed, shape)
-    noise = gains * reconstructor.astype(float) * sky.slope_noise
+    noise = gains * reconstructor.astype(float) * work.slope_noise
     # slopes are many more than modes; white noise has a power of 1 within a frame's frequencies,
     # half of it on each side of zero
-    total += basis.left(_factor(noise @ noise.T), passed, 2.0 * spectra.widths)
+    total += basis.left(_factor(noise @ noise.T), passed, 2.0 * work.widths)
     return total, float(radius)
 
 

@@ -35,8 +35,6 @@ class Light:
     """For the model's pupil amplitude."""
 
     position: PupilPosition
-    """Where the pupil images lie."""
-
     turn: LightRotation | CannotTell | None = None
     """Against the spider's arms at rotation 0, or the light of another day; None: neither is
     known."""

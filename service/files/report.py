@@ -36,11 +36,7 @@ class FitReport:
     """What was found, from which file, for which instrument."""
 
     fit: Fit
-    """What was found."""
-
     method: Method
-    """How."""
-
     instrument: str
     """Name of the instrument."""
 
@@ -278,8 +274,6 @@ class KnownFit:
     """What a reconstructor needs of an earlier fit."""
 
     alpha: Misregistration
-    """The registration."""
-
     covariance: NDArray[np.float64] | None = None
     """``(4, 4)`` of ``alpha.vector``; None: only α is known."""
 
@@ -316,11 +310,7 @@ class Provenance:
     """What a reconstructor was made of: whoever finds it years later can make it again."""
 
     recipe: Recipe
-    """How it was inverted."""
-
     inversion: Inversion
-    """What came of it."""
-
     fit: KnownFit
     """The registration of its synthetic matrix, and the measured one that was fitted."""
 

@@ -236,8 +236,6 @@ class UploadFitter:
     """Fits what was uploaded into a folder; can be pickled."""
 
     own: Instrument
-    """The service's own instrument."""
-
     load_instrument: Callable[[Path], Instrument]
     """Reads that of an upload."""
 

@@ -208,8 +208,6 @@ class _Turned:
     """What a coarse model says of the lowest orders at every rotation."""
 
     lowest: LowOrder
-    """The lowest orders."""
-
     columns: Array
     """``(n_low, n_angles, n_slopes)`` the model's answer at each of ``ANGLES_RAD``."""
 

@@ -79,8 +79,6 @@ class Mirror(Mount):
     """Typical distance between neighbours, metres in the pupil plane."""
 
     influence: Influence = Influence.THIN_PLATE
-    """Shape of the influence functions."""
-
     coupling: float = 0.35
     """Gaussian influence functions only: height at a distance of one pitch, 0..1."""
 
@@ -162,23 +160,13 @@ class Instrument:
     """Linear central obscuration, 0..1."""
 
     stop: Stop
-    """Which element limits the beam."""
-
     double_pass: bool = False
     """Whether a measured matrix of this instrument sees the mirror twice."""
 
     wfs: Pyramid
-    """The wavefront sensor."""
-
     mirror: Mirror | TabulatedModes
-    """The deformable mirror."""
-
     modes: KarhunenLoeve = field(default_factory=KarhunenLoeve)
-    """The modal basis."""
-
     slopes: SlopeRecipe = field(default_factory=SlopeRecipe)
-    """How the RTC makes and lists its slopes."""
-
     frames: FrameWindows | None = None
     """The RTC delivers detector frames, cut like this; None: it delivers slopes."""
 

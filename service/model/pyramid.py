@@ -38,7 +38,6 @@ class Nodes:
     """Positions relative to the subaperture's centre, in subapertures."""
 
     weights: NDArray[np.float64]
-    """Weights of the positions."""
 
     @classmethod
     def area(cls, n: int) -> Nodes:
@@ -94,11 +93,7 @@ class PyramidOptics:
     """
 
     wfs: Pyramid
-    """The sensor."""
-
     pupil: PupilGrid
-    """Grid and illumination."""
-
     n_nodes: int = 3
     """Quadrature nodes per axis in a subaperture."""
 

@@ -52,8 +52,6 @@ class DitheredEstimate(Estimate):
     """The reconstructor in use."""
 
     session: str
-    """The RTC's session."""
-
     modes: tuple[int, ...] = ()
     """0-based basis index of each gain; empty: not known."""
 

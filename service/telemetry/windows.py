@@ -76,14 +76,10 @@ class Telemetry:
     """Which telemetry a finished window is of."""
 
     session: str
-    """The RTC's session."""
-
     cm_id: str | None
     """The reconstructor in use, at the end where windows are joined; None: the RTC did not know."""
 
     first_seq: int
-    """Its first frame."""
-
     t_end_ns_utc: int
     """End of exposure of its last frame."""
 

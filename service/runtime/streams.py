@@ -390,9 +390,7 @@ def taken(streams: Streams, *, told: bool = False) -> tuple[Streams, Passive | s
     waiting_ns = round(sums.n_waiting * 1e9 / rtc.frame_rate_hz)
     begun = replace(
         sums,
-        cross=None,
-        moved=None,
-        power=None,
+        sums=(),
         n_effective=0.0,
         since_ns_utc=streams.heard_ns_utc - waiting_ns,
     )

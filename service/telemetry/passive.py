@@ -195,14 +195,9 @@ class Passive:
     delay_frames: float = 2.0
     """Of the loop; with less than two nothing is summed."""
 
-    cross: NDArray[np.float32] | None = None
-    """``(n_slopes, n_modes)`` sum of s z^T, metres; z are the filtered commands."""
-
-    moved: NDArray[np.float32] | None = None
-    """``(n_modes, n_modes)`` sum of c z^T, metres²."""
-
-    power: NDArray[np.float32] | None = None
-    """``(n_modes, n_modes)`` sum of z z^T, metres²."""
+    sums: tuple[NDArray[np.float32], ...] = ()
+    """Of s z^T ``(n_slopes, n_modes)``, metres, of c z^T and z z^T ``(n_modes, n_modes)``, metres²;
+    z are the filtered commands. Empty: of no frame."""
 
     n_effective: float = 0.0
     """Frames in the sums, forgetting included."""
@@ -322,16 +317,13 @@ def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     if last:
         weight[-TAPER_FRAMES:] *= rise[::-1][-n:]
     filtered *= weight
-    cross = frames.slopes[now].T @ filtered
-    moved = commands[now, : state.n_modes].T @ filtered
-    power = filtered.T @ filtered
+    with_z = (frames.slopes[now], commands[now, : state.n_modes], filtered)
+    sums = tuple(rows.T @ filtered for rows in with_z)
     fade = np.float32(np.exp(-n / state.memory_frames))
-    if state.cross is not None and state.moved is not None and state.power is not None:
-        cross += fade * state.cross
-        moved += fade * state.moved
-        power += fade * state.power
+    for new, old in zip(sums, state.sums, strict=False):
+        new += fade * old
     n_effective = float(fade) * state.n_effective + float(weight.sum())
-    return replace(state, cross=cross, moved=moved, power=power, n_effective=n_effective)
+    return replace(state, sums=sums, n_effective=n_effective)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -351,20 +343,19 @@ def passive_matrix(state: Passive) -> PassiveMatrix | None:
     ``D = (sum s z^T) (sum c z^T)^-1``, as z is independent of the noise of its frame. The errors of
     its columns go as ``X^-T (sum z z^T) X^-1`` with ``X = sum c z^T``.
     """
-    if state.cross is None or state.moved is None or state.power is None:
+    if not state.sums or state.n_effective < MIN_FRAMES_PER_MODE * state.n_modes:
         return None
-    if state.n_effective < MIN_FRAMES_PER_MODE * state.n_modes:
-        return None
-    own = np.diag(state.power).astype(np.float64)
+    cross, moved, power = (part.astype(np.float64) for part in state.sums)
+    own = np.diag(power)
     if not own.any():
         return None
     # relative to each mode's own power, or the strongest would drown the weakest, with just
     # enough of the mean for a mode that never moves
     ridge = np.diag(1e-6 * own + 1e-9 * own.mean())
-    inverse = np.linalg.inv(state.moved.astype(np.float64) + ridge)
+    inverse = np.linalg.inv(moved + ridge)
     return PassiveMatrix(
-        matrix=state.cross.astype(np.float64) @ inverse,
-        shape=inverse.T @ state.power.astype(np.float64) @ inverse,
+        matrix=cross @ inverse,
+        shape=inverse.T @ power @ inverse,
     )
 
 

@@ -8,7 +8,8 @@ make of it; the noise of that is read off beside the lines.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,8 @@ UNANSWERED = 0.03
 
 REPEATED = 0.02
 """Share of frames with the very slopes of the frame before: these are frozen, and tell nothing."""
+
+_nothing = partial(np.zeros, (), np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,10 +107,10 @@ class Meter:
     n_frames: int = 0
     """Summed so far."""
 
-    squares: Array | None = None
+    squares: Array = field(default_factory=_nothing)
     """``(n_modes,)`` sum of the squares of the dither columns, metres²."""
 
-    lines: Array | None = None
+    lines: Array = field(default_factory=_nothing)
     """``(2, n_asked)`` dither columns and steps of the commands of the asked modes, demodulated."""
 
     last_m: Array | None = None
@@ -116,7 +119,7 @@ class Meter:
     next_seq: int = 0
     """The frame those are followed by."""
 
-    slopes: Array | None = None
+    slopes: Array = field(default_factory=_nothing)
     """``(2 * n_heard * (1 + n_sides), n_slopes)`` slopes times cosines, then sines, on and beside
     each line heard."""
 
@@ -155,8 +158,8 @@ def _added(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
     meter = replace(
         meter,
         n_frames=meter.n_frames + len(dither),
-        squares=squares if meter.squares is None else meter.squares + squares,
-        lines=lines if meter.lines is None else meter.lines + lines,
+        squares=meter.squares + squares,
+        lines=meter.lines + lines,
     )
     if meter.n_frames < _enough(asked):
         return meter, None
@@ -198,7 +201,7 @@ def _heard(meter: Meter, slopes: Array, first_seq: int) -> Meter:
     summed = np.concatenate(cosines_and_sines(turns)) @ slopes
     return replace(
         meter,
-        slopes=summed if meter.slopes is None else meter.slopes + summed,
+        slopes=meter.slopes + summed,
         n_repeated=meter.n_repeated + _repeated(slopes),
     )
 
@@ -216,7 +219,7 @@ def _powers(meter: Meter) -> tuple[float, float, float]:
     What earlier seconds have told is in it, where that was too little for a verdict.
     """
     asked, heard, before = meter.asked, meter.asked.heard, meter.powers
-    if meter.slopes is None or meter.lines is None or meter.n_repeated > REPEATED * meter.n_frames:
+    if not heard or meter.n_repeated > REPEATED * meter.n_frames:
         return before
     parts = np.einsum("ks,ks->k", meter.slopes, meter.slopes).astype(float)
     power = parts.reshape(2, len(heard), -1).sum(axis=0)
@@ -246,8 +249,6 @@ def _unanswered(powers: tuple[float, float, float], asked: Asked) -> str | None:
 
 def _found(meter: Meter) -> Finding:
     asked = meter.asked
-    if meter.squares is None or meter.lines is None:
-        raise ValueError("no frame has been summed")
     rms = np.sqrt(meter.squares / meter.n_frames)
     wanted, modes = np.array(asked.amplitude_m), list(asked.modes)
     told, moved = np.abs(meter.lines) * np.sqrt(2.0) / meter.n_frames

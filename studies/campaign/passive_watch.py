@@ -160,7 +160,7 @@ class Watch:
         if found is None:
             return
         # like the service: no two looks share telemetry
-        self._passive = replace(self._passive, cross=None, moved=None, power=None, n_effective=0.0)
+        self._passive = replace(self._passive, sums=(), n_effective=0.0)
         if self._joint is None:
             self._near = found.alpha
         measured, sigma = {"passive": found.alpha.vector}, {"passive": found.sigma}

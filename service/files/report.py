@@ -28,7 +28,7 @@ from service.model.misregistration import (
     PARAMETERS,
     Misregistration,
 )
-from service.model.slopes import Orientation
+from service.model.slopes import FLIPS, Orientation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,13 +93,8 @@ def verdict_line(fit: Fit) -> str:
 def orientation_words(orientation: Orientation, order: SlopeOrder) -> dict[str, Any]:
     """Return order and orientation as the instrument file would say them."""
     both = [orientation.sign_x, orientation.sign_y]
-    return {
-        "order": str(order),
-        "swap_xy": orientation.swap_xy,
-        "flip_x": orientation.flip_x,
-        "flip_y": orientation.flip_y,
-        "sign": both[0] if both[0] == both[1] else both,
-    }
+    flips = {name: getattr(orientation, name) for name in FLIPS}
+    return {"order": str(order), **flips, "sign": both[0] if both[0] == both[1] else both}
 
 
 def _four(values: NDArray[np.float64]) -> dict[str, float | None]:
@@ -380,11 +375,7 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
         alpha=Misregistration.from_boundary(values),
         covariance=np.array(values["covariance"], dtype=np.float64) / COVARIANCE_SCALE,
         orientation=Orientation(
-            swap_xy=words["swap_xy"],
-            flip_x=words["flip_x"],
-            flip_y=words["flip_y"],
-            sign_x=sign_x,
-            sign_y=sign_y,
+            **{name: words[name] for name in FLIPS}, sign_x=sign_x, sign_y=sign_y
         ),
         order=SlopeOrder(words["order"]),
         accepted=str(values["verdict"]).startswith("accepted"),

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.fit.orientation import (
-    FLIPS,
     LEAST_CORRELATION,
     LEAST_LEAD,
     Pose,
@@ -32,7 +31,7 @@ from service.model.interaction import rtc_valid_subapertures
 from service.model.misregistration import Misregistration, unit_like, wrapped
 from service.model.modes import Basis
 from service.model.pyramid import Mapper
-from service.model.slopes import SlopeRecipe, to_conventions, turned_mask
+from service.model.slopes import FLIPS, SlopeRecipe, to_conventions, turned_mask
 
 Array = NDArray[Any]
 

@@ -372,8 +372,6 @@ def _lit_start(
         seen = find_pupil(np.frombuffer(flux, "<f4").reshape(4, side, side), instrument)
     except ModelError:
         return None
-    if not isinstance(seen, PupilPosition):
-        return None
-    if max(map(abs, seen.at)) > FARTHEST_SUBAP:
+    if isinstance(seen, CannotTell) or max(map(abs, seen.at)) > FARTHEST_SUBAP:
         return None
     return replace(nominal, shift_x_subap=seen.at[0], shift_y_subap=seen.at[1])

@@ -28,11 +28,9 @@ from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration, rotation, wrapped
 from service.model.modes import Basis
 from service.model.pyramid import Mapper
-from service.model.slopes import Orientation, SlopeRecipe, turned_mask
+from service.model.slopes import FLIPS, Orientation, SlopeRecipe, turned_mask
 
 Array = NDArray[np.float64]
-
-FLIPS = ("swap_xy", "flip_x", "flip_y")
 
 SAMPLING = 1
 """Pupil points per subaperture: enough for shapes this smooth."""

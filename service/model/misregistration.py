@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
@@ -83,13 +83,8 @@ class Misregistration:
     @classmethod
     def from_vector(cls, vector: NDArray[np.float64]) -> Self:
         """Build from a numeric 4-vector (shape ``(4,)``, rotation in radians)."""
-        shift_x, shift_y, rotation, magnification = (float(v) for v in vector)
-        return cls(
-            shift_x_subap=shift_x,
-            shift_y_subap=shift_y,
-            rotation_rad=rotation,
-            magnification=magnification,
-        )
+        names = (field.name for field in fields(cls))
+        return cls(**dict(zip(names, vector.tolist(), strict=True)))
 
     @classmethod
     def from_boundary(cls, values: dict[str, float]) -> Self:

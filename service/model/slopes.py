@@ -75,6 +75,10 @@ class Orientation:
             )
 
 
+FLIPS = ("swap_xy", "flip_x", "flip_y")
+"""What turns the grid, by the names of an instrument file."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlopeRecipe:
     """How the RTC makes and lists its signals."""
@@ -176,12 +180,9 @@ def _listing(
     planes[:, mask] = _places(order, mask)
     valid = turned_mask(mask, orientation)
     turned = np.array([turned_mask(plane, orientation)[valid] for plane in planes])
-    signs = np.array(
-        [
-            -orientation.sign_x if orientation.flip_x else orientation.sign_x,
-            -orientation.sign_y if orientation.flip_y else orientation.sign_y,
-        ],
-        dtype=np.int8,
+    sign_x, sign_y = orientation.sign_x, orientation.sign_y
+    signs = np.array([sign_x, sign_y], np.int8) * (-1) ** np.array(
+        [orientation.flip_x, orientation.flip_y]
     )
     if order.kind is SignalKind.INTENSITY:
         images = turned.reshape(2, 2, n_valid)[:: signs[1], :: signs[0]]

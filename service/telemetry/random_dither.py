@@ -8,7 +8,7 @@ loop's own reply, which pulls the fit toward the old geometry.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -188,18 +188,11 @@ def joined(one: Correlated, other: Correlated) -> Correlated:
             f"and {len(other.plan.modes)} in {other.session}, expected the same modes and session"
         )
     a, b = one.sums, other.sums
-    n_pairs = a.n_pairs + b.n_pairs
+    both = {part.name: getattr(a, part.name) + getattr(b, part.name) for part in fields(a)}
+    both["memory"] = (a.memory * a.n_pairs + b.memory * b.n_pairs) / both["n_pairs"]
     return replace(
         other,
-        sums=Correlations(
-            response=a.response + b.response,
-            late=a.late + b.late,
-            dither_power=a.dither_power + b.dither_power,
-            noise_power=a.noise_power + b.noise_power,
-            slope_power=a.slope_power + b.slope_power,
-            memory=(a.memory * a.n_pairs + b.memory * b.n_pairs) / n_pairs,
-            n_pairs=n_pairs,
-        ),
+        sums=Correlations(**both),
         first_seq=one.first_seq,
         n_missing=one.n_missing + other.n_missing,
         n_windows=one.n_windows + other.n_windows,

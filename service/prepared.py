@@ -22,9 +22,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.files.report import instrument_sha256
 from service.model import instrument as model_code
-from service.model.instrument import Instrument, Mirror
+from service.model.instrument import Instrument, Mirror, instrument_sha256
 from service.model.kinds import BasisKind
 from service.model.modes import Basis, ModalBasis, mirror_surface, modal_basis
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
-from service.model.instrument import Instrument, KarhunenLoeve, TabulatedModes
+from service.model.described import KarhunenLoeve
+from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import Normalisation
 from service.model.modes import ModalBasis, analytic_basis, mirror_surface
 from service.model.slopes import Orientation

@@ -18,8 +18,9 @@ from threadpoolctl import threadpool_limits
 from service.config.mirrors import grid
 from service.fit.matrix import fit_matrix
 from service.fit.reference import Reference
+from service.model.described import KarhunenLoeve
 from service.model.detector_windows import frame_windows, slopes_from_frames, slopes_per_unit
-from service.model.instrument import FrameWindows, Instrument, KarhunenLoeve, Mirror, Pyramid
+from service.model.instrument import FrameWindows, Instrument, Mirror, Pyramid
 from service.model.interaction import rtc_valid_subapertures
 from service.model.kinds import Normalisation, Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation

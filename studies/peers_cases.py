@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import load_instrument
+from service.model.described import InfluenceShape
 from service.model.instrument import Instrument, Mirror
 from service.model.kinds import Influence, Stop
 from service.model.misregistration import Misregistration, rotation
@@ -111,7 +112,7 @@ def basis(influence: Influence) -> ModalBasis:
     mirror = Mirror(
         positions_m=drawn.positions_m,
         pitch_m=drawn.pitch_m,
-        influence=influence,
+        shape=InfluenceShape(influence=influence),
     )
     return karhunen_loeve_basis(
         replace(shared, mirror=mirror, modes=replace(shared.modes, n_modes=N_MODES))

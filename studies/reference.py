@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping
+from dataclasses import is_dataclass
 from typing import Any
 
 from check_rtc.__main__ import check_parser
 from service.commands.arguments import OTHER_PROGRAMS, command_line
-from service.config.instrument_schema import InstrumentFile
+from service.config.instrument_schema import TABLES, WHOLE
 from service.config.settings import Settings
 from service.config.sources import Table
 from service.tracking.alarms import ALARMS
-from studies.contract_tables import table
+from studies.contract_tables import described, table
 from studies.demo.arguments import demo_parser
 
 Schema = Mapping[str, Any]
 
 _LIMITS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+
+EMPTY: Mapping[str, type] = {}
 
 _HEAD = ("key", "type", "default", "meaning")
 
@@ -50,19 +53,22 @@ def instrument() -> str:
         "the smallest one, and what orientation means. A reference to data is `path:/dataset`, "
         "relative to the file."
     )
-    return page("The instrument file", intro, *_tables(InstrumentFile))
+    return page("The instrument file", intro, *_tables(WHOLE, TABLES))
 
 
-def _tables(whole: type[Table]) -> Iterator[str]:
-    """Yield the sections of a file, each with its keys."""
-    described = whole.model_json_schema()
-    kinds: dict[str, Schema] = described["$defs"]
-    for section, place in described["properties"].items():
+def _tables(whole: type[Table], records: Mapping[str, type] = EMPTY) -> Iterator[str]:
+    """Yield the sections of a file, each with its keys; some are read into ``records``."""
+    schema = whole.model_json_schema()
+    kinds: dict[str, Schema] = schema["$defs"]
+    for section, place in schema["properties"].items():
         of_each = place.get("items", place)
         kind = kinds[of_each["$ref"].rpartition("/")[2]]
         yield f"## [{section}]" if of_each is place else f"## [[{section}]]"
-        yield _text(kind).partition(": ")[2].capitalize()
+        about = _text(kind).partition(": ")[2]
+        yield about[:1].upper() + about[1:]
         needed = kind.get("required", ())
+        record = records.get(section)
+        told = _told(record) if record is not None and is_dataclass(record) else {}
         yield table(
             _HEAD,
             [
@@ -70,11 +76,17 @@ def _tables(whole: type[Table]) -> Iterator[str]:
                     f"`{key}`",
                     _type(field, kinds),
                     "needed" if key in needed else _default(field),
-                    _text(field),
+                    _text({"description": told.get(key, "")} | field),
                 )
                 for key, field in kind["properties"].items()
             ],
         )
+
+
+def _told(record: type) -> dict[str, str]:
+    """Return what a record says of its fields, or those it is made of."""
+    told = [described(base) for base in reversed(record.__mro__[:-1])]
+    return {key: text for texts in told for key, text in texts.items() if text}
 
 
 def _type(field: Schema, kinds: Mapping[str, Schema]) -> str:

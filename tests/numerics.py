@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from service.config.instrument import load_instrument
 from service.config.mirrors import rings
 from service.control.reconstructor import invert
-from service.model.instrument import Instrument, KarhunenLoeve, Mirror, Pyramid
+from service.model.described import InfluenceShape, KarhunenLoeve
+from service.model.instrument import Instrument, Mirror, Pyramid
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.kinds import Influence, Stop
 from service.model.misregistration import Misregistration
@@ -66,7 +67,7 @@ def small_instrument(
         mirror=Mirror(
             positions_m=rings(1, 5, 0.8) if positions_m is None else positions_m,
             pitch_m=0.8,
-            influence=influence,
+            shape=InfluenceShape(influence=influence),
         ),
         modes=replace(turbulence or KarhunenLoeve(), n_modes=n_modes),
     )

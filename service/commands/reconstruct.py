@@ -28,11 +28,10 @@ from service.files.report import (
     KnownFit,
     Provenance,
     fill_reconstructor,
-    instrument_sha256,
     orientation_words,
     read_fit,
 )
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
 from service.model.modes import modal_basis
 

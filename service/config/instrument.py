@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 
 from service.config import packaged_file
 from service.config.instrument_schema import (
+    AboutTable,
     Centres,
     InstrumentFile,
-    LoopTable,
-    ModesTable,
+    MirrorTable,
+    SlopesTable,
     WfsTable,
     read_instrument_file,
 )
 from service.config.mirrors import MirrorFile, own_modes, read_mirror
 from service.config.sources import read_dataset, refuse
 from service.errors import ConfigurationError, ModelError
+from service.model.described import KarhunenLoeve, LoopFacts, PyramidNumbers
 from service.model.detector_windows import by_quadrant
 from service.model.instrument import (
     FrameWindows,
     Instrument,
-    KarhunenLoeve,
-    LoopFacts,
     Mirror,
     Pyramid,
     TabulatedModes,
@@ -49,26 +49,26 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         One line with the file and the key: unknown, missing, of the wrong type, out of range, or
         in contradiction to another.
     """
-    tables, path = read_instrument_file(name_or_path)
-    about = tables.instrument
-    wfs = _pyramid(tables.wfs, path)
+    file = read_instrument_file(name_or_path)
+    about = file.table(AboutTable)
+    wfs = _pyramid(file)
     mirror, remarks = read_mirror(
         MirrorFile(
-            table=tables.mirror,
-            path=path,
+            file=file,
+            table=file.table(MirrorTable),
             diameter_m=about.diameter_m,
             subaperture_m=about.diameter_m / wfs.pupil_diameter,
         )
     )
-    modes = _modes(tables.modes, mirror, path)
+    modes = _modes(file, mirror)
     return Instrument(
-        **about.model_dump(),
+        **asdict(about),
         wfs=wfs,
         mirror=mirror,
         modes=modes,
-        slopes=_slopes(tables, path),
-        frames=_frames(tables.wfs, path),
-        loop=_loop(tables.loop, modes.n_modes, path),
+        slopes=_slopes(file),
+        frames=_frames(file),
+        loop=_loop(file, modes.n_modes),
         remarks=remarks,
     )
 
@@ -84,13 +84,13 @@ def packaged_instrument(name: str) -> Instrument:
     return load_instrument(packaged_file(name))
 
 
-def _modes(table: ModesTable, mirror: Mirror | TabulatedModes, path: Path) -> KarhunenLoeve:
+def _modes(file: InstrumentFile, mirror: Mirror | TabulatedModes) -> KarhunenLoeve:
     """Return the turbulence, and as many modes as the user's basis or ``[modes]`` has."""
-    where, own = f"{path}: modes.n_modes", own_modes(mirror)
+    where, own, table = file.where("modes.n_modes"), own_modes(mirror), file.table(KarhunenLoeve)
     if own is not None:
-        if "n_modes" in table.model_fields_set:
+        if "n_modes" in file.given["modes"]:
             refuse(where, f"it beside a basis of its own {own} modes", "it for KL modes only")
-        return replace(KarhunenLoeve(**table.model_dump()), n_modes=own)
+        return replace(table, n_modes=own)
     n_max = len(mirror.positions_m) - 1 if isinstance(mirror, Mirror) else 0
     if table.n_modes > n_max:
         refuse(
@@ -98,14 +98,14 @@ def _modes(table: ModesTable, mirror: Mirror | TabulatedModes, path: Path) -> Ka
             str(table.n_modes),
             f"at most {n_max}: {n_max + 1} actuators make {n_max} modes without piston",
         )
-    return KarhunenLoeve(**table.model_dump())
+    return table
 
 
-def _slopes(tables: InstrumentFile, path: Path) -> SlopeRecipe:
-    table = tables.slopes
-    if tables.wfs.input == "frames" and "order" in table.model_fields_set:
+def _slopes(file: InstrumentFile) -> SlopeRecipe:
+    table = file.table(SlopesTable)
+    if file.table(WfsTable).input == "frames" and "order" in file.given["slopes"]:
         raise ConfigurationError(
-            f'{path}: slopes.order: has no meaning beside wfs.input = "frames", '
+            f'{file.where("slopes.order")}: has no meaning beside wfs.input = "frames", '
             "whose slopes are made here"
         )
     orientation = None
@@ -117,88 +117,91 @@ def _slopes(tables: InstrumentFile, path: Path) -> SlopeRecipe:
     order = table.order or orders[0]
     if order not in orders:
         refuse(
-            f"{path}: slopes.order", f'{order} beside kind = "{table.kind}"', " or ".join(orders)
+            file.where("slopes.order"), f'{order} beside kind = "{table.kind}"', " or ".join(orders)
         )
     return SlopeRecipe(order=order, orientation=orientation, normalisation=table.normalisation)
 
 
-def _frames(table: WfsTable, path: Path) -> FrameWindows | None:
+def _frames(file: InstrumentFile) -> FrameWindows | None:
+    table = file.table(WfsTable)
     if table.input == "slopes":
         for key in _FRAME_KEYS:
-            if key in table.model_fields_set and getattr(table, key) != 1:
+            if key in file.given["wfs"] and getattr(table, key) != 1:
                 raise ConfigurationError(
-                    f'{path}: wfs.{key}: belongs to input = "frames", found input = "slopes"'
+                    f'{file.where(f"wfs.{key}")}: belongs to input = "frames", '
+                    'found input = "slopes"'
                 )
         return None
     centres = None
     if table.pupil_centres_px is not None:
-        centres = _by_quadrant(table.pupil_centres_px, path).reshape(4, 2)
+        centres = _by_quadrant(table.pupil_centres_px, file).reshape(4, 2)
     return FrameWindows(centres_px=centres, pixels_per_subaperture=table.pixels_per_subaperture)
 
 
-def _by_quadrant(centres_px: Centres, path: Path) -> NDArray[np.float64]:
+def _by_quadrant(centres_px: Centres, file: InstrumentFile) -> NDArray[np.float64]:
     try:
         return by_quadrant(np.array(centres_px))
     except ModelError as error:
-        raise ConfigurationError(f"{path}: wfs.pupil_centres_px: {error}") from error
+        raise ConfigurationError(f"{file.where('wfs.pupil_centres_px')}: {error}") from error
 
 
-def _loop(table: LoopTable, n_modes: int, path: Path) -> LoopFacts | None:
-    if not table.model_fields_set:
+def _loop(file: InstrumentFile, n_modes: int) -> LoopFacts | None:
+    if not file.given["loop"]:
         return None
+    table = file.table(LoopFacts)
     if table.n_controlled is not None and table.n_controlled > n_modes:
         refuse(
-            f"{path}: loop.n_controlled",
+            file.where("loop.n_controlled"),
             str(table.n_controlled),
             f"at most the {n_modes} modes of the basis",
         )
-    return LoopFacts(**table.model_dump())
+    return table
 
 
-def _pyramid(table: WfsTable, path: Path) -> Pyramid:
-    diameter = table.pupil_diameter_subap or float(table.n_subapertures)
-    separation = _separation(table, path)
+def _pyramid(file: InstrumentFile) -> Pyramid:
+    table = file.table(WfsTable)
+    diameter, separation = table.pupil_diameter, _separation(file)
     if separation < diameter:
         refuse(
-            f"{path}: wfs.pupil_separation_subap",
+            file.where("wfs.pupil_separation_subap"),
             f"{separation:g}",
             f"at least the pupil's diameter, {diameter:g} subapertures: the images would overlap",
         )
     mask = None
     if table.valid_subapertures != "auto":
-        if "flux_threshold" in table.model_fields_set:
+        if "flux_threshold" in file.given["wfs"]:
             raise ConfigurationError(
-                f"{path}: wfs.flux_threshold: has no meaning beside a mask file "
+                f"{file.where('wfs.flux_threshold')}: has no meaning beside a mask file "
                 "(wfs.valid_subapertures): remove one of the two"
             )
-        mask = _mask(table, path)
-    kept = {field.name for field in fields(Pyramid)}
-    found = {"pupil_separation_subap": separation, "valid_subapertures": mask}
-    return Pyramid(**table.model_dump(include=kept) | found)
+        mask = _mask(file)
+    optics = {field.name: getattr(table, field.name) for field in fields(PyramidNumbers)}
+    return Pyramid(**optics | {"pupil_separation_subap": separation}, valid_subapertures=mask)
 
 
-def _separation(table: WfsTable, path: Path) -> float:
+def _separation(file: InstrumentFile) -> float:
     """Return the images' distance: as given, or as the images on the frames lie."""
+    table = file.table(WfsTable)
     stated = table.pupil_separation_subap
     if table.pupil_centres_px is None or table.input == "slopes":
         return stated
-    centres = _by_quadrant(table.pupil_centres_px, path)
+    centres = _by_quadrant(table.pupil_centres_px, file)
     sides = (centres[1, :, 0] - centres[0, :, 0], centres[:, 1, 1] - centres[:, 0, 1])
     measured = float(np.mean(sides)) / table.pixels_per_subaperture
-    if "pupil_separation_subap" not in table.model_fields_set:
+    if "pupil_separation_subap" not in file.given["wfs"]:
         return measured
     if abs(measured / stated - 1.0) > _SEPARATION_TOLERANCE:
         refuse(
-            f"{path}: wfs.pupil_separation_subap",
+            file.where("wfs.pupil_separation_subap"),
             f"{stated:g}",
             f"about {measured:.1f}, the distance of wfs.pupil_centres_px",
         )
     return stated
 
 
-def _mask(table: WfsTable, path: Path) -> NDArray[np.bool_]:
-    where = f"{path}: wfs.valid_subapertures"
-    values = read_dataset(table.valid_subapertures, path.parent, where)
+def _mask(file: InstrumentFile) -> NDArray[np.bool_]:
+    table, where = file.table(WfsTable), file.where("wfs.valid_subapertures")
+    values = read_dataset(table.valid_subapertures, file.path.parent, where)
     n = table.n_subapertures
     if values.shape != (n, n):
         refuse(where, f"shape {values.shape}", f"(n_subapertures, n_subapertures) = ({n}, {n})")

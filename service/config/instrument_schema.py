@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, create_model
 
 from service.config import instrument_path
-from service.config.sources import Id, Named, Table, in_file, read_toml, validated
-from service.model.kinds import BasisKind, Influence, Normalisation, SignalKind, SlopeOrder, Stop
+from service.config.sources import Id, Table, in_file, read_toml, validated
+from service.model.described import (
+    Count,
+    InfluenceShape,
+    KarhunenLoeve,
+    LoopFacts,
+    Positive,
+    PyramidNumbers,
+    Telescope,
+)
+from service.model.kinds import BasisKind, Normalisation, SignalKind, SlopeOrder
 
-Positive = Annotated[float, Field(gt=0.0)]
-Count = Annotated[int, Field(ge=1)]
 Sign = Literal[-1, 1]
 Pixel = Annotated[float, Field(ge=0.0)]
 Centre = tuple[Pixel, Pixel]
@@ -40,56 +49,26 @@ def _centres(value: object) -> object:
     return tuple(tuple(point) for point in pairs)
 
 
-class AboutTable(Table):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AboutTable(Telescope):
     """``[instrument]``: the telescope as a whole."""
 
     name: Id
-    """Also the ``{system}`` of the wire unless configured otherwise."""
-
-    diameter_m: Positive
-    """Pupil diameter, metres."""
-
-    obscuration_ratio: float = Field(default=0.0, ge=0.0, lt=1.0)
-    """Linear central obscuration."""
-
-    stop: Named[Stop]
-    """Which element limits the beam."""
-
-    double_pass: bool = False
-    """Whether a measured matrix sees the mirror twice."""
-
     basis_id: Id | None = None
-    """Pins the RTC's basis."""
+    """Pins the RTC's basis; None: the first seen is adopted."""
 
     config_id: Id | None = None
-    """Pins the RTC's sensor configuration."""
+    """Pins the RTC's sensor configuration; None: the first seen is adopted."""
 
 
-class WfsTable(Table):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WfsTable(PyramidNumbers):
     """``[wfs]``: the pyramid sensor."""
 
     kind: Literal["pyramid"]
 
-    n_subapertures: int = Field(ge=4, le=1000)
-    """Subapertures across."""
-
-    pupil_separation_subap: Positive = 36.0
-    """Distance between the centres of neighbouring pupil images, subapertures."""
-
-    wavelength_m: float = Field(gt=1e-7, lt=1e-4)
-    """Sensing wavelength, metres."""
-
-    modulation_lambda_over_d: float = Field(ge=0.0, le=100.0)
-    """Radius of the modulation circle, λ/D."""
-
     valid_subapertures: str = "auto"
     """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
-
-    flux_threshold: float = Field(default=0.5, gt=0.0, le=1.0)
-    """Least flux of a valid subaperture, relative to a full one."""
-
-    pupil_diameter_subap: Positive | None = None
-    """Diameter of the pupil image; None: ``n_subapertures``."""
 
     input: Literal["slopes", "frames"] = "slopes"
     """What the RTC sends."""
@@ -101,7 +80,8 @@ class WfsTable(Table):
     """Frames only."""
 
 
-class MirrorTable(Table):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MirrorTable(InfluenceShape):
     """``[mirror]``: analytic (``layout``) or measured (``modes``, ``influence_functions``)."""
 
     layout: Literal["rings", "grid", "positions"] | None = None
@@ -125,16 +105,10 @@ class MirrorTable(Table):
     positions: str | None = None
     """Positions only: ``path:/dataset`` of ``(n_actuators, 2)``, x and y in metres."""
 
-    influence: Named[Influence] = Influence.THIN_PLATE
-    """Shape of an influence function."""
-
-    coupling: float = Field(default=0.35, gt=0.0, lt=1.0)
-    """Gaussian only: height at the neighbour."""
-
     mode_to_actuator: str | None = None
     """``path:/dataset`` of the user's modes, ``(n_actuators, n_modes)``."""
 
-    basis: Named[BasisKind] = BasisKind.KARHUNEN_LOEVE
+    basis: BasisKind = BasisKind.KARHUNEN_LOEVE
     """Modes of an analytic mirror without ``mode_to_actuator``."""
 
     nominal_rotation_deg: float | None = None
@@ -159,19 +133,6 @@ class MirrorTable(Table):
     """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``."""
 
 
-class ModesTable(Table):
-    """``[modes]``: the Karhunen-Loeve basis of an analytic mirror."""
-
-    n_modes: Count = 594
-    """Modes of the basis."""
-
-    r0_m: Positive = 0.10
-    """Fried parameter at 500 nm, metres."""
-
-    outer_scale_m: Positive = 25.0
-    """Outer scale, metres."""
-
-
 class OrientationTable(Table):
     """``orientation``: how the RTC's slopes map to the conventions' axes."""
 
@@ -185,38 +146,59 @@ class OrientationTable(Table):
 class SlopesTable(Table):
     """``[slopes]``: the RTC's own signals: kind, order, sign and recipe."""
 
-    kind: Named[SignalKind] = SignalKind.XY
+    kind: SignalKind = SignalKind.XY
     """Two slopes for each subaperture, or its four normalised pixels."""
 
-    order: Named[SlopeOrder] | None = None
+    order: SlopeOrder | None = None
     """`xy`, `yx`, `interleaved` of slopes, the others of pixels; None: `xy`, or `images`."""
 
     orientation: Annotated[OrientationTable | None, BeforeValidator(_auto_is_none)] = None
-    normalisation: Named[Normalisation] = Normalisation.GLOBAL
+    normalisation: Normalisation = Normalisation.GLOBAL
     """By the mean flux of a subaperture, or by each one's own: of its four pixels together."""
 
 
-class LoopTable(Table):
-    """``[loop]``: what the RTC's status would say."""
+TABLES: Mapping[str, type] = {
+    "instrument": AboutTable,
+    "wfs": WfsTable,
+    "mirror": MirrorTable,
+    "modes": KarhunenLoeve,
+    "slopes": SlopesTable,
+    "loop": LoopFacts,
+}
+"""The whole file; the first three must be there."""
 
-    frame_rate_hz: Positive | None = None
-    delay_frames: Annotated[float, Field(ge=1.0)] | None = None
-    n_controlled: Count | None = None
+_NEEDED = tuple(TABLES)[:3]
+
+_DEFAULTS: dict[str, Any] = {
+    name: (kind, ... if name in _NEEDED else Field(default_factory=kind))
+    for name, kind in TABLES.items()
+}
+WHOLE = create_model("InstrumentFile", __base__=Table, **_DEFAULTS)
+
+_Table = TypeVar("_Table")
 
 
-class InstrumentFile(Table):
-    """The whole file."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstrumentFile:
+    """The tables of an instrument file, and where it is."""
 
-    instrument: AboutTable
-    wfs: WfsTable
-    mirror: MirrorTable
-    modes: ModesTable = Field(default_factory=ModesTable)
-    slopes: SlopesTable = Field(default_factory=SlopesTable)
-    loop: LoopTable = Field(default_factory=LoopTable)
+    path: Path
+    given: Mapping[str, frozenset[str]]
+    """Keys that are written there, by table."""
+
+    tables: tuple[object, ...]
+
+    def table(self, kind: type[_Table]) -> _Table:
+        """Return what a table says, by what it is read into."""
+        return next(table for table in self.tables if isinstance(table, kind))
+
+    def where(self, key: str) -> str:
+        """Return the file and a key, ``table.key``, for messages."""
+        return f"{self.path}: {key}"
 
 
-def read_instrument_file(name_or_path: str | Path) -> tuple[InstrumentFile, Path]:
-    """Return what the file of a packaged instrument or of a user's own says, and where it is.
+def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
+    """Return what the file of a packaged instrument or of a user's own says.
 
     Raises
     ------
@@ -224,4 +206,10 @@ def read_instrument_file(name_or_path: str | Path) -> tuple[InstrumentFile, Path
         If there is no such file, or one line with the key that cannot be used.
     """
     path = instrument_path(name_or_path)
-    return validated(InstrumentFile, read_toml(path), in_file(path)), path
+    written = read_toml(path)
+    whole = validated(WHOLE, written, in_file(path))
+    return InstrumentFile(
+        path=path,
+        given={name: frozenset(written.get(name, ())) for name in TABLES},
+        tables=tuple(getattr(whole, name) for name in TABLES),
+    )

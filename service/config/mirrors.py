@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config.instrument_schema import MirrorTable
+from service.config.instrument_schema import InstrumentFile, MirrorTable
 from service.config.sources import read_dataset, refuse
 from service.errors import ConfigurationError
+from service.model.described import InfluenceShape
 from service.model.instrument import Mirror, TabulatedModes
 from service.model.kinds import BasisKind, Influence
 from service.model.tabulated import (
@@ -50,23 +50,33 @@ _LARGEST_TABLE = 5.0
 class MirrorFile:
     """The ``[mirror]`` table and what is needed to understand it."""
 
-    table: MirrorTable
-    path: Path
-    """Of the file; references in it are relative to where it lies."""
+    file: InstrumentFile
+    """References in it are relative to where it lies."""
 
+    table: MirrorTable
     diameter_m: float
     """Of the pupil."""
 
     subaperture_m: float
     """Width of a subaperture in the pupil plane."""
 
+    @property
+    def given(self) -> frozenset[str]:
+        """Keys that are written."""
+        return self.file.given["mirror"]
+
+    @property
+    def whole(self) -> str:
+        """The file and the table, for messages."""
+        return self.file.where("mirror")
+
     def where(self, key: str) -> str:
         """Return the file and key, for messages."""
-        return f"{self.path}: mirror.{key}"
+        return self.file.where(f"mirror.{key}")
 
     def read(self, key: str) -> NDArray[np.floating]:
         """Return the array this key refers to, as float32 where it is no finer, else float64."""
-        values = read_dataset(getattr(self.table, key), self.path.parent, self.where(key))
+        values = read_dataset(getattr(self.table, key), self.file.path.parent, self.where(key))
         single = values.dtype.kind == "f" and values.dtype.itemsize <= 4
         return values.astype(np.float32 if single else np.float64, copy=False)
 
@@ -95,10 +105,10 @@ def own_modes(mirror: Mirror | TabulatedModes) -> int | None:
 
 
 def _check_keys(file: MirrorFile) -> None:
-    table, given = file.table, file.table.model_fields_set
+    table, given = file.table, file.given
     kinds = [kind for kind in _KINDS if getattr(table, kind) is not None]
     if len(kinds) != 1:
-        refuse(f"{file.path}: mirror", " and ".join(kinds) or "none of them", f"one of {_listed()}")
+        refuse(file.whole, " and ".join(kinds) or "none of them", f"one of {_listed()}")
     for key in sorted(_FOREIGN[kinds[0]] & given):
         raise ConfigurationError(f"{file.where(key)}: has no meaning beside mirror.{kinds[0]}")
     if table.mode_to_actuator is not None and "basis" in given:
@@ -135,15 +145,14 @@ def _analytic(file: MirrorFile) -> Mirror:
     pair = coincident(positions)
     if pair is not None:
         refuse(
-            f"{file.path}: mirror",
+            file.whole,
             f"actuators {pair[0]} and {pair[1]} in the same place",
             "every actuator in a place of its own",
         )
     return Mirror(
         positions_m=positions,
         pitch_m=table.pitch_m or typical_pitch(positions),
-        influence=table.influence,
-        coupling=table.coupling,
+        shape=InfluenceShape(influence=table.influence, coupling=table.coupling),
         basis=table.basis,
         mode_to_actuator=_mode_to_actuator(file, len(positions)),
         **_mount(table),
@@ -153,13 +162,13 @@ def _analytic(file: MirrorFile) -> Mirror:
 def _check_layout_keys(file: MirrorFile) -> None:
     table = file.table
     foreign = set().union(*_LAYOUT_KEYS.values()) - _LAYOUT_KEYS[str(table.layout)]
-    for key in sorted(foreign & table.model_fields_set):
+    for key in sorted(foreign & file.given):
         owners = [f'"{name}"' for name, keys in _LAYOUT_KEYS.items() if key in keys]
         raise ConfigurationError(
             f"{file.where(key)}: belongs to layout = {' or '.join(owners)}, "
             f'found layout = "{table.layout}"'
         )
-    if "coupling" in table.model_fields_set and table.influence is not Influence.GAUSSIAN:
+    if "coupling" in file.given and table.influence is not Influence.GAUSSIAN:
         raise ConfigurationError(
             f"{file.where('coupling')}: belongs to influence = "
             f'"gaussian", found influence = "{table.influence}"'
@@ -175,14 +184,14 @@ def _rings(file: MirrorFile) -> NDArray[np.float64]:
             f"at least first_ring = {table.first_ring}",
         )
     positions = rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
-    _check_number(len(positions), f"{file.path}: mirror")
+    _check_number(len(positions), file.whole)
     return positions
 
 
 def _grid(file: MirrorFile) -> NDArray[np.float64]:
     n_across, pitch_m, diameter_m = _mandatory(file, ("n_across", "pitch_m", "diameter_m"))
     positions = grid(n_across, pitch_m, diameter_m)
-    _check_number(len(positions), f"{file.path}: mirror")
+    _check_number(len(positions), file.whole)
     return positions
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args, get_origin
 
 from pydantic import Field, model_validator
 
-from service.config.sources import Id, Table, Tuple, in_file, nearest, read_toml, validated
+from service.config.sources import Id, Table, in_file, nearest, read_toml, validated
 from service.errors import ConfigurationError
 
 PREFIX = "PYRCAL_"
@@ -34,10 +34,10 @@ class ServiceTable(Table):
     mode: Literal["auto", "propose", "hold"] = "propose"
     """How much the service may do by itself when it starts."""
 
-    data_dir: Path = Field(default=Path("var"), strict=False)
+    data_dir: Path = Path("var")
     """Where products, index and audit trail live; relative to the working directory."""
 
-    cache_dir: Path | None = Field(default=None, strict=False)
+    cache_dir: Path | None = None
     """Where what takes long to compute and is always the same is kept; it may be deleted at any
     time. None: ``pyrcal`` in the user's cache folder."""
 
@@ -48,10 +48,10 @@ class ServiceTable(Table):
 class ZenohTable(Table):
     """``[zenoh]``: the way to the RTC."""
 
-    listen: Tuple[str] = ("tcp/127.0.0.1:7447",)
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints the embedded router listens on."""
 
-    connect: Tuple[str] = ()
+    connect: tuple[str, ...] = ()
     """Endpoints of an observatory's own routers; not empty: no router is embedded."""
 
     chunk_bytes: int = Field(default=4_000_000, ge=1024, le=4_000_000)
@@ -67,7 +67,7 @@ class ApiTable(Table):
     port: int = Field(default=8080, ge=0, le=65535)
     """TCP port; 0: any free one."""
 
-    allowed_hosts: Tuple[str] = ()
+    allowed_hosts: tuple[str, ...] = ()
     """Names under which it may be asked for besides loopback and ``host``, without a port: that of
     the machine where ``host`` is all of its interfaces, or of a proxy before it."""
 
@@ -96,13 +96,13 @@ class DitherTable(Table):
     amplitude_m: float | None = Field(default=None, gt=0.0, le=1e-7)
     """RMS of each mode, metres OPD; None: the service chooses, within the budget."""
 
-    modes: Tuple[Annotated[int, Field(ge=0)]] | None = None
+    modes: tuple[Annotated[int, Field(ge=0)], ...] | None = None
     """0-based basis indices; None: four the loop does not control."""
 
-    frequencies_hz: Tuple[Positive] | None = None
+    frequencies_hz: tuple[Positive, ...] | None = None
     """One for each mode; None: spread over 0.2-0.35 of the frame rate."""
 
-    avoid_hz: Tuple[Positive] = ()
+    avoid_hz: tuple[Positive, ...] = ()
     """Vibrations to keep clear of besides those that are heard in the slopes."""
 
     window_s: float = Field(default=2.0, ge=0.1, le=60.0)
@@ -233,7 +233,7 @@ class ControlTable(Table):
 
 
 Size = Annotated[float, Field(ge=0.0)]
-FourAxes = Annotated[tuple[Size, Size, Size, Size], Field(strict=False)]
+FourAxes = tuple[Size, Size, Size, Size]
 """Shift x and y in subapertures, rotation in degrees, magnification."""
 
 
@@ -328,7 +328,7 @@ class RuleTable(Table):
     """Name of a value told with ``PUT /v1/values/{name}``, or of a field such as
     ``state.elevation_deg``; how it is compared; with what."""
 
-    blocks: Tuple[Literal["measure", "decide", "send_new", "send_known", "ask"]] = ()
+    blocks: tuple[Literal["measure", "decide", "send_new", "send_known", "ask"], ...] = ()
     """What is forbidden while it holds, as docs/states.md says of alarms."""
 
     severity: Literal["warning", "serious", "critical"] = "serious"
@@ -380,7 +380,7 @@ class Settings(Table):
     compute: ComputeTable = Field(default_factory=ComputeTable)
     fits: FitsTable = Field(default_factory=FitsTable)
     archive: ArchiveTable = Field(default_factory=ArchiveTable)
-    rules: Tuple[RuleTable] = ()
+    rules: tuple[RuleTable, ...] = ()
 
     @model_validator(mode="after")
     def _one_kind_for_each_value(self) -> Settings:

@@ -6,17 +6,17 @@ Whatever is wrong with either is one line that says where, what was found and wh
 from __future__ import annotations
 
 import difflib
+import json
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar, get_args, get_type_hints
 
 from pydantic import (
     BaseModel,
-    BeforeValidator,
     ConfigDict,
-    Field,
     StringConstraints,
     ValidationError,
 )
@@ -48,19 +48,8 @@ class Table(BaseModel):
     )
 
 
-def _as_tuple(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
-
-
-Item = TypeVar("Item")
-Tuple = Annotated[tuple[Item, ...], BeforeValidator(_as_tuple)]
-"""A TOML array, kept as a tuple."""
-
 Id = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
 """An id as the wire allows it."""
-
-Named = Annotated[Item, Field(strict=False)]
-"""One of a list of names."""
 
 Schema = TypeVar("Schema", bound=Table)
 Place = Callable[[tuple[str, ...]], str]
@@ -94,7 +83,8 @@ def validated(schema: type[Schema], data: Mapping[str, Any], place: Place) -> Sc
         One line: where, what was found, what was expected; the first problem of several.
     """
     try:
-        return schema.model_validate(data)
+        # as JSON: arrays become tuples there, and texts names or paths, however strict
+        return schema.model_validate_json(json.dumps(data, default=_in_json))
     except ValidationError as error:
         # a misspelt key is also a missing one: what was written says more
         problems = sorted(
@@ -102,6 +92,11 @@ def validated(schema: type[Schema], data: Mapping[str, Any], place: Place) -> Sc
         )
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise ConfigurationError(_line(schema, problems[0], place) + more) from error
+
+
+def _in_json(value: object) -> object:
+    """Return a path as its text; what else JSON lacks, TOML's dates, as no key takes it."""
+    return str(value) if isinstance(value, Path) else [str(value)]
 
 
 def in_file(path: Path) -> Place:
@@ -167,13 +162,13 @@ def _line(schema: type[Table], problem: ErrorDetails, place: Place) -> str:
     key = tuple(str(part) for part in problem["loc"])
     where = place(key)
     kind, message = problem["type"], problem["msg"]
-    if kind == "extra_forbidden":
+    if kind in {"extra_forbidden", "unexpected_keyword_argument"}:
         return f"{where}: unknown key{nearest(key[-1], _known_keys(schema, key[:-1]))}"
     if kind == "missing":
         return f"{where}: missing, this key is mandatory"
     if kind == "value_error":
         return f"{where}: {message.removeprefix('Value error, ')}"
-    if kind in {"model_type", "model_attributes_type"}:
+    if kind in {"model_type", "dataclass_type"}:
         return f"{where}: found {problem['input']!r}, expected a table [{'.'.join(key)}]"
     if kind == "string_pattern_mismatch":
         message = f"text that matches {problem['ctx']['pattern']}"
@@ -183,11 +178,18 @@ def _line(schema: type[Table], problem: ErrorDetails, place: Place) -> str:
 
 
 def _known_keys(schema: type[Table], key: tuple[str, ...]) -> Iterable[str]:
-    fields = schema.model_fields
+    known = _types_of(schema)
     for part in (part for part in key if not part.isdigit()):
-        annotation = fields[part].annotation
-        alternatives = (annotation, *get_args(annotation))
-        fields = next(
-            a.model_fields for a in alternatives if isinstance(a, type) and issubclass(a, Table)
-        )
-    return fields
+        alternatives = (known[part], *get_args(known[part]))
+        known = next(found for found in map(_types_of, alternatives) if found)
+    return known
+
+
+def _types_of(table: Any) -> Mapping[str, Any]:  # noqa: ANN401  any type, or none
+    """Return the type of each key of a table; none where it is no table."""
+    if isinstance(table, type) and issubclass(table, Table):
+        return {name: field.annotation for name, field in table.model_fields.items()}
+    if is_dataclass(table):
+        hints = get_type_hints(table)
+        return {field.name: hints[field.name] for field in fields(table)}
+    return {}

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from service.control.reconstructor import Inversion, Recipe
 from service.errors import MatrixError, shown
 from service.fit.matrix import Fit, Method
 from service.fit.methods import ScanStep
-from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import (
     BOUNDARY_SCALE,
@@ -447,31 +445,3 @@ def _made_now() -> dict[str, str]:
         "software": f"pyrcal {__version__}",
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-
-
-def instrument_sha256(instrument: Instrument) -> str:
-    """Return the SHA-256 of every field of an instrument, arrays included, as hex.
-
-    Two files that describe the same instrument, one with the defaults spelt out, are the same.
-    """
-    digest = hashlib.sha256()
-    _add(digest, replace(instrument, remarks=()))
-    return digest.hexdigest()
-
-
-def _add(digest: hashlib._Hash, value: object) -> None:
-    if is_dataclass(value):
-        digest.update(f"{type(value).__name__}(".encode())
-        for part in fields(value):
-            digest.update(f"{part.name}=".encode())
-            _add(digest, getattr(value, part.name))
-        digest.update(b")")
-    elif isinstance(value, np.ndarray):
-        digest.update(f"{value.dtype.str}{value.shape}".encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
-    elif isinstance(value, tuple):
-        for item in value:
-            _add(digest, item)
-        digest.update(f"{len(value)};".encode())
-    else:
-        digest.update(f"{value!r};".encode())

@@ -13,11 +13,11 @@ from threadpoolctl import threadpool_limits
 
 from service.errors import MatrixError
 from service.files.container import FLUX_FRAME, Recorded, read_recorded
-from service.files.report import FitReport, instrument_sha256
+from service.files.report import FitReport
 from service.fit.matrix import FitOptions, fit_matrix
 from service.fit.reference import Reference
 from service.model.detector_windows import frame_windows, slopes_from_frames
-from service.model.instrument import FrameWindows, Instrument
+from service.model.instrument import FrameWindows, Instrument, instrument_sha256
 
 Progress = Callable[[str], None]
 

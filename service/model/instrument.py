@@ -1,48 +1,41 @@
-"""What pyrcal knows of an instrument: frozen records, filled from a TOML file elsewhere."""
+"""What pyrcal knows of an instrument: frozen records, filled from a TOML file elsewhere.
+
+What the file says as it is comes from ``service.model.described``; arrays are added here.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.kinds import BasisKind, Influence, Stop
+from service.model.described import (
+    InfluenceShape,
+    KarhunenLoeve,
+    LoopFacts,
+    PyramidNumbers,
+    Telescope,
+)
+from service.model.kinds import BasisKind
 from service.model.misregistration import Misregistration
 from service.model.slopes import SlopeRecipe
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Pyramid:
-    """The modulated pyramid wavefront sensor."""
-
-    n_subapertures: int
-    """Subapertures across the sensor grid."""
-
-    wavelength_m: float
-    """Sensing wavelength, metres."""
-
-    modulation_lambda_over_d: float
-    """Radius of the modulation circle, in λ/D."""
-
-    pupil_separation_subap: float = 36.0
-    """Distance between the centres of neighbouring pupil images, in subapertures."""
-
-    pupil_diameter_subap: float | None = None
-    """Diameter of the pupil image, in subapertures; None: ``n_subapertures``."""
-
-    flux_threshold: float = 0.5
-    """A subaperture is valid when its flux is at least this fraction of a full one."""
+class Pyramid(PyramidNumbers):
+    """The modulated pyramid wavefront sensor, and which of its subapertures are valid."""
 
     valid_subapertures: NDArray[np.bool_] | None = None
     """Mask ``(n_subapertures, n_subapertures)``, [y, x] in the RTC's own axes, as its slopes are
     listed; None: by ``flux_threshold`` at α = 0."""
-
-    @property
-    def pupil_diameter(self) -> float:
-        """Diameter of the pupil image, in subapertures."""
-        return float(self.pupil_diameter_subap or self.n_subapertures)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,9 +71,8 @@ class Mirror(Mount):
     pitch_m: float
     """Typical distance between neighbours, metres in the pupil plane."""
 
-    influence: Influence = Influence.THIN_PLATE
-    coupling: float = 0.35
-    """Gaussian influence functions only: height at a distance of one pitch, 0..1."""
+    shape: InfluenceShape = field(default_factory=InfluenceShape)
+    """Of the influence functions."""
 
     basis: BasisKind = BasisKind.KARHUNEN_LOEVE
     """Modes where ``mode_to_actuator`` is None."""
@@ -115,53 +107,9 @@ class FrameWindows:
     """Detector pixels along a side of a subaperture."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopFacts:
-    """What the RTC's status would say of the loop, for work without an RTC."""
-
-    frame_rate_hz: float | None = None
-    """Frames per second."""
-
-    delay_frames: float | None = None
-    """From a frame to the first one that sees its correction."""
-
-    n_controlled: int | None = None
-    """Modes in the loop, the first ones."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KarhunenLoeve:
-    """The modal basis: Karhunen-Loeve modes of von Karman turbulence in mirror space.
-
-    A basis of the user's own takes only the turbulence from here.
-    """
-
-    n_modes: int = 594
-    """Modes of the basis, controlled or not; of a user's own basis as many as it has."""
-
-    r0_m: float = 0.10
-    """Fried parameter at 500 nm, metres: sets the expected variance of each mode."""
-
-    outer_scale_m: float = 25.0
-    """Outer scale of the turbulence, metres."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Instrument:
+class Instrument(Telescope):
     """One telescope, its mirror and its wavefront sensor."""
-
-    name: str
-    """Also the ``{system}`` of the wire unless configured otherwise."""
-
-    diameter_m: float
-    """Pupil diameter, metres."""
-
-    obscuration_ratio: float = 0.0
-    """Linear central obscuration, 0..1."""
-
-    stop: Stop
-    double_pass: bool = False
-    """Whether a measured matrix of this instrument sees the mirror twice."""
 
     wfs: Pyramid
     mirror: Mirror | TabulatedModes
@@ -207,3 +155,41 @@ class Instrument:
                 "(mirror.layout), whose actuators are known"
             )
         return self.mirror
+
+
+def instrument_sha256(instrument: Instrument) -> str:
+    """Return the SHA-256 of every field of an instrument, arrays included, as hex.
+
+    Two files that describe the same instrument, one with the defaults spelt out, are the same.
+    """
+    digest = hashlib.sha256()
+    _add(digest, replace(instrument, remarks=()))
+    return digest.hexdigest()
+
+
+def _add(digest: hashlib._Hash, value: object) -> None:
+    if is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"{type(value).__name__}(".encode())
+        for name, part in _parts(value):
+            digest.update(f"{name}=".encode())
+            _add(digest, part)
+        digest.update(b")")
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, tuple):
+        for item in value:
+            _add(digest, item)
+        digest.update(f"{len(value)};".encode())
+    else:
+        digest.update(f"{value!r};".encode())
+
+
+def _parts(record: DataclassInstance) -> Iterator[tuple[str, object]]:
+    """Yield fields by name, of an influence function its own: so fits of before know it."""
+    for one in fields(record):
+        value = getattr(record, one.name)
+        if isinstance(value, InfluenceShape):
+            yield from _parts(value)
+        else:
+            yield one.name, value

@@ -103,11 +103,11 @@ Surface = ThinPlate | Gaussian
 def mirror_surface(mirror: Mirror, subaperture_m: float) -> Surface:
     """Return the surface of this mirror in coordinates of subapertures."""
     positions = mirror.positions_m / subaperture_m
-    match mirror.influence:
+    match mirror.shape.influence:
         case Influence.THIN_PLATE:
             return ThinPlate(positions)
         case Influence.GAUSSIAN:
-            return Gaussian(positions, mirror.pitch_m / subaperture_m, mirror.coupling)
+            return Gaussian(positions, mirror.pitch_m / subaperture_m, mirror.shape.coupling)
 
 
 def _offsets(points: Array, centres: Array) -> tuple[Array, Array]:

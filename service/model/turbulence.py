@@ -17,7 +17,8 @@ import scipy
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import Instrument, KarhunenLoeve
+from service.model.described import KarhunenLoeve
+from service.model.instrument import Instrument
 from service.model.pupil import instrument_pupil
 
 Array = NDArray[np.float64]

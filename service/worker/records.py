@@ -124,7 +124,7 @@ def outer_of(model: RtcInteractionModel) -> NDArray[np.float64] | None:
     actuators, mirror = actuators_of(model), model.instrument.mirror
     if actuators is None or not isinstance(mirror, Mirror):
         return None
-    if mirror.influence is not Influence.THIN_PLATE or not mirror.stroke_known:
+    if mirror.shape.influence is not Influence.THIN_PLATE or not mirror.stroke_known:
         return None
     return actuators.strokes[actuators.outer]
 

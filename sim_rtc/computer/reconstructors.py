@@ -245,7 +245,7 @@ def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:
     """Return the names of basis and sensor configuration: they change when either does."""
     mirror, wfs = instrument.analytic_mirror, instrument.wfs
     basis = hashlib.sha256(np.round(mirror.positions_m, 6).tobytes())
-    basis.update(repr((mirror.influence, mirror.coupling, instrument.modes)).encode())
+    basis.update(repr((mirror.shape.influence, mirror.shape.coupling, instrument.modes)).encode())
     kind = "kl"
     if mirror.mode_to_actuator is not None or mirror.basis is not BasisKind.KARHUNEN_LOEVE:
         kind = "own"

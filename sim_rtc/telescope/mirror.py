@@ -202,7 +202,7 @@ def heights(mirror: Mirror, strokes: Array) -> Array:
 
     A thin plate passes through its strokes; Gaussians overlap, and add up to more.
     """
-    if mirror.influence is Influence.THIN_PLATE:
+    if mirror.shape.influence is Influence.THIN_PLATE:
         return strokes
     drawn = mirror_surface(mirror, mirror.pitch_m)
     return np.asarray(

@@ -11,7 +11,7 @@ import pytest
 from service.config import Settings, load_instrument, load_settings
 from service.config.mirrors import coincident, grid, rings, typical_pitch
 from service.errors import ConfigurationError
-from service.model.instrument import LoopFacts
+from service.model.described import LoopFacts
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.kinds import Influence, Normalisation, SignalKind, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
@@ -104,7 +104,7 @@ def test_the_packaged_flao_is_what_the_paper_describes():
     assert (flao.wfs.flux_threshold, flao.wfs.valid_subapertures) == (0.5, None)
     assert flao.mirror.positions_m.shape == (663, 2)
     assert flao.mirror.pitch_m == 0.30
-    assert flao.mirror.influence is Influence.THIN_PLATE
+    assert flao.mirror.shape.influence is Influence.THIN_PLATE
     assert (flao.modes.n_modes, flao.modes.r0_m, flao.modes.outer_scale_m) == (594, 0.10, 25.0)
     assert (flao.basis_id, flao.config_id) == (None, None)
 
@@ -119,7 +119,7 @@ def test_a_users_file_gives_an_instrument(write):
     assert bench.double_pass
     assert (bench.basis_id, bench.config_id) == ("kl-7", "b1")
     assert bench.wfs.pupil_diameter == 19.5
-    assert (bench.mirror.influence, bench.mirror.coupling) == (Influence.GAUSSIAN, 0.2)
+    assert (bench.mirror.shape.influence, bench.mirror.shape.coupling) == (Influence.GAUSSIAN, 0.2)
     assert len(bench.mirror.positions_m) == 97
     assert bench.modes.n_modes == 50
 

@@ -10,7 +10,8 @@ from service.commands.arguments import check_files, command_line, with_negative_
 from service.commands.reconstruct import SAMPLING, main
 from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError
-from service.files.report import document, fill_fit, instrument_sha256
+from service.files.report import document, fill_fit
+from service.model.instrument import instrument_sha256
 from service.model.interaction import InteractionModel
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from service.errors import MatrixError
-from service.files.report import document, fill_fit, instrument_sha256, read_fit
+from service.files.report import document, fill_fit, read_fit
+from service.model.instrument import instrument_sha256
 from service.model.kinds import SlopeOrder, Stop
 from service.model.slopes import Orientation
 from tests.numerics import small_instrument
@@ -83,6 +84,12 @@ def test_another_hdf5_file_is_refused(path):
 
 def test_the_same_instrument_has_the_same_number():
     assert instrument_sha256(small_instrument()) == instrument_sha256(small_instrument())
+
+
+def test_it_has_the_number_that_fits_of_before_know_it_by():
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    told = instrument_sha256(small_instrument(positions_m=corners))
+    assert told == "24097de8dd098eeed652d3a9ce41997aa338ae08b0221ad6d3b8645da98514b0"
 
 
 def test_every_change_of_an_instrument_changes_it():

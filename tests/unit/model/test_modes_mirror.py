@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.config.mirrors import rings
+from service.model.described import InfluenceShape
 from service.model.instrument import Mirror
 from service.model.kinds import Influence
 from service.model.modes import Gaussian, ThinPlate, mirror_surface
@@ -66,7 +67,8 @@ def test_slopes_are_finite_on_the_actuators_and_linear_in_the_direction(surface)
     ("influence", "kind"), [(Influence.THIN_PLATE, ThinPlate), (Influence.GAUSSIAN, Gaussian)]
 )
 def test_a_mirror_in_metres_becomes_a_surface_in_subapertures(influence, kind):
-    mirror = Mirror(positions_m=POSITIONS, pitch_m=1.1, influence=influence, coupling=0.2)
+    shape = InfluenceShape(influence=influence, coupling=0.2)
+    mirror = Mirror(positions_m=POSITIONS, pitch_m=1.1, shape=shape)
     surface = mirror_surface(mirror, subaperture_m=0.5)
     assert isinstance(surface, kind)
     np.testing.assert_allclose(surface.positions, 2 * POSITIONS)
@@ -76,8 +78,7 @@ def test_the_gaussians_pitch_is_scaled_with_the_positions():
     mirror = Mirror(
         positions_m=np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
         pitch_m=1.0,
-        influence=Influence.GAUSSIAN,
-        coupling=0.2,
+        shape=InfluenceShape(influence=Influence.GAUSSIAN, coupling=0.2),
     )
     surface = mirror_surface(mirror, subaperture_m=0.25)
     assert surface.basis(np.array([[4.0, 0.0]]))[0, 0] == pytest.approx(0.2)

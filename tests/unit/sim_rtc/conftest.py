@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
-from service.model.instrument import KarhunenLoeve, Mirror
+from service.model.described import KarhunenLoeve
+from service.model.instrument import Mirror
 from service.model.modes import karhunen_loeve_basis
 
 

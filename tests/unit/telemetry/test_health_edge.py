@@ -9,7 +9,7 @@ import pytest
 import scipy
 
 from service.config.mirrors import rings
-from service.model.instrument import KarhunenLoeve
+from service.model.described import KarhunenLoeve
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.telemetry.health import (
     SLIPPED_RATIO,

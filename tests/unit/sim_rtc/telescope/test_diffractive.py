@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.instrument import KarhunenLoeve
+from service.model.described import KarhunenLoeve
 from service.model.interaction import (
     normalised_jacobian,
     reference_slopes,

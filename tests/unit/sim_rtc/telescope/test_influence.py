@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
+from service.model.described import InfluenceShape
 from service.model.kinds import Influence
 from service.model.misregistration import Misregistration
 from service.model.modes import ThinPlate, karhunen_loeve_basis, mirror_surface
@@ -233,7 +234,7 @@ def test_a_mirror_drawn_with_gaussians_keeps_its_heights_on_the_plate(small_inst
     """Its strokes are not heights: Gaussians overlap, and a plate holds heights."""
     gaussian = replace(
         small_instrument,
-        mirror=replace(small_instrument.mirror, influence=Influence.GAUSSIAN, coupling=0.35),
+        mirror=replace(small_instrument.mirror, shape=InfluenceShape(influence=Influence.GAUSSIAN)),
     )
     basis = karhunen_loeve_basis(gaussian)
     found = plant(gaussian, basis, "--plant", "diffractive")

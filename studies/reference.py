@@ -9,7 +9,7 @@ from typing import Any
 
 from check_rtc.__main__ import check_parser
 from service.commands.arguments import OTHER_PROGRAMS, command_line
-from service.config.instrument_schema import TABLES, WHOLE
+from service.config.instrument_schema import WHOLE
 from service.config.settings import Settings
 from service.config.sources import Table
 from service.tracking.alarms import ALARMS
@@ -19,8 +19,6 @@ from studies.demo.arguments import demo_parser
 Schema = Mapping[str, Any]
 
 _LIMITS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-
-EMPTY: Mapping[str, type] = {}
 
 _HEAD = ("key", "type", "default", "meaning")
 
@@ -53,11 +51,11 @@ def instrument() -> str:
         "the smallest one, and what orientation means. A reference to data is `path:/dataset`, "
         "relative to the file."
     )
-    return page("The instrument file", intro, *_tables(WHOLE, TABLES))
+    return page("The instrument file", intro, *_tables(WHOLE))
 
 
-def _tables(whole: type[Table], records: Mapping[str, type] = EMPTY) -> Iterator[str]:
-    """Yield the sections of a file, each with its keys; some are read into ``records``."""
+def _tables(whole: type[Table]) -> Iterator[str]:
+    """Yield the sections of a file, each with its keys."""
     schema = whole.model_json_schema()
     kinds: dict[str, Schema] = schema["$defs"]
     for section, place in schema["properties"].items():
@@ -67,8 +65,8 @@ def _tables(whole: type[Table], records: Mapping[str, type] = EMPTY) -> Iterator
         about = _text(kind).partition(": ")[2]
         yield about[:1].upper() + about[1:]
         needed = kind.get("required", ())
-        record = records.get(section)
-        told = _told(record) if record is not None and is_dataclass(record) else {}
+        record = whole.model_fields[section].annotation
+        told = _told(record) if isinstance(record, type) and is_dataclass(record) else {}
         yield table(
             _HEAD,
             [

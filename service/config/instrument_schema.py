@@ -157,23 +157,17 @@ class SlopesTable(Table):
     """By the mean flux of a subaperture, or by each one's own: of its four pixels together."""
 
 
-TABLES: Mapping[str, type] = {
+TABLES: Mapping[str, Any] = {
     "instrument": AboutTable,
     "wfs": WfsTable,
     "mirror": MirrorTable,
-    "modes": KarhunenLoeve,
-    "slopes": SlopesTable,
-    "loop": LoopFacts,
+    "modes": (KarhunenLoeve, Field(default_factory=KarhunenLoeve)),
+    "slopes": (SlopesTable, Field(default_factory=SlopesTable)),
+    "loop": (LoopFacts, Field(default_factory=LoopFacts)),
 }
-"""The whole file; the first three must be there."""
+"""What each table is read into, and what it is where it may be left out."""
 
-_NEEDED = tuple(TABLES)[:3]
-
-_DEFAULTS: dict[str, Any] = {
-    name: (kind, ... if name in _NEEDED else Field(default_factory=kind))
-    for name, kind in TABLES.items()
-}
-WHOLE = create_model("InstrumentFile", __base__=Table, **_DEFAULTS)
+WHOLE = create_model("InstrumentFile", __base__=Table, **TABLES)
 
 _Table = TypeVar("_Table")
 

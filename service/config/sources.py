@@ -10,7 +10,7 @@ import json
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar, get_args, get_type_hints
 
@@ -187,9 +187,6 @@ def _known_keys(schema: type[Table], key: tuple[str, ...]) -> Iterable[str]:
 
 def _types_of(table: Any) -> Mapping[str, Any]:  # noqa: ANN401  any type, or none
     """Return the type of each key of a table; none where it is no table."""
-    if isinstance(table, type) and issubclass(table, Table):
-        return {name: field.annotation for name, field in table.model_fields.items()}
-    if is_dataclass(table):
-        hints = get_type_hints(table)
-        return {field.name: hints[field.name] for field in fields(table)}
-    return {}
+    if not (is_dataclass(table) or (isinstance(table, type) and issubclass(table, Table))):
+        return {}
+    return {name: kind for name, kind in get_type_hints(table).items() if name[0] != "_"}

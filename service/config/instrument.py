@@ -12,14 +12,14 @@ from service.config import packaged_file
 from service.config.instrument_schema import (
     AboutTable,
     Centres,
-    InstrumentFile,
     MirrorTable,
+    Section,
     SlopesTable,
     WfsTable,
     read_instrument_file,
 )
-from service.config.mirrors import MirrorFile, own_modes, read_mirror
-from service.config.sources import read_dataset, refuse
+from service.config.mirrors import Pupil, own_modes, read_mirror
+from service.config.sources import refuse
 from service.errors import ConfigurationError, ModelError
 from service.model.described import KarhunenLoeve, LoopFacts, PyramidNumbers
 from service.model.detector_windows import by_quadrant
@@ -49,26 +49,20 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         One line with the file and the key: unknown, missing, of the wrong type, out of range, or
         in contradiction to another.
     """
-    file = read_instrument_file(name_or_path)
-    about = file.table(AboutTable)
-    wfs = _pyramid(file)
-    mirror, remarks = read_mirror(
-        MirrorFile(
-            file=file,
-            table=file.table(MirrorTable),
-            diameter_m=about.diameter_m,
-            subaperture_m=about.diameter_m / wfs.pupil_diameter,
-        )
-    )
-    modes = _modes(file, mirror)
+    section = read_instrument_file(name_or_path).section
+    about, wfs = section(AboutTable).said, section(WfsTable)
+    pupil = Pupil(about.diameter_m, about.diameter_m / wfs.said.pupil_diameter)
+    pyramid = _pyramid(wfs)
+    mirror, remarks = read_mirror(section(MirrorTable), pupil)
+    modes = _modes(section(KarhunenLoeve), mirror)
     return Instrument(
         **asdict(about),
-        wfs=wfs,
+        wfs=pyramid,
         mirror=mirror,
         modes=modes,
-        slopes=_slopes(file),
-        frames=_frames(file),
-        loop=_loop(file, modes.n_modes),
+        slopes=_slopes(section(SlopesTable), wfs.said),
+        frames=_frames(wfs),
+        loop=_loop(section(LoopFacts), modes.n_modes),
         remarks=remarks,
     )
 
@@ -84,11 +78,11 @@ def packaged_instrument(name: str) -> Instrument:
     return load_instrument(packaged_file(name))
 
 
-def _modes(file: InstrumentFile, mirror: Mirror | TabulatedModes) -> KarhunenLoeve:
+def _modes(file: Section[KarhunenLoeve], mirror: Mirror | TabulatedModes) -> KarhunenLoeve:
     """Return the turbulence, and as many modes as the user's basis or ``[modes]`` has."""
-    where, own, table = file.where("modes.n_modes"), own_modes(mirror), file.table(KarhunenLoeve)
+    where, own, table = file.where("n_modes"), own_modes(mirror), file.said
     if own is not None:
-        if "n_modes" in file.given["modes"]:
+        if "n_modes" in file.given:
             refuse(where, f"it beside a basis of its own {own} modes", "it for KL modes only")
         return replace(table, n_modes=own)
     n_max = len(mirror.positions_m) - 1 if isinstance(mirror, Mirror) else 0
@@ -101,11 +95,11 @@ def _modes(file: InstrumentFile, mirror: Mirror | TabulatedModes) -> KarhunenLoe
     return table
 
 
-def _slopes(file: InstrumentFile) -> SlopeRecipe:
-    table = file.table(SlopesTable)
-    if file.table(WfsTable).input == "frames" and "order" in file.given["slopes"]:
+def _slopes(file: Section[SlopesTable], wfs: WfsTable) -> SlopeRecipe:
+    table = file.said
+    if wfs.input == "frames" and "order" in file.given:
         raise ConfigurationError(
-            f'{file.where("slopes.order")}: has no meaning beside wfs.input = "frames", '
+            f'{file.where("order")}: has no meaning beside wfs.input = "frames", '
             "whose slopes are made here"
         )
     orientation = None
@@ -116,20 +110,17 @@ def _slopes(file: InstrumentFile) -> SlopeRecipe:
     orders = table.kind.orders
     order = table.order or orders[0]
     if order not in orders:
-        refuse(
-            file.where("slopes.order"), f'{order} beside kind = "{table.kind}"', " or ".join(orders)
-        )
+        refuse(file.where("order"), f'{order} beside kind = "{table.kind}"', " or ".join(orders))
     return SlopeRecipe(order=order, orientation=orientation, normalisation=table.normalisation)
 
 
-def _frames(file: InstrumentFile) -> FrameWindows | None:
-    table = file.table(WfsTable)
+def _frames(file: Section[WfsTable]) -> FrameWindows | None:
+    table = file.said
     if table.input == "slopes":
         for key in _FRAME_KEYS:
-            if key in file.given["wfs"] and getattr(table, key) != 1:
+            if key in file.given and getattr(table, key) != 1:
                 raise ConfigurationError(
-                    f'{file.where(f"wfs.{key}")}: belongs to input = "frames", '
-                    'found input = "slopes"'
+                    f'{file.where(key)}: belongs to input = "frames", found input = "slopes"'
                 )
         return None
     centres = None
@@ -138,40 +129,40 @@ def _frames(file: InstrumentFile) -> FrameWindows | None:
     return FrameWindows(centres_px=centres, pixels_per_subaperture=table.pixels_per_subaperture)
 
 
-def _by_quadrant(centres_px: Centres, file: InstrumentFile) -> NDArray[np.float64]:
+def _by_quadrant(centres_px: Centres, file: Section[WfsTable]) -> NDArray[np.float64]:
     try:
         return by_quadrant(np.array(centres_px))
     except ModelError as error:
-        raise ConfigurationError(f"{file.where('wfs.pupil_centres_px')}: {error}") from error
+        raise ConfigurationError(f"{file.where('pupil_centres_px')}: {error}") from error
 
 
-def _loop(file: InstrumentFile, n_modes: int) -> LoopFacts | None:
-    if not file.given["loop"]:
+def _loop(file: Section[LoopFacts], n_modes: int) -> LoopFacts | None:
+    if not file.given:
         return None
-    table = file.table(LoopFacts)
+    table = file.said
     if table.n_controlled is not None and table.n_controlled > n_modes:
         refuse(
-            file.where("loop.n_controlled"),
+            file.where("n_controlled"),
             str(table.n_controlled),
             f"at most the {n_modes} modes of the basis",
         )
     return table
 
 
-def _pyramid(file: InstrumentFile) -> Pyramid:
-    table = file.table(WfsTable)
+def _pyramid(file: Section[WfsTable]) -> Pyramid:
+    table = file.said
     diameter, separation = table.pupil_diameter, _separation(file)
     if separation < diameter:
         refuse(
-            file.where("wfs.pupil_separation_subap"),
+            file.where("pupil_separation_subap"),
             f"{separation:g}",
             f"at least the pupil's diameter, {diameter:g} subapertures: the images would overlap",
         )
     mask = None
     if table.valid_subapertures != "auto":
-        if "flux_threshold" in file.given["wfs"]:
+        if "flux_threshold" in file.given:
             raise ConfigurationError(
-                f"{file.where('wfs.flux_threshold')}: has no meaning beside a mask file "
+                f"{file.where('flux_threshold')}: has no meaning beside a mask file "
                 "(wfs.valid_subapertures): remove one of the two"
             )
         mask = _mask(file)
@@ -179,30 +170,29 @@ def _pyramid(file: InstrumentFile) -> Pyramid:
     return Pyramid(**optics | {"pupil_separation_subap": separation}, valid_subapertures=mask)
 
 
-def _separation(file: InstrumentFile) -> float:
+def _separation(file: Section[WfsTable]) -> float:
     """Return the images' distance: as given, or as the images on the frames lie."""
-    table = file.table(WfsTable)
+    table = file.said
     stated = table.pupil_separation_subap
     if table.pupil_centres_px is None or table.input == "slopes":
         return stated
     centres = _by_quadrant(table.pupil_centres_px, file)
     sides = (centres[1, :, 0] - centres[0, :, 0], centres[:, 1, 1] - centres[:, 0, 1])
     measured = float(np.mean(sides)) / table.pixels_per_subaperture
-    if "pupil_separation_subap" not in file.given["wfs"]:
+    if "pupil_separation_subap" not in file.given:
         return measured
     if abs(measured / stated - 1.0) > _SEPARATION_TOLERANCE:
         refuse(
-            file.where("wfs.pupil_separation_subap"),
+            file.where("pupil_separation_subap"),
             f"{stated:g}",
             f"about {measured:.1f}, the distance of wfs.pupil_centres_px",
         )
     return stated
 
 
-def _mask(file: InstrumentFile) -> NDArray[np.bool_]:
-    table, where = file.table(WfsTable), file.where("wfs.valid_subapertures")
-    values = read_dataset(table.valid_subapertures, file.path.parent, where)
-    n = table.n_subapertures
+def _mask(file: Section[WfsTable]) -> NDArray[np.bool_]:
+    where, n = file.where("valid_subapertures"), file.said.n_subapertures
+    values = file.array("valid_subapertures")
     if values.shape != (n, n):
         refuse(where, f"shape {values.shape}", f"(n_subapertures, n_subapertures) = ({n}, {n})")
     if not np.isin(values, (0, 1)).all():

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import BeforeValidator, Field, create_model
 
 from service.config import instrument_path
-from service.config.sources import Id, Table, in_file, read_toml, validated
+from service.config.sources import Id, Table, in_file, read_dataset, read_toml, validated
 from service.model.described import (
     Count,
     InfluenceShape,
@@ -21,6 +21,9 @@ from service.model.described import (
     Telescope,
 )
 from service.model.kinds import BasisKind, Normalisation, SignalKind, SlopeOrder
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 Sign = Literal[-1, 1]
 Pixel = Annotated[float, Field(ge=0.0)]
@@ -169,26 +172,40 @@ TABLES: Mapping[str, Any] = {
 
 WHOLE = create_model("InstrumentFile", __base__=Table, **TABLES)
 
-_Table = TypeVar("_Table")
+Said = TypeVar("Said")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InstrumentFile:
-    """The tables of an instrument file, and where it is."""
+@dataclass(frozen=True, slots=True)
+class Section(Generic[Said]):
+    """A table of a file, as it is read and as it is written."""
+
+    said: Said
+    given: frozenset[str]
+    """Keys that are written."""
 
     path: Path
-    given: Mapping[str, frozenset[str]]
-    """Keys that are written there, by table."""
+    """Of the file; references are relative to where it lies."""
 
-    tables: tuple[object, ...]
-
-    def table(self, kind: type[_Table]) -> _Table:
-        """Return what a table says, by what it is read into."""
-        return next(table for table in self.tables if isinstance(table, kind))
+    name: str
 
     def where(self, key: str) -> str:
-        """Return the file and a key, ``table.key``, for messages."""
-        return f"{self.path}: {key}"
+        """Return the file and key, for messages."""
+        return f"{self.path}: {self.name}.{key}"
+
+    def array(self, key: str) -> NDArray[Any]:
+        """Return the array that a key refers to."""
+        return read_dataset(getattr(self.said, key), self.path.parent, self.where(key))
+
+
+@dataclass(frozen=True, slots=True)
+class InstrumentFile:
+    """An instrument file by its tables."""
+
+    sections: tuple[Section[Any], ...]
+
+    def section(self, kind: type[Said]) -> Section[Said]:
+        """Return the table that is read into this."""
+        return next(section for section in self.sections if isinstance(section.said, kind))
 
 
 def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
@@ -203,7 +220,8 @@ def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
     written = read_toml(path)
     whole = validated(WHOLE, written, in_file(path))
     return InstrumentFile(
-        path=path,
-        given={name: frozenset(written.get(name, ())) for name in TABLES},
-        tables=tuple(getattr(whole, name) for name in TABLES),
+        tuple(
+            Section(getattr(whole, name), frozenset(written.get(name, ())), path, name)
+            for name in TABLES
+        )
     )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config.instrument_schema import InstrumentFile, MirrorTable
-from service.config.sources import read_dataset, refuse
+from service.config.instrument_schema import MirrorTable, Section
+from service.config.sources import refuse
 from service.errors import ConfigurationError
 from service.model.described import InfluenceShape
 from service.model.instrument import Mirror, TabulatedModes
@@ -46,43 +45,21 @@ _LARGEST_TABLE = 5.0
 """Width of a table in pupil diameters, beyond which its pitch is in another unit."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MirrorFile:
-    """The ``[mirror]`` table and what is needed to understand it."""
+MirrorSection = Section[MirrorTable]
 
-    file: InstrumentFile
-    """References in it are relative to where it lies."""
 
-    table: MirrorTable
+class Pupil(NamedTuple):
+    """What a mirror is seen in."""
+
     diameter_m: float
-    """Of the pupil."""
-
     subaperture_m: float
     """Width of a subaperture in the pupil plane."""
 
-    @property
-    def given(self) -> frozenset[str]:
-        """Keys that are written."""
-        return self.file.given["mirror"]
 
-    @property
-    def whole(self) -> str:
-        """The file and the table, for messages."""
-        return self.file.where("mirror")
-
-    def where(self, key: str) -> str:
-        """Return the file and key, for messages."""
-        return self.file.where(f"mirror.{key}")
-
-    def read(self, key: str) -> NDArray[np.floating]:
-        """Return the array this key refers to, as float32 where it is no finer, else float64."""
-        values = read_dataset(getattr(self.table, key), self.file.path.parent, self.where(key))
-        single = values.dtype.kind == "f" and values.dtype.itemsize <= 4
-        return values.astype(np.float32 if single else np.float64, copy=False)
-
-
-def read_mirror(file: MirrorFile) -> tuple[Mirror | TabulatedModes, tuple[str, ...]]:
-    """Return the mirror, and what its owner should be told about it.
+def read_mirror(
+    file: MirrorSection, pupil: Pupil
+) -> tuple[Mirror | TabulatedModes, tuple[str, ...]]:
+    """Return the mirror of a pupil, and what its owner should be told about it.
 
     Raises
     ------
@@ -90,9 +67,16 @@ def read_mirror(file: MirrorFile) -> tuple[Mirror | TabulatedModes, tuple[str, .
         One line: a key that contradicts another, is missing, or whose array cannot be used.
     """
     _check_keys(file)
-    if file.table.layout is not None:
+    if file.said.layout is not None:
         return _analytic(file), ()
-    return _tabulated(file)
+    return _tabulated(file, pupil)
+
+
+def _read(file: MirrorSection, key: str) -> NDArray[np.floating]:
+    """Return the array a key refers to, as float32 where it is no finer, else float64."""
+    values = file.array(key)
+    single = values.dtype.kind == "f" and values.dtype.itemsize <= 4
+    return values.astype(np.float32 if single else np.float64, copy=False)
 
 
 def own_modes(mirror: Mirror | TabulatedModes) -> int | None:
@@ -104,11 +88,11 @@ def own_modes(mirror: Mirror | TabulatedModes) -> int | None:
     return len(mirror.positions_m) if mirror.basis is BasisKind.ZONAL else None
 
 
-def _check_keys(file: MirrorFile) -> None:
-    table, given = file.table, file.given
+def _check_keys(file: MirrorSection) -> None:
+    table, given = file.said, file.given
     kinds = [kind for kind in _KINDS if getattr(table, kind) is not None]
     if len(kinds) != 1:
-        refuse(file.whole, " and ".join(kinds) or "none of them", f"one of {_listed()}")
+        refuse(f"{file.path}: mirror", " and ".join(kinds) or "none of them", f"one of {_listed()}")
     for key in sorted(_FOREIGN[kinds[0]] & given):
         raise ConfigurationError(f"{file.where(key)}: has no meaning beside mirror.{kinds[0]}")
     if table.mode_to_actuator is not None and "basis" in given:
@@ -130,22 +114,22 @@ def _mount(table: MirrorTable) -> dict[str, Any]:
     }
 
 
-def _opd(file: MirrorFile, heights: NDArray[np.floating]) -> NDArray[np.floating]:
+def _opd(file: MirrorSection, heights: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return what a wavefront sees of these heights: twice a surface."""
-    return heights * heights.dtype.type(2) if file.table.modes_kind == "surface" else heights
+    return heights * heights.dtype.type(2) if file.said.modes_kind == "surface" else heights
 
 
 # --- analytic
 
 
-def _analytic(file: MirrorFile) -> Mirror:
-    table = file.table
+def _analytic(file: MirrorSection) -> Mirror:
+    table = file.said
     _check_layout_keys(file)
     positions = _LAYOUTS[str(table.layout)](file)
     pair = coincident(positions)
     if pair is not None:
         refuse(
-            file.whole,
+            f"{file.path}: mirror",
             f"actuators {pair[0]} and {pair[1]} in the same place",
             "every actuator in a place of its own",
         )
@@ -159,8 +143,8 @@ def _analytic(file: MirrorFile) -> Mirror:
     )
 
 
-def _check_layout_keys(file: MirrorFile) -> None:
-    table = file.table
+def _check_layout_keys(file: MirrorSection) -> None:
+    table = file.said
     foreign = set().union(*_LAYOUT_KEYS.values()) - _LAYOUT_KEYS[str(table.layout)]
     for key in sorted(foreign & file.given):
         owners = [f'"{name}"' for name, keys in _LAYOUT_KEYS.items() if key in keys]
@@ -175,8 +159,8 @@ def _check_layout_keys(file: MirrorFile) -> None:
         )
 
 
-def _rings(file: MirrorFile) -> NDArray[np.float64]:
-    table = file.table
+def _rings(file: MirrorSection) -> NDArray[np.float64]:
+    table = file.said
     if table.last_ring < table.first_ring:
         refuse(
             file.where("last_ring"),
@@ -184,21 +168,21 @@ def _rings(file: MirrorFile) -> NDArray[np.float64]:
             f"at least first_ring = {table.first_ring}",
         )
     positions = rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
-    _check_number(len(positions), file.whole)
+    _check_number(len(positions), f"{file.path}: mirror")
     return positions
 
 
-def _grid(file: MirrorFile) -> NDArray[np.float64]:
+def _grid(file: MirrorSection) -> NDArray[np.float64]:
     n_across, pitch_m, diameter_m = _mandatory(file, ("n_across", "pitch_m", "diameter_m"))
     positions = grid(n_across, pitch_m, diameter_m)
-    _check_number(len(positions), file.whole)
+    _check_number(len(positions), f"{file.path}: mirror")
     return positions
 
 
-def _listed_positions(file: MirrorFile) -> NDArray[np.float64]:
+def _listed_positions(file: MirrorSection) -> NDArray[np.float64]:
     where = file.where("positions")
     _mandatory(file, ("positions",))
-    values = file.read("positions")
+    values = _read(file, "positions")
     if values.ndim != 2 or values.shape[1] != 2:
         turned = " (it looks transposed)" if values.ndim == 2 and len(values) == 2 else ""
         refuse(where, f"shape {values.shape}{turned}", "(n_actuators, 2), x and y in metres")
@@ -208,21 +192,20 @@ def _listed_positions(file: MirrorFile) -> NDArray[np.float64]:
     return values.astype(np.float64)
 
 
-_LAYOUTS: dict[str, Callable[[MirrorFile], NDArray[np.float64]]] = {
+_LAYOUTS: dict[str, Callable[[MirrorSection], NDArray[np.float64]]] = {
     "rings": _rings,
     "grid": _grid,
     "positions": _listed_positions,
 }
 
 
-def _mandatory(file: MirrorFile, keys: tuple[str, ...]) -> tuple[Any, ...]:
+def _mandatory(file: MirrorSection, keys: tuple[str, ...]) -> tuple[Any, ...]:
     for key in keys:
-        if getattr(file.table, key) is None:
+        if getattr(file.said, key) is None:
             raise ConfigurationError(
-                f"{file.where(key)}: missing, "
-                f'layout = "{file.table.layout}" needs {", ".join(keys)}'
+                f'{file.where(key)}: missing, layout = "{file.said.layout}" needs {", ".join(keys)}'
             )
-    return tuple(getattr(file.table, key) for key in keys)
+    return tuple(getattr(file.said, key) for key in keys)
 
 
 def _check_number(n_actuators: int, where: str) -> None:
@@ -230,11 +213,11 @@ def _check_number(n_actuators: int, where: str) -> None:
         refuse(where, f"{n_actuators} actuators", "at least 4: tip, tilt and something to correct")
 
 
-def _mode_to_actuator(file: MirrorFile, n_actuators: int) -> NDArray[np.float64] | None:
-    if file.table.mode_to_actuator is None:
+def _mode_to_actuator(file: MirrorSection, n_actuators: int) -> NDArray[np.float64] | None:
+    if file.said.mode_to_actuator is None:
         return None
     where = file.where("mode_to_actuator")
-    values = file.read("mode_to_actuator")
+    values = _read(file, "mode_to_actuator")
     expected = f"({n_actuators} actuators, n_modes)"
     if values.ndim != 2 or len(values) != n_actuators:
         turned = values.ndim == 2 and values.shape[1] == n_actuators
@@ -311,33 +294,33 @@ def _nearest(positions_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDA
 # --- measured
 
 
-def _tabulated(file: MirrorFile) -> tuple[TabulatedModes, tuple[str, ...]]:
-    key = "modes" if file.table.modes is not None else "influence_functions"
-    if file.table.modes_pitch_m is None:
+def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple[str, ...]]:
+    key = "modes" if file.said.modes is not None else "influence_functions"
+    if file.said.modes_pitch_m is None:
         raise ConfigurationError(
             f"{file.where('modes_pitch_m')}: missing, mirror.{key} needs the step of its grid"
         )
-    cube = file.read(key)
+    cube = _read(file, key)
     if cube.ndim != 3 or min(cube.shape) < 1:
         refuse(file.where(key), f"shape {cube.shape}", "(n, ny, nx), one table for each")
     known = known_samples(cube)
-    _check_table(file, key, known, file.table.modes_pitch_m)
-    remarks = _remarks(file, key, known, file.table.modes_pitch_m)
+    _check_table(file, pupil, key, known, file.said.modes_pitch_m)
+    remarks = _remarks(file, pupil, key, known, file.said.modes_pitch_m)
     cube = np.where(known, cube, cube.dtype.type(0))
     if key == "influence_functions":
         cube = _combined(file, cube)
     modes = TabulatedModes(
         cube=_opd(file, cube),
-        pitch_m=file.table.modes_pitch_m,
+        pitch_m=file.said.modes_pitch_m,
         known=known,
-        **_mount(file.table),
+        **_mount(file.said),
     )
     return modes, remarks
 
 
-def _combined(file: MirrorFile, cube: NDArray[np.floating]) -> NDArray[np.floating]:
+def _combined(file: MirrorSection, cube: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the modes that influence functions make."""
-    if file.table.basis is BasisKind.ZONAL:
+    if file.said.basis is BasisKind.ZONAL:
         return cube
     strokes = _mode_to_actuator(file, len(cube))
     if strokes is None:
@@ -348,8 +331,10 @@ def _combined(file: MirrorFile, cube: NDArray[np.floating]) -> NDArray[np.floati
     return np.tensordot(strokes.T.astype(cube.dtype), cube, axes=1)
 
 
-def _check_table(file: MirrorFile, key: str, known: NDArray[np.bool_], pitch_m: float) -> None:
-    density = file.subaperture_m / pitch_m
+def _check_table(
+    file: MirrorSection, pupil: Pupil, key: str, known: NDArray[np.bool_], pitch_m: float
+) -> None:
+    density = pupil.subaperture_m / pitch_m
     if density < LEAST_POINTS_PER_SUBAPERTURE:
         refuse(
             file.where("modes_pitch_m"),
@@ -357,14 +342,14 @@ def _check_table(file: MirrorFile, key: str, known: NDArray[np.bool_], pitch_m: 
             f"at least {LEAST_POINTS_PER_SUBAPERTURE:g}, "
             f"{ENOUGH_POINTS_PER_SUBAPERTURE:g} for 0.5 %",
         )
-    width = max(known.shape) * pitch_m / file.diameter_m
+    width = max(known.shape) * pitch_m / pupil.diameter_m
     if width > _LARGEST_TABLE:
         refuse(
             file.where("modes_pitch_m"),
             f"{pitch_m:g} m, a table of {width:.3g} pupil diameters",
             f"at most {_LARGEST_TABLE:g}: is it in metres of the pupil plane?",
         )
-    covered = known.sum() * pitch_m**2 / (np.pi / 4 * file.diameter_m**2)
+    covered = known.sum() * pitch_m**2 / (np.pi / 4 * pupil.diameter_m**2)
     if covered < 0.5:
         refuse(
             file.where(key),
@@ -375,10 +360,10 @@ def _check_table(file: MirrorFile, key: str, known: NDArray[np.bool_], pitch_m: 
 
 
 def _remarks(
-    file: MirrorFile, key: str, known: NDArray[np.bool_], pitch_m: float
+    file: MirrorSection, pupil: Pupil, key: str, known: NDArray[np.bool_], pitch_m: float
 ) -> tuple[str, ...]:
     remarks = []
-    density = file.subaperture_m / pitch_m
+    density = pupil.subaperture_m / pitch_m
     if density < ENOUGH_POINTS_PER_SUBAPERTURE:
         remarks.append(
             f"{file.where('modes_pitch_m')}: {density:.2g} table points per subaperture; below "

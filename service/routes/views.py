@@ -284,7 +284,9 @@ _FOUR: Schema = {
 
 def beside_the_four(schema: Schema) -> None:
     """Add the four parameters of a registration to the keys they lie beside."""
-    schema["properties"] = _FOUR["properties"] | schema["properties"]
+    four = _FOUR["properties"].items()
+    titled = {name: {**said, "title": name.replace("_", " ").title()} for name, said in four}
+    schema["properties"] = titled | schema["properties"]
     schema["required"] = [*PARAMETERS, *schema["required"]]
 
 

@@ -36,7 +36,7 @@ LATENCIES: Final = 1024
 TAKE_FRAMES: Final = 512
 """Frames copied under one hold of the lock, so that ingest never waits for long."""
 
-LEFT_AS_THEY_CAME: Final = 32
+LEFT_AS_THEY_CAME: Final = 16
 """Batches that nobody has looked at; each is done many times as quickly right after another one."""
 
 STATUS_INTERVAL_S: Final = 0.45

@@ -39,6 +39,10 @@ LOOK_LIMIT = 26.9
 that both are normalised by is itself learnt, from some forty looks (four times F of 4 and 156, at
 half of that)."""
 
+LOOK_BIAS = np.array([0.0, 0.0, 0.0, 4.0])
+"""By how many times its own scatter a look may be off, beside what is known of its bias: where 60
+modes look through bad seeing its magnification is 2 to 5 times that too large, every time."""
+
 SCATTERED = 1.5
 """How much more windows scatter than they say, in variance, that is no chance: twenty windows that
 tell it scatter by 0.1 themselves, and one that was put aside adds a quarter."""
@@ -162,12 +166,13 @@ def wholly_after(first: Seen, reading: Reading, old: Misregistration, policy: Po
 def look_surprise(known: Registration, joint: Joint, reading: Reading, policy: Policy) -> float:
     """Return the same of a passive look, its bias allowed for; ``joint`` is at ``known``'s time."""
     before = known.bias.earlier if known.bias is not None else None
-    found = []
+    found, off = [], LOOK_BIAS**2 * np.diag(reading.covariance)
     for earlier in (sum_of(known, joint), before):
         if earlier is not None:
             elapsed_s = max(reading.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
             fading = -np.expm1(-2.0 * elapsed_s / policy.bias_memory_s)
-            found.append(_surprise(earlier, reading, policy, BIAS_FLOOR**2 * fading).innovation)
+            forgot = BIAS_FLOOR**2 * fading + off
+            found.append(_surprise(earlier, reading, policy, forgot).innovation)
     return max(found)
 
 

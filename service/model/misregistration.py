@@ -84,7 +84,7 @@ class Misregistration:
     def from_vector(cls, vector: NDArray[np.float64]) -> Self:
         """Build from a numeric 4-vector (shape ``(4,)``, rotation in radians)."""
         names = (field.name for field in fields(cls))
-        return cls(**dict(zip(names, vector.tolist(), strict=True)))
+        return cls(**{name: float(v) for name, v in zip(names, vector, strict=True)})
 
     @classmethod
     def from_boundary(cls, values: dict[str, float]) -> Self:

@@ -23,7 +23,7 @@ from tests.unit.runtime.small import (
 )
 from tests.unit.runtime.test_workbench import ALPHA, MODES, dithered_window
 
-AT_WORK = replace(COMPUTE, working_point_modes=N_CONTROLLED)
+AT_WORK = replace(COMPUTE, sampling=COMPUTE.sampling._replace(working_point_modes=N_CONTROLLED))
 
 
 @pytest.fixture(autouse=True)
@@ -48,7 +48,7 @@ def on_sky(strength):
         instrument,
         n_controlled=N_CONTROLLED,
         r0_m=instrument.modes.r0_m * strength**-0.6,
-        sampling=COMPUTE.pupil_sampling,
+        sampling=COMPUTE.sampling.pupil,
     )
     other = OpticsWorker(instrument, COMPUTE)
     other._model = RtcInteractionModel(instrument, other._model.basis, halo=halo)

@@ -96,3 +96,27 @@ def pole_radius(
     else:
         companion[..., 0, order - 1] -= values
     return np.asarray(np.abs(np.linalg.eigvals(companion)).max(axis=-1))
+
+
+def amplification(
+    gain: NDArray[np.float64], frequency: NDArray[np.float64], *, leak: float, delay_frames: float
+) -> NDArray[np.float64]:
+    """Return what the loop makes of what is added to its commands, of the shape of both together.
+
+    With ``c[k+d] = leak c[k+d-1] - gain (c + u)[k]`` the mirror moves by ``u / (1 + L)``,
+    ``L = gain z^-d / (1 - leak z^-1)``; a fractional delay is shared as in ``pole_radius``.
+
+    Parameters
+    ----------
+    gain
+        Of the loop, the sensor's own included.
+    frequency
+        Over the frame rate.
+    leak, delay_frames
+        As a status tells them.
+    """
+    late = np.exp(-2j * np.pi * np.asarray(frequency))
+    whole = int(np.floor(delay_frames))
+    share = delay_frames - whole
+    delayed = late**whole * ((1.0 - share) + share * late)
+    return np.asarray(1.0 / np.abs(1.0 + gain * delayed / (1.0 - leak * late)))

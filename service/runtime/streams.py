@@ -23,7 +23,7 @@ from service.telemetry.lockin import LockIn, Spectra
 from service.telemetry.loopcheck import ENOUGH_SAMPLES, SAMPLES_PER_S, LoopCheck, Obedience
 from service.telemetry.looplaw import LoopLaw
 from service.telemetry.passive import Passive
-from service.telemetry.played import Finding, Meter, measured
+from service.telemetry.played import Finding, Meter, asked_anew, measured
 from service.telemetry.probation import Comparison
 from service.telemetry.random_dither import Correlated, RandomDither
 from service.telemetry.windows import ClosedLoop, Telemetry, WindowRefused
@@ -170,6 +170,9 @@ def with_rtc(streams: Streams, rtc: Status | None) -> Streams:
     known = in_loop[in_loop < streams.description.n_modes]
     still = np.setdiff1d(np.arange(rtc.n_controlled), known)
     streams = replace(streams, in_loop=known, still=still)
+    if streams.dither is not None and streams.meter is not None:
+        asked = asked_of(streams.dither, rtc, streams.description.products)
+        streams = replace(streams, meter=asked_anew(streams.meter, asked))
     streams = _watching_the_edge(streams, rtc)
     # frames that are on their way may have been made by the loop as it was
     streams = replace(streams, check=LoopCheck(from_seq=last_seq(rtc) + 1), off=None, obeyed_seq=0)

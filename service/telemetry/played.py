@@ -28,6 +28,10 @@ LEAST_FRAMES = 50
 LOUDER, WEAKER = 1.25, 0.5
 """Of what was asked for: a mode that is beyond is named."""
 
+AMPLIFIED = 3.0
+"""Times what its column says a mode may carry that the loop has just begun to control: its status
+tells so up to a second later than the frames show it."""
+
 STRAY = 0.2
 """Share of what was asked for in all that modes nobody asked for may carry together."""
 
@@ -70,7 +74,8 @@ class Asked:
     """First frame that holds it, and the first that holds it no more."""
 
     own: tuple[bool, ...]
-    """Whether a mode is outside the loop: all that its command does is the dither."""
+    """Whether a mode is outside the loop: all that its command does is the dither. In the loop it
+    is amplified, and its column alone tells how strong it is."""
 
     response: tuple[float, ...] = ()
     """Of each mode, the sum of the squares of the slopes it makes, per metre²; empty: not known."""
@@ -126,6 +131,9 @@ class Meter:
     n_repeated: int = 0
     """Frames with the very slopes of the frame before."""
 
+    doubted: bool = False
+    """Whether the second before held what the loop may have made of modes outside it."""
+
     powers: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of the slopes on the lines, its variance, and what is expected, summed until it can be told
     whether they answer."""
@@ -141,6 +149,11 @@ def measured(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
         meter, new = _added(meter, block.rows(start, end))
         start, found = end, new or found
     return meter, found
+
+
+def asked_anew(meter: Meter, asked: Asked) -> Meter:
+    """Return the meter of the same dither whose modes have come into the loop, or left it."""
+    return meter if asked.own == meter.asked.own else Meter(asked=asked)
 
 
 def _enough(asked: Asked) -> int:
@@ -165,10 +178,11 @@ def _added(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
         return meter, None
     powers = _powers(meter)
     unanswered = _unanswered(powers, asked)
-    begun = Meter(asked=asked, last_m=meter.last_m, next_seq=meter.next_seq)
+    found, doubted = _found(meter)
+    begun = Meter(asked=asked, last_m=meter.last_m, next_seq=meter.next_seq, doubted=doubted)
     if unanswered is None:
         begun = replace(begun, powers=powers)
-    return begun, replace(_found(meter), unanswered=unanswered)
+    return begun, replace(found, unanswered=unanswered)
 
 
 def _demodulated(meter: Meter, block: FrameBlock, dither: Array) -> tuple[Meter, Array]:
@@ -247,16 +261,22 @@ def _unanswered(powers: tuple[float, float, float], asked: Asked) -> str | None:
     )
 
 
-def _found(meter: Meter) -> Finding:
+def _found(meter: Meter) -> tuple[Finding, bool]:
+    """Return what a second of frames holds, and whether the loop may have made it of its dither."""
     asked = meter.asked
     rms = np.sqrt(meter.squares / meter.n_frames)
     wanted, modes = np.array(asked.amplitude_m), list(asked.modes)
     told, moved = np.abs(meter.lines) * np.sqrt(2.0) / meter.n_frames
-    carried, rate_hz = rms[modes], asked.frame_rate_hz
+    carried, own, doubted = rms[modes], np.array(asked.own), False
     if asked.frequency_hz:
-        moved = moved / np.abs(2.0 * np.sin(np.pi * np.array(asked.frequency_hz) / rate_hz))
+        fraction = np.array(asked.frequency_hz) / asked.frame_rate_hz
+        moved = moved / np.abs(2.0 * np.sin(np.pi * fraction))
+        beyond = own & (moved > LOUDER * told)
+        doubted = bool(np.any(beyond & (moved <= AMPLIFIED * told)))
+        if doubted and not meter.doubted:
+            own = own & (moved > AMPLIFIED * told)
         # a mode of the loop answers the dither: there its column alone tells how strong it is
-        carried = np.maximum(carried, np.where(asked.own, moved, 0.0))
+        carried = np.maximum(carried, np.where(own, moved, 0.0))
     stray = rms.copy()
     stray[modes] = 0.0
     total = float(np.sqrt(np.sum(carried**2) + np.sum(stray**2)))
@@ -264,11 +284,11 @@ def _found(meter: Meter) -> Finding:
     said = [
         *_off(asked, carried, wanted, told),
         *_strays(stray, wanted_total),
-        *_hidden(asked, told, moved),
+        *_hidden(asked, own, told, moved),
     ]
     head = f"the frames hold {1e9 * total:.3g} nm RMS of dither in all, {1e9 * wanted_total:.3g} nm"
     text = f"{head} were asked for: {'; '.join(said)}" if said else ""
-    return Finding(found_m=total, asked_m=wanted_total, text=text)
+    return Finding(found_m=total, asked_m=wanted_total, text=text), doubted
 
 
 def _off(asked: Asked, carried: Array, wanted: Array, told: Array) -> list[str]:
@@ -297,12 +317,12 @@ def _strays(stray: Array, wanted_m: float) -> list[str]:
     return [f"modes nobody asked for ({named}{more}) carry {1e9 * together:.3g} nm"]
 
 
-def _hidden(asked: Asked, told: Array, moved: Array) -> list[str]:
+def _hidden(asked: Asked, own: Array, told: Array, moved: Array) -> list[str]:
     """Return which modes outside the loop move more than the columns of the dither say."""
     if not asked.frequency_hz:
         return []
     much = moved > LOUDER * told + WEAKER * np.array(asked.amplitude_m)
-    hidden = np.flatnonzero(np.array(asked.own) & much)
+    hidden = np.flatnonzero(own & much)
     return [
         f"the commands of mode {asked.modes[k]} hold {1e9 * moved[k]:.3g} nm at "
         f"{asked.frequency_hz[k]:g} Hz, its dither column {1e9 * told[k]:.3g} nm"

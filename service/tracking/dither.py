@@ -84,7 +84,7 @@ def choose_dither(turn: Turn, rtc: Status) -> None:
     )
     _show(turn, wish.phase, wish.reason)
     if dither is not None:
-        _end_when_done(turn, dither, wish)
+        _end_when_done(turn, rtc, dither, wish)
     elif not _adopt(turn, rtc):
         _begin(turn, rtc, wish)
 
@@ -335,8 +335,8 @@ def _ask(turn: Turn, rtc: Status, wish: Wish) -> None:
     ask_for(turn, dither)
 
 
-def _end_when_done(turn: Turn, dither: Dither, wish: Wish) -> None:
-    """Stop a dither that has done its work, or is too weak for what has come up meanwhile."""
+def _end_when_done(turn: Turn, rtc: Status, dither: Dither, wish: Wish) -> None:
+    """Stop a dither that has done its work, or is no longer the one to ask for."""
     left_s = dither.request.duration_s - (turn.now_ns - dither.asked_ns_utc) / SECOND_NS
     deaf = dither.id == turn.dithering.stopped_id
     if dither.start_seq is None or left_s < SOON_OVER_S or deaf:
@@ -345,11 +345,12 @@ def _end_when_done(turn: Turn, dither: Dither, wish: Wish) -> None:
     pause_s = (wish.next_ns_utc - turn.now_ns) / SECOND_NS
     done = seen and wish.phase is DitherPhase.SPARSE and pause_s >= dither_plan.SHORTEST_PAUSE_S
     weak = wish.phase is DitherPhase.ACQUIRE and 2.0 * total_m(dither.request) < wish.choice.total_m
-    if done or weak:
+    moved = dither_plan.why_moved(dither, rtc, turn.policy)
+    if done or weak or moved:
         # the next one must not overtake the command to stop
         turn.put_off(dither_s=1.0)
-        weakness = "" if done else " is too weak"
-        turn.log("dither.stopped", f"{dither.id}{weakness}: {wish.reason}")
+        weakness = "" if done or moved else " is too weak"
+        turn.log("dither.stopped", f"{dither.id}{weakness}: {moved or wish.reason}")
         make_way(turn)
 
 

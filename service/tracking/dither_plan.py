@@ -15,12 +15,14 @@ from service.control.dither import (
     tabulated,
 )
 from service.tracking.alarms import Act
+from service.tracking.dither_modes import controlled, expected_amplification, why_elsewhere
 from service.tracking.dither_request import (
     OUR_DITHERS,
     OWN_DITHER,
     SETTLING_S,
     SPARE_S,
     Choice,
+    Dither,
     DitherPhase,
     DitherPlan,
     n_lines,
@@ -112,7 +114,7 @@ def by_hand(turn: Turn, rtc: Status) -> Choice:
     policy, plan = turn.policy, turn.dithering.plan
     window_s = policy.window_s if plan is None else plan.window_s
     lasting_s = policy.dither_duration_s - SETTLING_S - SPARE_S
-    return _choice(turn, budget_m(rtc, policy), window_s, lasting_s)
+    return _choice(turn, quiet_budget_m(rtc, policy), window_s, lasting_s)
 
 
 def _choice(turn: Turn, total_m: float, window_s: float, lasting_s: float) -> Choice:
@@ -158,6 +160,25 @@ def budget_m(rtc: Status, policy: Policy) -> float:
     return float(min(policy.dither_budget_m, largest * np.sqrt(max(n, 1))))
 
 
+def quiet_budget_m(rtc: Status, policy: Policy) -> float:
+    """Return the same of what is asked for: the loop amplifies a dither of its own modes."""
+    quiet_m = policy.dither_budget_m / expected_amplification(rtc, policy)
+    return float(min(budget_m(rtc, policy), quiet_m))
+
+
+def why_moved(dither: Dither, rtc: Status, policy: Policy) -> str:
+    """Return why another dither should take the place of one that runs; empty: it is as it should.
+
+    It was asked for when fewer modes were controlled.
+    """
+    elsewhere = why_elsewhere(dither.request, rtc, policy)
+    if elsewhere or not controlled(dither.request.modes, rtc):
+        return elsewhere
+    if total_m(dither.request) <= CHANGE * quiet_budget_m(rtc, policy):
+        return ""
+    return "the loop controls its modes now and amplifies it: a weaker one is asked for"
+
+
 def window_lengths_s(policy: Policy) -> tuple[float, ...]:
     """Return how long a window may be, shortest first."""
     lengths = [policy.window_s * step for step in WINDOW_LADDER]
@@ -169,7 +190,7 @@ def _demand(turn: Turn, rtc: Status, kappa: NDArray[np.float64]) -> Demand:
     demand = Demand(
         sigma=policy.dither_sigma,
         drift_rate=np.sqrt(np.maximum(_walk_rate(turn), _SLOWEST**2)),
-        budget_m=budget_m(rtc, policy),
+        budget_m=quiet_budget_m(rtc, policy),
         window_s=policy.window_s,
         window_sigma=JUMP / STANDS_OUT,
         longest_s=policy.longest_pause_s,

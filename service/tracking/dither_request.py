@@ -8,26 +8,19 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.dither import (
-    SPAN,
-    Schedule,
-    clear_of,
-    most_telling,
-)
+from service.control.dither import Schedule, clear_of
 from service.errors import CommandError, ModelError
 from service.telemetry.comb import SIDE_OFFSETS_HZ
 from service.telemetry.lockin import LockInPlan
 from service.telemetry.played import Asked
 from service.telemetry.random_dither import FRAMES_PER_MODE, RandomPlan
+from service.tracking.dither_modes import LINE_RANGE, N_LINES, chosen_modes
 from service.tracking.policy import Policy
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, Status
 
 LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
 """Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""
-
-LINE_RANGE = (0.2, 0.35)
-"""Of the frame rate, where lines may go to keep clear of vibrations."""
 
 CLEARANCES_HZ = (21.0, 8.0)
 """Between a line and a vibration: beyond the side bins that measure the noise, or at least beyond
@@ -47,8 +40,6 @@ ACQUIRING_DITHER = "acquire-"
 noisy interaction matrix, and one that finds α from nothing."""
 
 OUR_DITHERS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
-
-_N_LINES = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,12 +115,10 @@ def plan_dither(
     """Return the dither to ask for: what is not given is the policy's own choice.
 
     The lines are rounded to whole periods in a window. The modes are ones the loop does not and
-    will not control: nothing there amplifies the dither or the noise.
+    will not control, where there are such: nothing there amplifies the dither or the noise.
     """
     asked = any(wish is not None for wish in (modes, amplitude_m, frequency_hz, duration_s))
-    chosen = (modes or policy.dither_modes or _uncontrolled_modes(rtc, policy))[
-        : rtc.max_dither_modes
-    ]
+    chosen = (modes or chosen_modes(rtc, policy))[: rtc.max_dither_modes]
     lines = frequency_hz or policy.dither_frequencies_hz
     if lines is None:
         lines = clear_lines(rtc, len(chosen), choice)
@@ -210,7 +199,7 @@ def clear_lines(rtc: Status, n_lines: int, choice: Choice) -> tuple[float, ...]:
         return last
     rate, step = rtc.frame_rate_hz, _step_hz(rtc, choice.window_s)
     fractions = LINE_FRACTIONS[:n_lines]
-    if n_lines > _N_LINES:
+    if n_lines > N_LINES:
         fractions = tuple(np.linspace(*LINE_RANGE, n_lines).tolist())
     wanted = tuple(fraction * rate for fraction in fractions)
     edge = float(SIDE_OFFSETS_HZ.max()) + step
@@ -232,28 +221,12 @@ def on_vibrations(dither: Dither, avoid_hz: tuple[float, ...]) -> tuple[float, .
 
 def n_lines(rtc: Status, policy: Policy) -> int:
     """Return how many modes the service dithers by itself."""
-    return min(len(policy.dither_modes or range(_N_LINES)), rtc.max_dither_modes)
+    return min(len(policy.dither_modes or range(N_LINES)), rtc.max_dither_modes)
 
 
 def _step_hz(rtc: Status, window_s: float) -> float:
     """Return the frequency of one period in a window."""
     return rtc.frame_rate_hz / max(round(window_s * rtc.frame_rate_hz), 1)
-
-
-def _uncontrolled_modes(rtc: Status, policy: Policy) -> tuple[int, ...]:
-    """Return the four most telling modes above the controlled ones, or the highest four there are.
-
-    Until the model is known they are spread evenly.
-    """
-    first = max(rtc.n_controlled, min(policy.n_modes_target, rtc.n_modes))
-    spare = rtc.n_modes - first
-    if spare < _N_LINES:
-        return tuple(range(max(rtc.n_modes - _N_LINES, 0), rtc.n_modes))
-    if policy.mode_information is not None:
-        above = range(first, min(first + SPAN, rtc.n_modes))
-        return most_telling(policy.mode_information, above, _N_LINES, policy.dither_sigma)
-    step = max(1, min(20, spare // (_N_LINES + 1)))
-    return tuple(first + step // 2 + step * line for line in range(_N_LINES))
 
 
 RANDOM_TOTAL_M = 5e-9

@@ -697,3 +697,42 @@ def test_estimators_follow_the_rtc_again_after_a_look_that_fails(streams, monkey
         engine.feed([block(0)])
     engine.hear(replace(RTC, session="s2"))
     assert engine.streams.rtc.session == "s2"
+
+
+class TestModesThatComeIntoTheLoop:
+    """A dithered mode that is controlled from now on is amplified by the loop: no fault of it."""
+
+    RAISED = replace(RTC, n_controlled=8, gains=(0.4,) * 8, seq=1049)
+
+    def amplified(self, first_seq, by=1.34):
+        """100 frames in which the loop answers the dither of mode 6."""
+        plain = block(first_seq, scale=1e-12)
+        commands = plain.commands_m.copy()
+        commands[:, 6] += (by - 1.0) * plain.dither_m[:, 6]
+        return replace(plain, commands_m=commands)
+
+    def heard(self, streams, first_seq, n_blocks, **changes):
+        found = []
+        for index in range(n_blocks):
+            streams, _ = fed(streams, self.amplified(first_seq + 100 * index, **changes))
+            found.append(streams.played.text if streams.played else "")
+        return streams, found
+
+    @pytest.mark.parametrize("late_by", [1, 5, 9])
+    def test_what_the_loop_makes_of_it_is_no_excess_however_late_the_status_says(
+        self, streams, late_by
+    ):
+        streams, before = self.heard(streams, 0, 10, by=1.0)
+        streams, meanwhile = self.heard(streams, 1000, late_by)
+        streams, after = self.heard(with_rtc(streams, self.RAISED), 1000 + 100 * late_by, 40)
+        assert not any([*before, *meanwhile, *after])
+        assert streams.played.found_m == pytest.approx(5e-9, rel=0.01)
+
+    def test_a_mode_that_no_status_tells_of_is_named_by_two_seconds(self, streams):
+        _, found = self.heard(streams, 0, 20)
+        assert not any(found[:19])
+        assert "mode 6 carries 6.7 nm instead of 5 nm" in found[19]
+
+    def test_what_no_loop_makes_of_it_is_named_by_one(self, streams):
+        _, found = self.heard(streams, 0, 10, by=4.0)
+        assert "mode 6 carries 20 nm instead of 5 nm" in found[9]

@@ -1,0 +1,91 @@
+"""Which modes the service dithers by itself, and what the loop makes of one that it controls."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.control.dither import SPAN, most_telling
+from service.control.loop import amplification
+from service.tracking.policy import Policy
+from service.wire import DitherRequest, Status
+
+N_LINES = 4
+"""Modes that are dithered at once."""
+
+LINE_RANGE = (0.2, 0.35)
+"""Of the frame rate, where lines may go to keep clear of vibrations."""
+
+_OPTICAL_GAINS = (0.25, 0.5, 0.75, 1.0)
+"""How much of its gain a loop on sky may have: nobody knows which when a dither is planned."""
+
+_FREQUENCIES = np.linspace(*LINE_RANGE, 16)
+
+
+def chosen_modes(rtc: Status, policy: Policy) -> tuple[int, ...]:
+    """Return the modes to dither: those of the settings, or the ones that tell most.
+
+    These are four above the controlled modes, or the highest four where fewer are left; until the
+    model is known they are spread evenly.
+    """
+    fixed = _without_choice(rtc, policy)
+    if fixed is not None:
+        return fixed
+    first = _first_free(rtc, policy)
+    if policy.mode_information is not None:
+        above = range(first, min(first + SPAN, rtc.n_modes))
+        return most_telling(policy.mode_information, above, N_LINES, policy.dither_sigma)
+    step = max(1, min(20, (rtc.n_modes - first) // (N_LINES + 1)))
+    return tuple(first + step // 2 + step * line for line in range(N_LINES))
+
+
+def controlled(modes: tuple[int, ...], rtc: Status) -> tuple[int, ...]:
+    """Return which of these modes the loop moves by itself."""
+    if rtc.loop == "open":
+        return ()
+    return tuple(mode for mode in modes if mode < rtc.n_controlled and rtc.gains[mode])
+
+
+def expected_amplification(rtc: Status, policy: Policy) -> float:
+    """Return how much more than was asked for a dither puts on the mirror; 1: on free modes.
+
+    The loop sees a dither of its own modes and answers it: at 0.2 to 0.35 of the frame rate with
+    a delay of two frames it adds to it. The most that it makes of any line, on any sky.
+    """
+    fixed = _without_choice(rtc, policy)
+    modes = () if fixed is None else controlled(fixed, rtc)
+    if not modes:
+        return 1.0
+    gains = np.outer([rtc.gains[mode] for mode in modes], _OPTICAL_GAINS).ravel()
+    found = amplification(
+        gains[:, None], _FREQUENCIES, leak=rtc.leak, delay_frames=max(rtc.delay_frames, 1.0)
+    )
+    return max(float(found.max()), 1.0)
+
+
+def why_elsewhere(request: DitherRequest, rtc: Status, policy: Policy) -> str:
+    """Return why a dither of the service's should go to modes that are still free; empty: it stays.
+
+    More modes may be controlled than when it was asked for.
+    """
+    inside = controlled(request.modes, rtc)
+    if not inside:
+        return ""
+    fixed = _without_choice(rtc, policy)
+    if fixed is not None and len(controlled(fixed, rtc)) >= len(inside):
+        return ""
+    named = ", ".join(str(mode) for mode in inside)
+    return f"the loop controls modes {named} now: others are free"
+
+
+def _without_choice(rtc: Status, policy: Policy) -> tuple[int, ...] | None:
+    """Return the modes to dither where there is no choice; None: there is."""
+    if policy.dither_modes:
+        return policy.dither_modes[: rtc.max_dither_modes]
+    if rtc.n_modes - _first_free(rtc, policy) >= N_LINES:
+        return None
+    return tuple(range(max(rtc.n_modes - N_LINES, 0), rtc.n_modes))
+
+
+def _first_free(rtc: Status, policy: Policy) -> int:
+    """Return the first mode that the loop neither controls nor is going to."""
+    return max(rtc.n_controlled, min(policy.n_modes_target, rtc.n_modes))

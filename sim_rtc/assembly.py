@@ -108,10 +108,7 @@ def build_telescope(
     """
     check_supported(instrument)
     n_modes = instrument.modes.n_modes
-    if options.n_controlled > n_modes:
-        raise ConfigurationError(
-            f"--n-controlled: found {options.n_controlled}; {instrument.name} has {n_modes} modes"
-        )
+    n_controlled = options.n_controlled(n_modes)
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
     basis = binned_basis(instrument, _modes(instrument), options.binning)
     instrument = binned(instrument, options.binning)
@@ -147,13 +144,13 @@ def build_telescope(
         optics=optics,
         detector=detector,
         identity=identity,
-        reconstructor=initial_reconstructor(instrument, basis, identity, options.n_controlled),
+        reconstructor=initial_reconstructor(instrument, basis, identity, n_controlled),
         settings=LoopSettings(
             frame_rate_hz=options.frame_rate_hz,
             delay_frames=options.delay_frames,
             gains=by_group(options.group_gains or (options.gain,) * 3, n_modes),
             leak=options.leak,
-            n_controlled_next=options.n_controlled,
+            n_controlled_next=n_controlled,
         ),
         weights=plant.weights,
         mode_to_actuator=basis.mode_to_actuator,

@@ -222,8 +222,10 @@ class Options:
     delay_frames: int = option(
         "--delay FRAMES", "from an exposure to the command that answers it", count(1, 10), default=2
     )
-    n_controlled: int = option(
-        "--n-controlled N", "modes in the loop at the start", count(1), default=400
+    given_n_controlled: int | None = option(
+        "--n-controlled N",
+        "modes in the loop at the start (default: 400, or seven tenths of all if fewer)",
+        count(1),
     )
     influence_cube: str | None = option(
         "--influence FILE:/DATASET",
@@ -338,6 +340,23 @@ class Options:
         """Of every mode; by day, when a command counts twice, half of it makes the same loop."""
         usual = 0.2 if self._by_day else 0.4
         return usual if self.given_gain is None else self.given_gain
+
+    def n_controlled(self, n_modes: int) -> int:
+        """Return how many of an instrument's modes are in the loop at the start.
+
+        Raises
+        ------
+        ConfigurationError
+            If more were asked for than there are.
+        """
+        if self.given_n_controlled is None:
+            return min(400, max(1, 7 * n_modes // 10))
+        if self.given_n_controlled > n_modes:
+            raise ConfigurationError(
+                f"--n-controlled: found {self.given_n_controlled}; {self.instrument} has "
+                f"{n_modes} modes"
+            )
+        return self.given_n_controlled
 
     @property
     def speed(self) -> float:
@@ -456,6 +475,7 @@ class Options:
         if self.preset is not None:
             preset = asdict(preset_for(self.magnitude))
             del preset["faintest"]
+            preset["given_n_controlled"] = preset.pop("n_controlled")
             chosen = replace(self, **preset)
         for name, value in vars(Options).items():
             if isinstance(value, property):

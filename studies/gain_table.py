@@ -32,7 +32,8 @@ def measured(seeing: float, n_frames: int) -> tuple[NDArray[np.float64], float]:
     words = f"--plant diffractive --alpha 0,0,0,1 --seed 3 --mag 8 --seeing {seeing}"
     options = parse_options(words.split())
     telescope = telescope_of(options)
-    run = closed_loop(telescope, np.full(options.n_controlled, RUN_GAIN, np.float32), n_frames)
+    gains = np.full(len(telescope.reconstructor.matrix), RUN_GAIN, np.float32)
+    run = closed_loop(telescope, gains, n_frames)
     return optical_gains(run, MODES), 1e9 * run.error_m(telescope.weights)
 
 

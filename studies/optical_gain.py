@@ -159,7 +159,8 @@ def main() -> None:
     n_frames = round(given.seconds * options.frame_rate_hz)
     with threadpool_limits(1):
         telescope = telescope_of(options)
-        n_modes, n_controlled = len(telescope.settings.gains), options.n_controlled
+        n_modes = len(telescope.settings.gains)
+        n_controlled = len(telescope.reconstructor.matrix)
         first = closed_loop(telescope, np.full(n_controlled, RUN_GAIN, np.float32), n_frames)
         spread = np.geomspace(1, n_modes - 1, 24).astype(np.intp)
         modes = np.unique(np.append(spread, [mode for mode in PROTOTYPE if mode < n_modes]))

@@ -85,9 +85,10 @@ def main() -> None:
                 f"--plant diffractive --imperfections {given.truth} --seed {seed} "
                 f"--seeing {given.seeing}".split()
             )
-            gains = np.full(options.n_controlled, GAIN, dtype=np.float32)
+            telescope = telescope_of(options)
+            gains = np.full(len(telescope.reconstructor.matrix), GAIN, dtype=np.float32)
             n_frames = round(given.seconds * options.frame_rate_hz)
-            run = closed_loop(telescope_of(options), gains, n_frames)
+            run = closed_loop(telescope, gains, n_frames)
             residuals = run.residual_m[SETTLED_FRAMES::SNAPSHOT_FRAMES]
             still = np.zeros_like(residuals[:1])
             alpha, n_modes = run.optics.alpha, instrument.modes.n_modes

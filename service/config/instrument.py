@@ -86,6 +86,9 @@ def _modes(file: Section[KarhunenLoeve], mirror: Mirror | TabulatedModes) -> Kar
             refuse(where, f"it beside a basis of its own {own} modes", "it for KL modes only")
         return replace(table, n_modes=own)
     n_max = len(mirror.positions_m) - 1 if isinstance(mirror, Mirror) else 0
+    if "n_modes" not in file.given:
+        # of the last modes the actuators make the sensor sees little, and the model says less
+        return replace(table, n_modes=min(table.n_modes, 9 * n_max // 10))
     if table.n_modes > n_max:
         refuse(
             where,

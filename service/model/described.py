@@ -94,7 +94,8 @@ class KarhunenLoeve(Read):
     """
 
     n_modes: Count = 594
-    """Modes of the basis, controlled or not; of a user's own basis as many as it has."""
+    """Modes of the basis, controlled or not; of a user's own basis as many as it has. Left out:
+    no more than nine tenths of what the actuators make."""
 
     r0_m: Positive = 0.10
     """Fried parameter at 500 nm, metres."""

@@ -131,6 +131,11 @@ def test_only_the_mandatory_keys_are_needed_for_rings(write):
     assert bench.modes.n_modes == 594
 
 
+def test_a_smaller_mirror_has_nine_tenths_of_its_modes_unless_told(write):
+    """97 actuators make 96 modes without piston; FLAO's file has 594 of 662."""
+    assert load_instrument(write(ABOUT + WFS + MIRROR)).modes.n_modes == 86
+
+
 def test_positions_come_from_a_dataset_beside_the_file(write, tmp_path):
     positions = grid(5, 1.0, 6.0)
     with h5py.File(tmp_path / "act.h5", "w") as file:
@@ -217,7 +222,7 @@ def test_values_that_ask_for_nothing_new_are_accepted(write):
             "mirror: found 1 actuators, expected",
         ),
         (
-            ABOUT + WFS + MIRROR,
+            ABOUT + WFS + MIRROR + "[modes]\nn_modes = 594\n",
             "modes.n_modes: found 594, expected at most 96: 97 actuators make 96 modes",
         ),
         (ABOUT + WFS + '[mirror]\nlayout = "positions"\n', "mirror.positions: missing"),

@@ -9,7 +9,8 @@ from sim_rtc.options import parse_options
 def test_the_defaults_are_one_arcsecond_400_modes_and_a_secret_registration():
     options = parse_options([])
     assert (options.seeing.start_arcsec, options.magnitude, options.gain) == (1.0, 8.0, 0.4)
-    assert (options.delay_frames, options.n_controlled, options.frame_rate_hz) == (2, 400, 1000.0)
+    assert (options.delay_frames, options.frame_rate_hz) == (2, 1000.0)
+    assert [options.n_controlled(n_modes) for n_modes in (594, 90)] == [400, 63]
     assert options.alpha is None
     assert options.connect == "tcp/127.0.0.1:7447"
     (layer,) = options.layers

@@ -44,7 +44,7 @@ def test_the_diffractive_plant_takes_its_time_unless_told_otherwise():
 
 def test_a_preset_follows_the_magnitude():
     options = parse_options(["--preset", "flao", "--mag", "12", "--plant", "diffractive"])
-    assert (options.frame_rate_hz, options.n_controlled) == (800.0, 153)
+    assert (options.frame_rate_hz, options.n_controlled(594)) == (800.0, 153)
     assert options.binning == 2
 
 

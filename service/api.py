@@ -29,12 +29,14 @@ from service.routes import (
     problems,
     reading,
     recordings,
+    refits,
     session,
     stream,
     views,
 )
 from service.routes.admission import OPEN, SCHEMES, Admission, Hosts, needs, scope_of
 from service.routes.connections import Once, Traced, server_config
+from service.routes.unchanged import NOT_MODIFIED, Unchanged
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 
@@ -115,6 +117,7 @@ def create_app(
         redoc_url=None,
         routes=_routes(with_fits=desk is not None),
     )
+    app.add_middleware(Unchanged)
     app.add_middleware(Once)
     app.add_middleware(
         Admission, hosts=hosts or Hosts(), keys=keys, audit=lambda entry: service.audit(entry)
@@ -142,6 +145,7 @@ def _routes(*, with_fits: bool) -> list[BaseRoute]:
         recordings.router,
         stream.router,
         page.router,
+        refits.router,
         commands.router,
         commands.observatory,
         matrices.router,
@@ -165,6 +169,9 @@ class _Application(FastAPI):
             document["components"]["schemas"] |= schemas | self._tell_bodies(document)
             document["components"]["securitySchemes"] = SCHEMES
             self._tell_scopes(document)
+            for operations in document["paths"].values():
+                for method, operation in operations.items():
+                    _tell_operation(method, operation, document["components"]["schemas"])
         return super().openapi()
 
     def _tell_bodies(self, document: dict[str, Any]) -> dict[str, views.Schema]:
@@ -190,6 +197,37 @@ class _Application(FastAPI):
                 scope = scope_of(route, method)
                 security = OPEN if scope is None else needs(scope)
                 document["paths"][route.path_format][method.lower()] |= security
+
+
+def _tell_operation(method: str, operation: dict[str, Any], schemas: dict[str, Any]) -> None:
+    """Say in one line what an operation does, what its answers are, and which are not sent again.
+
+    FastAPI's own summary is the name of a function.
+    """
+    first, _, rest = operation["description"].partition("\n\n")
+    operation["summary"] = " ".join(first.split()).rstrip(".")
+    operation["description"] = rest or first
+    answers = operation["responses"]
+    for found in answers.values():
+        contents = found.get("content", {}).values()
+        names = [one["schema"].get("$ref", "").rpartition("/")[2] for one in contents]
+        if found["description"] == "Successful Response":
+            told = schemas.get(names[0], {}) if names else {}
+            found["description"] = told.get("description", "Done").partition("\n\n")[0]
+        if any(name.endswith("AcceptedView") for name in names):
+            found["headers"] = {"Location": _LOCATION}
+    kept = answers.get("200", {}).get("content", {}).keys()
+    if method == "get" and kept & _HAVE_TAGS:
+        answers["304"] = NOT_MODIFIED
+
+
+_HAVE_TAGS = {"application/json", *numbers.MEDIA_TYPES.values()}
+"""Kinds of answers with an ETag."""
+
+_LOCATION = {
+    "description": "Where to look for what was begun",
+    "schema": {"type": "string", "format": "uri-reference"},
+}
 
 
 def _operation_id(route: APIRoute) -> str:

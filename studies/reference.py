@@ -183,8 +183,8 @@ def rest(described: Schema) -> str:
     by_tag: dict[str, list[tuple[str, str]]] = {}
     for path, operations in described["paths"].items():
         for method, operation in operations.items():
-            text = operation.get("description", "").partition("\n\n")[0]
-            row = (f"`{method.upper()} {path}`", " ".join(text.replace("``", "`").split()))
+            text = f"{operation['summary']}.".replace("``", "`")
+            row = (f"`{method.upper()} {path}`", text)
             by_tag.setdefault(operation["tags"][0], []).append(row)
     parts = []
     for tag, rows in by_tag.items():

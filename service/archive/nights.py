@@ -140,6 +140,13 @@ class Nights:
         )
         return tuple(map(_entry, reversed(rows) if newest else rows))
 
+    def n_estimates(self, first_ns: int, last_ns: int) -> int:
+        """Return how many estimates there are of a time, both ends included."""
+        ((n_there,),) = self._asked(
+            "SELECT count(*) FROM estimate WHERE t_ns_utc BETWEEN ? AND ?", (first_ns, last_ns)
+        )
+        return int(n_there)
+
     def thinned(self, first_ns: int, last_ns: int, n_points: int) -> tuple[HistoryEntry, ...]:
         """Return at most so many estimates of a time, oldest first.
 

@@ -23,7 +23,7 @@ SENT_WITHIN_S = 30.0
 
 _ON_ITS_WAY = {"proposed", "published", "staged"}
 _UNDER_WAY = _ON_ITS_WAY | {"waiting", "asked", "running", "finishing"}
-_WELL = {"applied", "superseded", "stored"}
+_WELL = {"applied", "superseded", "stored", "made"}
 
 
 class Step(NamedTuple):

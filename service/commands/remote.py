@@ -258,8 +258,9 @@ REQUESTS = (
         "refit",
         "compute a reconstructor for the alpha of now",
         "POST /v1/refit",
-        words("--n-modes N", "to control; default: as many as now", type=int),
+        *(words("--n-modes N", "to control; default: as many as now", type=int), _NO_WAIT),
         body="n_modes",
+        follows="/v1/refits/{id}",
     ),
     _orders(
         "abort", "end an acquisition under way", "POST /v1/acquisition", always={"action": "abort"}

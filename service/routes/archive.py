@@ -69,7 +69,7 @@ async def pin(client: ClientDep, product_id: ProductId, said: Said) -> AcceptedV
     made = Pin(id=product_id, who=entry.who, why=entry.why)
     await run_in_threadpool(client.service.archive.pin, made)
     client.service.audit(entry)
-    return AcceptedView(text=f"{product_id} is kept for ever", links=_LINKS)
+    return client.accepted(f"{product_id} is kept for ever", archive="/v1/archive")
 
 
 @router.delete("/archive/{id}/pin", status_code=202, responses=UNKNOWN)
@@ -79,10 +79,7 @@ async def unpin(client: ClientDep, product_id: ProductId, said: Said) -> Accepte
     client.service.audit(
         client.caller.entry("archive.unpinned", product_id, by=said.by, why=said.reason)
     )
-    return AcceptedView(text=f"{product_id} goes when it is old", links=_LINKS)
-
-
-_LINKS = {"archive": "/v1/archive"}
+    return client.accepted(f"{product_id} goes when it is old", archive="/v1/archive")
 
 
 # --- the audit trail: who ordered what, when, why and from where, and what it was answered

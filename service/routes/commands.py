@@ -15,6 +15,7 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Discriminator, TypeAdapter, ValidationError
 from pydantic_core import from_json
+from starlette.datastructures import MutableHeaders
 
 from service.errors import StaleError, UntaggedError
 from service.routes.admission import caller_of
@@ -36,7 +37,6 @@ from service.tracking.commands import (
     MuteTime,
     Publish,
     Ramp,
-    Refit,
     Reject,
     Resume,
     Rollback,
@@ -249,6 +249,9 @@ class Client:
     strict: bool
     """Whether an order that decides about something is refused without them."""
 
+    headers: MutableHeaders
+    """Of the answer."""
+
     async def orders(self, command: Command, **links: str) -> AcceptedView:
         """Hand a command on; say what was done, and where to look for what becomes of it."""
         return await self._orders(command, self.caller, links)
@@ -276,14 +279,20 @@ class Client:
             by = f"{command.by} ({caller.key})" if command.by else caller.key
             command = replace(command, by=by)
         text = await self.service.submit(command, caller)
-        links = {"state": "/v1/state", "events": "/v1/events", **links}
+        usual = {"state": "/v1/state", "events": "/v1/events"}
+        accepted = self.accepted(text, **(links or usual))
+        return accepted.model_copy(update={"links": usual | links})
+
+    def accepted(self, text: str, **links: str) -> AcceptedView:
+        """Return what came of an order; the first link is where to look for what was begun."""
+        self.headers["Location"] = next(iter(links.values()))
         return AcceptedView(text=text, links=links)
 
 
-async def _client_of(request: Request, service: ServiceDep) -> Client:
+async def _client_of(request: Request, response: Response, service: ServiceDep) -> Client:
     sent = request.headers
     strict = "handling=strict" in sent.get("prefer", "").replace(" ", "").lower()
-    return Client(service, caller_of(request), sent.get("if-match"), strict)
+    return Client(service, caller_of(request), sent.get("if-match"), strict, response.headers)
 
 
 ClientDep = Annotated[Client, Depends(_client_of)]
@@ -297,12 +306,6 @@ def _link(matrix_id: str) -> str:
 _ALL = "/v1/reconstructors"
 
 AlarmName = Annotated[str, Path(max_length=128)]
-
-
-@router.post("/refit", status_code=202)
-async def refit(client: ClientDep, command: Annotated[Refit, body(Refit)]) -> AcceptedView:
-    """Compute a reconstructor for the current registration; gate and mode apply as always."""
-    return await client.orders(command, reconstructors=_ALL)
 
 
 @router.post("/dither", status_code=202)

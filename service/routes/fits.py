@@ -18,7 +18,16 @@ from service.files import parse_alpha, parse_modes
 from service.files.uploads import FitAsked, FitJob, FitState
 from service.fit.matrix import FitOptions, Method
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.routes.views import ServiceDep, answer, beside_the_four, known, picture, shows, view
+from service.routes.views import (
+    SCHEMAS,
+    ServiceDep,
+    answer,
+    beside_the_four,
+    known,
+    picture,
+    shows,
+    view,
+)
 from service.runtime.uploads import FitQueue
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
@@ -193,6 +202,7 @@ async def fit(
     request: Request,
     service: ServiceDep,
     fits: FitsDep,
+    response: Response,
     parameters: Annotated[FitParameters, Query()],
     content_length: Annotated[int | None, Header(ge=0)] = None,
 ) -> FitAcceptedView:
@@ -210,7 +220,9 @@ async def fit(
         body, content_length = _kept(content), len(content)
     name = parameters.name or parameters.measurement or ""
     job = await fits.take(parameters.asked(), body, content_length, name)
-    return FitAcceptedView(id=job.id, links={"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"})
+    links = {"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"}
+    response.headers["Location"] = links["fit"]
+    return FitAcceptedView(id=job.id, links=links)
 
 
 @router.get("/fits", responses={200: shows(FIT_JOBS)})
@@ -219,22 +231,33 @@ async def fits_known(fits: FitsDep) -> Response:
     return answer(FitJobs(fits=tuple(fits.jobs())))
 
 
+_FOUND = {"anyOf": [{"$ref": f"{SCHEMAS}FitDocument"}, {"$ref": f"{SCHEMAS}{FIT_JOB.name}"}]}
+
+
 @router.get(
     "/fits/{id}",
     response_model=FitDocument,
     responses={
+        200: {
+            "description": "What was found; of a fit that failed or was given up the job itself: "
+            "its `state` and the `reason`",
+            "content": {"application/json": {"schema": _FOUND}},
+        },
         202: shows(FIT_JOB) | {"description": "Not finished yet"},
         **UNKNOWN,
     },
 )
 async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
-    """Return what a fit has found; 202 while it has not, 422 with the reason where it could not."""
+    """Return what a fit has found, or why it has found nothing; 202 while it is not finished.
+
+    What was found has a ``verdict``; a fit that failed, or was given up, has ``state`` and
+    ``reason`` instead.
+    """
     job = fits.job(fit_id)
     if job.document is not None:
         return JSONResponse(dict(job.document))
-    if job.state in {FitState.FAILED, FitState.GIVEN_UP}:
-        raise MatrixError(job.reason)
-    return JSONResponse(picture(job), status_code=HTTPStatus.ACCEPTED)
+    ended = job.state in {FitState.FAILED, FitState.GIVEN_UP}
+    return JSONResponse(picture(job), HTTPStatus.OK if ended else HTTPStatus.ACCEPTED)
 
 
 class FitMap(BaseModel):

@@ -10,13 +10,14 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.routes import views
 from service.routes.commands import AcceptedView, ClientDep, Said, about, body
 from service.routes.numbers import MatrixParameters, describes_numbers, numbers_of
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
+from service.routes.unchanged import not_modified, tag_of
 from service.routes.views import ServiceDep, answer, known, shows, view
 from service.snapshot import Snapshot
 from service.tracking.commands import (
@@ -81,12 +82,13 @@ def _new_id(prefix: str, snapshot: Snapshot) -> str:
     return f"{prefix}{now:%Y%m%dT%H%M%S.%f}"
 
 
-async def _file(file_of: Callable[[str], bytes], matrix_id: str) -> Response:
-    """Return the archived product."""
-    return Response(
+async def _file(request: Request, file_of: Callable[[str], bytes], matrix_id: str) -> Response:
+    """Return the archived product, unless the client has it."""
+    tag = tag_of(matrix_id)
+    return not_modified(request, tag) or Response(
         await run_in_threadpool(file_of, matrix_id),
         media_type="application/x-hdf5",
-        headers={"Content-Disposition": f'attachment; filename="{matrix_id}.h5"'},
+        headers={"Content-Disposition": f'attachment; filename="{matrix_id}.h5"', "ETag": tag},
     )
 
 
@@ -134,6 +136,7 @@ async def give_up(client: ClientDep, measurement_id: MeasurementId, said: Said) 
     responses={200: _MEASURED_NUMBERS, **UNKNOWN},
 )
 async def measured_matrix(
+    request: Request,
     service: ServiceDep,
     measurement_id: MeasurementId,
     parameters: Annotated[MatrixParameters, Query()],
@@ -145,7 +148,7 @@ async def measured_matrix(
     image.
     """
     kept = service.archive.measured
-    return await numbers_of(measurement_id, parameters.format, kept.matrix, kept.file)
+    return await numbers_of(request, measurement_id, parameters.format, kept.matrix, kept.file)
 
 
 @noisy.post("/noisy-matrix", status_code=202, responses={**COMMAND})
@@ -169,14 +172,14 @@ async def noisy_matrices(service: ServiceDep) -> Response:
 
 @noisy.get("/noisy-matrix/{id}", responses={200: shows(NOISY), **UNKNOWN})
 async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
-    """Return what is known of one, or how far it is."""
+    """Return what is known of a noisy matrix, or how far it is."""
     record = service.snapshot().tracker.measurement(noisy_id)
     return answer(known(record, f"noisy matrix {noisy_id}"), NOISY)
 
 
 @noisy.delete("/noisy-matrix/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
 async def give_up_noisy(client: ClientDep, noisy_id: NoisyId, said: Said) -> AcceptedView:
-    """End one under way, and its dither; one that is stored stays."""
+    """End a noisy matrix under way, and its dither; one that is stored stays."""
     command = about(GiveUp, said, id=noisy_id)
     return await client.orders(command, matrix=f"{_NOISY}/{noisy_id}")
 
@@ -192,6 +195,6 @@ async def give_up_noisy(client: ClientDep, noisy_id: NoisyId, said: Said) -> Acc
         **UNKNOWN,
     },
 )
-async def noisy_file(service: ServiceDep, noisy_id: NoisyId) -> Response:
-    """Return the archived HDF5 file of one; ``pyrcal fit`` reads it."""
-    return await _file(service.archive.noisy.file, noisy_id)
+async def noisy_file(request: Request, service: ServiceDep, noisy_id: NoisyId) -> Response:
+    """Return the archived HDF5 file of a noisy matrix; ``pyrcal fit`` reads it."""
+    return await _file(request, service.archive.noisy.file, noisy_id)

@@ -21,6 +21,7 @@ from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
 from service.model.slopes import slopes_of, to_conventions, turned_mask
 from service.routes.problems import INVALID, UNKNOWN, problem_response
+from service.routes.unchanged import not_modified, tag_of
 from service.routes.views import ServiceDep, answer, shows, view
 from service.runtime.supervisor import Supervisor
 from service.telemetry.frames import FrameBlock
@@ -102,6 +103,7 @@ _EXTENSIONS = {MatrixFormat.RAW: "f4", MatrixFormat.HDF5: "h5"}
 
 
 async def numbers_of(
+    request: Request,
     matrix_id: str,
     form: MatrixFormat,
     matrix_of: Callable[[str], Numbers],
@@ -109,13 +111,19 @@ async def numbers_of(
 ) -> Response:
     """Return a matrix as it is asked for; the shape is in the headers, but with HDF5.
 
+    An id is never reused: whoever has its numbers in this format need not have them again.
+
     Raises
     ------
     CommandError
         If it cannot leave like that from here.
     """
     extension = _EXTENSIONS.get(form, form.value)
+    tag = tag_of(matrix_id, form)
+    if (same := not_modified(request, tag)) is not None:
+        return same
     headers = {"Content-Disposition": f'attachment; filename="{matrix_id}.{extension}"'}
+    headers["ETag"] = tag
     if form is MatrixFormat.HDF5:
         content = await run_in_threadpool(file_of, matrix_id)
     else:
@@ -213,12 +221,16 @@ SLOPES = view("SlopeMapsView", SlopeMaps)
 
 
 @router.get("/reconstructors/{id}/singular-values", responses={200: shows(SINGULAR), **UNKNOWN})
-async def singular_values(service: ServiceDep, matrix_id: MatrixId) -> Response:
+async def singular_values(request: Request, service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the singular values that a reconstructor stands for."""
-    matrix = await run_in_threadpool(service.matrix, matrix_id)
     known = service.description
     products = None if known is None else known.products
+    tag = tag_of(matrix_id, products is None)
+    if (same := not_modified(request, tag)) is not None:
+        return same
+    matrix = await run_in_threadpool(service.matrix, matrix_id)
     found = answer(await run_in_threadpool(_singular_values, matrix_id, matrix, products))
+    found.headers["ETag"] = tag
     if products is not None:
         found.headers["Cache-Control"] = "private, max-age=86400"  # an id is never reused
     return found

@@ -25,6 +25,7 @@ from service.routes.numbers import (
     numbers_of,
 )
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
+from service.routes.unchanged import not_modified, tag_of
 from service.routes.views import ServiceDep, answer, known, shows, tagged, view
 from service.runtime.supervisor import Supervisor
 from service.snapshot import GainTableShown
@@ -110,7 +111,7 @@ def _nanoseconds(time: datetime | None) -> int | None:
 
 @router.get("/state", responses={200: shows(views.STATE)})
 async def state(service: ServiceDep) -> Response:
-    """Everything at one glance."""
+    """Return everything the service knows, at one glance."""
     return answer(service.snapshot())
 
 
@@ -137,25 +138,33 @@ async def alpha(request: Request, service: ServiceDep) -> Response:
 
 @router.get("/alpha/history", responses={200: shows(views.HISTORY)})
 async def alpha_history(
-    service: ServiceDep, parameters: Annotated[RangeParameters, Query()]
+    request: Request, service: ServiceDep, parameters: Annotated[RangeParameters, Query()]
 ) -> Response:
     """Return the last estimates, or those of a time, oldest first.
 
     Those of the last hours are in memory; what is older, or of the run before, is in the archive.
     """
     # a night takes a quarter of a second, in which telemetry is taken in
-    return await run_in_threadpool(_history, service, parameters)
+    return await run_in_threadpool(_history, request, service, parameters)
 
 
-def _history(service: Supervisor, asked: RangeParameters) -> Response:
+def _history(request: Request, service: Supervisor, asked: RangeParameters) -> Response:
+    """Return a part of the history, unless nothing of it has come since the client asked last."""
     tracker = service.snapshot().tracker
     first_ns, last_ns = asked.between
     first_ns = first_ns if asked.after is None else max(first_ns, asked.after + 1)
     found = tuple(entry for entry in tracker.history if first_ns <= entry.t_ns_utc <= last_ns)
+    n_older = service.archive.nights.n_estimates(first_ns, last_ns)
+    ends = [entry.t_ns_utc for entry in (*found[:1], *found[-1:])]
+    tag = tag_of(asked, n_older, len(found), *ends)
+    if (same := not_modified(request, tag)) is not None:
+        return same
     if asked.points or asked.after is not None or len(found) < asked.limit:
         last_ns = min([last_ns, *(entry.t_ns_utc - 1 for entry in tracker.history)])
         found = (*_older(service.archive, first_ns, last_ns, asked), *found)
-    return answer(replace(tracker, history=_cut(found, asked)), views.HISTORY)
+    told = answer(replace(tracker, history=_cut(found, asked)), views.HISTORY)
+    told.headers["ETag"] = tag
+    return told
 
 
 History = tuple[HistoryEntry, ...]
@@ -275,7 +284,10 @@ async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
     },
 )
 async def reconstructor_matrix(
-    service: ServiceDep, matrix_id: MatrixId, parameters: Annotated[MatrixParameters, Query()]
+    request: Request,
+    service: ServiceDep,
+    matrix_id: MatrixId,
+    parameters: Annotated[MatrixParameters, Query()],
 ) -> Response:
     """Return a reconstructor's numbers, ``(n_modes, n_slopes)``, metres OPD per slope.
 
@@ -284,6 +296,7 @@ async def reconstructor_matrix(
     image.
     """
     return await numbers_of(
+        request,
         matrix_id,
         parameters.format,
         service.matrix,
@@ -306,7 +319,7 @@ async def events(service: ServiceDep, parameters: Annotated[LimitParameters, Que
 
 @router.get("/gains", responses={200: shows(views.GAINS), **COMMAND})
 async def gains(service: ServiceDep) -> Response:
-    """Return the table as it is now, for all modes of the basis.
+    """Return the optical gains as they are now, for all modes of the basis.
 
     ``POST /v1/loop`` with ``effective_gain`` sets the loop gains by it, if the gate agrees.
     """
@@ -320,7 +333,7 @@ async def gains(service: ServiceDep) -> Response:
 
 @router.get("/reconstructors/{id}/gains", responses={200: shows(views.GAINS), **UNKNOWN})
 async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Response:
-    """Return the table that was measured when this reconstructor was made, for its modes."""
+    """Return the optical gains that were measured when a reconstructor was made, for its modes."""
     found = service.snapshot().tracker.reconstructor(matrix_id)
     record = known(found, f"reconstructor {matrix_id}")
     return _gain_table(record.id, record.optical_gains, record.n_modes)

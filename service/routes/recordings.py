@@ -6,7 +6,7 @@ from collections.abc import Awaitable
 from dataclasses import dataclass, replace
 from typing import Annotated, TypeVar
 
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse
 
@@ -14,6 +14,7 @@ from service.archive.recordings import RecordingRecord
 from service.errors import PyrcalError
 from service.routes.commands import AcceptedView, Client, ClientDep, Said, body
 from service.routes.problems import COMMAND, INVALID, UNKNOWN
+from service.routes.unchanged import not_modified, tag_of
 from service.routes.views import ServiceDep, answer, known, shows, view
 from service.runtime.keeping import RecordingChoice
 from service.tracking.commands import Instruction
@@ -68,9 +69,9 @@ async def begin(
     who = client.caller.entry("", by=choice.by).who
     begun = client.service.recordings.begin(choice.duration_s, who, choice.reason)
     made = await _tried(client, "recording.begin", choice, begun)
-    links = {"recording": f"/v1/recordings/{made.id}"}
     text = f"{made.id} keeps telemetry for {made.duration_s:g} s"
-    return RecordingAcceptedView(id=made.id, text=text, links=links)
+    accepted = client.accepted(text, recording=f"/v1/recordings/{made.id}")
+    return RecordingAcceptedView(id=made.id, **accepted.model_dump())
 
 
 @router.get("/recordings", responses={200: shows(RECORDINGS)})
@@ -94,7 +95,7 @@ async def end(client: ClientDep, recording_id: RecordingId, said: Said) -> Accep
     reason = f"{said.by or client.caller.key or 'an operator'} has ended it"
     record = await _tried(client, "recording.end", said, recordings.end(reason, recording_id))
     text = f"{recording_id} has ended: {record.n_bytes / 1e6:.0f} MB"
-    return AcceptedView(text=text, links={"recording": f"/v1/recordings/{recording_id}"})
+    return client.accepted(text, recording=f"/v1/recordings/{recording_id}")
 
 
 @router.delete("/recordings/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
@@ -102,7 +103,7 @@ async def remove(client: ClientDep, recording_id: RecordingId, said: Said) -> Ac
     """Remove a recording that has ended: it is gone for good."""
     removed = client.service.recordings.remove(recording_id)
     await _tried(client, "recording.remove", said, removed)
-    return AcceptedView(text=f"{recording_id} is removed", links={"recordings": "/v1/recordings"})
+    return client.accepted(f"{recording_id} is removed", recordings="/v1/recordings")
 
 
 @router.get(
@@ -117,7 +118,11 @@ async def remove(client: ClientDep, recording_id: RecordingId, said: Said) -> Ac
         **UNKNOWN,
     },
 )
-async def file(service: ServiceDep, recording_id: RecordingId) -> Response:
+async def file(request: Request, service: ServiceDep, recording_id: RecordingId) -> Response:
     """Return a recording that has ended."""
     path = await run_in_threadpool(service.recordings.file, recording_id)
-    return FileResponse(path, media_type="application/x-hdf5", filename=path.name)
+    tag = tag_of(recording_id).removeprefix("W/")  # a download may be resumed by a strong one
+    headers = {"ETag": tag}
+    return not_modified(request, tag) or FileResponse(
+        path, media_type="application/x-hdf5", filename=path.name, headers=headers
+    )

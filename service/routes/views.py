@@ -234,9 +234,9 @@ ServiceDep = Annotated[Supervisor, Depends(_service_of)]
 
 def shows(of: View) -> dict[str, Any]:
     """Return the OpenAPI description of an answer that shows a record."""
-    schema = {"$ref": f"{_SCHEMAS}{of.name}"}
+    schema = {"$ref": f"{SCHEMAS}{of.name}"}
     content = {"application/json": {"schema": schema}}
-    return {"description": "Successful Response", "content": content}
+    return {"description": _for_readers(of.text), "content": content}
 
 
 def schemas() -> dict[str, Schema]:
@@ -260,7 +260,7 @@ def schemas() -> dict[str, Schema]:
     return found
 
 
-_SCHEMAS = "#/components/schemas/"
+SCHEMAS = "#/components/schemas/"
 _NUMBER: Schema = {"anyOf": [{"type": "number"}, {"type": "null"}]}
 _CLOCK: Schema = {"anyOf": [{"type": "string", "format": "date-time"}, {"type": "null"}]}
 _OF_KIND: dict[object, Schema] = {
@@ -299,7 +299,7 @@ def _schema(kind: Any, of: View | None, found: dict[str, Schema]) -> Schema:  # 
         schema = _schema(next(one for one in inside if one is not NoneType), of, found)
         return schema if schema == _NUMBER else {"anyOf": [schema, {"type": "null"}]}
     if kind is Misregistration or origin is np.ndarray:
-        return {"$ref": f"{_SCHEMAS}FourView"}
+        return {"$ref": f"{SCHEMAS}FourView"}
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return {"type": "object", "additionalProperties": _schema(inside[1], of, found)}
     if origin in {tuple, list}:
@@ -310,8 +310,8 @@ def _schema(kind: Any, of: View | None, found: dict[str, Schema]) -> Schema:  # 
             "enum": [entry.value for entry in kind],
             "description": inspect.getdoc(kind) or "",
         }
-        return {"$ref": f"{_SCHEMAS}{kind.__name__}"}
-    return {"$ref": f"{_SCHEMAS}{(of or _USUAL[kind]).name}"}
+        return {"$ref": f"{SCHEMAS}{kind.__name__}"}
+    return {"$ref": f"{SCHEMAS}{(of or _USUAL[kind]).name}"}
 
 
 def _field(record: type, path: str) -> tuple[Any, str]:

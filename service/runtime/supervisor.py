@@ -27,6 +27,7 @@ from service.runtime.engine import Engine, looked_at
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.keeping import TelemetryKeeper
 from service.runtime.recording import Caller, Recorder, ids_of
+from service.runtime.refits import Refits
 from service.runtime.streams import WATCH_INTERVAL_S, Streams, Window
 from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
 from service.runtime.workers import PaceMeter, WorkerPool
@@ -96,6 +97,8 @@ class Supervisor:
             audit=self._recorder.add,
         )
         """Telemetry kept on request."""
+        self.refits = Refits()
+        """Reconstructors that operators have ordered."""
         self._backlog = Backlog()
         self._meter = PaceMeter(workers)
         self._eyes = ThreadPoolExecutor(1, "telemetry")
@@ -189,7 +192,9 @@ class Supervisor:
     async def _carried_out(self, command: Command) -> str:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
         before, running = self._engine.state, set(self._running)
-        self._post(command)
+        for effect in self._post(command):
+            if isinstance(command, cmd.Refit) and isinstance(effect, ev.MakeMatrix):
+                self.refits.begin(effect, time.time_ns())
         given = Given(command, before, self._engine.state)
         asked = self._running - running
         if asked and isinstance(command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
@@ -441,6 +446,7 @@ class Supervisor:
         except Exception as error:  # noqa: BLE001 - a bug in one action must not end the service
             self._log.exception("action.broken", effect=type(effect).__name__)
             event = ev.JobFailed(effect=effect, text=f"internal error: {error!r}")
+        self.refits.end(effect, event)
         if event is not None:
             self._post(event)
 

@@ -2,7 +2,10 @@
 
 from dataclasses import dataclass, field
 
+from service.runtime.refits import Refits
 from service.snapshot import Snapshot
+from service.tracking.commands import Refit
+from service.tracking.events import MakeMatrix
 from service.tracking.state import TrackerState
 
 
@@ -15,6 +18,7 @@ class Obedient:
     archive: object = None
     refusal: Exception | None = None
     commands: list = field(default_factory=list)
+    refits: Refits = field(default_factory=Refits)
 
     def snapshot(self):
         return Snapshot(
@@ -30,4 +34,6 @@ class Obedient:
         if self.refusal is not None:
             raise self.refusal
         self.commands.append(command)
+        if isinstance(command, Refit):
+            self.refits.begin(MakeMatrix(n_modes=command.n_modes or 1, why=""), self.now_ns)
         return f"{type(command).__name__}: 1 action(s) under way"

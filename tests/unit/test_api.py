@@ -28,6 +28,7 @@ from service.errors import (
 )
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
+from service.runtime.refits import Refits
 from service.snapshot import Snapshot
 from service.tracking.alarms import Alarm
 from service.tracking.commands import (
@@ -42,6 +43,7 @@ from service.tracking.commands import (
     StopDither,
 )
 from service.tracking.dither_request import Dither, Dithering, DitherPhase, DitherPlan
+from service.tracking.events import MakeMatrix
 from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.products import (
     MatrixState,
@@ -219,6 +221,7 @@ class FakeService:
     refusal: Exception | None = None
     thread: int | None = None
     archive: Archive | None = None
+    refits: Refits = field(default_factory=Refits)
 
     def snapshot(self):
         return self.now
@@ -228,6 +231,8 @@ class FakeService:
             raise self.refusal
         self.commands.append(command)
         self.callers.append(caller)
+        if isinstance(command, Refit):
+            self.refits.begin(MakeMatrix(n_modes=command.n_modes or 1, why=""), self.now.now_ns)
         return f"{type(command).__name__} is on its way"
 
     def audit(self, entry):

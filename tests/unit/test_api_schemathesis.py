@@ -42,7 +42,6 @@ TOGETHER = {
     "POST /v1/loop": "at least one of loop|gains or effective_gain|no mode in two groups|first <=",
     "POST /v1/loop/ramp": "no mode in two groups|first <=",
     "POST /v1/fits": r"query\.(modes|start|instrument): found|unusable-matrix ",
-    "GET /v1/fits/{id}": "unusable-matrix ",
 }
 """Of each operation, rules that JSON Schema cannot say: what is refused by one of them is meant."""
 

@@ -23,6 +23,7 @@ from service.errors import CommandError
 from service.routes.connections import server_config
 from service.runtime.recording import Whence
 from service.snapshot import Snapshot
+from service.tracking.events import MatrixMade
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import AcquisitionStage, Mode
 from tests.unit.test_api import LINK, MATRIX, SECOND, STATE, FakeService
@@ -69,7 +70,8 @@ def clock():
 def served():
     service = Listening(None)
     trail = lambda part: [e for e in TRAIL if e.id > (part.after or 0)]  # noqa: E731
-    service.archive = SimpleNamespace(audit_trail=trail)
+    nights = SimpleNamespace(n_estimates=lambda *_: 0)
+    service.archive = SimpleNamespace(audit_trail=trail, nights=nights)
     with serving(create_app(service)) as url:
         yield service, url
 
@@ -115,7 +117,7 @@ ORDERS = [
      {"modes": (3, 5), "frequency_hz": (90.0, 110.0), "over_budget": False}),
     (["dither", "start", "--kind", "binary", "--modes", "all", "--over-budget"], "StartDither",
      {"modes": "all", "over_budget": True}),
-    (["refit", "--n-modes", "300"], "Refit", {"n_modes": 300}),
+    (["refit", "--n-modes", "300", "--no-wait"], "Refit", {"n_modes": 300}),
     (["abort"], "AbortAcquisition", {}),
     (["acquire", "--yes", "--no-wait"], "Acquire", {}),
     (["approve", "--yes", "--no-wait"], "Approve", {"id": "cm-1"}),
@@ -298,6 +300,26 @@ def test_every_screen_is_there_and_json_is_what_rest_answers(capsys, service):
         told = capsys.readouterr().out
         assert "\x1b" not in told
         assert isinstance(json.loads(told), dict)
+
+
+@pytest.mark.parametrize(("accepted", "status"), [(True, 0), (False, 1)])
+def test_a_refit_is_followed_until_there_is_a_reconstructor(
+    capsys, service, monkeypatch, accepted, status
+):
+    state = MatrixState.PROPOSED if accepted else MatrixState.REFUSED
+    made = ReconstructorRecord(
+        id="cm-7", state=state, n_modes=300, created_ns_utc=3, reason="pole radius 0.9"
+    )
+
+    def happens():
+        (effect,) = service.refits._effects.values()
+        service.refits.end(effect, MatrixMade(record=made, wanted=True))
+
+    at_the_next_look(monkeypatch, happens)
+    assert main(["refit"]) == status
+    told = capsys.readouterr().out
+    assert "cm-7, 300 modes" in told
+    assert "pole radius 0.9" in told
 
 
 def test_what_nobody_has_heard_of_is_a_refusal(capsys, service):

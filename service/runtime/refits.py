@@ -1,0 +1,105 @@
+"""Refits that operators have ordered: each a job with an id, and what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from enum import StrEnum
+
+from service.errors import UnknownIdError
+from service.tracking import events as ev
+from service.tracking.events import Effect, Event
+from service.tracking.products import MatrixState
+
+REFITS_KEPT = 100
+"""Newest jobs that are remembered, until the service ends."""
+
+
+class RefitState(StrEnum):
+    """How far a refit is."""
+
+    RUNNING = "running"
+    """The reconstructor is being computed and judged."""
+
+    MADE = "made"
+    """There is a reconstructor; its own state says what becomes of it."""
+
+    REFUSED = "refused"
+    """There is one, and the gate refuses it."""
+
+    FAILED = "failed"
+    """There is none, for a reason."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefitJob:
+    """An order to compute a reconstructor for the registration of now."""
+
+    id: str
+    state: RefitState
+    n_modes: int
+    """Modes asked for."""
+
+    asked_ns_utc: int
+    reconstructor: str | None = None
+    """Id of the one that was made; None: there is none, or not yet."""
+
+    reason: str = ""
+    """What came of it, in words."""
+
+
+class Refits:
+    """The refits that the service remembers; belongs to the event loop."""
+
+    def __init__(self) -> None:
+        self._jobs: dict[str, RefitJob] = {}
+        self._effects: dict[str, Effect] = {}
+
+    @property
+    def newest(self) -> RefitJob:
+        """The job that began last; there must have been one."""
+        return next(reversed(self._jobs.values()))
+
+    def begin(self, effect: ev.MakeMatrix, now_ns: int) -> None:
+        """Remember a job from the moment its computation begins."""
+        name = f"refit-{datetime.fromtimestamp(now_ns / 1e9, UTC):%Y%m%dT%H%M%S.%f}"
+        self._effects[name] = effect
+        self._jobs[name] = RefitJob(
+            id=name, state=RefitState.RUNNING, n_modes=effect.n_modes, asked_ns_utc=now_ns
+        )
+        while len(self._jobs) > REFITS_KEPT:
+            oldest = next(iter(self._jobs))
+            del self._jobs[oldest]
+            self._effects.pop(oldest, None)
+
+    def end(self, effect: Effect, event: Event | None) -> None:
+        """Note what came of an effect, if a job waits for it."""
+        name = next((name for name, one in self._effects.items() if one is effect), None)
+        if name is None:
+            return
+        del self._effects[name]
+        job = self._jobs[name]
+        match event:
+            case ev.MatrixMade(record=record):
+                verdict = record.reason if record.gate is None else record.gate.reason
+                text = f"{record.id}, {record.n_modes} modes: {verdict}"
+                refused = record.state is MatrixState.REFUSED
+                state = RefitState.REFUSED if refused else RefitState.MADE
+                job = replace(job, state=state, reconstructor=record.id, reason=text)
+            case ev.JobFailed(text=text):
+                job = replace(job, state=RefitState.FAILED, reason=text)
+            case _:
+                job = replace(job, state=RefitState.FAILED, reason="it was given up")
+        self._jobs[name] = job
+
+    def job(self, refit_id: str) -> RefitJob:
+        """Return what is known of a job.
+
+        Raises
+        ------
+        UnknownIdError
+            If there is none of this id.
+        """
+        if refit_id not in self._jobs:
+            raise UnknownIdError(f"refit {refit_id}: this service has begun no such refit")
+        return self._jobs[refit_id]

@@ -20,6 +20,7 @@ from service.tracking import (
     operator,
     probation,
     reconstructors,
+    refusals,
     resume,
     rtc,
     validity,
@@ -94,6 +95,7 @@ def _go_on(turn: Turn) -> None:
 def _on_tick(turn: Turn, _: ev.Tick) -> None:
     rtc.on_tick(turn)
     validity.age(turn)
+    refusals.follow(turn)
     operator.close_again(turn)
 
 

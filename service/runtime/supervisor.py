@@ -29,7 +29,15 @@ from service.runtime.keeping import TelemetryKeeper
 from service.runtime.recording import Caller, Recorder, ids_of
 from service.runtime.refits import Refits
 from service.runtime.streams import WATCH_INTERVAL_S, Streams, Window
-from service.runtime.waiting import Facts, Revival, Told, news_of_link, state_message, waiting_for
+from service.runtime.waiting import (
+    Facts,
+    Losses,
+    Revival,
+    Told,
+    news_of_link,
+    state_message,
+    waiting_for,
+)
 from service.runtime.workers import PaceMeter, WorkerPool
 from service.snapshot import Snapshot
 from service.telemetry.frames import FrameBlock
@@ -320,7 +328,7 @@ class Supervisor:
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
-        told, revival = Told(), Revival()
+        told, revival, losses = Told(), Revival(), Losses()
         while True:
             link = self._bridge.statistics()
             if revival.due(link, time.monotonic()):
@@ -332,7 +340,8 @@ class Supervisor:
             for trouble in self._meter.news(self._engine.state):
                 self._post(trouble)
             now_ns = time.time_ns()
-            for event in news_of_link(link, self._engine.state, now_ns):
+            lost = losses.complaint(link, time.monotonic())
+            for event in news_of_link(link, self._engine.state, now_ns, lost):
                 self._post(event)
             waiting = self._waiting(link)
             for text in told.news(waiting, self._engine.state.alarms, now_ns):

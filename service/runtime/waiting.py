@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -53,7 +54,18 @@ TOLD_AFTER_NS: Final = 2 * SECOND_NS
 TOLD_EVERY_NS: Final = 60 * SECOND_NS
 """Least time between two records of the same."""
 
-COMPLAINTS: Final = (alarms.FRAMES_UNUSED, alarms.MESSAGES_REFUSED, alarms.STATUS_FLOOD)
+LOST_S: Final = 5.0
+"""Losses are summed over so long."""
+
+LOST_SHARE: Final = 0.01
+"""Of the frames: more of them lost are an alarm, which half as many do not end."""
+
+COMPLAINTS: Final = (
+    alarms.FRAMES_LOST,
+    alarms.FRAMES_UNUSED,
+    alarms.MESSAGES_REFUSED,
+    alarms.STATUS_FLOOD,
+)
 """Names of the alarms that are made here."""
 
 
@@ -125,12 +137,63 @@ def _flood(link: LinkStatistics) -> str:
     )
 
 
-def news_of_link(link: LinkStatistics, state: TrackerState, now_ns: int) -> list[ev.Event]:
+class Losses:
+    """How many frames of the last seconds were lost: the counters, as they were each second."""
+
+    __slots__ = ("_counts", "_raised")
+
+    def __init__(self) -> None:
+        self._counts: deque[tuple[float, LinkStatistics]] = deque()
+        self._raised = False
+
+    def complaint(self, link: LinkStatistics, now_s: float) -> str:
+        """Return what is lost, where it is more than chance; empty: next to nothing.
+
+        ``now_s`` is of a clock that does not leap.
+        """
+        counts = self._counts
+        counts.append((now_s, link))
+        while len(counts) > 1 and now_s - counts[1][0] >= LOST_S:
+            counts.popleft()
+        since_s, before = counts[0]
+        never_came = max(link.frames_lost - before.frames_lost, 0)
+        not_finite = link.frames_nonfinite - before.frames_nonfinite
+        overwritten = link.frames_overwritten - before.frames_overwritten
+        received = link.frames_received - before.frames_received
+        lost = never_came + not_finite + overwritten
+        n_frames = max(received + never_came + not_finite, 1)
+        share = lost / n_frames
+        enough = now_s - since_s >= LOST_S
+        self._raised = share > (0.5 if self._raised else 1.0) * LOST_SHARE and enough
+        if not self._raised:
+            return ""
+        found = [
+            f"{n} {how}"
+            for n, how in (
+                (never_came, "never came"),
+                (not_finite, "are not finite"),
+                (overwritten, "were not looked at in time"),
+            )
+            if n
+        ]
+        return (
+            f"frames are lost: of {n_frames} in the last {now_s - since_s:.0f} s {', '.join(found)}"
+            f" ({100.0 * share:.1f} %): look at the network, the RTC's publisher, and what else "
+            "this machine does"
+        )
+
+
+def news_of_link(
+    link: LinkStatistics, state: TrackerState, now_ns: int, lost: str = ""
+) -> list[ev.Event]:
     """Return which complaints are made, again or anew, and which are over.
 
+    ``lost`` is what ``Losses`` complains of.
     One that differs in its numbers alone keeps its text: that is no news.
     """
     made, found = complaints(link), []
+    if lost:
+        made[alarms.FRAMES_LOST] = lost
     raised = {alarm.name: alarm for alarm in state.alarms if alarm.name in COMPLAINTS}
     for name, text in made.items():
         before = raised.get(name)

@@ -110,6 +110,9 @@ class RefusalKind(StrEnum):
     CUT_SHORT = "cut-short"
     """Its reconstructor or its dither ended in it, which they do when all is well."""
 
+    VOID = "void"
+    """It was taken while nothing could be measured, for a reason that is known."""
+
     MISALIGNED = "misaligned"
     """The slopes of a row are not those that its commands were sent for."""
 

@@ -20,7 +20,7 @@ from service.telemetry.kalman import Joint
 from service.telemetry.passive import PassiveEstimate
 from service.telemetry.random_dither import RandomEstimate
 from service.telemetry.windows import RefusalKind
-from service.tracking import alarms, filtering, jumps, validity
+from service.tracking import alarms, filtering, jumps, refusals, validity
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import count_miss
 from service.tracking.dither import found_again
@@ -57,6 +57,7 @@ def on_window(turn: Turn, event: ev.WindowFitted) -> None:
         kind, reason = why
         refuse_window(turn, reason, kind)
         return
+    refusals.use(turn)
     if validity.tells_of(turn.state, alarms.DITHER_LOST, when):
         found_again(turn)
     random = isinstance(estimate, RandomEstimate)
@@ -93,7 +94,6 @@ def on_lost(turn: Turn, event: ev.WindowLost) -> None:
 
 def refuse_window(turn: Turn, reason: str, kind: RefusalKind = RefusalKind.OTHER) -> None:
     """Count a window that gave nothing, and say why."""
-    _count_refused(turn)
     count_miss(turn, kind)
     if kind is RefusalKind.MISALIGNED:
         turn.alarm(alarms.MISALIGNED, reason)
@@ -101,6 +101,7 @@ def refuse_window(turn: Turn, reason: str, kind: RefusalKind = RefusalKind.OTHER
         turn.alarm(alarms.WRONG_ANSWER, reason)
     level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
     turn.log("window.refused", reason, level)
+    refusals.refuse(turn, reason, kind)
 
 
 def enter(turn: Turn, measured: Measured) -> None:
@@ -124,7 +125,7 @@ def enter(turn: Turn, measured: Measured) -> None:
         and not far.far
         and validity.precedes(turn.state, measured.when, known.doubted_ns_utc)
     ):
-        _count_refused(turn)
+        refusals.count(turn)
         turn.log("window.refused", TOO_EARLY)
         return
     if known.candidate is not None:
@@ -205,10 +206,6 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
     both = whole and known.candidate is not None
     filtering.accept(turn, folded, measured, n_accepted=2 if both else 1)
     turn.warn("registration.jump", f"jumped by {_away(measured, known)}, as two windows have seen")
-
-
-def _count_refused(turn: Turn) -> None:
-    turn.state = replace(turn.state, windows_refused=turn.state.windows_refused + 1)
 
 
 def _doubted(known: Registration, doubt: str, since_ns_utc: int) -> Registration:

@@ -329,10 +329,10 @@ def gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
 def why_no_window(turn: Turn, estimate: DitheredEstimate, when: Taken) -> Why | None:
     """Return why a window's estimate must not be used, or None."""
     if turn.rtc is None or estimate.session != turn.rtc.session:
-        return RefusalKind.OTHER, "the RTC has restarted since"
+        return RefusalKind.VOID, "the RTC has restarted since"
     reason = why_no_measurement(turn.state, when)
     if reason is not None:
-        return RefusalKind.OTHER, reason
+        return RefusalKind.VOID, reason
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
         late = f"slopes lag commands by {lag:+.2f} frame, 0 is expected"

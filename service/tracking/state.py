@@ -385,6 +385,9 @@ class TrackerState:
 
     windows_accepted: int = 0
     windows_refused: int = 0
+    window_run: int = 0
+    """How many of the last windows could be used one after the other; below 0: were refused."""
+
     windows_outlying: int = 0
     """Believable in themselves, but so far from all others that they were not believed."""
 

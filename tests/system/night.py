@@ -39,7 +39,7 @@ n_modes_target = {N_TARGET}
 minimum_interval_s = 1.0
 """
 
-UNDER_LOAD = {"worker-behind", "estimate-stale"}
+UNDER_LOAD = {"worker-behind", "estimate-stale", "frames-lost", "windows-refused"}
 """Alarms that are right where others need the processors, too."""
 
 

@@ -98,8 +98,9 @@ def test_damaged_telemetry_costs_windows_and_nothing_else(night, late):
     assert state["in_use"] == in_use
     assert {r["id"] for r in kept} <= {r["id"] for r in night.shelf}
     check_registration(state["registration"])
-    night.check_alarms("watchdog", "frames-unused")
+    night.check_alarms("watchdog", "frames-unused", "frames-lost", "windows-refused")
     assert "frames-unused" in service.log
+    assert "frames-lost" in service.log
     assert link["frames_refused"] == {"shape": 300}
     assert "Traceback" not in service.log
 

@@ -1,0 +1,96 @@
+"""Windows refused one after the other are an alarm, unless something else explains them."""
+
+import pytest
+
+from service.telemetry.windows import RefusalKind, WindowRefused
+from service.tracking import commands as cmd
+from service.tracking import events as ev
+from service.tracking.activity import Operation, operating
+from service.tracking.alarms import WINDOWS_REFUSED
+from service.tracking.refusals import IN_A_ROW
+from service.tracking.state import Mode
+from tests.unit.tracking.situations import ALPHA, Story, moved, rtc
+
+MISSING = "150 of 2000 frames missing, more than 5%: check the link to the RTC"
+
+
+@pytest.fixture
+def story():
+    """α is known, and a dither runs."""
+    told = Story(Mode.HOLD).meet()
+    told.see(n_windows=3)
+    return told
+
+
+def refuse(story, n=1, kind=RefusalKind.OTHER):
+    for _ in range(n):
+        refused = WindowRefused(reason=MISSING, t_ns_utc=story.now_ns, kind=kind)
+        story.tell(ev.WindowLost(refused=refused), after_s=2.0)
+    return story
+
+
+def text_of(story):
+    return next(alarm.text for alarm in story.state.alarms if alarm.name == WINDOWS_REFUSED)
+
+
+@pytest.mark.parametrize("between", [0, 4])
+def test_the_third_in_a_row_is_an_alarm_with_the_reason_and_the_service_is_degraded(story, between):
+    assert WINDOWS_REFUSED not in refuse(story, IN_A_ROW - 1).alarms
+    refuse(story, between, RefusalKind.CUT_SHORT)
+    assert WINDOWS_REFUSED not in story.alarms, "a matrix was swapped in them: no fault"
+    refuse(story)
+    assert MISSING in text_of(story)
+    assert operating(story.state, "", story.now_ns).operation is Operation.DEGRADED
+
+
+def test_hundreds_of_them_are_one_line_of_alarm(story):
+    refuse(story, 145)
+    assert story.logged.count(WINDOWS_REFUSED) == 1
+    assert text_of(story).startswith("145 windows in a row")
+
+
+def test_two_in_a_row_between_good_ones_are_none(story):
+    for _ in range(20):
+        refuse(story, IN_A_ROW - 1)
+        story.see()
+    assert not story.alarms
+
+
+def test_it_ends_by_itself_after_as_many_good_ones_and_not_by_one(story):
+    refuse(story, 5)
+    story.see(n_windows=IN_A_ROW - 1)
+    assert WINDOWS_REFUSED in story.alarms
+    refuse(story)
+    story.see(n_windows=IN_A_ROW - 1)
+    assert WINDOWS_REFUSED in story.alarms, "every second window refused is no end of it"
+    story.see()
+    assert WINDOWS_REFUSED not in story.alarms
+
+
+def test_a_window_far_from_alpha_could_be_used_and_has_an_alarm_of_its_own(story):
+    refuse(story, IN_A_ROW - 1)
+    story.see(moved(ALPHA, shift_x_subap=0.4))
+    refuse(story, IN_A_ROW - 1)
+    assert story.alarms == {"jump-suspected"}
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        cmd.StopDither(),
+        cmd.StopEverything(by="x", reason="y"),
+        ev.RtcVanished(),
+        ev.Trouble(name="loop-diverging", text="found"),
+        ev.SessionStarted(session="s2"),
+        rtc(loop="open"),
+    ],
+    ids=lambda event: type(event).__name__,
+)
+def test_it_ends_where_no_window_is_expected_and_does_not_begin_there(story, event):
+    refuse(story, 5)
+    story.tell(event)
+    story.tell(ev.Tick(), after_s=1.0)
+    assert WINDOWS_REFUSED not in story.alarms
+    refuse(story, 5)
+    story.tell(ev.Tick(), after_s=1.0)
+    assert WINDOWS_REFUSED not in story.alarms

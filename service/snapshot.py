@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
@@ -17,8 +17,11 @@ from service.tracking.alarms import ALARMS, Kind, Note, Severity
 from service.tracking.attention import muted, note_of, stale, worst
 from service.tracking.commands import GainGroup
 from service.tracking.registration import Registration
-from service.tracking.state import TrackerState, Waiting
+from service.tracking.state import LogEntry, TrackerState, Waiting
 from service.wire import Status
+
+WINDOW_REFUSED = "window.refused"
+"""Name of the line of the log that a refused window leaves."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +91,13 @@ class Snapshot:
         """What the service is in, as a control room has it."""
         hindered = "; ".join(wait.text for wait in self.waiting_for if wait.hinders)
         return operating(self.tracker, hindered, self.now_ns)
+
+    @property
+    def window_refusal(self) -> LogEntry | None:
+        """The last window that was refused, and why; null: none was, or it is long ago."""
+        log = reversed(self.tracker.log)
+        last = next((line for line in log if line.name == WINDOW_REFUSED), None)
+        return last and replace(last, t_ns_utc=last.last_ns_utc or last.t_ns_utc)
 
     @property
     def alarms(self) -> tuple[AlarmShown, ...]:

@@ -1,8 +1,10 @@
 """Settings that must hold before any test module imports numpy, and the order of the suite."""
 
+import atexit
 import gc
 import inspect
 import os
+import shutil
 import signal
 import tempfile
 
@@ -20,6 +22,9 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 os.environ.setdefault(
     "PYRCAL_SERVICE__CACHE_DIR", os.path.join(tempfile.gettempdir(), f"pyrcal-tests-{os.getuid()}")
 )
+# Services that others run on this machine are none of a test's.
+os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="pyrcal-tests-run-")
+atexit.register(shutil.rmtree, os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
 # A property that others slow down still holds: the limits of time are those of every test.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")

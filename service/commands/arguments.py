@@ -87,6 +87,11 @@ _OF_A_FOLDER = (
 )
 """What commands that work in a service's folder have in common."""
 
+_OF_ITS_KEYS = (
+    _OF_A_FOLDER[0],
+    words("--data-dir DIR", "the service's data_dir, default that of the one that runs, else var"),
+)
+
 
 def _describe_key(key: argparse.ArgumentParser) -> None:
     key.description = (
@@ -107,7 +112,7 @@ def _describe_key(key: argparse.ArgumentParser) -> None:
         ("revoke", "make one worthless", (name,)),
         ("list", "who has a key, and for what", ()),
     ):
-        add(actions.add_parser(action, help=purpose), *_OF_A_FOLDER, *more)
+        add(actions.add_parser(action, help=purpose), *_OF_ITS_KEYS, *more)
 
 
 def _describe_archive(archive: argparse.ArgumentParser) -> None:

@@ -9,6 +9,7 @@ import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 
+from service.commands.running import data_dir_of_the_one
 from service.commands.terminal import login, say
 from service.errors import ArchiveError, ConfigurationError
 from service.keys import KeyFile, KeyScope
@@ -76,12 +77,14 @@ def _recorded(file: KeyFile, name: str, text: str) -> None:
 
 
 def data_dir(options: argparse.Namespace) -> Path:
-    """Return where the service keeps its keys: command line > environment > TOML file > default.
+    """Return where the service keeps its keys.
+
+    Command line > environment > TOML file > the service of this user that runs > default.
 
     Raises
     ------
     ConfigurationError
-        If the file cannot be read.
+        If the file cannot be read, or several services run and nobody says which is meant.
     """
     given = options.data_dir or os.environ.get("PYRCAL_SERVICE__DATA_DIR")
     if given is None and options.config is not None:
@@ -90,4 +93,4 @@ def data_dir(options: argparse.Namespace) -> Path:
             given = settings.get("service", {}).get("data_dir")
         except (OSError, ValueError, AttributeError) as error:
             raise ConfigurationError(f"{options.config}: cannot be read: {error}") from error
-    return Path(given or DATA_DIR)
+    return Path(given or data_dir_of_the_one() or DATA_DIR)

@@ -21,6 +21,7 @@ from typing_extensions import override
 
 from service.archive import Archive
 from service.commands.program import leave
+from service.commands.running import announced
 from service.config import Settings, load_instrument, packaged_instrument
 from service.config.policy import keeping_of, policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
@@ -72,7 +73,8 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
     endpoint = Endpoint(system=system, listen=settings.zenoh.listen, connect=settings.zenoh.connect)
     with _listener(settings.api.host, settings.api.port) as listener:
         archive.open()
-        with archive, Bridge(endpoint) as bridge:
+        where = "http://{}:{}".format(*listener.getsockname()[:2])
+        with archive, announced(archive.directory, where), Bridge(endpoint) as bridge:
             bridge.expect(instrument.basis_id, instrument.config_id)
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
             desk = _desk(settings, instrument)

@@ -65,12 +65,24 @@ def _rtc(state: Document) -> list[str]:
 
 def _alpha(state: Document) -> list[str]:
     known = state["registration"]
-    windows = f"{state['windows_accepted']} windows accepted, {state['windows_refused']} refused"
+    windows = f"{state['windows_accepted']} accepted, {state['windows_refused']} refused"
+    lines = [f"windows  {windows}", *_refusal(state)]
     if known is None:
-        return [f"alpha    not known yet; {windows}"]
-    worth = f"{known['validity']}, {span(known['age_s'])} old; {windows}"
+        return ["alpha    not known yet", *lines]
+    worth = f"{known['validity']}, {span(known['age_s'])} old"
     why = f" ({known['validity_reason']})" if known["validity_reason"] else ""
-    return [f"alpha    {worth}{why}", *(f"         {line}" for line in registration_lines(known))]
+    four = (f"         {line}" for line in registration_lines(known))
+    return [f"alpha    {worth}{why}", *four, *lines]
+
+
+def _refusal(state: Document) -> list[str]:
+    """Return why the last window that was refused was, and when."""
+    last = state["window_refusal"]
+    if last is None:
+        return []
+    gone_s = max(0.0, (state["now_ns"] - last["t_ns_utc"]) / 1e9)
+    often = f" ({last['n_times']} times within a minute)" if last["n_times"] > 1 else ""
+    return [f"         refused {span(gone_s)} ago{often}: {last['text']}"]
 
 
 def registration_lines(known: Document) -> list[str]:

@@ -487,7 +487,7 @@ STATE = view(
     "tracker.acquisition tracker.move tracker.loop_command tracker.dither_due_since_ns_utc "
     "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating "
     "tracker.told alarms stale_alarms muted_alarms worst_severity tracker.windows_accepted "
-    "tracker.windows_refused tracker.windows_outlying pace link",
+    "tracker.windows_refused tracker.windows_outlying window_refusal pace link",
     "What the service knows, at one glance.",
     measuring=MEASURING,
     gathering=GATHERING,

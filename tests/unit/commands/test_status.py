@@ -14,7 +14,7 @@ from service.commands.status import status_lines
 from service.routes.views import STATE as STATE_VIEW
 from service.routes.views import picture
 from service.snapshot import Snapshot
-from service.tracking.state import TrackerState
+from service.tracking.state import Level, LogEntry, TrackerState
 from tests.unit.test_api import LINK, SECOND, STATE
 
 
@@ -50,9 +50,27 @@ def test_the_registration_the_loop_and_the_matrix_are_on_the_screen():
         "magnification 1.",
         "rtc-0 in use, worst pole radius 0.",
         "sparse: ordinary telemetry keeps σ between windows",
-        "4 windows accepted, 1 refused",
+        "windows  4 accepted, 1 refused",
     ):
         assert part in text, text
+
+
+def test_it_says_why_the_last_window_was_refused():
+    log = (
+        LogEntry(t_ns_utc=SECOND, level=Level.WARNING, name="window.refused", text="edge slip"),
+        LogEntry(
+            t_ns_utc=70 * SECOND,
+            level=Level.WARNING,
+            name="window.refused",
+            text="38 % of its frames were lost",
+            times=3,
+            last_ns_utc=88 * SECOND,
+        ),
+        LogEntry(t_ns_utc=90 * SECOND, level=Level.INFO, name="mode", text="mode is auto"),
+    )
+    text = "\n".join(status_lines(told(log=log)))
+    assert "refused 12 s ago (3 times within a minute): 38 % of its frames were lost" in text
+    assert "edge slip" not in text
 
 
 def test_a_service_that_knows_nothing_says_so():

@@ -12,7 +12,7 @@ RUN python -m sphinx -q docs manual
 FROM ${BASE}
 
 WORKDIR /opt/pyrcal
-COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY pyproject.toml build_backend.py constraints.txt README.md LICENSE ./
 COPY service service
 COPY --from=manual /opt/manual service/manual
 COPY check_rtc check_rtc

@@ -232,10 +232,10 @@ def _beyond(item: object) -> str | None:
 @contextmanager
 def _fits(path: Path) -> Iterator[Container]:
     try:
-        from astropy.io import fits  # an extra: HDF5 needs nothing
+        from astropy.io import fits  # takes long to import: who has HDF5 need not wait
     except ImportError as error:
         raise MatrixError(
-            f"{path}: a FITS file needs astropy; expected pyrcal installed with its extra 'fits'"
+            f"{path}: a FITS file needs astropy; expected it beside pyrcal: pip install astropy"
         ) from error
     with path.open("rb") as raw, warnings.catch_warnings():
         # astropy warns of a truncated file and goes on; what else it warns of does no harm

@@ -83,7 +83,7 @@ class MatrixFormat(StrEnum):
     """The archived product, with what it was made from, or how it was measured."""
 
     FITS = "fits"
-    """An image of float32; the service then needs astropy, its extra ``fits``."""
+    """An image of float32."""
 
 
 class MatrixParameters(Parameters):
@@ -142,7 +142,7 @@ def _written(numbers: Numbers, form: MatrixFormat, matrix_id: str) -> bytes:
             try:
                 from astropy.io import fits
             except ImportError:
-                text = "FITS: found no astropy, expected pyrcal installed with its extra 'fits'"
+                text = "FITS: found no astropy, expected it beside pyrcal: pip install astropy"
                 raise CommandError(text) from None
             image = fits.PrimaryHDU(numbers)
             image.header["OBJECT"] = matrix_id

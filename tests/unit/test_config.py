@@ -497,7 +497,7 @@ def test_without_astropy_a_fits_file_is_refused_with_what_to_install(write, tmp_
         load_instrument, write(ABOUT + WFS + CUBE.replace("cube.h5:/modes", "cube.fits"))
     )
     assert "mirror.modes: " in message
-    assert "needs astropy; expected pyrcal installed with its extra 'fits'" in message
+    assert "needs astropy; expected it beside pyrcal: pip install astropy" in message
 
 
 @pytest.mark.parametrize(

@@ -158,7 +158,7 @@ def test_a_truncated_fits_file_is_damaged(fits_file, tmp_path):
 
 def test_without_astropy_it_says_what_to_install(fits_file, monkeypatch):
     monkeypatch.setitem(sys.modules, "astropy.io", None)
-    assert "extra 'fits'" in refused(fits_file, "0")
+    assert "pip install astropy" in refused(fits_file, "0")
 
 
 # --- files made to deceive

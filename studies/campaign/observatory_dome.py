@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from typing import ParamSpec, TypeVar
@@ -16,10 +16,10 @@ from service.config import load_instrument
 from service.model.misregistration import Misregistration
 from service.telemetry.frames import FrameBlock
 from service.wire import Command, Reply, Status, decode, encode
-from sim_rtc.assembly import build_telescope
-from sim_rtc.computer.feed import BATCH_FRAMES
+from sim_rtc.assembly import Telescope, build_telescope
+from sim_rtc.computer.feed import BATCH_FRAMES, Block
 from sim_rtc.computer.telemetry import Batch, FrameClock, Reconstructor
-from sim_rtc.options import parse_options
+from sim_rtc.options import Options, parse_options
 from sim_rtc.telescope.plant import Optics
 from sim_rtc.truth import WavefrontError
 
@@ -84,8 +84,8 @@ class Dome:
         """Take the simulator's command line; ``block_batches`` messages make a block."""
         options = parse_options(list(words))
         self.instrument = load_instrument(options.instrument)
-        self.telescope = build_telescope(options, self.instrument, Inline())
-        self.computer = self.telescope.computer(self.telescope.feed.blocks())
+        self.telescope = self._built(options)
+        self.computer = self.telescope.computer(self._blocks())
         self.magnitude = options.magnitude
         self.rate_hz = options.frame_rate_hz
         self.jump_times_s = tuple(sorted(jump.time_s for jump in options.jumps))
@@ -151,6 +151,14 @@ class Dome:
             flux=self.telescope.detector.flux(self.computer.images),
         )
         return decode(Status, encode(status))
+
+    def _built(self, options: Options) -> Telescope:
+        """Return the telescope; another one may be built of the same options."""
+        return build_telescope(options, self.instrument, Inline())
+
+    def _blocks(self) -> Iterator[Block]:
+        """Yield what comes to the sensor."""
+        return self.telescope.feed.blocks()
 
     def _moment(self, batches: list[Batch]) -> Moment:
         last = batches[-1]

@@ -262,9 +262,10 @@ class OtherDome(Dome):
     def _built(self, options: Options) -> Telescope:
         telescope = super()._built(options)
         optics = self._other(telescope.plant.optics(self._calibrated))
-        matrix = truncated_inverse(true_response(optics, options.n_controlled))
+        n_controlled = options.n_controlled(self.instrument.modes.n_modes)
+        matrix = truncated_inverse(true_response(optics, n_controlled))
         own = Reconstructor.own(
-            f"own-{options.n_controlled}",
+            f"own-{n_controlled}",
             matrix,
             telescope.identity,
             created_ns=telescope.reconstructor.manifest.created_ns,

@@ -28,8 +28,15 @@ def check_parser() -> argparse.ArgumentParser:
     check.epilog = _EPILOG
     add(
         check,
-        words("--instrument NAME|FILE", "default %(default)s", default="flao-lbt"),
-        words("--system NAME", "of the keys, default the instrument's name"),
+        words(
+            "--instrument NAME|FILE",
+            "what slopes and commands are held against; default flao-lbt, and with --connect the "
+            "packaged one of the system's name",
+        ),
+        words(
+            "--system NAME",
+            "of the keys; default the instrument's name, and with --connect that of the RTC found",
+        ),
     )
     add(
         check.add_mutually_exclusive_group(),

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from check_rtc.articles import ARTICLES, Checked, Outcome
-from check_rtc.ear import Ear
+from check_rtc.ear import Ear, systems_with_rtc
 from check_rtc.examine import Examination, examine
 from check_rtc.offload import Registered
 from check_rtc.talk import Talk
 from check_rtc.watch import Watch
 from service.commands.terminal import say
-from service.config import load_instrument
-from service.errors import ConfigurationError, ModelError, shown
+from service.config import load_instrument, packaged_instrument
+from service.errors import ConfigurationError, LinkError, ModelError, shown
 from service.fit.dialect import Dialect, of_reconstructor
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
@@ -40,6 +40,11 @@ KEPT, BROKEN = 0, 1
 
 PAGE = "docs/rtc.md"
 
+DEFAULT = "flao-lbt"
+"""Instrument of an RTC that is waited for, where none is named."""
+
+NO_FILE = "slopes and commands are held against nothing; name its file with --instrument"
+
 
 def check(options: argparse.Namespace) -> int:
     """Check, tell, and return the exit status: 0 nothing is wrong, 1 something is.
@@ -54,25 +59,24 @@ def check(options: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"--only: found {', '.join(unknown)}, expected some of {', '.join(ARTICLES)}"
         )
-    instrument = load_instrument(options.instrument)
-    endpoint = Endpoint(
-        system=options.system or instrument.name,
-        listen=(options.listen,) if options.listen else Endpoint(system="any").listen,
-        connect=(options.connect,) if options.connect else (),
-    )
+    endpoint, instrument = _whom(options)
     wish = Examination(
         only=frozenset(options.only),
         passive=options.passive,
         open_loop=options.open_loop,
         listen_s=options.seconds,
         wait_s=options.wait,
-        basis_id=instrument.basis_id,
-        config_id=instrument.config_id,
         consent=lambda moved: _agreed(moved, yes=options.yes),
         move_image=options.move_image,
-        dialect=lambda matrix: compared(instrument, matrix),
-        registered=registering(instrument),
     )
+    if instrument is not None:
+        wish = replace(
+            wish,
+            basis_id=instrument.basis_id,
+            config_id=instrument.config_id,
+            dialect=lambda matrix: compared(instrument, matrix),
+            registered=registering(instrument),
+        )
     checks = []
     with Ear(endpoint, as_service=not options.passive) as ear:
         for one in examine(Talk(ear, Watch(endpoint, time.monotonic)), wish):
@@ -84,6 +88,44 @@ def check(options: argparse.Namespace) -> int:
     broken = [one.name for one in checks if one.outcome is Outcome.WRONG]
     say(f"{len(checks)} checks, {len(broken)} wrong{': ' if broken else ''}{', '.join(broken)}")
     return BROKEN if broken else KEPT
+
+
+def _whom(options: argparse.Namespace) -> tuple[Endpoint, Instrument | None]:
+    """Return where whose RTC is listened to, and its instrument; None: no file says of it.
+
+    Raises
+    ------
+    PyrcalError
+        If there is no RTC at a router, or there are several and none was named.
+    """
+    endpoint = Endpoint(
+        system=options.system or "any",
+        listen=(options.listen,) if options.listen else Endpoint(system="any").listen,
+        connect=(options.connect,) if options.connect else (),
+    )
+    if options.instrument is not None or (options.system is None and not options.connect):
+        instrument = load_instrument(options.instrument or DEFAULT)
+        return replace(endpoint, system=options.system or instrument.name), instrument
+    if options.system is None:
+        endpoint = replace(endpoint, system=_only_system(endpoint, options.wait))
+        say(f"the RTC there is that of system {endpoint.system}")
+    try:
+        return endpoint, packaged_instrument(endpoint.system)
+    except ConfigurationError:
+        say(f"no instrument of that name is packaged: {NO_FILE}")
+        return endpoint, None
+
+
+def _only_system(endpoint: Endpoint, wait_s: float) -> str:
+    found = systems_with_rtc(endpoint, wait_s)
+    where = ", ".join(endpoint.connect)
+    if not found:
+        raise LinkError(f"no RTC of any system was at {where} within {wait_s:g} s: start it")
+    if len(found) > 1:
+        raise ConfigurationError(
+            f"--system: found RTCs of {', '.join(found)} at {where}, expected the name of one"
+        )
+    return found[0]
 
 
 def line(one: Checked) -> str:

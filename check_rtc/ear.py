@@ -71,6 +71,26 @@ class Heard:
     """Of a token: whether it came; else it went."""
 
 
+def systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
+    """Return the systems whose RTC is at a router, the first to be there within ``wait_s``.
+
+    Raises
+    ------
+    LinkError
+        If no router answers.
+    """
+    session = link.open_session(endpoint)
+    end_s = time.monotonic() + wait_s
+    try:
+        while not (found := link.tokens(session, Keys.every_alive(Role.RTC))):
+            if time.monotonic() >= end_s:
+                return []
+            time.sleep(0.2)
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+    return sorted({Keys.system_of(key) for key in found})
+
+
 class Ear:
     """A context manager; what zenoh's threads bring waits until it is taken.
 

@@ -108,6 +108,16 @@ class Keys:
         """Liveliness token of one side."""
         return f"{self.root}/alive/{role}"
 
+    @staticmethod
+    def every_alive(role: Role) -> str:
+        """Liveliness tokens of one side in every system."""
+        return f"ao/v1/*/alive/{role}"
+
+    @staticmethod
+    def system_of(key: str) -> str:
+        """Return the system that a key belongs to."""
+        return key.split("/")[2]
+
     def rank(self, name: str) -> str:
         """Liveliness token of one of several services; its name tells who was first."""
         return f"{self.root}/alive/{Role.SERVICE}/{name}"

@@ -17,6 +17,7 @@ from service.tracking.alarms import ALARMS, Kind, Note, Severity
 from service.tracking.attention import muted, note_of, stale, worst
 from service.tracking.commands import GainGroup
 from service.tracking.registration import Registration
+from service.tracking.sending import why_no_return
 from service.tracking.state import LogEntry, TrackerState, Waiting
 from service.wire import Status
 
@@ -125,6 +126,11 @@ class Snapshot:
         """Null until the first accepted window."""
         known = self.tracker.registration
         return None if known is None else Alpha(known=known, snapshot=self)
+
+    @property
+    def no_return(self) -> str | None:
+        """Why the matrix in use could not be sent back after another one; null: it could."""
+        return why_no_return(self.tracker)
 
     @property
     def rtc(self) -> Rtc | None:

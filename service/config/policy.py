@@ -83,6 +83,7 @@ def policy_of(settings: Settings) -> Policy:
         update_gain_m=control.update_gain_nm * 1e-9,
         update_margin=control.update_margin,
         minimum_interval_s=control.minimum_interval_s,
+        opens_lost_loop=control.open_lost_loop,
         rules=tuple(
             Rule(
                 name=rule.name,

@@ -231,6 +231,10 @@ class ControlTable(Table):
     minimum_interval_s: float = Field(default=5.0, ge=0.0)
     """Least time between two reconstructors, seconds."""
 
+    open_lost_loop: bool | None = None
+    """Whether the RTC is asked to open a loop that is lost with a matrix just applied, where going
+    back to the one before does not help; left out: if the mode was auto when it was applied."""
+
 
 Size = Annotated[float, Field(ge=0.0)]
 FourAxes = tuple[Size, Size, Size, Size]

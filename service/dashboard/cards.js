@@ -147,7 +147,7 @@ export function showReconstructors(service, orders) {
     make("th", { scope: "row", text: role }),
     make("td", { text: r.id }),
     make("td", { className: "n", text: String(r.n_modes) }),
-    make("td", { text: shortly(r.alpha, r.sigma), title: registrationOf(r.alpha, r.sigma) }),
+    make("td", r.alpha ? { text: shortly(r.alpha, r.sigma), title: registrationOf(r.alpha, r.sigma) } : { text: r.origin }),
     make("td", { text: `${r.gate && !r.gate.accepted ? "REFUSED, " : ""}${margin(r.gate)?.text ?? "not judged"}`, title: verdict(r.gate) }),
     make("td", { text: r.created_ns_utc > 0 ? ago(milliseconds(r.created_ns_utc), now, true) : DASH }),
     make("td", { text: r.reason || DASH, title: r.reason }),

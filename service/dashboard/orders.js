@@ -316,6 +316,7 @@ const ORDERS = {
         `Largest closed-loop pole radius within α ± 3σ: ${verdict(record.gate)}.`,
         present(orders.wins) && `By the linear model it wins ${nanometres(orders.wins)} of wavefront error.`,
         "It is judged again first if the loop has changed, and not sent if it would not hold.",
+        orders.state.no_return && `There is no way back: ${orders.state.no_return}.`,
       ],
       button: "Approve and send",
       method: "POST",
@@ -344,7 +345,7 @@ const ORDERS = {
       title: `Roll back to ${before.id}`,
       facts: [
         `${before.id}, ${before.n_modes} modes, goes out again under a new id${inUse ? ` in place of ${inUse.id}, ${inUse.n_modes} modes` : ""}.`,
-        `Made for ${registrationOf(before.alpha, before.sigma)}.`,
+        before.alpha ? `Made for ${registrationOf(before.alpha, before.sigma)}.` : `It is ${before.origin}.`,
         `When it was judged last: ${verdict(before.gate)}. The gate judges it anew where it can.`,
         state.mode === "hold" ? "Mode stays hold." : `Mode becomes hold (it is ${state.mode}), so that the service does not undo it.`,
       ],

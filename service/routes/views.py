@@ -422,7 +422,7 @@ view("MoveView", Move, "id state text step total n_moves asked_ns_utc")
 RECONSTRUCTOR = view(
     "ReconstructorView",
     ReconstructorRecord,
-    "id state n_modes created_ns_utc alpha sigma parent sha256 condition_number gate reason "
+    "id state n_modes created_ns_utc alpha sigma parent origin sha256 condition_number gate reason "
     "published_ns_utc applied_frame_seq",
 )
 RECONSTRUCTORS = view(
@@ -486,8 +486,9 @@ STATE = view(
     "tracker.dithering tracker.vibrations_hz tracker.measuring tracker.gathering "
     "tracker.acquisition tracker.move tracker.loop_command tracker.dither_due_since_ns_utc "
     "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating "
-    "tracker.told alarms stale_alarms muted_alarms worst_severity tracker.windows_accepted "
-    "tracker.windows_refused tracker.windows_outlying window_refusal pace link",
+    "no_return tracker.told alarms stale_alarms muted_alarms worst_severity "
+    "tracker.windows_accepted tracker.windows_refused tracker.windows_outlying window_refusal pace "
+    "link",
     "What the service knows, at one glance.",
     measuring=MEASURING,
     gathering=GATHERING,

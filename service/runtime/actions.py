@@ -187,7 +187,9 @@ class Actions:
         gate, judged, why = None, None, effect.why
         gains = commanded_gains(rtc, len(matrix))
         if not effect.judged and source is not None:
-            gate, judged = source.gate, source.judged
+            # the loop ran with it: what the gate has against it since does not count
+            held = source.gate is not None and source.gate.accepted
+            gate, judged = (source.gate, source.judged) if held else (None, None)
         elif registration is not None and any(gains):
             gate = await self._verdict(matrix, gains, state)
             judged = judged_now(state, gains)

@@ -12,7 +12,7 @@ from service.tracking.commands import Command
 from service.tracking.dither_request import total_m
 from service.tracking.loop import CommandState
 from service.tracking.products import MatrixState, MeasureState, ReconstructorRecord
-from service.tracking.reconstructors import why_unsendable
+from service.tracking.sending import why_unsendable
 from service.tracking.state import TrackerState
 from service.tracking.turn import new_lines
 

@@ -17,7 +17,7 @@ from service.tracking.activity import operating
 from service.tracking.alarms import Act, Alarm, Party, forbids
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
-from service.tracking.reconstructors import why_unread
+from service.tracking.sending import why_no_return, why_unread
 from service.tracking.state import AcquisitionStage, Mode, TrackerState, Waiting
 from service.wire import TEXT_LIMIT, StateMessage
 
@@ -300,12 +300,14 @@ def _for_the_matrix(facts: Facts) -> Iterator[Waiting]:
     ):
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_told(state)}"
         yield Waiting(name="matrix-in-use", party=Party.RTC, text=text)
+    no_return = why_no_return(state)
     for record in state.reconstructors:
         if record.on_its_way:
             text = f"reconstructor {record.id} was sent: acknowledge that it is applied"
             yield Waiting(name="acknowledgement", party=Party.RTC, text=text)
-        elif record.state is MatrixState.PROPOSED and state.mode is not Mode.AUTO:
-            text = f"reconstructor {record.id} is proposed: approve or reject it"
+        elif record.state is MatrixState.PROPOSED and (state.mode is not Mode.AUTO or no_return):
+            why = f" ({no_return})" if no_return else ""
+            text = f"reconstructor {record.id} is proposed: approve or reject it{why}"
             yield Waiting(name="approval", party=Party.OPERATOR, text=text)
 
 

@@ -125,6 +125,10 @@ class ProbationFinding:
     slopes_ratio: float = 0.0
     """RMS of all slopes over that before."""
 
+    lost: bool = False
+    """Whether the loop does no longer what a loop is for: without it the wavefront would be no
+    worse."""
+
     ring_ratio: float | None = None
     """RMS of the outer ring against the mirror inside, over that before; None: too few modes."""
 

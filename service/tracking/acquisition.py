@@ -29,6 +29,7 @@ from service.tracking.dither import allow, choose_dither, make_way
 from service.tracking.measuring import cut_off
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.sending import why_unsendable
 from service.tracking.state import Acquisition, AcquisitionStage, Interruption, Mode, TrackerState
 from service.tracking.turn import Turn
 from service.wire import DitherRequest, LoopRequest, Reply, Status
@@ -255,7 +256,7 @@ def _on_made(turn: Turn, made: ev.MatrixMade) -> None:
         )
         turn.log("reconstructor.discarded", f"{record.id}: {stale}")
         return
-    reason = reconstructors.why_unsendable(turn.state, record)
+    reason = why_unsendable(turn.state, record)
     if reason is not None:
         stages.restart(turn, f"{record.id} cannot be sent: {reason}")
         return

@@ -53,6 +53,7 @@ MESSAGES_REFUSED = "messages-refused"
 STATUS_FLOOD = "status-flood"
 WORKER_LOST = "worker-lost"
 WORKER_BEHIND = "worker-behind"
+LOOP_OPENED = "loop-opened"
 
 
 class Act(StrEnum):

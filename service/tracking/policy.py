@@ -143,6 +143,10 @@ class Policy:
     rules: tuple[Rule, ...] = ()
     """Operators' own."""
 
+    opens_lost_loop: bool | None = None
+    """Whether a loop that is lost with a matrix just applied is asked to open where going back does
+    not help; None: where the mode was auto when it was applied."""
+
     offloading: Offloading | None = None
     """None: α is corrected by the matrix alone."""
 

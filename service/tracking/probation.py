@@ -1,15 +1,28 @@
-"""Probation: a matrix just applied that makes the loop worse gives way to the one before."""
+"""Probation: a matrix just applied that makes the loop worse gives way to the one before.
+
+The one before held the loop until a moment ago, whoever made it: it is sent again whatever the gate
+or telemetry have said since. If the loop is lost all the same it is asked to open.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from service.telemetry.probation import WITHIN_S, Verdict
+from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors
-from service.tracking.alarms import PROBATION
-from service.tracking.loop import commanded_gains, same_but_for_modes, why_open
-from service.tracking.operator import hold
+from service.tracking.alarms import (
+    DIVERGING,
+    LOOP_OPENED,
+    OFF_LOOP,
+    PROBATION,
+    WRONG_LOOP,
+    Act,
+    forbids,
+)
+from service.tracking.loop import CommandState, same_but_for_modes, why_open
+from service.tracking.operator import hold, set_loop
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import (
     MatrixState,
@@ -17,9 +30,9 @@ from service.tracking.products import (
     ProbationState,
     ReconstructorRecord,
 )
-from service.tracking.state import TrackerState
+from service.tracking.sending import why_unsendable
+from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
-from service.tracking.worth import why_of_another_loop
 
 LATE_S = 1.0
 """For telemetry to come with the verdict: nothing else waits longer."""
@@ -27,10 +40,33 @@ LATE_S = 1.0
 COPIED_WITHIN_S = 10.0
 """For the matrix before to be ready to be sent again."""
 
+LAW_WITHIN_S = 5.0
+"""After a swap commands that do not obey the loop are the swap's doing: it takes up to 2 s of
+telemetry to show that they do not."""
+
+CALM_WITHIN_S = 1.0
+"""For a loop that diverges to be calm again with the matrix before: the watch on it remembers half
+a second."""
+
+OPEN_AGAIN_S = 2.0
+"""Between two requests to open the loop."""
+
+_TELLING = (WRONG_LOOP, OFF_LOOP, DIVERGING)
+"""Alarms that say by themselves that the RTC plays another matrix, or one that does not hold."""
+
 _OVER = frozenset(
     {MatrixState.FAILED, MatrixState.REJECTED, MatrixState.REFUSED, MatrixState.DISCARDED}
 )
 _GOING_BACK = frozenset({ProbationState.ROLLING_BACK, ProbationState.KEPT})
+_WORSE = frozenset(
+    {
+        ProbationState.ROLLING_BACK,
+        ProbationState.WATCHED,
+        ProbationState.ROLLED_BACK,
+        ProbationState.KEPT,
+        ProbationState.OPENING,
+    }
+)
 
 
 def follow(turn: Turn) -> None:
@@ -41,16 +77,26 @@ def follow(turn: Turn) -> None:
     trial = turn.state.probation
     if trial is None:
         return
-    if trial.awaits(trial.before, trial.id):
-        why = _why_not_comparable(turn)
-        if why:
-            _set(turn, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
-        elif trial.under_way and turn.now_ns > trial.until_ns_utc + LATE_S * SECOND_NS:
-            _set(turn, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
-    elif trial.under_way:
-        why = _why_stuck(turn, trial)
-        if why:
-            _keep(turn, trial, why)
+    told = _told_by_alarm(turn, trial)
+    if told:
+        _go_back(turn, trial, told)
+    else:
+        _go_on(turn, trial)
+
+
+def _go_on(turn: Turn, trial: Probation) -> None:
+    match trial.state:
+        case ProbationState.RUNNING | ProbationState.OVERDUE:
+            _await_verdict(turn, trial)
+        case ProbationState.ROLLING_BACK:
+            _await_copy(turn, trial)
+        case ProbationState.WATCHED:
+            _watch(turn, trial)
+        case ProbationState.OPENING:
+            _await_opening(turn, trial)
+        case ProbationState.OPENED if turn.rtc is not None and turn.rtc.in_loop:
+            _set(turn, replace(trial, state=ProbationState.ROLLED_BACK))
+            turn.calm(LOOP_OPENED)
 
 
 def on_compared(turn: Turn, event: ev.Compared) -> None:
@@ -61,24 +107,17 @@ def on_compared(turn: Turn, event: ev.Compared) -> None:
     trial, found = turn.state.probation, event.finding
     if trial is None or not trial.awaits(found.before, found.after):
         return
+    if trial.state is ProbationState.WATCHED:
+        _end_watch(turn, trial, found.text, lost=found.lost)
+        return
     trial = replace(trial, finding=found)
     if found.verdict is Verdict.UNKNOWN:
         _end(turn, trial, ProbationState.NOT_JUDGED, found.text)
-        return
-    if found.verdict is Verdict.AS_GOOD:
+    elif found.verdict is Verdict.AS_GOOD:
         _end(turn, trial, ProbationState.PASSED, found.text)
         turn.calm(PROBATION)
-        return
-    hold(turn, f"{trial.id} made the loop worse")
-    why = _why_no_way_back(turn, trial)
-    if why is not None:
-        _keep(turn, trial, why)
-        return
-    text = f"{_numbers(trial)}: going back to {trial.before}"
-    _set(turn, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
-    turn.alarm(PROBATION, f"{trial.id} {text}")
-    why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
-    reconstructors.make(turn, ev.CopyMatrix(source=trial.before, why=why, judged=False))
+    else:
+        _go_back(turn, trial, found.text)
 
 
 def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
@@ -103,47 +142,155 @@ def go_back(turn: Turn, made: ev.MatrixMade) -> None:
     if why is not None:
         _keep(turn, trial, why)
         return
-    reconstructors.send(turn, made.record.id)
+    reconstructors.send(turn, made.record.id, trial.since_ns_utc)
     _set(turn, replace(trial, rollback=made.record.id))
+
+
+def _go_back(turn: Turn, trial: Probation, found: str) -> None:
+    """Have the matrix before sent again; where that cannot be say why."""
+    hold(turn, f"{trial.id} made the loop worse")
+    trial = replace(trial, text=found)
+    why = _why_no_way_back(turn, trial)
+    if why is not None:
+        _keep(turn, trial, why)
+        return
+    text = f"made the loop worse: {found}: going back to {trial.before}"
+    _set(turn, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
+    turn.alarm(PROBATION, f"{trial.id} {text}")
+    why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
+    reconstructors.make(turn, ev.CopyMatrix(source=trial.before, why=why, judged=False))
 
 
 def _on_swap(turn: Turn, before: str | None, in_use: str | None) -> None:
     trial = turn.state.probation
     record = None if in_use is None else turn.state.reconstructor(in_use)
     if trial is not None and trial.state in _GOING_BACK and trial.rollback == in_use is not None:
-        text = f"{_numbers(trial)}: the service went back to {trial.before}, as {in_use}"
-        # an operator's rollback would go back to it
-        reconstructors.change_state(
-            turn, trial.id, MatrixState.FAILED, f"rolled back, it {_numbers(trial)}"
-        )
-        _end(turn, trial, ProbationState.ROLLED_BACK, text)
-        turn.alarm(PROBATION, f"{trial.id} {text}; the mode is hold until an operator sets another")
+        _begin_watch(turn, trial, in_use)
         return
     if record is None or before is None:
-        if trial is not None and trial.awaits(trial.before, trial.id):
+        if trial is not None and trial.judges is not None:
             why = "nobody knows what the RTC uses"
             _set(turn, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
         return
     why = _why_none(turn, record, trial)
+    worse = trial is not None and trial.id == before and trial.state in _WORSE
+    asked = turn.policy.opens_lost_loop
     _set(
         turn,
         Probation(
             id=record.id,
             before=before,
+            reference=trial.reference if trial is not None and worse else before,
             state=ProbationState.NOT_JUDGED if why else ProbationState.RUNNING,
             text=why or f"compared with {before}",
             since_ns_utc=turn.now_ns,
             until_ns_utc=turn.now_ns + round(WITHIN_S * SECOND_NS),
             loop=turn.before.rtc,
+            opens=turn.before.mode is Mode.AUTO if asked is None else asked,
         ),
     )
+
+
+def _await_verdict(turn: Turn, trial: Probation) -> None:
+    why = _why_not_comparable(turn)
+    if why:
+        _set(turn, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
+    elif trial.under_way and turn.now_ns > trial.until_ns_utc + LATE_S * SECOND_NS:
+        _set(turn, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
+
+
+def _await_copy(turn: Turn, trial: Probation) -> None:
+    why = _why_stuck(turn, trial)
+    if why:
+        _keep(turn, trial, why)
+
+
+def _begin_watch(turn: Turn, trial: Probation, in_use: str) -> None:
+    """Look whether the loop is as it was, now that the matrix before is in use again."""
+    text = f"{_numbers(trial)}: the service went back to {trial.before}, as {in_use}"
+    # an operator's rollback would go back to it
+    reconstructors.change_state(
+        turn, trial.id, MatrixState.FAILED, f"rolled back, it {_numbers(trial)}"
+    )
+    watched = replace(
+        trial,
+        since_ns_utc=turn.now_ns,
+        until_ns_utc=turn.now_ns + round(WITHIN_S * SECOND_NS),
+    )
+    _end(turn, watched, ProbationState.WATCHED, text)
+    turn.alarm(PROBATION, f"{trial.id} {text}; the mode is hold until an operator sets another")
+
+
+def _watch(turn: Turn, trial: Probation) -> None:
+    """End the look at a loop with the matrix before: it is lost, opened, or nothing tells."""
+    waited_s = (turn.now_ns - trial.since_ns_utc) / SECOND_NS
+    lost = next((a for a in turn.state.alarms if forbids(a, Act.HOLD)), None)
+    if turn.rtc is None or not turn.rtc.in_loop:
+        why = "the RTC is gone" if turn.rtc is None else why_open(turn.rtc)
+        _end_watch(turn, trial, why, lost=False)
+    elif lost is not None and waited_s > CALM_WITHIN_S:
+        _end_watch(turn, trial, lost.text, lost=True)
+    elif waited_s > WITHIN_S + LATE_S:
+        _end_watch(turn, trial, "telemetry does not tell how the loop is since", lost=False)
+
+
+def _end_watch(turn: Turn, trial: Probation, found: str, *, lost: bool) -> None:
+    trial = replace(trial, text=f"{trial.text}; since then: {found}")
+    if lost and trial.opens:
+        _open(turn, trial)
+        return
+    _end(turn, trial, ProbationState.ROLLED_BACK, trial.text)
+    do = "; open the loop" if lost else ""
+    text = f"{trial.id} {trial.text}; the mode is hold until an operator sets another{do}"
+    turn.alarm(PROBATION, text, critical=lost)
+
+
+def _open(turn: Turn, trial: Probation) -> None:
+    """Ask the RTC to open a loop that is lost, and say so."""
+    _end(turn, trial, ProbationState.OPENING, trial.text)
+    turn.alarm(LOOP_OPENED, _opening(trial, "the RTC is asked to open the loop"))
+    set_loop(turn, cmd.SetLoop(loop="open"))
+
+
+def _await_opening(turn: Turn, trial: Probation) -> None:
+    """Ask again until the loop is open, or an operator says how to go on."""
+    rtc, asked = turn.rtc, turn.state.loop_command
+    if isinstance(turn.event, cmd.SetMode):
+        _set(turn, replace(trial, state=ProbationState.KEPT))
+        turn.calm(LOOP_OPENED)
+    elif rtc is not None and not rtc.in_loop:
+        _set(turn, replace(trial, state=ProbationState.OPENED))
+        turn.alarm(LOOP_OPENED, _opening(trial, "the loop was asked to open, and is open"))
+    elif rtc is not None and asked is not None and not turn.state.stopped_because:
+        if asked.state in {CommandState.REFUSED, CommandState.FAILED}:
+            why = f"the RTC was asked to open the loop and has not ({asked.reason}): open it there"
+            turn.alarm(LOOP_OPENED, _opening(trial, why))
+        if turn.now_ns - asked.asked_ns_utc > OPEN_AGAIN_S * SECOND_NS:
+            set_loop(turn, cmd.SetLoop(loop="open"))
+
+
+def _opening(trial: Probation, does: str) -> str:
+    return (
+        f"{trial.id} {trial.text}; {does}; find out why, then close it on a matrix known to be "
+        "good; the mode is hold until an operator sets another"
+    )
+
+
+def _told_by_alarm(turn: Turn, trial: Probation) -> str:
+    """Return what an alarm says of a matrix just applied; empty: none has come with it."""
+    judged = {ProbationState.RUNNING, ProbationState.OVERDUE, ProbationState.PASSED}
+    late = turn.now_ns > trial.since_ns_utc + LAW_WITHIN_S * SECOND_NS
+    if trial.state not in judged or late or _why_not_comparable(turn):
+        return ""
+    since = (a for a in turn.state.alarms if a.since_ns_utc >= trial.since_ns_utc)
+    return next((alarm.text for alarm in since if alarm.name in _TELLING), "")
 
 
 def _why_none(turn: Turn, record: ReconstructorRecord, last: Probation | None) -> str:
     """Return why a matrix just applied is not put on probation; empty: it is."""
     if record.published_ns_utc is None:
         return "the RTC took it by itself"
-    if last is not None and last.state in {ProbationState.ROLLED_BACK, ProbationState.KEPT}:
+    if last is not None and last.state in _WORSE:
         worse = turn.state.reconstructor(last.id)
         if worse is not None and worse.sha256 == record.sha256 != "":
             return "it was found worse before, and somebody wants it all the same"
@@ -176,37 +323,41 @@ def _why_stuck(turn: Turn, trial: Probation) -> str:
 def _why_no_way_back(turn: Turn, trial: Probation) -> str | None:
     """Return why the matrix before may not be sent by itself now, or None.
 
-    The RTC has shown its numbers in this session, the gate has accepted it in this loop, and the
-    loop is as it was then. α may be what is wrong: it is not judged at that.
+    The RTC has shown its numbers in this session, and the loop is as it was then. The gate is not
+    asked: the loop ran with it, and α may be what is wrong.
     """
     state, rtc, record = turn.state, turn.rtc, turn.state.reconstructor(trial.before)
     if rtc is None or record is None:
         return "it is no longer known, or the RTC is gone"
     if record.id not in state.proven:
         return "the RTC has not shown its numbers in this session"
-    if record.gate is None or not record.gate.accepted:
-        return "the gate has not accepted it" if record.gate is None else record.gate.reason
     if trial.loop is None or not same_but_for_modes(trial.loop, rtc):
         return "the loop has been changed since"
     on_way = next((r.id for r in state.reconstructors if r.on_its_way), None)
     if on_way is not None:
         return f"{on_way} is on its way to the RTC"
-    gains = commanded_gains(rtc, record.n_modes)
-    return reconstructors.why_unsendable(state, record) or why_of_another_loop(
-        state, record.judged, gains
-    )
+    return why_unsendable(state, record, trial.since_ns_utc)
 
 
 def _numbers(trial: Probation) -> str:
+    """Return what was found of a matrix that is worse."""
     found = trial.finding
-    return "made the loop worse" + ("" if found is None else f": {found.text}")
+    if found is None:
+        return f"made the loop worse: {trial.text.removeprefix('made the loop worse: ')}"
+    return f"made the loop worse: {found.text}"
 
 
 def _keep(turn: Turn, trial: Probation, why: str) -> None:
-    """Say that a matrix that is worse stays in use."""
+    """Say that a matrix that is worse stays in use; open the loop that is lost with it."""
     text = f"{_numbers(trial)}; the service did not go back to {trial.before}: {why}"
+    out_of_hand = turn.forbidden(Act.HOLD) is not None
+    lost = out_of_hand or (trial.finding is not None and trial.finding.lost)
+    if lost and trial.opens and turn.rtc is not None and not turn.state.stopped_because:
+        _open(turn, replace(trial, text=text))
+        return
     _end(turn, trial, ProbationState.KEPT, text)
-    turn.alarm(PROBATION, f"{trial.id} {text}; open the loop if it suffers, or roll back by hand")
+    do = "open the loop if it suffers, or roll back by hand"
+    turn.alarm(PROBATION, f"{trial.id} {text}; {do}", critical=lost)
 
 
 def _end(turn: Turn, trial: Probation, state: ProbationState, text: str) -> None:

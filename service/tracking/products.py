@@ -126,6 +126,18 @@ class ReconstructorRecord:
     """First frame whose slopes it multiplied; None: not applied, or before this service came."""
 
     @property
+    def is_rtcs(self) -> bool:
+        """Whether its numbers are the RTC's own, brought by it or sent again."""
+        return self.alpha is None
+
+    @property
+    def origin(self) -> str:
+        """Who made its numbers: the RTC, or the service."""
+        if not self.is_rtcs:
+            return "the service's"
+        return "the RTC's own" + ("" if self.parent is None else f", {self.parent} sent again")
+
+    @property
     def on_its_way(self) -> bool:
         """Whether it was sent, and the RTC has not said what became of it."""
         return self.state in _ON_ITS_WAY
@@ -214,14 +226,27 @@ class ProbationState(StrEnum):
     ROLLING_BACK = "rolling-back"
     """It is worse: the matrix before is on its way back."""
 
+    WATCHED = "watched"
+    """It was worse; the matrix before is in use again, and the loop is looked at with it."""
+
     ROLLED_BACK = "rolled-back"
     """It was worse; the matrix before is in use again."""
 
     KEPT = "kept"
     """It is worse, and the service could not go back; the text says why."""
 
+    OPENING = "opening"
+    """The loop was lost with it, and going back was no help or no way: it is asked to open."""
+
+    OPENED = "opened"
+    """The loop opened when it was asked to."""
+
     NOT_JUDGED = "not-judged"
     """There was nothing to compare with; the text says why."""
+
+
+_ON_PROBATION = (ProbationState.RUNNING, ProbationState.ROLLING_BACK, ProbationState.WATCHED)
+"""As above."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -233,6 +258,10 @@ class Probation:
 
     before: str
     """Of the one that was in use before."""
+
+    reference: str
+    """Of the one whose telemetry it is compared with: the one before, or the last that was not
+    found worse."""
 
     state: ProbationState
     text: str
@@ -251,15 +280,25 @@ class Probation:
     rollback: str | None = None
     """Id under which the matrix before was sent again; None: it was not."""
 
+    opens: bool = False
+    """Whether the loop may be asked to open where it is lost and going back does not help."""
+
+    @property
+    def judges(self) -> str | None:
+        """Id of the matrix on which a verdict is waited for; None: on none."""
+        if self.state is ProbationState.WATCHED:
+            return self.rollback
+        waits = self.state in {ProbationState.RUNNING, ProbationState.OVERDUE}
+        return self.id if waits else None
+
     def awaits(self, before: str, after: str) -> bool:
         """Return whether a verdict on these two is waited for."""
-        waits = self.state in {ProbationState.RUNNING, ProbationState.OVERDUE}
-        return waits and (before, after) == (self.before, self.id)
+        return (before, after) == (self.reference, self.judges)
 
     @property
     def under_way(self) -> bool:
         """Whether nothing else is to be sent meanwhile."""
-        return self.state in {ProbationState.RUNNING, ProbationState.ROLLING_BACK}
+        return self.state in _ON_PROBATION
 
 
 class MeasureState(StrEnum):

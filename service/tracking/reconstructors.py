@@ -7,9 +7,16 @@ from dataclasses import replace
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking import worth
-from service.tracking.alarms import NOT_ACKNOWLEDGED, OTHER_SUM, SHORT_MARGIN, Act, forbidding
+from service.tracking.alarms import NOT_ACKNOWLEDGED, OTHER_SUM, SHORT_MARGIN, Act
 from service.tracking.loop import commanded_gains, extended_gains
 from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
+from service.tracking.sending import (
+    beyond_judging,
+    may_follow,
+    why_no_return,
+    why_unread,
+    why_unsendable,
+)
 from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.turn import Turn
 from service.wire import Acknowledgement, AckState, Status
@@ -145,10 +152,13 @@ def on_matrix(turn: Turn, made: ev.MatrixMade) -> None:
         change_state(turn, record.id, MatrixState.DISCARDED, text)
         turn.log("reconstructor.discarded", text)
         return
-    held = why_unsendable(turn.state, record) or _beyond_judging(turn.state, record)
-    if not held and made.anyway:
+    held = why_unsendable(turn.state, record) or beyond_judging(turn.state, record)
+    no_return = None if wanted or turn.state.mode is not Mode.AUTO else why_no_return(turn.state)
+    if not held and no_return is not None:
+        turn.log("reconstructor.kept-back", f"{record.id} is proposed and not sent: {no_return}")
+    elif not held and made.anyway:
         send(turn, record.id)
-    elif not held and (wanted or _may_follow(turn.state)):
+    elif not held and (wanted or may_follow(turn.state)):
         send_once_judged(turn, record.id, wanted=wanted)
 
 
@@ -180,7 +190,7 @@ def send_once_judged(turn: Turn, matrix_id: str, *, wanted: bool = True) -> None
     if stale is None or (rtc.loop == "open" and record.gate is None):
         send(turn, matrix_id)
         return
-    if _beyond_judging(turn.state, record):
+    if beyond_judging(turn.state, record):
         raise CommandError(f"{matrix_id}: an open loop does not tell its gains: close it first")
     if rtc.loop == "open" and record.judged is not None:
         gains = record.judged.gains
@@ -202,7 +212,7 @@ def on_proposal_judged(turn: Turn, event: ev.ProposalJudged) -> None:
         return
     change(turn, record)
     reason = why_unsendable(turn.state, record)
-    if reason is None and not event.wanted and not _may_follow(turn.state):
+    if reason is None and not event.wanted and not may_follow(turn.state):
         alarm = turn.forbidden(Act.DECIDE)
         reason = f"{alarm.name}: {alarm.text}" if alarm else "the mode, the loop or α has changed"
     if rtc is not None and reason is None:
@@ -214,17 +224,19 @@ def on_proposal_judged(turn: Turn, event: ev.ProposalJudged) -> None:
     turn.warn("reconstructor.not-sent", text)
 
 
-def send(turn: Turn, matrix_id: str) -> None:
+def send(turn: Turn, matrix_id: str, swapped_ns_utc: int | None = None) -> None:
     """Mark a reconstructor as published and ask for it to be sent, with the gains in force.
+
+    ``swapped_ns_utc``: to go back behind the swap of then, as :func:`why_unsendable` has it.
 
     Raises
     ------
     CommandError
         If no RTC is there, it may be the wrong one, or the gate's latest verdict is no.
     """
-    record, rtc = _sendable(turn, matrix_id)
+    record, rtc = _sendable(turn, matrix_id, swapped_ns_utc)
     same = record.n_modes == rtc.n_controlled
-    send_with(turn, matrix_id, None if same else extended_gains(rtc, record.n_modes))
+    _send(turn, record, None if same else extended_gains(rtc, record.n_modes))
 
 
 def send_with(turn: Turn, matrix_id: str, gains: tuple[float, ...] | None) -> None:
@@ -236,14 +248,18 @@ def send_with(turn: Turn, matrix_id: str, gains: tuple[float, ...] | None) -> No
         As above.
     """
     record, _ = _sendable(turn, matrix_id)
+    _send(turn, record, gains)
+
+
+def _send(turn: Turn, record: ReconstructorRecord, gains: tuple[float, ...] | None) -> None:
     unjudged = _why_unjudged(record)
     change(
         turn,
         replace(record, state=MatrixState.PUBLISHED, published_ns_utc=turn.now_ns, reason=unjudged),
     )
-    text = f"{matrix_id} sent to the RTC{'; ' if unjudged else ''}{unjudged}"
+    text = f"{record.id} sent to the RTC{'; ' if unjudged else ''}{unjudged}"
     turn.log("reconstructor.published", text, Level.WARNING if unjudged else Level.INFO)
-    turn.ask(ev.SendMatrix(id=matrix_id, n_modes=record.n_modes, gains=gains))
+    turn.ask(ev.SendMatrix(id=record.id, n_modes=record.n_modes, gains=gains))
 
 
 def on_acknowledgement(turn: Turn, event: Acknowledgement) -> None:
@@ -320,17 +336,6 @@ def use_named(turn: Turn, matrix_id: str) -> None:
         turn.log("reconstructor.applied", text)
 
 
-def why_unread(state: TrackerState, matrix_id: str | None) -> str | None:
-    """Return why nobody knows the numbers of this matrix of the RTC's, or None."""
-    if matrix_id is None or matrix_id in state.proven:
-        return None
-    if matrix_id == state.wrong_matrix:
-        return f"the RTC holds other numbers as {matrix_id}"
-    if state.unfetched:
-        return None  # an RTC need not offer its matrix; its id is believed then
-    return f"the RTC's matrix {matrix_id} is being read back: wait some seconds"
-
-
 def on_margin(turn: Turn, event: ev.MarginJudged) -> None:
     """Note margin and loss of the matrix in use; raise an alarm when the margin is short."""
     record, verdict, judged = turn.state.reconstructor(event.id), event.verdict, event.judged
@@ -357,7 +362,9 @@ def on_margin(turn: Turn, event: ev.MarginJudged) -> None:
         turn.alarm(SHORT_MARGIN, f"{event.id}: {verdict.reason}", critical=verdict.unstable)
 
 
-def _sendable(turn: Turn, matrix_id: str) -> tuple[ReconstructorRecord, Status]:
+def _sendable(
+    turn: Turn, matrix_id: str, swapped_ns_utc: int | None = None
+) -> tuple[ReconstructorRecord, Status]:
     """Return a reconstructor that may be sent, and to whom.
 
     Raises
@@ -366,7 +373,7 @@ def _sendable(turn: Turn, matrix_id: str) -> tuple[ReconstructorRecord, Status]:
         If it cannot be sent now.
     """
     record, rtc = known_record(turn.state, matrix_id), turn.rtc
-    reason = why_unsendable(turn.state, record)
+    reason = why_unsendable(turn.state, record, swapped_ns_utc)
     if record.gate is not None and not record.gate.accepted:
         reason = record.gate.reason
     if rtc is None or reason is not None:
@@ -404,43 +411,6 @@ def _trust(turn: Turn, matrix_id: str) -> None:
         turn.state = replace(turn.state, wrong_matrix=None)
         turn.log("reconstructor.right", f"the RTC holds {matrix_id} as it was sent")
         turn.calm(OTHER_SUM)
-
-
-def why_unsendable(state: TrackerState, record: ReconstructorRecord) -> str | None:
-    """Return why a reconstructor may not be published now, whoever wants it, or None."""
-    if state.rtc is None:
-        return "no RTC is there"
-    known, registration = _was_in_use(state, record), state.registration
-    if registration is not None and not known:  # one must be able to go back
-        if registration.candidate is not None:
-            return "a jump is suspected: the next window of telemetry decides"
-        if registration.doubt:
-            return f"α is invalid ({registration.doubt})"
-    act = Act.SEND_KNOWN if known else Act.SEND_NEW
-    alarm = forbidding(state, act)
-    return why_unread(state, state.rtc.cm_id) if alarm is None else alarm.text
-
-
-def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
-    """Return whether the very numbers of this reconstructor have been in use before."""
-    same = (r for r in state.reconstructors if r.sha256 == record.sha256)
-    return bool(record.sha256) and any(r.was_used for r in same)
-
-
-def _may_follow(state: TrackerState) -> bool:
-    """Return whether a reconstructor that nobody asked for may be sent."""
-    rtc, known = state.rtc, state.registration
-    if state.mode is not Mode.AUTO or state.on_probation or rtc is None or not rtc.in_loop:
-        return False
-    if forbidding(state, Act.DECIDE) is not None:
-        return False
-    return known is not None and worth.settled(known)
-
-
-def _beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
-    """Return whether nobody knows the gains it was judged with, nor those it would run with."""
-    opened = state.rtc is not None and state.rtc.loop == "open"
-    return opened and record.gate is not None and record.judged is None
 
 
 def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:

@@ -122,15 +122,14 @@ def obey(turn: Turn, orders: Orders) -> None:
 def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRecord, ...]:
     """Return what a restarted service takes over from its archive.
 
-    Only its own: what the RTC brought is fetched anew, for nobody can say it is the same as last
-    time. What was under way has failed; a proposal's verdict is of another day.
+    What was under way has failed; a proposal's verdict is of another day. What the RTC brought can
+    be gone back to, and is read back anew, for nobody can say it is the same as last time.
     """
-    own = [record for record in records if record.parent is not None]
     taken_over = [
         replace(record, state=_RESTARTED[record.state], reason="the service restarted")
         if record.state in _RESTARTED
         else record
-        for record in own
+        for record in records
     ]
     return thinned(taken_over, None)
 

@@ -9,6 +9,7 @@ from service.tracking.events import MakeMatrix
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import fetch, judge, make
+from service.tracking.sending import why_no_return
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.worth import (
@@ -115,15 +116,12 @@ def _choose_update(turn: Turn, rtc: Status) -> None:
 def _busy(state: TrackerState) -> bool:
     """Return whether a reconstructor is on its way, or one that fits α awaits an operator.
 
-    In auto nobody is going to decide on a proposal left from another mode or an absent RTC.
+    In auto nobody is going to decide on a proposal left from another mode or an absent RTC, but
+    where there would be no way back.
     """
+    awaited = state.mode is not Mode.AUTO or why_no_return(state) is not None
     return any(
-        r.on_its_way
-        or (
-            r.state is MatrixState.PROPOSED
-            and state.mode is not Mode.AUTO
-            and not outdated(state, r)
-        )
+        r.on_its_way or (r.state is MatrixState.PROPOSED and awaited and not outdated(state, r))
         for r in state.reconstructors
     )
 

@@ -9,7 +9,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState, ProbationState
 from service.tracking.state import Mode
-from tests.unit.tracking.situations import Story, acknowledged, moved, rtc
+from tests.unit.tracking.situations import Story, acknowledged, moved, rtc, verdict
 
 NUMBERS = "mode 30 moves 3.10 times as much"
 
@@ -70,10 +70,12 @@ def test_one_that_makes_the_loop_worse_gives_way_to_the_one_before():
     copied(told)
     assert told.asked(ev.SendMatrix) == [ev.SendMatrix(id="cm-3", n_modes=400, gains=None)]
     told.acknowledge("cm-3")
-    assert (trial(told).state, trial(told).rollback) == (ProbationState.ROLLED_BACK, "cm-3")
+    assert (trial(told).state, trial(told).rollback) == (ProbationState.WATCHED, "cm-3")
     assert told.state.in_use == "cm-3"
     assert told.matrix_state("cm-2") is MatrixState.FAILED
     assert told.state.previous != "cm-2", "an operator's rollback would use it again"
+    told.tell(found(Verdict.AS_GOOD, after="cm-3"))
+    assert trial(told).state is ProbationState.ROLLED_BACK
     assert "probation" in told.alarms
     assert "probation.rolled-back" in told.logged
 
@@ -141,13 +143,23 @@ def test_nothing_is_sent_where_something_forbids_it(obstacle, text, late):
         assert "open the loop" in alarm.text
 
 
-def test_one_whose_numbers_nobody_has_seen_or_that_the_gate_refused_is_not_gone_back_to():
+def test_one_whose_numbers_the_rtc_has_not_shown_is_not_gone_back_to():
     told = story(after="")
+    told.state = replace(told.state, proven=frozenset({"cm-1"}))
     told.tell(found(before="initial", after="cm-1"))
     assert trial(told).state is ProbationState.KEPT
-    assert "the gate has not accepted it" in trial(told).text
+    assert "has not shown its numbers" in trial(told).text
     assert told.asked(ev.CopyMatrix) == []
     assert told.state.mode is Mode.HOLD
+
+
+def test_what_the_gate_says_of_the_matrix_before_by_now_is_not_asked():
+    """α may be what is wrong, and the loop held with it until a moment ago."""
+    told = story()
+    told.tell(ev.MarginJudged(id="cm-1", verdict=verdict(accepted=False)))
+    told.tell(found())
+    copied(told, gate=None, judged=None)
+    assert [effect.id for effect in told.asked(ev.SendMatrix)] == ["cm-3"]
 
 
 def test_while_it_runs_nothing_is_made_or_sent_unasked():

@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import pytest
 
 from service.errors import UnknownIdError
+from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.reconstructors import (
     RECONSTRUCTORS_KEPT,
@@ -12,7 +15,7 @@ from service.tracking.reconstructors import (
 )
 from service.tracking.resume import restored
 from service.tracking.state import TrackerState
-from tests.unit.tracking.situations import foreign, record, turned
+from tests.unit.tracking.situations import Story, foreign, record, rtc, turned
 
 STATE = TrackerState(system="flao")
 
@@ -42,8 +45,14 @@ def test_a_restarted_service_gives_up_what_was_under_way_and_keeps_what_was_deci
     assert (kept.reason == "the service restarted") is (before is not after)
 
 
-def test_a_restarted_service_fetches_the_rtcs_own_matrices_anew():
-    assert restored((foreign(), record("cm-1")))[0].id == "cm-1"
+def test_a_restarted_service_knows_the_rtcs_own_matrices_and_believes_none_of_them():
+    assert [kept.id for kept in restored((foreign(), record("cm-1")))] == ["initial", "cm-1"]
+    story = Story(state=replace(STATE, reconstructors=restored((foreign(),))))
+    story.shows = False
+    story.tell(ev.SessionStarted(session="s1"))
+    story.tell(rtc())
+    assert story.asked(ev.FetchMatrix) == [ev.FetchMatrix(id="initial")]
+    assert story.state.in_use is None
 
 
 def test_a_restarted_service_takes_over_the_newest_only():

@@ -1,0 +1,91 @@
+"""Whether a reconstructor may be sent now, by whom, and whether one could go back after it."""
+
+from __future__ import annotations
+
+from service.tracking import alarms, worth
+from service.tracking.alarms import Act, Alarm, forbidding, forbids
+from service.tracking.products import ReconstructorRecord
+from service.tracking.state import Mode, TrackerState
+
+_OF_A_SWAP = (
+    *(alarms.DIVERGING, alarms.EDGE_SLIP, alarms.OFF_LOOP, alarms.WRONG_LOOP, alarms.WRONG_UNIT),
+    *(alarms.WRONG_MATRIX, alarms.WRONG_ANSWER),
+)
+"""What telemetry complains of when another matrix than the right one multiplies its slopes."""
+
+
+def why_unsendable(
+    state: TrackerState, record: ReconstructorRecord, swapped_ns_utc: int | None = None
+) -> str | None:
+    """Return why a reconstructor may not be published now, whoever wants it, or None.
+
+    ``swapped_ns_utc``: it was in use until then. What telemetry has complained of since is what the
+    swap has done, and no reason against going back.
+    """
+    if state.rtc is None:
+        return "no RTC is there"
+    known, registration = _was_in_use(state, record), state.registration
+    if registration is not None and not known:  # one must be able to go back
+        if registration.candidate is not None:
+            return "a jump is suspected: the next window of telemetry decides"
+        if registration.doubt:
+            return f"α is invalid ({registration.doubt})"
+    act = Act.SEND_KNOWN if known else Act.SEND_NEW
+    before = state.alarms if swapped_ns_utc is None else _not_of_swap(state, swapped_ns_utc)
+    alarm = next((alarm for alarm in before if forbids(alarm, act)), None)
+    return why_unread(state, state.rtc.cm_id) if alarm is None else alarm.text
+
+
+def why_no_return(state: TrackerState) -> str | None:
+    """Return why the matrix in use could not be sent back after another one, or None."""
+    rtc = state.rtc
+    if rtc is None or (rtc.cm_id or state.in_use) in state.proven:
+        return None
+    name = "its matrix" if rtc.cm_id is None else rtc.cm_id
+    why = state.unfetched or why_unread(state, rtc.cm_id) or "its status does not name it"
+    return (
+        f"there would be no way back: the RTC has not shown {name} on rtc/cm/applied ({why}); "
+        "have it offered there, or approve what is proposed and watch the loop"
+    )
+
+
+def _not_of_swap(state: TrackerState, swapped_ns_utc: int) -> tuple[Alarm, ...]:
+    """Return the alarms that a matrix applied then cannot have caused."""
+    return tuple(
+        alarm
+        for alarm in state.alarms
+        if alarm.name not in _OF_A_SWAP or alarm.since_ns_utc < swapped_ns_utc
+    )
+
+
+def why_unread(state: TrackerState, matrix_id: str | None) -> str | None:
+    """Return why nobody knows the numbers of this matrix of the RTC's, or None."""
+    if matrix_id is None or matrix_id in state.proven:
+        return None
+    if matrix_id == state.wrong_matrix:
+        return f"the RTC holds other numbers as {matrix_id}"
+    if state.unfetched:
+        return None  # an RTC need not offer its matrix; its id is believed then
+    return f"the RTC's matrix {matrix_id} is being read back: wait some seconds"
+
+
+def may_follow(state: TrackerState) -> bool:
+    """Return whether a reconstructor that nobody asked for may be sent."""
+    rtc, known = state.rtc, state.registration
+    if state.mode is not Mode.AUTO or state.on_probation or rtc is None or not rtc.in_loop:
+        return False
+    if forbidding(state, Act.DECIDE) is not None or why_no_return(state) is not None:
+        return False
+    return known is not None and worth.settled(known)
+
+
+def beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether nobody knows the gains it was judged with, nor those it would run with."""
+    opened = state.rtc is not None and state.rtc.loop == "open"
+    return opened and record.gate is not None and record.judged is None
+
+
+def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether the very numbers of this reconstructor have been in use before."""
+    same = (r for r in state.reconstructors if r.sha256 == record.sha256)
+    return bool(record.sha256) and any(r.was_used for r in same)

@@ -485,10 +485,9 @@ STATE = view(
     "tracker.probation rtc tracker.pointing tracker.basis_id tracker.config_id tracker.dither "
     "tracker.dithering tracker.vibrations_hz tracker.measuring tracker.gathering "
     "tracker.acquisition tracker.move tracker.loop_command tracker.dither_due_since_ns_utc "
-    "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating "
-    "no_return tracker.told alarms stale_alarms muted_alarms worst_severity "
-    "tracker.windows_accepted tracker.windows_refused tracker.windows_outlying window_refusal pace "
-    "link",
+    "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating no_return "
+    "tracker.told alarms stale_alarms muted_alarms worst_severity tracker.windows_accepted "
+    "tracker.windows_refused tracker.windows_outlying window_refusal pace link",
     "What the service knows, at one glance.",
     measuring=MEASURING,
     gathering=GATHERING,

@@ -32,6 +32,7 @@ from service.routes import (
     refits,
     session,
     stream,
+    trends,
     views,
 )
 from service.routes.admission import OPEN, SCHEMES, Admission, Hosts, needs, scope_of
@@ -143,6 +144,7 @@ def _routes(*, with_fits: bool) -> list[BaseRoute]:
         numbers.router,
         archive.router,
         recordings.router,
+        trends.router,
         stream.router,
         page.router,
         refits.router,

@@ -14,6 +14,7 @@ from service.archive.products import MeasuredArchive, NoisyArchive, Reconstructo
 from service.archive.recordings import Recordings
 from service.archive.records import TrackingFile
 from service.archive.store import Store
+from service.archive.trends import Trends, TrendSample
 from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.tracking.registration import HistoryEntry
@@ -57,6 +58,8 @@ class Archive:
         """What is known of the registration, for the service after this one."""
         self.nights = Nights(self.index.asked, noon_utc_h)
         """Every estimate of α, and what happened beside it."""
+        self.trends = Trends(self.index.asked)
+        """What was known at every moment, a sample every few seconds."""
         self._lock: IO[str] | None = None
         self.wrong: tuple[str, ...] = ()
         """What :meth:`open` has found wrong, a line for each."""
@@ -161,6 +164,7 @@ class Archive:
         records: Sequence[ReconstructorRecord],
         entries: Sequence[AuditEntry],
         estimates: Sequence[HistoryEntry] = (),
+        samples: Sequence[TrendSample] = (),
     ) -> None:
         """Remember where reconstructors are, add to audit trail and history: all or nothing.
 
@@ -171,7 +175,7 @@ class Archive:
         """
         for record in records:
             self.reconstructors.write_fate(record)
-        self.index.record(records, entries, estimates)
+        self.index.record(records, entries, estimates, samples)
 
     def measurements(self) -> tuple[MeasurementRecord, ...]:
         """Return what is known of each measured interaction matrix, oldest first."""

@@ -10,9 +10,10 @@ from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from service.archive import nights
+from service.archive import nights, trends
 from service.archive.nights import Values
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
+from service.archive.trends import TrendSample
 from service.errors import ArchiveError, StorageError, shown
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.tracking.registration import HistoryEntry
@@ -53,6 +54,7 @@ CREATE TABLE IF NOT EXISTS audit (
 );
 CREATE INDEX IF NOT EXISTS audit_by_time ON audit (t_ns_utc);
 {nights.SCHEMA}
+{trends.SCHEMA}
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_entries BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_words BEFORE UPDATE ON audit
@@ -206,6 +208,7 @@ class Index:
         records: Sequence[ReconstructorRecord],
         entries: Sequence[AuditEntry],
         estimates: Sequence[HistoryEntry] = (),
+        samples: Sequence[TrendSample] = (),
     ) -> None:
         """Replace what is known of reconstructors, add to trail and history: all or nothing.
 
@@ -223,6 +226,7 @@ class Index:
                 [tuple(map(_storable, astuple(entry)[:_N_COLUMNS])) for entry in entries],
             )
             connection.executemany(nights.INSERT, nights.rows_of(estimates))
+            connection.executemany(trends.INSERT, trends.rows_of(samples))
             connection.execute("COMMIT")
 
     def asked(self, question: str, values: Values) -> list[Any]:

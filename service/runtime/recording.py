@@ -20,6 +20,7 @@ import structlog
 
 from service.archive import Archive, AuditEntry
 from service.archive.retention import Keeping, due, items, low_on_space, remove
+from service.archive.trends import TrendSample
 from service.errors import ArchiveError, StorageError
 from service.tracking import events as ev
 from service.tracking.alarms import ARCHIVE_FAILED, DISK_LOW
@@ -126,6 +127,7 @@ class Recorder:
         self._records: dict[str, ReconstructorRecord] = {}
         self._entries: list[AuditEntry] = []
         self._estimates: list[HistoryEntry] = []
+        self._samples: list[TrendSample] = []
         self._lost = 0
         self._guard = threading.Lock()
         self._writing = threading.Lock()
@@ -338,17 +340,24 @@ class Recorder:
                 self._lost += 1
         self._news.set()
 
+    def sampled(self, sample: TrendSample) -> None:
+        """Take a sample of the trends; while the disk refuses, the oldest ones go."""
+        with self._guard:
+            self._samples = [*self._samples, sample][-MOST_WAITING:]
+        self._news.set()
+
     def _write(self) -> None:
         """Write all that waits as one; in a thread, one at a time."""
         with self._writing:
             with self._guard:
                 records, entries = dict(self._records), tuple(self._entries)
-                estimates = tuple(self._estimates)
+                estimates, samples = tuple(self._estimates), tuple(self._samples)
                 lost = self._lost
             told = _told(lost) if lost else ()
             try:
-                if records or entries or estimates:
-                    self._archive.record(tuple(records.values()), (*entries, *told), estimates)
+                if records or entries or estimates or samples:
+                    entries_told = (*entries, *told)
+                    self._archive.record(tuple(records.values()), entries_told, estimates, samples)
             except StorageError:
                 raise
             except ArchiveError as error:  # a damaged index is a disk that refuses, too
@@ -356,6 +365,8 @@ class Recorder:
             with self._guard:
                 del self._entries[: len(entries)]
                 del self._estimates[: len(estimates)]
+                written = set(map(id, samples))
+                self._samples = [one for one in self._samples if id(one) not in written]
                 self._lost -= lost
                 for name, record in records.items():
                     if self._records[name] is record:

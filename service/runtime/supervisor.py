@@ -29,6 +29,7 @@ from service.runtime.keeping import TelemetryKeeper
 from service.runtime.recording import Caller, Recorder, ids_of
 from service.runtime.refits import Refits
 from service.runtime.streams import WATCH_INTERVAL_S, Streams, Window
+from service.runtime.trends import TrendSampler
 from service.runtime.waiting import (
     Facts,
     Losses,
@@ -109,6 +110,12 @@ class Supervisor:
         """Reconstructors that operators have ordered."""
         self._backlog = Backlog()
         self._meter = PaceMeter(workers)
+        self._trends = TrendSampler(
+            state=lambda: self._engine.state,
+            frames=lambda: self.newest_frames,
+            matrix=self.matrix,
+            keep=self._recorder.sampled,
+        )
         self._eyes = ThreadPoolExecutor(1, "telemetry")
         self._looking = asyncio.Lock()
         """Held by whoever has, or changes, the estimators."""
@@ -240,7 +247,7 @@ class Supervisor:
             self._engine.prepared(description)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"
             self._post(ev.Noted(name="service.ready", text=text))
-            for work in (self._listen, self._tick, self._fit, self._watch):
+            for work in (self._listen, self._tick, self._fit, self._watch, self._trends.run):
                 group.create_task(work())
 
     @property

@@ -22,6 +22,7 @@ from service.errors import PyrcalError
 from service.runtime.actions import Actions, Publishing, judged_now
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
+from service.runtime.ports import StorePort
 from service.runtime.streams import WATCH_INTERVAL_S
 from service.runtime.workers import PATIENCE_S
 from service.telemetry.lockin import Spectra
@@ -112,11 +113,13 @@ class Observatory:
         with_poles: bool = True,
         dome: Dome | None = None,
         link: Callable[[Any], ShortLink] = ShortLink,
+        archive: StorePort | None = None,
     ) -> None:
         """Take the simulator's command line, ``--plant linear --seed 1``, and the policy.
 
         ``with_poles`` finds the true poles of every swap, seconds on a diffractive telescope.
-        ``dome`` and ``link`` are another telescope and the way to it.
+        ``dome`` and ``link`` are another telescope and the way to it; without an ``archive``
+        matrices are kept in memory.
         """
         self.dome = dome or Dome(options)
         self.latencies = latencies or Latencies()
@@ -131,17 +134,11 @@ class Observatory:
 
         self._link = link(self.dome)
         self._workers = OwnHands(workbench)
-        self._shelf = Shelf()
-        self._actions = Actions(
-            bridge=self._link,
-            workers=self._workers,
-            archive=self._shelf,
-            instrument=self.dome.instrument,
-            publishing=Publishing(
-                system=system, chunk_bytes=CHUNK_LIMIT, pole_radius_bound=pole_radius_bound
-            ),
-            clock_ns=lambda: self.dome.now_ns,
+        self._shelf: StorePort = archive or Shelf()
+        self._publishing = Publishing(
+            system=system, chunk_bytes=CHUNK_LIMIT, pole_radius_bound=pole_radius_bound
         )
+        self._actions = self._new_actions()
         self._n_restarts = 0
         self._agenda: list[_Due] = []
         self._numbers = itertools.count()
@@ -225,6 +222,17 @@ class Observatory:
         self.dome.restart()
         self._link.void()
         self._hear(ev.SessionStarted(session=self.dome.computer.session))
+
+    def _new_actions(self) -> Actions:
+        """Return what carries out effects, nothing in its memory."""
+        return Actions(
+            bridge=self._link,
+            workers=self._workers,
+            archive=self._shelf,
+            instrument=self.dome.instrument,
+            publishing=self._publishing,
+            clock_ns=lambda: self.dome.now_ns,
+        )
 
     def _begin(self) -> None:
         self._post(ev.Noted(name="service.ready", text="a night in simulated time"))
@@ -410,6 +418,12 @@ class Observatory:
             sent = partial(self._deliver, self._n_restarts, *self._link.sent.pop())
             self._in(self.latencies.send_s, sent)
         return event
+
+    def _arrive(self) -> None:
+        """Let every matrix that is on its way to the RTC come there."""
+        for due in sorted(self._agenda):
+            if isinstance(due.happen, partial) and due.happen.func == self._deliver:
+                due.happen()
 
     def _deliver(self, n_restarts: int, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         if n_restarts != self._n_restarts:

@@ -11,34 +11,22 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
-from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.tracking.state import Mode
-from service.wire import DitherRequest, Loop, LoopRequest
-from service.worker import Compute, OpticsWorker, Sampling
-from studies.campaign.observatory import Observatory
+from service.wire import Loop, LoopRequest
+from studies.campaign.observatory_checks import Swap
 from studies.campaign.observatory_dome import Dome, Moment
-from studies.campaign.other_truth import LIES, STANDING, Kind, OtherDome, OtherLink, Truth
+from studies.campaign.other_night import GAINS, N_CONTROLLED, N_TARGET, OtherNight, Plan
+from studies.campaign.other_truth import LIES, STANDING, Kind, Truth
 from studies.campaign.rows import Row, RowFile, heading, line, tell
-from studies.campaign.small import bench_of
-
-INSTRUMENT = "tests/system/middle.toml"
-GAINS = {"linear": 0.4, "diffractive": 0.5}
-ALPHA = (0.12, -0.08, 0.2, 1.003)
-"""Where the mirror truly lies, at the boundary."""
-
-CALIBRATED = (0.05, -0.03, 0.05, 1.001)
-"""Where it lay by day, when the RTC's own matrix was measured."""
 
 WORSE, WORSE_S = 1.1, 1.0
 """A loop is made worse when its wavefront error is above the first times that of the same night
@@ -53,99 +41,17 @@ CLOSED_S = 2.0
 LATE_S = 3.0
 """At the end of a night, to tell what it came to."""
 
-N_CONTROLLED, N_TARGET = 120, 150
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """One night."""
-
-    truth: Truth = field(default_factory=Truth)
-    instrument: str = INSTRUMENT
-    plant: str = "linear"
-    seconds: float = 40.0
-    n_controlled: int = N_CONTROLLED
-    n_target: int = N_TARGET
-    jump_s: float | None = None
-    """When the mirror jumps by .3 subapertures and 1 degree; None: never."""
-
-    killed_s: float | None = None
-    """When the service is killed and begun again; None: never."""
-
-    magnitude: float = 8.0
-    seed: int = 1
-
-    @property
-    def name(self) -> str:
-        """What tells it from other nights."""
-        jump = f"jump with {self.n_target}" if self.jump_s is not None else ""
-        kill = "" if self.killed_s is None else f"killed at {self.killed_s:.1f} s"
-        return ", ".join(word for word in (jump or self.truth.name, kill) if word)
-
-    @property
-    def words(self) -> list[str]:
-        """The simulator's command line."""
-        angle = np.random.default_rng(self.seed).uniform(0.0, 2.0 * np.pi)
-        x, y = 0.3 * np.cos(angle), 0.3 * np.sin(angle)
-        jump = [] if self.jump_s is None else [f"--jump={self.jump_s}:{x:.4f},{y:.4f},1,0"]
-        return [
-            f"--instrument={self.instrument}",
-            f"--plant={self.plant}",
-            f"--n-controlled={self.n_controlled}",
-            f"--gain={GAINS[self.plant]}",
-            "--leak=0.99",
-            "--seeing=0.7",
-            "--wind=8,20",
-            f"--mag={self.magnitude}",
-            f"--alpha={','.join(map(str, ALPHA))}",
-            f"--seed={self.seed}",
-            *jump,
-        ]
-
-    def dome(self) -> OtherDome:
-        """Return the telescope and its RTC."""
-        calibrated = Misregistration.from_vector(np.array(CALIBRATED) / BOUNDARY_SCALE)
-        return OtherDome(self.words, self.truth, calibrated)
-
-
-class OtherNight(Observatory):
-    """The service at such a telescope."""
-
-    def __init__(self, plan: Plan) -> None:
-        settings = load_settings(None, {}, {"control.n_modes_target": plan.n_target})
-        super().__init__(
-            plan.words,
-            policy_of(settings),
-            Mode.AUTO,
-            bench_of(plan.instrument)
-            if plan.plant == "linear"
-            else _at_work(plan.instrument, settings.compute.working_point_modes),
-            with_poles=False,
-            dome=plan.dome(),
-            link=OtherLink,
-        )
-        self.said: dict[tuple[str, str], float] = {}
-        """Every text of an alarm, and when it was said first."""
-
-    def pass_(self, until_s: float) -> None:
-        """Let time pass, and read what is said."""
-        while self.time_s < until_s - 1e-9:
-            self.advance(0.25)
-            for alarm in self.state.alarms:
-                self.said.setdefault((alarm.name, alarm.text), round(self.time_s, 2))
-
-
-def _at_work(instrument: str, working_point_modes: int | None) -> OpticsWorker:
-    sampling = Sampling(working_point_modes=working_point_modes)
-    return OpticsWorker(load_instrument(instrument), Compute(threads=1, sampling=sampling))
-
 
 def play(plan: Plan) -> Row:
     """Run one night with a service and without, and return what came of it."""
     begun = time.process_time()
-    with threadpool_limits(1):
-        night = OtherNight(plan)
+    with threadpool_limits(1), tempfile.TemporaryDirectory() as folder:
+        night = OtherNight(plan, None if plan.killed_s is None else Path(folder))
+        if plan.killed_s is not None:
+            night.pass_(plan.killed_s)
+            night.kill()
         night.pass_(plan.seconds)
+        night.close()
         alone = plan.dome()
         while alone.time_s < plan.seconds:
             alone.play()
@@ -178,13 +84,36 @@ def came_of(plan: Plan, night: OtherNight, alone: Dome) -> Row:
         "n_modes": night.dome.moments[-1].n_controlled,
         "opened": opened,
         "closed_at_last": night.dome.moments[-1].closed,
-        "n_dithers": sum(isinstance(what, DitherRequest) for _, what in orders),
+        "undithered_s": undithered_s(night.dome.moments),
+        "corrected_s": corrected_s(plan, night.swaps),
         "said": said,
         "log": [
             (round((entry.t_ns_utc - night.state.log[0].t_ns_utc) / 1e9, 2), entry.name, entry.text)
             for entry in night.state.log[-60:]
         ],
     }
+
+
+def undithered_s(moments: Sequence[Moment]) -> float:
+    """Return the longest time without a dither after the first one."""
+    times = [moment.time_s for moment in moments if moment.dither_nm > 0.0]
+    if not times:
+        return moments[-1].time_s
+    return float(np.diff([*times, moments[-1].time_s]).max())
+
+
+CORRECTED = np.array([0.1, 0.1, np.deg2rad(0.3), 0.01])
+"""A matrix is made for where the mirror is when its α is as near as this (numeric units)."""
+
+
+def corrected_s(plan: Plan, swaps: Sequence[Swap]) -> float | None:
+    """Return how long after the jump a matrix for the mirror's new place came into use."""
+    for swap in swaps:
+        if plan.jump_s is None or swap.made_for is None or swap.time_s <= plan.jump_s:
+            continue
+        if np.all(np.abs(swap.made_for.vector - swap.alpha.vector) < CORRECTED):
+            return swap.time_s - plan.jump_s
+    return None
 
 
 def smoothed(moments: Sequence[Moment]) -> NDArray[np.float64]:
@@ -294,6 +223,17 @@ def table(rows: Iterable[Row]) -> str:
     return text
 
 
+def run(nights: Iterable[Plan], output: Path) -> list[Row]:
+    """Play the nights that are not in the file yet, and return all rows of it."""
+    file = RowFile(output)
+    done = {(row["plant"], row["name"], row["seed"]) for row in file.rows}
+    for plan in nights:
+        if (plan.plant, plan.name, plan.seed) not in done:
+            file.add(play(plan))
+            sys.stderr.write(table(file.rows[-1:]).splitlines()[-1] + "\n")
+    return file.rows
+
+
 def main() -> int:
     """Run what is missing, then print the table; 1 if a loop was made worse."""
     parser = argparse.ArgumentParser(prog="python -m studies.campaign.other_modes")
@@ -304,14 +244,9 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=Path("other_modes.jsonl"))
     parser.add_argument("--table", type=Path, metavar="FILE.md")
     given = parser.parse_args()
-    file = RowFile(given.output)
-    done = {(row["plant"], row["name"], row["seed"]) for row in file.rows}
-    for plan in plans(given):
-        if (plan.plant, plan.name, plan.seed) not in done:
-            file.add(play(plan))
-            sys.stderr.write(table(file.rows[-1:]).splitlines()[-1] + "\n")
-    tell(table(file.rows), given.table, "python -m studies.campaign.other_modes")
-    return int(any(row["worse_s"] > WORSE_S for row in file.rows))
+    rows = run(plans(given), given.output)
+    tell(table(rows), given.table, "python -m studies.campaign.other_modes")
+    return int(any(row["worse_s"] > WORSE_S for row in rows))
 
 
 if __name__ == "__main__":

@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 from service.errors import LinkError
+from service.model.misregistration import Misregistration
 from service.tracking.state import Level, LogEntry
-from studies.campaign.other_modes import Plan, came_of, longest, names, smoothed
+from studies.campaign.observatory_checks import Swap
+from studies.campaign.other_campaign import differing
+from studies.campaign.other_modes import came_of, corrected_s, longest, names, smoothed
+from studies.campaign.other_night import DOWN_S, OtherNight, Plan
 from studies.campaign.other_truth import Kind, Truth
 
 SMALL = {"instrument": "tests/system/small.toml", "n_controlled": 45, "n_target": 60}
@@ -109,3 +113,43 @@ def test_what_is_worse_is_counted_against_the_night_without_a_service():
     assert row["worse_s"] == pytest.approx(1.25)
     assert row["first_worse_s"] == 2.0
     assert row["named_s"] is None
+
+
+def test_a_service_that_is_killed_begins_again_from_what_it_has_written(tmp_path):
+    night = OtherNight(Plan(**SMALL), tmp_path)
+    night.pass_(7.0)
+    known = night.state.registration.alpha
+    night.kill()
+    assert night.time_s == pytest.approx(7.0 + DOWN_S)
+    taken_up = night.state.registration.alpha
+    assert np.abs(taken_up.vector - known.vector).max() < 0.01
+    night.pass_(night.time_s + 2.0)
+    assert night.state.in_use == night.dome.computer.reconstructor.manifest.id
+    night.close()
+
+
+def test_what_was_on_its_way_when_the_service_was_killed_arrives(tmp_path):
+    night = OtherNight(Plan(**SMALL), tmp_path)
+    while not any(r.on_its_way for r in night.state.reconstructors):
+        night.advance(0.05)
+    sent = next(r.id for r in night.state.reconstructors if r.on_its_way)
+    night.kill()
+    assert night.dome.computer.reconstructor.manifest.id == sent
+    night.close()
+
+
+def test_the_same_rtc_is_drawn_for_the_same_seed_and_40_are_of_every_kind():
+    plans = [differing(seed) for seed in range(40)]
+    assert plans == [differing(seed) for seed in range(40)]
+    found = {(p.plant, p.truth.offered, p.truth.kind is Kind.SCALE) for p in plans}
+    assert len(found) == 8
+    assert {p.truth.kind for p in plans} >= {Kind.EXCHANGE, Kind.ROLL, Kind.PERMUTE}
+
+
+def test_a_jump_is_corrected_once_a_matrix_for_the_new_place_is_in_use():
+    here, there = (Misregistration(shift_x_subap=x) for x in (0.0, 0.3))
+    swap = Swap(id="a", n_modes=45, time_s=22.0, alpha=there, made_for=here, gate=None, radius=None)
+    plan = Plan(jump_s=20.0)
+    assert corrected_s(plan, [swap]) is None
+    assert corrected_s(plan, [swap, replace(swap, time_s=27.0, made_for=there)]) == 7.0
+    assert corrected_s(Plan(), [replace(swap, made_for=there)]) is None

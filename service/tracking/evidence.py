@@ -24,6 +24,7 @@ from service.tracking import alarms, filtering, jumps, refusals, validity
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import count_miss
 from service.tracking.dither import found_again
+from service.tracking.dither_plan import why_none as why_no_dither
 from service.tracking.filtering import Folded, Measured
 from service.tracking.jumps import Distance
 from service.tracking.loop import loop_numbers, same_numbers
@@ -211,7 +212,7 @@ def _jump(turn: Turn, known: Registration, first: Seen, measured: Measured) -> N
 def _doubted(known: Registration, doubt: str, since_ns_utc: int) -> Registration:
     """Return what is known in doubt, not since earlier than it already is."""
     since_ns = max(known.doubted_ns_utc if known.doubt else 0, since_ns_utc)
-    return replace(known, doubt=doubt, doubted_ns_utc=since_ns)
+    return replace(known, doubt=doubt, doubted_ns_utc=since_ns, doubt_voids=True)
 
 
 def _innovation(prior: Joint, measured: Measured) -> float:
@@ -252,7 +253,7 @@ def on_watchdog(turn: Turn, event: ev.Watched) -> None:
     )
     far = jumps.look_surprise(known, filtering.joint_of(known), reading, turn.policy)
     if far > jumps.LOOK_LIMIT:
-        _doubt_by_look(turn, known, event, prior, far)
+        _ask_for_window(turn, known, event, prior, far)
         return
     joint = kalman.scattered(
         kalman.corrected(prior, measured, estimate.covariance, kalman.PASSIVE), far
@@ -351,22 +352,31 @@ def _mixed(known: Registration) -> bool:
     return known.candidate is not None or (jumped_ns_utc > 0 and began_ns_utc < jumped_ns_utc)
 
 
-def _doubt_by_look(
+def _ask_for_window(
     turn: Turn, known: Registration, event: ev.Watched, prior: Joint, far: float
 ) -> None:
-    """Forget the bias and doubt α: the wind has changed or the mirror has moved."""
+    """Forget the bias and want a dithered window: the wind has changed or the mirror has moved.
+
+    A look alone is no match for windows: α stays valid, and nothing is made or sent until a window
+    taken since has told. It is an alarm where none can, or none has when a second look disagrees.
+    """
     text = (
         "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
         "dithered window must tell which"
     )
     known = turn.known or known
+    waits, void = bool(known.doubt), bool(known.doubt) and known.doubt_voids
+    why_none = None if turn.rtc is None else why_no_dither(turn, turn.rtc)
     gone = kalman.forgotten(prior, event.estimate.bias_excess)
     after = _after_look(turn, known, gone, event)
     bias = filtering.bias_of(gone, event.t_ns_utc, _loop(turn.state, known))
-    validity.hold(turn, replace(_doubted(after, text, event.t_ns_utc), bias=bias))
+    doubted = replace(_doubted(after, text, event.t_ns_utc), bias=bias, doubt_voids=void)
+    validity.hold(turn, doubted)
     turn.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
-    turn.alarm(alarms.DISAGREES, text)
     validity.want_window(turn, text)
+    if why_none is not None or waits:
+        cannot = "none has since the last look that did" if why_none is None else why_none
+        turn.alarm(alarms.DISAGREES, f"{text}: {cannot}; α stands as windows have it")
     validity.age(turn)
     _show(turn, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
 

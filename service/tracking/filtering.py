@@ -240,6 +240,7 @@ def accept(turn: Turn, folded: Folded, measured: Measured, *, n_accepted: int = 
         jumped_ns_utc=_jumped_ns_utc(known, folded, turn.now_ns),
         doubt=known.doubt if known is not None and doubted else "",
         doubted_ns_utc=known.doubted_ns_utc if known is not None and doubted else 0,
+        doubt_voids=known is None or known.doubt_voids,
         pointing=measured.pointing,
         window_pointing=validity.pointing_at(turn.state, when.began_ns_utc),
         restored_ns_utc=known.restored_ns_utc if known is not None else None,

@@ -195,6 +195,9 @@ class Registration:
     doubt: str = ""
     """Why α may be somewhere else, until a dithered window decides; empty: no doubt."""
 
+    doubt_voids: bool = True
+    """Whether α is invalid for that: a look at ordinary telemetry alone only asks for a window."""
+
     doubted_ns_utc: int = 0
     """End of the telemetry that cast the doubt, the RTC's clock: a window that began before it
     cannot end it."""

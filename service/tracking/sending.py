@@ -29,7 +29,8 @@ def why_unsendable(
         if registration.candidate is not None:
             return "a jump is suspected: the next window of telemetry decides"
         if registration.doubt:
-            return f"α is invalid ({registration.doubt})"
+            now = "invalid" if registration.doubt_voids else "in question"
+            return f"α is {now} ({registration.doubt})"
     act = Act.SEND_KNOWN if known else Act.SEND_NEW
     before = state.alarms if swapped_ns_utc is None else _not_of_swap(state, swapped_ns_utc)
     alarm = next((alarm for alarm in before if forbids(alarm, act)), None)

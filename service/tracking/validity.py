@@ -261,7 +261,7 @@ def _standing(turn: Turn, known: Registration) -> Standing:
 
 def _why_invalid(state: TrackerState, known: Registration, policy: Policy) -> str | None:
     """Return why α may be somewhere else altogether, or None."""
-    if known.doubt:
+    if known.doubt and known.doubt_voids:
         return known.doubt
     moved_deg = slewed_deg(state, known)
     if moved_deg > policy.slew_limit_deg:
@@ -282,7 +282,8 @@ def _without_old_candidate(known: Registration, now_ns: int) -> Registration:
     candidate = known.candidate
     if candidate is None or now_ns - candidate.held_ns_utc < CANDIDATE_FOR_S * SECOND_NS:
         return known
-    return replace(known, candidate=None, doubt="a window was far out, and none has come since")
+    doubt = "a window was far out, and none has come since"
+    return replace(known, candidate=None, doubt=doubt, doubt_voids=True)
 
 
 def _why_stale(state: TrackerState, now_ns: int) -> str | None:

@@ -47,7 +47,8 @@ VERDICT_REACH = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 
 def settled(known: Registration) -> bool:
     """Return whether α may be believed: windows agree, and none of them hints at a jump."""
-    return known.n_windows >= MIN_WINDOWS and known.candidate is None and known.usable
+    sure = known.candidate is None and not known.doubt
+    return known.n_windows >= MIN_WINDOWS and sure and known.usable
 
 
 def why_stale(state: TrackerState, judged: Judged | None, gains: tuple[float, ...]) -> str | None:

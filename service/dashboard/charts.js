@@ -1,12 +1,14 @@
 // The four parameters over time: four charts on one time axis, each with its band, tolerance and marks.
 
 /* global uPlot */
-import { PARAMETERS, DASH, clock, day, lay, make, present, put, rounded } from "./words.js";
+import { Presence, axes, drawMarks } from "./axes.js";
 import { colour } from "./scheme.js";
+import { PARAMETERS, DASH, clock, day, lay, make, present, put, rounded } from "./words.js";
 
-const GAP_S = 120; // longer than any pause between two sittings
-const SHAPES = { swap: "▲", jump: "◆", alarm: "■" };
+const GAP_S = 120; // longer than any pause between two sittings, where no sample says more
 const KINDS = {
+  "reconstructor.adopted": "swap",
+  "service.ready": "start",
   "reconstructor.applied": "swap",
   "registration.jump": "jump",
   "registration.passive-jump": "jump",
@@ -56,10 +58,13 @@ export class Charts {
     }
   }
 
-  // entries of the history, marks, from and to in seconds; tolerance of a parameter as [low, high];
+  // entries of the history, samples of the trends, marks, from and to in seconds; tolerance of a parameter as [low, high];
   // ahead: by how much to draw telemetry later, seconds; last: what is known at the end, or null.
-  show({ entries, marks, from, to, tolerance = () => [null, null], ahead = 0, last = null }) {
-    this.#shown = { entries, marks, from, to, tolerance, ahead, last };
+  show(asked) {
+    const { entries, samples = [], interval = 0, marks, from, to, ahead = 0 } = asked;
+    const starts = marks.filter((mark) => mark.kind === "start").map((mark) => mark.t);
+    const presence = new Presence(samples, starts, interval, Math.max(GAP_S, (to - from) / 20));
+    this.#shown = { tolerance: () => [null, null], last: null, ...asked, points: pointsOf(entries, samples, ahead), presence };
     this.#list();
     if (document.hidden || !this.root.clientWidth) return;
     this.rows.forEach((row, k) => {
@@ -80,22 +85,21 @@ export class Charts {
 
   // x, lower and upper edge of the band, the estimate, single measurements, tolerance.
   #data(parameter) {
-    const { entries, from, to, tolerance, ahead, last } = this.#shown;
+    const { points, presence, to, tolerance, last } = this.#shown;
     const { key, scale } = parameter;
     const columns = [[], [], [], [], [], [], []];
-    const gap = Math.max(GAP_S, (to - from) / 20);
     const reach = tolerance(parameter);
     const add = (t, value, sigma, measured) => {
       const before = columns[0].at(-1);
       // no line is drawn across a time of which nothing is known
-      if (t - before > gap && present(value)) add((t + before) / 2, null, null, null);
+      const stopped = before === undefined ? null : presence.stopped(before, t);
+      if (stopped !== null && present(value)) add(Math.min(stopped, t), null, null, null);
       const known = present(value) && present(sigma);
       const numbers = [known ? (value - 3 * sigma) * scale : null, known ? (value + 3 * sigma) * scale : null,
         present(value) ? value * scale : null, present(measured) ? measured * scale : null, ...reach];
       [t, ...numbers].forEach((x, column) => columns[column].push(x));
     };
-    for (const e of entries)
-      add(e.t_ns_utc / 1e9 + ahead, e.filtered[key], e.filtered_sigma[key], e.source === "passive" ? null : e.measured[key]);
+    for (const p of points) add(p.t, p.alpha?.[key], p.sigma?.[key], p.measured?.[key]);
     if (last && !(columns[0].at(-1) >= to)) add(to, last.alpha[key], last.sigma[key], null);
     return columns;
   }
@@ -103,21 +107,14 @@ export class Charts {
   #chart({ parameter, plot }, k, data) {
     const last = k === PARAMETERS.length - 1;
     const dashed = { stroke: () => colour("tolerance"), dash: [6, 4], width: 1, points: { show: false } };
-    const axis = { stroke: () => colour("quiet"), grid: { stroke: () => colour("line"), width: 1 }, ticks: { show: false }, font: "11px system-ui" };
     const options = {
       width: Math.max(plot.clientWidth, 120),
       height: this.#height(plot),
       cursor: { sync: { key: this.root.id || "registration" }, drag: { x: Boolean(this.chosen), y: false, setScale: false }, y: false },
       legend: { show: false },
       tzDate: (t) => uPlot.tzDate(new Date(t * 1000), "UTC"),
-      scales: { x: { time: true }, y: { range: (u, low, high) => visible(low, high, parameter) } },
-      axes: [
-        { ...axis, size: last ? 22 : 4, space: 90,
-          values: last ? (u, ticks) => ticks.map((t) => clock(t * 1000).slice(0, this.#shown.to - this.#shown.from < 1200 ? 8 : 5)) : () => [] },
-        { ...axis, size: 54, space: 22,
-          // an axis of nothing has no numbers
-          values: (u, ticks, of, space, step) => ticks.map((y) => (u.data[3].some(present) ? y.toFixed(decimals(step)) : "")) },
-      ],
+      scales: { x: { time: true }, y: { range: (u) => visible(...reachOf(u.data), parameter) } },
+      axes: axes({ labelled: last, span: () => this.#shown.to - this.#shown.from, known: (u) => u.data[3].some(present) }),
       series: [
         {},
         { stroke: "transparent", points: { show: false } },
@@ -128,33 +125,9 @@ export class Charts {
         { ...dashed },
       ],
       bands: [{ series: [2, 1], fill: () => colour("band") }],
-      hooks: { draw: [(u) => this.#drawMarks(u, k === 0)], setCursor: [(u) => this.#hover(u, k)], setSelect: [(u) => this.#drawnOver(u)] },
+      hooks: { draw: [(u) => drawMarks(u, this.#shown.marks, k === 0)], setCursor: [(u) => this.#hover(u, k)], setSelect: [(u) => this.#drawnOver(u)] },
     };
     return new uPlot(options, data, plot);
-  }
-
-  #drawMarks(u, named) {
-    const { ctx, bbox } = u;
-    ctx.save();
-    ctx.strokeStyle = colour("quiet");
-    ctx.fillStyle = colour("text");
-    ctx.textAlign = "center";
-    ctx.font = `${11 * devicePixelRatio}px system-ui`;
-    let shapeX = -Infinity; // shapes that would lie on one another are drawn once
-    for (const mark of this.#shown.marks) {
-      const x = u.valToPos(mark.t, "x", true);
-      if (x < bbox.left || x > bbox.left + bbox.width) continue;
-      ctx.globalAlpha = 0.45;
-      ctx.beginPath();
-      ctx.moveTo(x, bbox.top);
-      ctx.lineTo(x, bbox.top + bbox.height);
-      ctx.stroke();
-      ctx.globalAlpha = 1;
-      if (!named || x - shapeX < 12 * devicePixelRatio) continue;
-      shapeX = x;
-      ctx.fillText(SHAPES[mark.kind], x, bbox.top + 10 * devicePixelRatio);
-    }
-    ctx.restore();
   }
 
   #hover(u, k) {
@@ -201,10 +174,20 @@ function tableOf(entries, most = 30) {
   });
 }
 
-// As many as every multiple of the step needs.
-function decimals(step) {
-  for (let n = 0; n < 6; n++) if (Math.abs(step * 10 ** n - Math.round(step * 10 ** n)) < 1e-6) return n;
-  return 6;
+// Measurements, and between them what was known as its 1 sigma grew, in order of time.
+function pointsOf(entries, samples, ahead) {
+  const measured = entries.map((e) => ({ t: e.t_ns_utc / 1e9 + ahead, alpha: e.filtered, sigma: e.filtered_sigma, measured: e.source === "passive" ? null : e.measured }));
+  const known = samples.filter((s) => s.alpha && s.telemetry_ns_utc).map((s) => ({ t: s.telemetry_ns_utc / 1e9 + ahead, alpha: s.alpha, sigma: s.sigma, measured: null }));
+  return [...measured, ...known].sort((a, b) => a.t - b.t);
+}
+
+// From where to where the estimate goes, with nearly all of its band: a moment of which little was known hides nothing else.
+function reachOf([, low, high, estimate, , ...tolerance]) {
+  const known = estimate.filter(present);
+  const halves = low.map((y, k) => (present(y) ? (high[k] - y) / 2 : null)).filter(present).sort((a, b) => a - b);
+  const half = halves[Math.floor(0.95 * (halves.length - 1))] ?? 0;
+  const ends = tolerance.map((column) => column[0]).filter(present);
+  return known.length ? [Math.min(...known.map((y) => y - half), ...ends), Math.max(...known.map((y) => y + half), ...ends)] : [null, null];
 }
 
 // The range of an axis: never so narrow that noise fills it.

@@ -1,9 +1,9 @@
 // Any night: α with its marks, what was in use and what was wrong for how long, who ordered what.
 
+import { behind } from "./axes.js";
 import { Charts } from "./charts.js";
 import { DASH, clock, day, make, milliseconds, number, put, registrationOf, span, verdict } from "./words.js";
 
-const DRAWN = new Set(["swap", "jump", "alarm"]);
 const LINES = 500; // of the audit trail that are read at once
 const HOUR_MS = 3_600_000;
 
@@ -94,9 +94,9 @@ export class History {
     put(this.root.querySelector(".read"), "◐ being read");
     let past;
     try {
-      const [history, marks] = await Promise.all([
-        this.#service.get(`v1/alpha/history?${time}&points=2000`), this.#service.get(`v1/marks?${time}&limit=2000`)]);
-      past = { entries: history.entries, marks: marks.marks };
+      const [history, marks, trends] = await Promise.all([`alpha/history?${time}&points=2000`, `marks?${time}&limit=2000`, `trends?${time}&points=2000`]
+        .map((what) => this.#service.get(`v1/${what}`, "no-cache")));
+      past = { entries: history.entries, marks: marks.marks, samples: trends.samples, interval: trends.interval_s };
     } catch {
       if (mine === this.#reading) put(this.root.querySelector(".read"), "this time cannot be read now: try again");
       return;
@@ -112,8 +112,8 @@ export class History {
   }
 
   // Of a whole night only that of which something is there, with a little at both ends.
-  #narrow({ entries, marks }) {
-    const times = [...entries, ...marks].map((e) => milliseconds(e.t_ns_utc));
+  #narrow({ entries, marks, samples }) {
+    const times = [...entries, ...marks, ...samples].map((e) => milliseconds(e.t_ns_utc));
     if (!times.length) return;
     const [first, last] = [Math.min(...times), Math.max(...times)];
     const margin = Math.max((last - first) * 0.01, 1000);
@@ -126,9 +126,10 @@ export class History {
 
   #draw() {
     if (!this.#past) return;
-    const { entries, marks } = this.#past;
-    const drawn = marks.filter((m) => DRAWN.has(m.kind)).map((m) => ({ t: m.t_ns_utc / 1e9, kind: m.kind }));
-    this.charts.show({ entries, marks: drawn, from: this.#from / 1000, to: this.#to / 1000 });
+    const { entries, samples, interval } = this.#past;
+    const marks = this.#past.marks.map(({ t_ns_utc: t, kind }) => ({ t: t / 1e9, kind }));
+    const time = { marks, from: this.#from / 1000, to: this.#to / 1000 };
+    this.charts.show({ entries, samples, interval, ahead: behind(samples), ...time });
     const last = entries.at(-1);
     this.charts.tell(last?.filtered, last?.filtered_sigma);
     const night = this.#chosen;

@@ -1,7 +1,7 @@
 // The mirror on the sensor: where its actuators should be, and where they are, exaggerated.
 
 import { colour } from "./scheme.js";
-import { PARAMETERS, DASH, put, present } from "./words.js";
+import { PARAMETERS, DASH, put, fixed, present } from "./words.js";
 
 export class MirrorOnSensor {
   #service;
@@ -158,8 +158,8 @@ export class MirrorOnSensor {
     let text = "point at an actuator";
     if (place) {
       const moved = place.to ? place.to.map((value, axis) => 100 * (value - place.from[axis])) : [null, null];
-      const words = moved.map((value) => (present(value) ? `${value >= 0 ? "+" : ""}${value.toFixed(1)}` : DASH));
-      text = `actuator ${k}: ${words[0]} %, ${words[1]} % of a subaperture along x, y`;
+      const words = moved.map((value) => (present(value) ? `${value >= 0.05 ? "+" : ""}${fixed(value, 1)}` : DASH));
+      text = `actuator ${k}: ${words[0]} %, ${words[1]} % along x, y`;
     }
     put(this.root.querySelector(".actuator"), text);
     this.#draw();

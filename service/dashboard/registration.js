@@ -1,18 +1,22 @@
 // The registration now and over the last time: what is read, when, and how much of it is kept.
 
 import { Charts, markOf } from "./charts.js";
-import { DASH, ago, clock, milliseconds, put } from "./words.js";
+import { DASH, ago, clock, milliseconds, put, span } from "./words.js";
 
 const RANGES = { 1: 600, 2: 3600, 3: 43_200 }; // seconds: ten minutes, an hour, a night
 const POINTS = { 1: 600, 2: 1200, 3: 2000 };
 const MOST = 4000; // then the range is read anew, thinned by the service
 const EVERY_MS = 5000; // between two looks at what has been measured since
+const SAMPLED_MS = 10_000; // between two looks at what was sampled beside measurements
 const LATE_MS = 5000; // telemetry takes less than this to be understood: more is another clock
 
 export class Registration {
   #service;
   #entries = []; // of the service's history, oldest first
   #marks = [];
+  #samples = []; // of the trends, oldest first
+  #interval = 0;
+  #sampled = 0;
   #mirror = null;
   #charts;
   #range = 1;
@@ -29,10 +33,7 @@ export class Registration {
     service.addEventListener("state", () => this.#onState());
     service.addEventListener("tick", () => this.#onTick());
     service.addEventListener("log", (event) => this.#mark(event.detail));
-    service.addEventListener("reset", () => {
-      this.#marks = [];
-      this.#begin();
-    });
+    service.addEventListener("reset", () => this.#begin());
     document.addEventListener("scheme", () => this.#draw());
   }
 
@@ -51,7 +52,39 @@ export class Registration {
   // Read the range anew: at the start, on another range, after a gap.
   async #begin() {
     this.#entries = [];
-    await this.#read();
+    this.#samples = [];
+    await Promise.all([this.#read(), this.#readMarks(), this.#readSamples()]);
+  }
+
+  // The log remembers the last of them only, and this run alone.
+  async #readMarks() {
+    try {
+      const { marks } = await this.#service.get(`v1/marks?since=${new Date(this.#since).toISOString()}&limit=2000`);
+      this.#add(marks.map(({ t_ns_utc: t, kind }) => ({ t: t / 1e9, kind })));
+    } catch {
+      // those of the log are there
+    }
+  }
+
+  get #since() {
+    return Math.max(0, this.#service.now - RANGES[this.#range] * 1000);
+  }
+
+  // What is read again comes from where the last of it was.
+  async #readSamples() {
+    this.#sampled = performance.now();
+    const range = this.#range;
+    const last = this.#samples.at(-1)?.t_ns_utc;
+    const since = last ? new Date(last / 1e6 + 1) : new Date(this.#since);
+    try {
+      const { samples, interval_s: interval } = await this.#service.get(`v1/trends?since=${since.toISOString()}&points=${POINTS[range]}`);
+      if (range !== this.#range) return;
+      this.#interval = Math.max(interval, last ? this.#interval : 0);
+      const oldest = this.#since - 60_000;
+      this.#samples = [...this.#samples, ...samples.filter((s) => s.t_ns_utc > (this.#samples.at(-1)?.t_ns_utc ?? 0))].filter((s) => s.t_ns_utc / 1e6 > oldest);
+    } catch {
+      // as of the measurements
+    }
   }
 
   // By how much the RTC's clock, which dates telemetry, is behind the service's, milliseconds.
@@ -67,7 +100,7 @@ export class Registration {
     this.#reading = true;
     this.#asked = performance.now();
     const range = this.#range;
-    const since = Math.max(0, this.#service.now - RANGES[range] * 1000 - this.#behind);
+    const since = Math.max(0, this.#since - this.#behind);
     const last = this.#entries.at(-1)?.t_ns_utc;
     const query = last ? `after=${last}&limit=2000` : `since=${new Date(since).toISOString()}&points=${POINTS[range]}`;
     try {
@@ -93,9 +126,13 @@ export class Registration {
   }
 
   #mark(lines) {
-    for (const mark of lines.map(markOf))
-      if (mark && !this.#marks.some((m) => m.t === mark.t && m.kind === mark.kind)) this.#marks.push(mark);
-    this.#marks = this.#marks.slice(-MOST);
+    this.#add(lines.map(markOf).filter(Boolean));
+  }
+
+  #add(marks) {
+    const known = new Set(this.#marks.map((mark) => `${mark.t} ${mark.kind}`));
+    this.#marks.push(...marks.filter((mark) => !known.has(`${mark.t} ${mark.kind}`)));
+    this.#marks = this.#marks.sort((a, b) => a.t - b.t).slice(-MOST);
   }
 
   #onState() {
@@ -110,12 +147,15 @@ export class Registration {
   #onTick() {
     const { state, now, fresh } = this.#service;
     const known = state?.registration;
+    if (fresh && !document.hidden && performance.now() - this.#sampled > SAMPLED_MS) this.#readSamples();
     const old = !fresh || (known && known.validity !== "fresh");
     for (const { value } of this.#charts.rows) value.parentElement.classList.toggle("old", Boolean(old));
     const measured = known && milliseconds(known.t_ns_utc);
-    const worth = known ? `${known.validity}, from telemetry of ${ago(measured, now)}` : "not known yet";
-    const why = known?.validity_reason ? `: ${known.validity_reason}` : "";
-    put(this.root.querySelector(".worth"), state ? worth + why : DASH);
+    // nobody knows what it is worth by now: only how old it is
+    const worth = fresh ? known?.validity : `▲ connection lost ${span(this.#service.age_s)} ago`;
+    const why = fresh && known?.validity_reason ? `: ${known.validity_reason}` : "";
+    const told = known ? `${worth}, from telemetry of ${ago(measured, now)}${why}` : "not known yet";
+    put(this.root.querySelector(".worth"), state ? told : DASH);
     if (performance.now() - this.#drawn > 1000) this.#draw();
   }
 
@@ -125,12 +165,14 @@ export class Registration {
     this.#drawn = performance.now();
     this.#charts.show({
       entries: this.#entries,
+      samples: this.#samples,
+      interval: this.#interval,
       marks: this.#marks,
       from: now / 1000 - RANGES[this.#range],
       to: now / 1000,
       tolerance: (parameter) => this.#tolerance(parameter),
       ahead: this.#behind / 1000,
-      last: fresh ? state.registration : null,
+      last: fresh && state.rtc ? state.registration : null,
     });
     const first = this.#entries[0];
     const span = first ? `${this.#entries.length} measurements since ${clock(first.t_ns_utc / 1e6)} UTC` : "no measurement in this time";

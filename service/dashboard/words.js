@@ -14,25 +14,34 @@ export function present(value) {
 }
 
 export function number(value, digits = 2, unit = "") {
-  return present(value) ? `${value.toFixed(digits)}${unit && ` ${unit}`}` : DASH;
+  return present(value) ? `${fixed(value, digits)}${unit && ` ${unit}`}` : DASH;
+}
+
+// What rounds to nothing has no sign.
+export function fixed(value, digits) {
+  const text = value.toFixed(digits);
+  return Number(text) === 0 ? text.replace("-", "") : text;
 }
 
 export function nanometres(metres) {
   if (!present(metres)) return DASH;
   const nm = metres * 1e9;
-  return `${nm.toFixed(Math.abs(nm) < 20 ? 1 : 0)} nm`.replace(/^-0\.0 /, "0.0 ");
+  return `${fixed(nm, Math.abs(nm) < 20 ? 1 : 0)} nm`;
 }
 
 // A value rounded to its 1 sigma, which is shown with two digits where it begins with 1.
 export function rounded(value, sigma, parameter) {
   if (!present(value)) return { value: DASH, sigma: DASH };
   const scaled = value * parameter.scale;
-  const sign = parameter.zero === 0 && scaled >= 0 ? "+" : "";
-  if (!present(sigma) || sigma <= 0) return { value: `${sign}${scaled.toFixed(3)}`, sigma: DASH };
+  const signed = (digits) => {
+    const text = fixed(scaled, digits);
+    return `${parameter.zero === 0 && !text.startsWith("-") && Number(text) !== 0 ? "+" : ""}${text}`;
+  };
+  if (!present(sigma) || sigma <= 0) return { value: signed(3), sigma: DASH };
   const error = sigma * parameter.scale;
   const first = error / 10 ** Math.floor(Math.log10(error));
   const digits = Math.min(6, Math.max(0, -Math.floor(Math.log10(error)) + (first < 1.95 ? 1 : 0)));
-  return { value: `${sign}${scaled.toFixed(digits)}`, sigma: error.toFixed(digits) };
+  return { value: signed(digits), sigma: error.toFixed(digits) };
 }
 
 export function clock(ms) {

@@ -1,19 +1,21 @@
 // The header, what waits for the operator, the loop, and the reconstructors.
 
+import { lasting, showAlarmCount } from "./alarms.js";
 import { margin, described, usable } from "./orders.js";
 import {
-  DASH, TONES, ago, clock, make, milliseconds, nanometres, number, operation, present, put, registrationOf, shortly, span, verdict,
+  DASH, SYMBOLS, ago, clock, make, milliseconds, nanometres, number, operation, present, put, registrationOf, shortly, span, verdict,
 } from "./words.js";
 import { bar, soFar } from "./work.js";
 
 const $ = (selector) => document.querySelector(selector);
+const UNKNOWN = { word: "NOT KNOWN", symbol: SYMBOLS.lost, tone: "bad", why: "the connection to the service is lost" };
 
 export function showHeader(service, orders) {
   const { state, fresh, now } = service;
-  const { word, tone, why } = fresh ? operation(state) : { word: "NOT KNOWN", tone: "bad", why: "the connection to the service is lost" };
+  const { word, symbol, tone, why } = fresh ? operation(state) : UNKNOWN;
   put($("#system"), state?.system ?? "pyrcal");
   const operational = $("#operation");
-  put(operational, `${TONES[tone]} ${word}`);
+  put(operational, `${symbol} ${word}`);
   operational.dataset.tone = tone;
   operational.title = why;
   put($("#utc"), `${clock(now)} UTC`);
@@ -23,17 +25,9 @@ export function showHeader(service, orders) {
   put($("#rtc"), rtcLine(state, fresh));
   const stop = $("#stop");
   stop.dataset.order = state?.stopped_because ? "resume" : "stop";
-  put(stop, state?.stopped_because ? "▶ Release" : "■ Stop everything");
-  const n = state?.alarms.filter((alarm) => !alarm.muted).length ?? 0;
-  const others = [[state?.stale_alarms, "unseen"], [state?.muted_alarms, "muted"]].filter(([list]) => list?.length);
-  const alarms = $("#alarm-count");
-  const lasting = n ? `■ ${n} alarm${n > 1 ? "s" : ""}` : "○ no alarm";
-  put(alarms, fresh ? [lasting, ...others.map(([list, word]) => `${list.length} ${word}`)].join(", ") : `alarms ${DASH}`);
-  alarms.dataset.tone = !fresh ? "" : n ? "bad" : state.stale_alarms.length ? "warn" : "";
-  // on the other pages the alarms themselves are out of sight
-  const lines = fresh ? (state?.alarms ?? []).filter((a) => !a.muted).slice(-3).map((a) => `■ ${a.name}: ${a.text}`) : [];
-  listed($("#alarm-lines"), lines);
-  document.title = `${fresh && n ? `(${n}) ` : ""}${word} ${state?.system ?? "pyrcal"}`;
+  put(stop, state?.stopped_because ? "Release" : "Stop everything");
+  const n = showAlarmCount(service);
+  document.title = `${n ? `(${n}) ` : ""}${word} ${state?.system ?? "pyrcal"}`;
 }
 
 function rtcLine(state, fresh) {
@@ -50,9 +44,9 @@ export function showConnection(service) {
   if (banner.hidden === lost) banner.hidden = !lost;
   document.body.classList.toggle("lost", lost);
   if (!lost) return;
-  const text = service.locked ? "■ This service wants a key: log in, at the top of the page."
-    : service.state ? `■ CONNECTION LOST: nothing below is of now; the last was heard ${span(service.age_s)} ago. Trying again.`
-    : "◐ Waiting for the service: nothing has been heard yet. Trying again.";
+  const text = service.locked ? `${SYMBOLS.lost} This service wants a key: log in, at the top of the page.`
+    : service.state ? `${SYMBOLS.lost} CONNECTION LOST: nothing below is of now; the last was heard ${span(service.age_s)} ago. Trying again.`
+    : `${SYMBOLS.busy} Waiting for the service: nothing has been heard yet. Trying again.`;
   put(banner, text);
 }
 
@@ -60,7 +54,8 @@ export function showWaiting(service, orders) {
   const { state, fresh } = service;
   const bar = $("#waiting");
   const { proposal } = orders;
-  const others = (state?.waiting_for ?? []).filter((w) => w.name !== "approval");
+  const told = new Set(["approval", ...lasting(state).filter((a) => a.severity === "critical").map((a) => a.name)]);
+  const others = (state?.waiting_for ?? []).filter((w) => !told.has(w.name)); // of the others the page says so already
   bar.hidden = !fresh || (!proposal && !others.length);
   bar.dataset.asks = String(Boolean(proposal));
   put($("#waiting-title"), proposal ? "WAITING FOR YOU" : "WAITING FOR");
@@ -81,7 +76,7 @@ export function showWork(service, orders) {
   const work = service.fresh ? orders.work : null;
   $("#work").hidden = !work;
   if (!work) return;
-  put($("#work-title"), `◐ ${work.title}`);
+  put($("#work-title"), `${SYMBOLS.busy} ${work.title}`);
   put($("#work-text"), soFar(work, service.now));
   bar($("#work progress"), work.share, work.title);
   const button = $("#work-end");
@@ -117,7 +112,7 @@ function gauge(root, share, text) {
   bar.hidden = !present(share);
   if (present(share)) bar.value = Math.min(Math.max(share, 0), 1.2);
   const word = !present(share) || share <= bar.low ? "" : share <= 1 ? ", near" : ", beyond";
-  put(root.querySelector("span"), `${share > 1 ? "▲ " : ""}${text}${word}`);
+  put(root.querySelector("span"), `${text}${word}`);
 }
 
 export function showProvenance(service, orders) {

@@ -1,20 +1,9 @@
 // What happened: alarms stay on top for as long as they last, the log below them, newest first.
 
-import { ago, clock, day, make, milliseconds, put } from "./words.js";
+import { runbookOf, unseen, worstFirst } from "./alarms.js";
+import { SYMBOLS, ago, clock, day, make, milliseconds, put, toneOf } from "./words.js";
 
 const MOST = 500;
-const SHAPES = { alarm: "■", critical: "■", serious: "◆", warning: "▲", info: "·" };
-
-const GRADES = ["warning", "serious", "critical"];
-
-// What nobody has acknowledged comes first, then what is worse, then what is newer.
-function worstFirst(a, b) {
-  const rank = (alarm) => [alarm.attention === "acknowledged" ? 0 : 1, GRADES.indexOf(alarm.worst_severity), alarm.since_ns_utc];
-  const [one, other] = [rank(a), rank(b)];
-  const k = one.findIndex((value, i) => value !== other[i]);
-  return k < 0 ? 0 : other[k] - one[k];
-}
-
 function about(order, name, text) {
   return make("button", { type: "button", data_about: order, data_name: name, aria_label: `${text} ${name}`, text });
 }
@@ -23,12 +12,13 @@ function lineOf(alarm) {
   const { name, acknowledged: seen, worst_severity: worst, over_ns_utc: over } = alarm;
   const word = alarm.severity ?? `over, was ${worst}`;
   const been = alarm.severity && alarm.severity !== worst ? `, has been ${worst}` : "";
-  const known = seen && `● ${seen.by} knows since ${clock(milliseconds(seen.t_ns_utc))} UTC${seen.reason ? `: ${seen.reason}` : ""}`;
-  return make("li", { className: alarm.attention, title: alarm.do },
-    make("strong", { text: `${over ? "◇" : SHAPES[worst]} ${name}` }),
+  const known = seen && `${seen.by} knows since ${clock(milliseconds(seen.t_ns_utc))} UTC${seen.reason ? `: ${seen.reason}` : ""}`;
+  const runbook = runbookOf(name);
+  return make("li", { className: alarm.attention, title: alarm.do, data_tone: over ? "" : toneOf(alarm.severity) },
+    make("strong", { text: `${over ? SYMBOLS.over : SYMBOLS[alarm.severity]} ${name}` }),
     make("span", { text: `${word}${been}` }),
     make("span", { className: "since", data_since: String(milliseconds(alarm.since_ns_utc)) }),
-    make("span", { className: "buttons" }, ...(seen ? [] : [about("acknowledge", name, "Acknowledge")]), about("mute", name, "Mute")),
+    make("span", { className: "buttons" }, ...(runbook ? [make("a", { href: runbook, text: "Runbook", aria_label: `Runbook: ${name}` })] : []), ...(seen ? [] : [about("acknowledge", name, "Acknowledge")]), about("mute", name, "Mute")),
     make("span", { className: "says", text: alarm.text }),
     ...(known ? [make("span", { className: "says", text: known })] : []));
 }
@@ -36,7 +26,7 @@ function lineOf(alarm) {
 function mutedLine({ name, muted }) {
   const why = muted.reason ? `: ${muted.reason}` : "";
   return make("li", { className: "muted" },
-    make("strong", { text: `○ ${name}` }),
+    make("strong", { text: `${SYMBOLS.muted} ${name}` }),
     make("span", { text: `muted by ${muted.by} until ${clock(milliseconds(muted.until_ns_utc))} UTC${why}` }),
     make("span", { className: "buttons" }, about("unmute", name, "Unmute")));
 }
@@ -82,7 +72,7 @@ export class Events {
       const text = line.n_times > 1 ? `${line.text} (${line.n_times} times)` : line.text;
       return make("tr", { className: line.level },
         make("td", {}, make("time", { datetime: new Date(ms).toISOString(), title: day(ms), text: clock(ms) })),
-        make("td", { text: `${SHAPES[line.level]} ${line.level}` }),
+        make("td", { text: `${SYMBOLS[line.level]} ${line.level}` }),
         make("td", { text: line.name }),
         make("td", { text }));
     });
@@ -99,6 +89,9 @@ export class Events {
     const list = this.root.querySelector("#alarms");
     const focus = document.activeElement?.closest?.("#alarms button")?.dataset; // a rebuilt list keeps it
     list.replaceChildren(...shown.map(lineOf), ...muted.map(mutedLine));
+    const n = unseen(this.#service.state).length;
+    this.root.querySelector("#unseen").hidden = n < 2;
+    put(this.root.querySelector("#unseen span"), `${n} that nobody has acknowledged`);
     if (focus) list.querySelector(`[data-about="${focus.about}"][data-name="${focus.name}"]`)?.focus();
     this.#age();
     this.#announce(alarms.filter((alarm) => !alarm.muted));

@@ -3,11 +3,15 @@
 import { colour } from "./scheme.js";
 import { PARAMETERS, DASH, put, fixed, present } from "./words.js";
 
+const CROWDED = 1; // of the distance of two actuators: longer lines are drawn of fewer
+const MOST_APART = 8; // subapertures
+
 export class MirrorOnSensor {
   #service;
   #mirror = null;
   #factor = 10;
   #places = [];
+  #drawn = []; // of the places, those that are drawn
   #marked = -1;
   #alpha = "";
 
@@ -53,8 +57,8 @@ export class MirrorOnSensor {
       const from = onSensor(p, nominal);
       return { from, to: alpha ? onSensor(p, alpha) : null };
     });
-    this.#draw();
     this.#tell(alpha);
+    this.#draw();
   }
 
   #tell(alpha) {
@@ -64,7 +68,7 @@ export class MirrorOnSensor {
       const most = far.length ? `farthest actuator ${(100 * Math.max(...far)).toFixed(1)} % of a subaperture from its place` : "no actuators are known: modes were measured";
       text = `${most}`;
     }
-    put(this.root.querySelector(".summary"), text);
+    this.text = text;
     this.canvas.setAttribute("aria-label", `Mirror on the sensor: ${text}`);
   }
 
@@ -77,6 +81,7 @@ export class MirrorOnSensor {
     canvas.width = canvas.clientWidth * ratio;
     canvas.height = canvas.clientHeight * ratio;
     const ctx = canvas.getContext("2d");
+    this.#drawn = apart(this.#places, mirror.pupil_diameter_subap * Math.sqrt(Math.PI / 4 / this.#places.length), (place) => this.#shown(place));
     const far = this.#places.flatMap((place) => [place.from, place.to ? this.#shown(place) : place.from]);
     const most = Math.max(mirror.pupil_diameter_subap / 2, ...far.map(([x, y]) => Math.max(Math.abs(x), Math.abs(y))));
     const across = 2 * most + 1;
@@ -87,6 +92,8 @@ export class MirrorOnSensor {
     this.#cells(ctx, mirror);
     this.#rim(ctx, mirror);
     this.#actuators(ctx);
+    const few = this.#drawn.length < this.#places.length ? `; ${this.#drawn.length} of ${this.#places.length} drawn` : "";
+    put(this.root.querySelector(".summary"), `${this.text ?? ""}${few}`);
   }
 
   #cells(ctx, { n_subapertures: n, pupil_diameter_subap: across, obscuration_ratio: hole }) {
@@ -121,20 +128,23 @@ export class MirrorOnSensor {
   }
 
   #actuators(ctx) {
-    const dot = this.#places.length > 300 ? 0.16 : 0.14 * Math.sqrt(300 / Math.max(this.#places.length, 30));
-    this.#places.forEach((place, k) => {
-      ctx.fillStyle = colour("nominal");
+    const few = this.#drawn.length < this.#places.length;
+    const dot = (few ? 1.6 : 1) * (this.#places.length > 300 ? 0.16 : 0.14 * Math.sqrt(300 / Math.max(this.#places.length, 30)));
+    const thin = Math.max(0.06, 1 / this.scale); // a line is a pixel at least
+    for (const place of this.#drawn) {
+      const marked = place === this.#places[this.#marked];
+      ctx.fillStyle = colour("quiet");
       disc(ctx, place.from, dot * 0.7);
-      if (!place.to) return;
+      if (!place.to) continue;
       const now = this.#shown(place);
-      ctx.strokeStyle = ctx.fillStyle = k === this.#marked ? colour("warn") : colour("accent");
-      ctx.lineWidth = k === this.#marked ? 0.14 : 0.06;
+      ctx.strokeStyle = ctx.fillStyle = marked ? colour("warn") : colour("accent");
+      ctx.lineWidth = marked ? 2 * thin : thin;
       ctx.beginPath();
       ctx.moveTo(...place.from);
       ctx.lineTo(...now);
       ctx.stroke();
-      disc(ctx, now, k === this.#marked ? dot * 2 : dot);
-    });
+      disc(ctx, now, marked ? dot * 2 : dot);
+    }
   }
 
   #point(event) {
@@ -143,7 +153,8 @@ export class MirrorOnSensor {
     const x = (event.clientX - box.left - box.width / 2) / this.scale;
     const y = -(event.clientY - box.top - box.height / 2) / this.scale;
     let [nearest, least] = [-1, 1.5];
-    this.#places.forEach((place, k) => {
+    this.#drawn.forEach((place) => {
+      const k = this.#places.indexOf(place);
       const [px, py] = place.to ? this.#shown(place) : place.from;
       const far = Math.hypot(px - x, py - y);
       if (far < least) [nearest, least] = [k, far];
@@ -164,6 +175,21 @@ export class MirrorOnSensor {
     put(this.root.querySelector(".actuator"), text);
     this.#draw();
   }
+}
+
+// Those of the places that stand so far apart that their lines do not cross: all of them while the lines are short.
+function apart(places, pitch, shown) {
+  const lengths = places.map((place) => (place.to ? distance(place.from, shown(place)) : 0));
+  const longest = Math.max(0, ...lengths);
+  if (!(longest > CROWDED * pitch)) return places;
+  const least = Math.min(Math.max(longest / 2, 1.5 * pitch), MOST_APART);
+  const chosen = [];
+  for (const place of places) if (chosen.every(({ from }) => distance(from, place.from) >= least)) chosen.push(place);
+  return chosen;
+}
+
+function distance([x, y], [otherX, otherY]) {
+  return Math.hypot(x - otherX, y - otherY);
 }
 
 // A point of the mirror on the sensor: turned and scaled about the pupil's centre, shifted last.

@@ -1,7 +1,8 @@
 // What an operator orders: one click, one dialog that says in numbers what will happen, one answer.
 
+import { unseen } from "./alarms.js";
 import { busy } from "./work.js";
-import { DASH, MODES, clock, make, milliseconds, nanometres, number, present, put, registrationOf, verdict } from "./words.js";
+import { DASH, MODES, SYMBOLS, clock, make, milliseconds, nanometres, number, present, put, registrationOf, verdict } from "./words.js";
 
 const NAME = "pyrcal.name"; // who sits here, kept by this browser
 
@@ -14,12 +15,20 @@ export class Orders {
 
   constructor(service) {
     this.#service = service;
-    this.#dialog.querySelector("form").addEventListener("submit", (event) => this.#send(event));
+    const form = this.#dialog.querySelector("form");
+    form.addEventListener("submit", (event) => this.#send(event));
+    form.addEventListener("keydown", (event) => this.#onKey(event));
+    form.addEventListener("invalid", (event) => this.#onLack(event), true);
     this.#dialog.querySelector("[value=cancel]").addEventListener("click", () => this.#dialog.close());
   }
 
   get service() {
     return this.#service;
+  }
+
+  // Whether a dialog is on its way: what is typed already is meant for it.
+  get opening() {
+    return this.#opening;
   }
 
   get state() {
@@ -82,12 +91,31 @@ export class Orders {
     const [reason, by, send] = ["#reason", "#by", "[value=send]"].map((s) => this.#dialog.querySelector(s));
     reason.value = "";
     reason.required = Boolean(asked);
+    put(reason.parentElement.querySelector(".need"), need(asked));
     by.value = localStorage.getItem(NAME) ?? "";
-    put(send, button);
+    put(send.querySelector("span"), button);
     this.#waits(false);
     put(this.#dialog.querySelector(".refused"), "");
     this.#dialog.showModal();
-    (asked ? reason : send).focus();
+    reason.focus(); // never what sends: somebody may be typing already
+  }
+
+  // Enter in a field is not an order; Ctrl+Enter is, wherever the focus is.
+  #onKey(event) {
+    if (event.key !== "Enter" || event.isComposing || event.target.tagName === "BUTTON" && !event.ctrlKey) return;
+    event.preventDefault();
+    if (event.ctrlKey || event.metaKey) this.#dialog.querySelector("form").requestSubmit();
+    else put(this.#dialog.querySelector(".asked"), "Ctrl+Enter sends");
+  }
+
+  // What is lacking is said in the dialog, once, by the first field that lacks it.
+  #onLack(event) {
+    event.preventDefault();
+    const field = event.target;
+    if (field !== this.#dialog.querySelector(":invalid:not(form)")) return;
+    const label = field.parentElement.querySelector("span").firstChild.textContent.trim();
+    put(this.#dialog.querySelector(".refused"), field.validity.valueMissing ? `Not sent: ${label} is needed` : `Not sent: ${label}: ${field.validationMessage}`);
+    field.focus();
   }
 
   // Say what will happen, from what is there now; what is decided on is read for it, with its tag.
@@ -124,13 +152,14 @@ export class Orders {
     event.preventDefault();
     const send = this.#dialog.querySelector("[value=send]");
     if (!this.#order || send.disabled) return; // a second click does nothing twice
-    const { title, method, path, body, tag } = this.#order;
+    const { title, parts, method, path, body, tag } = this.#order;
     const chosen = typeof body === "function" ? body(this.#chosen) : { ...body, ...this.#chosen };
     const reason = this.#dialog.querySelector("#reason").value.trim();
     const by = this.#dialog.querySelector("#by").value.trim();
     localStorage.setItem(NAME, by);
     this.#waits(true);
-    const answer = await this.#service.order(method, path, { ...chosen, reason, by }, this.#key, tag);
+    const answer = parts ? await this.#sendAll(parts, { reason, by })
+      : await this.#service.order(method, path, { ...chosen, reason, by }, this.#key, tag);
     this.#waits(false);
     if (answer.stale) return this.#again();
     if (answer.refused) {
@@ -141,6 +170,17 @@ export class Orders {
     }
     this.#dialog.close();
     this.say(`${title}: ${answer.text}`);
+  }
+
+  // Several orders of one dialog: what was refused is told, and stays on the page.
+  async #sendAll(parts, signed) {
+    const refused = [];
+    for (const { path, body, name } of parts) {
+      const answer = await this.#service.order("POST", path, { ...body, ...signed }, `${this.#key}-${name}`);
+      if (answer.refused) refused.push(`${name}: ${answer.text}`);
+    }
+    const done = parts.length - refused.length;
+    return { refused: false, text: [`${done} of ${parts.length} done`, ...refused].join("; ") };
   }
 
   // Nothing was done: somebody, or the service, was faster. The dialog says how it is now.
@@ -160,13 +200,18 @@ export class Orders {
   }
 }
 
-// One field of a dialog: a choice of some, or a number.
-function fieldOf({ name, label, options, value = "", ...rest }) {
+// One field of a dialog: a choice of some, or a number; which are needed is said, not only shown.
+function fieldOf({ name, label, options, value = "", needed = false, ...rest }) {
   const input = options
-    ? make("select", { name }, ...Object.entries(options).map(([key, text]) => make("option", { value: key, text })))
+    ? make("select", { name }, ...options.map(([key, text]) => make("option", { value: key, text })))
     : make("input", { name, type: "number", autocomplete: "off", ...rest });
   input.value = value;
-  return make("label", { text: label }, input);
+  input.required = needed;
+  return make("label", {}, make("span", { text: `${label} ` }, make("em", { className: "need", text: options && !needed ? "" : need(needed) })), input);
+}
+
+function need(needed) {
+  return needed ? "needed" : "if you like";
 }
 
 function newKey() {
@@ -215,6 +260,7 @@ const NEEDS = {
   acknowledge: (_, state, name) => (alarmOf(state, name)?.attention ? "" : `${name} is over`),
   mute: (_, state, name) => (alarmOf(state, name) ? "" : `${name} is over`),
   unmute: (_, state, name) => (alarmOf(state, name)?.muted ? "" : `${name} is not muted`),
+  "acknowledge-all": (_, state) => (unseen(state).length ? "" : "every alarm is acknowledged"),
   "dither-start": (orders, state) => (state.dither ? `${state.dither.id} is running: stop it first` : ""),
 };
 
@@ -228,10 +274,10 @@ const TITLES = {
   approve: "Approve", reject: "Reject", rollback: "Roll back", hold: "Hold", mode: "Mode", acquire: "Acquire",
   abort: "Abort the acquisition", "give-up": "Give up", "dither-start": "Start the dither", "dither-stop": "Stop the dither",
   stop: "Stop everything", resume: "Release", measure: "Measure", noisy: "Noisy matrix", record: "Keep telemetry", "open-loop": "End the gain ramp",
-  acknowledge: "Acknowledge", mute: "Mute", unmute: "Unmute",
+  acknowledge: "Acknowledge", "acknowledge-all": "Acknowledge all", mute: "Mute", unmute: "Unmute",
 };
 
-const MUTE_S = 3600;
+const MUTE_TIMES = [["", "choose"], ["900", "15 minutes"], ["3600", "an hour"], ["14400", "4 hours"], ["43200", "12 hours"]];
 
 const ORDERS = {
   stop(orders) {
@@ -266,20 +312,34 @@ const ORDERS = {
       body: { severity: alarm.worst_severity },
     };
   },
+  // Each as it was seen here: one that has become worse meanwhile is refused.
+  "acknowledge-all"(orders) {
+    const alarms = unseen(orders.state);
+    return {
+      title: `Acknowledge ${alarms.length} alarms`,
+      facts: [
+        ...alarms.map((alarm) => `${alarm.severity ? SYMBOLS[alarm.severity] : SYMBOLS.over} ${alarm.name}${alarm.severity ? "" : " (over)"}: ${alarm.text}`),
+        "Those that last stay on this page, with who knows of them; those that are over leave it.",
+      ],
+      button: "Acknowledge all",
+      parts: alarms.map(({ name, worst_severity: severity }) => ({ name, path: `v1/alarms/${encodeURIComponent(name)}/acknowledge`, body: { severity } })),
+    };
+  },
   mute(orders, name) {
     const alarm = alarmOf(orders.state, name);
     return {
-      title: `Mute ${name} for an hour`,
-      facts: [
+      title: `Mute ${name}`,
+      fields: [{ name: "for_s", label: "For", options: MUTE_TIMES, needed: true }],
+      facts: ({ for_s: seconds }) => [
         alarm.text,
-        `It is not listed here until ${clock(orders.service.now + MUTE_S * 1000)} UTC, however often it comes; muted alarms are counted.`,
+        `It is not listed here until ${seconds ? `${clock(orders.service.now + seconds * 1000)} UTC` : DASH}, however often it comes; muted alarms are counted.`,
         "What it forbids, it goes on to forbid.",
       ],
-      button: "Mute for an hour",
+      button: "Mute",
       asked: true,
       method: "POST",
       path: `v1/alarms/${encodeURIComponent(name)}/mute`,
-      body: { for_s: MUTE_S },
+      body: ({ for_s: seconds }) => ({ for_s: Number(seconds) }),
     };
   },
   unmute(orders, name) {
@@ -352,7 +412,7 @@ const ORDERS = {
       fields: [{
         name: "anyway",
         label: "If the gate refuses it",
-        options: { "": "nothing is sent", yes: "it goes out all the same: α may be what is wrong" },
+        options: [["", "nothing is sent"], ["yes", "it goes out all the same: α may be what is wrong"]],
       }],
       button: "Roll back",
       asked: true,
@@ -470,7 +530,7 @@ const ORDERS = {
     return {
       title: "Measure an interaction matrix",
       fields: [
-        { name: "pattern", label: "How", options: PATTERNS, value: "push-pull-modal" },
+        { name: "pattern", label: "How", options: Object.entries(PATTERNS), value: "push-pull-modal" },
         { name: "modes", label: "Modes, the first", min: 1, max: rtc.n_modes, placeholder: `the ${rtc.n_controlled} controlled` },
         { name: "n_average", label: "Repetitions", min: 1, max: 10_000, placeholder: "the service chooses" },
       ],
@@ -495,7 +555,7 @@ const ORDERS = {
   record() {
     return {
       title: "Keep telemetry",
-      fields: [{ name: "duration_s", label: "Seconds", min: 1, max: 3600, step: "any", value: 60 }],
+      fields: [{ name: "duration_s", label: "Seconds", needed: true, min: 1, max: 3600, step: "any", value: 60 }],
       facts: ({ duration_s: seconds }) => [
         `All that the RTC sends in the next ${number(seconds, 0)} s goes to the archive, byte for byte; what came before is gone.`,
         "It stays until somebody removes it; it ends before its time where the disk becomes full.",
@@ -510,7 +570,7 @@ const ORDERS = {
     const { rtc, dithering } = orders.state;
     return {
       title: "Measure a noisy interaction matrix",
-      fields: [{ name: "duration_s", label: "Seconds", min: 1, max: 3600, step: "any", value: 30 }],
+      fields: [{ name: "duration_s", label: "Seconds", needed: true, min: 1, max: 3600, step: "any", value: 30 }],
       facts: ({ duration_s: seconds }) => [
         `The loop stays closed: random signs on its ${rtc.n_controlled} modes at once for ${number(seconds, 0)} s of telemetry.`,
         `What moves: at most ${nanometres(Math.min(5e-9, dithering.budget_m))} RMS of all modes together; the service's own dither makes way.`,

@@ -1,7 +1,9 @@
 // The operator's page: what is known, what wants a decision, and the keys.
 
+import { CriticalBanner, showAlarmLines } from "./alarms.js";
 import { showButtons, showConnection, showHeader, showLoop, showProvenance, showReconstructors, showWaiting, showWork } from "./cards.js";
 import { Events } from "./events.js";
+import { Large } from "./large.js";
 import { MirrorOnSensor } from "./mirror.js";
 import { Orders } from "./orders.js";
 import { Registration } from "./registration.js";
@@ -17,8 +19,10 @@ const orders = new Orders(service);
 const registration = new Registration(service, document.querySelector("#registration"));
 const mirror = new MirrorOnSensor(service, document.querySelector("#mirror"));
 new Events(service, orders, document.querySelector("#events"));
-const help = document.querySelector("#help");
 const $ = (selector) => document.querySelector(selector);
+const banner = new CriticalBanner(service, orders);
+const large = new Large(service, orders, $("#large"));
+const help = $("#help");
 
 // The other pages are fetched when they are looked at first.
 const PAGES = {
@@ -38,13 +42,15 @@ async function fetched(name) {
 }
 
 async function turnTo() {
-  const name = location.hash.slice(1) in PAGES ? location.hash.slice(1) : "operate";
+  const wanted = location.hash.slice(1);
+  const name = wanted in PAGES || wanted === "large" ? wanted : "operate";
   for (const main of document.querySelectorAll("main")) main.hidden = main.id !== name;
   for (const link of document.querySelectorAll("nav a")) {
     if (link.hash === `#${name}`) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
   document.body.dataset.page = name;
+  large.show();
   if (!PAGES[name]) return;
   try {
     pages[name] ??= fetched(name);
@@ -64,6 +70,9 @@ function showScheme() {
 function show() {
   showConnection(service);
   showHeader(service, orders);
+  banner.show();
+  showAlarmLines(service);
+  large.show();
   showWaiting(service, orders);
   showWork(service, orders);
   showProvenance(service, orders);
@@ -113,11 +122,13 @@ const KEYS = {
   m: () => (location.hash = "measurements"),
   o: () => (location.hash = "operate"),
   y: () => (location.hash = "history"),
+  b: () => (location.hash = document.body.dataset.page === "large" ? "operate" : "large"),
   "?": () => help.showModal(),
 };
 
+// While a dialog is open, or on its way, no key does anything but what it does there.
 document.addEventListener("keydown", (event) => {
-  const typing = event.target.closest("input, textarea, select, dialog");
+  const typing = event.target.closest("input, textarea, select") || orders.opening || $("dialog[open]");
   if (typing || event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
   const act = KEYS[event.key];
   if (!act) return;

@@ -72,16 +72,42 @@ export function milliseconds(ns) {
   return present(ns) ? ns / 1e6 : null;
 }
 
-// What the service is in and does; tone is shown as a shape, too.
-export function operation(state) {
-  const { operation: word, occupation, because } = state.operating;
-  const idle = word === "Ready" || word === "NotReady";
-  return { word: (idle ? word.replace("tR", "t r") : `${word} · ${occupation}`).toUpperCase(), tone: TONE_OF[word], why: because };
+// Each symbol means one thing, wherever it stands.
+export const SYMBOLS = {
+  critical: "■", serious: "◆", warning: "▲", info: "·", // how much an alarm or a line of the log matters
+  over: "◇", muted: "⊘", none: "○", // an alarm that nobody has seen, one that is muted; nothing of the kind
+  good: "●", busy: "◐", lost: "✕", // all is well; under way; not known
+  swap: "⇄", jump: "↯", alarm: "!", // on a time axis
+};
+
+export const SEVERITIES = ["warning", "serious", "critical"];
+
+// The colour of what matters so much.
+export function toneOf(severity) {
+  return severity === "critical" ? "bad" : severity ? "warn" : "";
 }
 
-const TONE_OF = { Operational: "good", Ready: "busy", Degraded: "warn", NotReady: "bad", Error: "bad" };
+// What the service is in and does. Only a loop that is closed and followed is well.
+export function operation(state) {
+  const { operation: word, occupation, because } = state.operating;
+  const [name, symbol, tone] = OPERATIONS[word];
+  const open = state.rtc?.loop === "open";
+  const does = state.stopped_because ? "STOPPED" : occupation !== "Idle" ? occupation.toUpperCase()
+    : open ? "LOOP OPEN" : state.rtc && !state.registration ? "α NOT KNOWN" : "";
+  const shown = { word: does ? `${name} · ${does}` : name, symbol, tone, why: because };
+  if (word !== "Operational" && word !== "Ready") return shown;
+  if (state.stopped_because) return { ...shown, symbol: SYMBOLS.warning, tone: "warn" };
+  const follows = word === "Operational" && !open && state.registration && occupation !== "Idle";
+  return follows ? shown : { ...shown, symbol: word === "Ready" ? SYMBOLS.none : SYMBOLS.busy, tone: "busy" };
+}
 
-export const TONES = { good: "●", busy: "◐", warn: "▲", bad: "■" };
+const OPERATIONS = {
+  Operational: ["OPERATIONAL", SYMBOLS.good, "good"],
+  Ready: ["READY", SYMBOLS.none, "busy"],
+  Degraded: ["DEGRADED", SYMBOLS.serious, "warn"],
+  NotReady: ["NOT READY", SYMBOLS.lost, "bad"],
+  Error: ["ERROR", SYMBOLS.critical, "bad"],
+};
 
 export const MODES = {
   auto: "it makes and sends by itself whatever passes the gate",

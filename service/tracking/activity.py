@@ -176,7 +176,7 @@ class Operation(StrEnum):
     """It works for an RTC whose loop is closed, or has its mirror; what it does says the rest."""
 
     READY = "Ready"
-    """It can work, and there is nothing to do: no RTC is there, or its loop is open."""
+    """It can work, and does not: no RTC is there, its loop is open, or everything was stopped."""
 
     DEGRADED = "Degraded"
     """An alarm that is serious lasts: it does less than it should."""
@@ -253,6 +253,8 @@ def operating(state: TrackerState, hindered: str, now_ns: int) -> Operating:
         operation, because = Operation.NOT_READY, hindered
     elif serious is not None:
         operation, because = Operation.DEGRADED, serious.text
+    elif state.stopped_because:
+        operation = Operation.READY
     elif occupation in {Occupation.IDLE, Occupation.HOLD, Occupation.TRACKING}:
         idle = _why_nothing_to_do(state)
         operation, because = (Operation.READY, idle) if idle else (operation, because)

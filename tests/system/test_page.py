@@ -1,97 +1,19 @@
 """The operator's page in a real browser, before a real service and a simulated RTC."""
 
-import shutil
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from service.keys import KeyFile, KeyScope
-from tests.system.night import a_night, wait_for
+from tests.system.browser import LAPTOP, NARROW, NEEDS_A_BROWSER, WIDE, Page, a_browser
+from tests.system.night import a_night
 from tests.system.pace import patience
 
-webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-DRIVER = shutil.which("chromedriver")
-DATA = Path(__file__).parents[1] / "data"
-AXE, TINY = DATA / "axe" / "axe.min.js", DATA / "tiny"
-WIDE, NARROW = (1440, 900), (390, 844)
-LAPTOP = (1280, 800)
+TINY = Path(__file__).parents[1] / "data" / "tiny"
 FIRST_LOAD_BYTES = 300_000
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.long,
-    pytest.mark.timeout(150),
-    pytest.mark.skipif(
-        CHROMIUM is None or DRIVER is None, reason="no chromium and chromedriver: apt install them"
-    ),
-]
-
-
-@contextmanager
-def a_browser():
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for word in ("headless=new", "no-sandbox", "disable-dev-shm-usage", "disable-gpu"):
-        options.add_argument(f"--{word}")
-    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
-    try:
-        yield driver
-    finally:
-        driver.quit()
-
-
-class Page:
-    """The page as an operator sees it, and what an operator does with it."""
-
-    def __init__(self, driver, night):
-        self.driver, self.night = driver, night
-        self.url = str(night.client.base_url)
-
-    def open(self, size=WIDE):
-        self.resize(size)
-        self.driver.get(self.url)
-        self.until("document.querySelector('#lost').hidden && document.title.includes('small')")
-
-    def resize(self, size):
-        """Give the page itself this size, narrower than a window can be."""
-        metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
-        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-
-    def js(self, script):
-        return self.driver.execute_script(f"return {script}")
-
-    def until(self, condition, timeout_s=10.0):
-        def why():
-            return f"{condition}; {self.text()}"
-
-        return wait_for(lambda: self.js(condition), timeout_s, why, every_s=0.05)
-
-    def text(self, selector="body"):
-        return self.js(f"document.querySelector({selector!r}).innerText")
-
-    def says(self, selector, words, timeout_s=10.0):
-        found = f"document.querySelector({selector!r}).innerText.includes({words!r})"
-        self.until(found, timeout_s)
-
-    def click(self, selector):
-        self.driver.find_element("css selector", selector).click()
-
-    def press(self, keys):
-        """Type with whatever has the focus."""
-        self.driver.switch_to.active_element.send_keys(keys)
-
-    def faults_of_access(self):
-        """Return what axe-core finds, all of its rules."""
-        self.driver.execute_script(AXE.read_text(encoding="utf-8"))
-        found = self.driver.execute_async_script(
-            "const done = arguments[0]; axe.run().then(r => done(r.violations.map("
-            "v => [v.id, v.help, v.nodes.map(n => n.target.join(' '))])))"
-        )
-        return [fault for fault in found if fault]
+pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150), NEEDS_A_BROWSER]
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +23,9 @@ def page(tmp_path_factory):
         night.running = night.service("propose")
         night.telescope = night.rtc()
         night.wait_for_rtc(night.telescope)
-        yield Page(driver, night)
+        page = Page(driver, str(night.client.base_url), "small")
+        page.night = night
+        yield page
 
 
 def proposal(page):
@@ -163,7 +87,7 @@ def test_on_a_wide_screen_nothing_is_scrolled_for(page):
     for width, height in (WIDE, LAPTOP):
         page.resize((width, height))
         page.until(f"innerWidth === {width}")
-        assert page.js("document.querySelector('header').offsetHeight") < 50, "one row"
+        assert page.js("document.querySelector('header').offsetHeight") < 80, "two rows"
         assert page.js("document.documentElement.scrollWidth") <= width
         assert page.js("document.documentElement.scrollHeight") <= height
         bottom = page.js("document.querySelector('#events').getBoundingClientRect().bottom")
@@ -192,8 +116,7 @@ def test_by_keys_alone_one_is_rejected_and_not_without_a_reason(page):
     page.driver.find_element("css selector", "#order [value=send]").send_keys("\n")
     assert page.js("document.querySelector('#order').open")
     assert page.night.client.get(f"/v1/reconstructors/{name}").json()["state"] == "proposed"
-    page.js("document.querySelector('#reason').focus()")
-    page.press("not tonight\tnight operator\n")  # Enter in a field sends
+    page.send("not tonight\tnight operator")
     page.says("#answer", f"{name} is discarded")
     assert page.night.client.get(f"/v1/reconstructors/{name}").json()["reason"] == "not tonight"
     trail = page.night.client.get("/v1/audit").json()["entries"]
@@ -207,7 +130,7 @@ def test_by_keys_alone_the_service_goes_back_and_holds(page):
     page.until("document.querySelector('[data-order=rollback]').ariaDisabled === 'false'", 20.0)
     page.press("r")
     page.says("#order", "Mode becomes hold")
-    page.press("the image was better before\n")
+    page.send("the image was better before")
     page.says("#answer", "applied at frame", 20.0)
     assert page.night.state["in_use"] != before
     page.says("#operation", "HOLD")
@@ -227,7 +150,7 @@ def test_what_was_decided_on_a_state_that_has_changed_is_not_done(page):
     page.night.client.post("/v1/rollback", json=body).raise_for_status()
     theirs = page.night.state["in_use"]
     page.says("#provenance", f"in use: {theirs}")
-    page.press("too late\n")
+    page.send("too late")
     page.says("#order .refused", "The state has changed since you looked, and nothing was done")
     page.says("#order", f"in place of {theirs}")
     assert page.night.state["in_use"] == theirs
@@ -277,7 +200,7 @@ def test_everything_is_stopped_and_released_in_two_clicks_each(page):
     page.click("#stop")
     page.says("#order", "Nothing is made or sent")
     page.click("#order [value=send]")
-    page.says("#operation", "HOLD")
+    page.says("#operation", "STOPPED")
     page.says("#alarms", "stopped")
     assert page.night.state["stopped_because"]
     page.says("#answer", "everything was stopped")
@@ -350,14 +273,16 @@ def test_an_alarm_is_acknowledged_and_muted_also_by_keys_alone(page):
     vanished = "#alarms [data-name=rtc-vanished]"
     page.driver.find_element("css selector", f"{vanished}[data-about=acknowledge]").send_keys("\n")
     page.says("#order", "restart it")
-    page.driver.find_element("css selector", "#reason").send_keys("power is off\tAda\n")
+    page.send("power is off\tAda")
     page.says("#answer", "rtc-vanished is acknowledged; it stays until it is over")
     page.says("#alarms", "Ada knows since")
     page.says("#alarms", "power is off")
     assert page.faults_of_access() == []
     page.click(f"{vanished}[data-about=mute]")
     page.says("#order", "it goes on to forbid")
-    page.driver.find_element("css selector", "#reason").send_keys("until noon\n")
+    page.driver.find_element("css selector", "#order [name=for_s]").send_keys("an hour")
+    page.js("document.querySelector('#reason').focus()")
+    page.send("until noon")
     page.says("#alarms", "muted by Ada until")
     page.says("#alarm-count", "1 muted")
     assert page.faults_of_access() == []

@@ -52,7 +52,7 @@ def test_what_has_the_mirror_is_what_it_does_whatever_the_loop(story):
     looking = replace(story.state, rtc=rtc(loop=Loop.OPEN), acquisition=acquiring)
     assert found(looking)[:2] == (Operation.OPERATIONAL, Occupation.ACQUIRING)
     stopped = replace(story.state, stopped_because="Ada stopped it")
-    assert found(stopped)[:2] == (Operation.OPERATIONAL, Occupation.HOLD)
+    assert found(stopped)[:2] == (Operation.READY, Occupation.HOLD)
     assert "Ada stopped it" in found(stopped)[2]
     assert found(replace(story.state, mode=Mode.HOLD))[1] is Occupation.HOLD
 

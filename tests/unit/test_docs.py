@@ -8,15 +8,17 @@ import sys
 from importlib.util import find_spec
 from itertools import groupby
 
+import h5py
 import httpx
+import numpy as np
 import pytest
 
 from cacao_bridge.__main__ import arguments_parser
+from cacao_bridge.settings import load as load_bridge
 from check_rtc.__main__ import check_parser
 from service.api import create_app
 from service.commands.arguments import command_line, with_negative_numbers
-from service.config import load_settings
-from service.config.instrument_schema import read_instrument_file
+from service.config import load_instrument, load_settings
 from service.routes import page
 from service.tracking.alarms import ALARMS
 from sim_rtc.options import parse_options
@@ -35,11 +37,22 @@ PARSER = command_line()
 REST = json.loads((ROOT / "docs" / "openapi.json").read_text(encoding="utf-8"))["paths"]
 
 
+NOT_RUN = re.compile(r"<!-- not run: (.+) -->\n\Z")
+"""On the line before a block that no test can run, with the reason."""
+
+
+def blocks_of(page, kind):
+    """Every fenced block of a kind on a page, and why it is not run; None: it is."""
+    whole = page.read_text("utf-8")
+    for found in re.finditer(rf"^```{kind}\n(.*?)^```", whole, re.M | re.S):
+        mark = NOT_RUN.search(whole[: found.start()])
+        yield found[1], mark and mark[1]
+
+
 def blocks(kind):
     """Every fenced block of a kind: (page and number, text)."""
     for path in PAGES:
-        found = re.findall(rf"^```{kind}\n(.*?)^```", path.read_text("utf-8"), re.M | re.S)
-        for number, text in enumerate(found):
+        for number, (text, _) in enumerate(blocks_of(path, kind)):
             yield pytest.param(text, id=f"{path.stem}-{number}")
 
 
@@ -135,12 +148,41 @@ def test_a_block_of_the_manual_is_one_that_the_shell_reads(text):
 
 @pytest.mark.parametrize("text", list(blocks("toml")))
 def test_a_file_of_the_manual_is_read(text, tmp_path):
+    """By whoever reads it for a user: an instrument, the bridge to cacao, the service."""
     path = tmp_path / "it.toml"
     path.write_text(text, encoding="utf-8")
     if text.startswith("[instrument]"):
-        assert read_instrument_file(path)
-    elif text.startswith("[service]"):
+        assert load_instrument(path).modes.n_modes > 100
+    elif text.startswith("[wire]"):
+        assert load_bridge(path)
+    else:
         assert load_settings(path, {})
+
+
+@pytest.mark.parametrize("text", list(blocks("python")))
+def test_what_the_manual_writes_in_python_runs(text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(text, "the manual", "exec"), {"matrix": np.eye(3)})
+    with h5py.File("im.h5") as file:
+        assert file["interaction_matrix"].shape == (3, 3)
+
+
+NEEDS_MORE = {"docker", "git", "pip"}
+
+
+def test_a_block_that_is_not_run_says_why():
+    """The mark stands on the line before the block, and nowhere else; the rest is understood by
+    the programs themselves, and run where it works on files: tests/system/test_manual.py.
+    """
+    for path in PAGES:
+        for text, why in blocks_of(path, "sh"):
+            words = {word for line in commands(text) for word in line[:3]}
+            assert why or not words & NEEDS_MORE, (path, text)
+    for path in PAGES:
+        marked = [
+            why for kind in ("sh", "toml", "python") for _, why in blocks_of(path, kind) if why
+        ]
+        assert len(marked) == path.read_text("utf-8").count("<!-- not run"), path
 
 
 @pytest.mark.long

@@ -1,9 +1,9 @@
 // What charts over time have in common: ticks, axes, marks, and where nothing was there to be drawn.
 
 import { colour } from "./scheme.js";
-import { clock, fixed } from "./words.js";
+import { SYMBOLS, clock, fixed } from "./words.js";
 
-const SHAPES = { swap: "▲", jump: "◆", alarm: "■", note: "✎" };
+const MARKS = new Set(["swap", "jump", "alarm", "note"]);
 const STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10_800, 21_600, 43_200, 86_400];
 const QUIET_S = 37; // between two samples of the service's at the most: two of them may be late
 
@@ -67,7 +67,7 @@ export function drawMarks(u, marks, named) {
   ctx.textAlign = "center";
   ctx.font = `${11 * devicePixelRatio}px system-ui`;
   const taken = {}; // shapes of a kind that would lie on one another are drawn once, a jump never lost behind a swap
-  for (const mark of marks.filter((one) => one.kind in SHAPES)) {
+  for (const mark of marks.filter((one) => MARKS.has(one.kind))) {
     const x = u.valToPos(mark.t, "x", true);
     if (x < bbox.left || x > bbox.left + bbox.width) continue;
     ctx.globalAlpha = 0.45;
@@ -79,7 +79,7 @@ export function drawMarks(u, marks, named) {
     if (!named || x - (taken[mark.kind] ?? -Infinity) < 12 * devicePixelRatio) continue;
     const row = Object.entries(taken).filter(([kind, at]) => kind !== mark.kind && Math.abs(x - at) < 12 * devicePixelRatio).length;
     taken[mark.kind] = x;
-    ctx.fillText(SHAPES[mark.kind], x, bbox.top + (10 + 11 * row) * devicePixelRatio);
+    ctx.fillText(SYMBOLS[mark.kind], x, bbox.top + (10 + 11 * row) * devicePixelRatio);
   }
   ctx.restore();
 }

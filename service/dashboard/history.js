@@ -2,7 +2,7 @@
 
 import { behind } from "./axes.js";
 import { Charts } from "./charts.js";
-import { DASH, clock, day, make, milliseconds, number, put, registrationOf, span, verdict } from "./words.js";
+import { DASH, SYMBOLS, clock, day, make, milliseconds, number, put, registrationOf, span, verdict } from "./words.js";
 
 const LINES = 500; // of the audit trail that are read at once
 const HOUR_MS = 3_600_000;
@@ -71,7 +71,7 @@ export class History {
   #typed() {
     const [from, to] = this.times.map((time) => this.#moment(time.value));
     if (from && to && from < to) this.#span(from, to);
-    else put(this.root.querySelector(".read"), "▲ from has to be before to, in a night that begins at noon");
+    else put(this.root.querySelector(".read"), "from has to be before to, in a night that begins at noon");
   }
 
   // A time of the clock in the night that is shown, which begins at its noon; 0: none was typed.
@@ -150,7 +150,7 @@ export class History {
       const what = record ? `, ${record.n_modes} modes, ${verdict(record.gate)}` : "";
       const title = record ? registrationOf(record.alpha, record.sigma) : line.text;
       return make("tr", {},
-        make("th", { scope: "row", text: `${line.kind === "alarm" ? "■ " : ""}${line.name}${what}`, title }),
+        make("th", { scope: "row", text: `${line.kind === "alarm" ? `${SYMBOLS.alarm} ` : ""}${line.name}${what}`, title }),
         make("td", { text: clock(line.from) }), make("td", { text: line.open ? DASH : clock(line.to) }),
         make("td", { text: span((line.to - line.from) / 1000) }), make("td", { className: "track" }, bar));
     });

@@ -214,7 +214,7 @@ export class Measurements {
     this.#show();
     const of = this.#fits.find((f) => f.id === id);
     put(root.querySelector("h2"), `Found: ${of?.name || id}`);
-    put(root.querySelector(".verdict"), found?.verdict ?? `■ ${found?.reason ?? found?.detail ?? "no answer"}`);
+    put(root.querySelector(".verdict"), found?.verdict ?? `✕ ${found?.reason ?? found?.detail ?? "no answer"}`);
     root.querySelector(".drawn").hidden = !found?.verdict;
     if (!found?.verdict) return;
     fill(root.querySelector(".links"), [download(path, "all numbers, JSON", `${id}.json`)]);

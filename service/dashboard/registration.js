@@ -152,7 +152,7 @@ export class Registration {
     for (const { value } of this.#charts.rows) value.parentElement.classList.toggle("old", Boolean(old));
     const measured = known && milliseconds(known.t_ns_utc);
     // nobody knows what it is worth by now: only how old it is
-    const worth = fresh ? known?.validity : `▲ connection lost ${span(this.#service.age_s)} ago`;
+    const worth = fresh ? known?.validity : `✕ connection lost ${span(this.#service.age_s)} ago`;
     const why = fresh && known?.validity_reason ? `: ${known.validity_reason}` : "";
     const told = known ? `${worth}, from telemetry of ${ago(measured, now)}${why}` : "not known yet";
     put(this.root.querySelector(".worth"), state ? told : DASH);

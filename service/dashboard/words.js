@@ -77,7 +77,7 @@ export const SYMBOLS = {
   critical: "■", serious: "◆", warning: "▲", info: "·", // how much an alarm or a line of the log matters
   over: "◇", muted: "⊘", none: "○", // an alarm that nobody has seen, one that is muted; nothing of the kind
   good: "●", busy: "◐", lost: "✕", // all is well; under way; not known
-  swap: "⇄", jump: "↯", alarm: "!", // on a time axis
+  swap: "⇄", jump: "↯", alarm: "!", note: "✎", // on a time axis
 };
 
 export const SEVERITIES = ["warning", "serious", "critical"];

@@ -22,7 +22,7 @@ from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
 from sim_rtc.telescope.detector import PixelDetector
 from sim_rtc.telescope.imperfections import SlopeErrors
-from sim_rtc.telescope.mirror import TensionedPlate, heights
+from sim_rtc.telescope.mirror import PlantSurface, TensionedPlate, heights
 from sim_rtc.telescope.plant import Departures, Optics, Plant, between, registration_between
 
 Array32 = NDArray[np.float32]
@@ -156,7 +156,7 @@ class DiffractivePlant(Plant):
         )
 
     @override
-    def _own_surface(self, mirror: Mirror, strokes: Array) -> tuple[TensionedPlate, Array]:
+    def _own_surface(self, mirror: Mirror, strokes: Array) -> tuple[PlantSurface, Array]:
         """Return a plate under tension."""
         width_m = self._instrument.subaperture_m
         plate = TensionedPlate(

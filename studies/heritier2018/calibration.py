@@ -21,6 +21,9 @@ STROKE_M = 20e-9
 PART_MODES = 50
 """Modes measured in one step."""
 
+SMALL_STROKE_M = 1e-9
+"""Small enough for the pyramid to be linear."""
+
 FRAME_COST_S = 7e-3
 
 
@@ -119,3 +122,46 @@ class Measurement:
         return Reference(
             matrix=self.matrix(store).astype(np.float64), double_pass=self.occasion.passes == 2
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """What a telescope truly answers to small strokes: no noise, nothing shakes."""
+
+    occasion: Occasion
+    alpha: Misregistration
+    n_modes: int
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        return f"noise-free matrix, {self.occasion.imperfections}, seed {self.occasion.seed}"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return 2 * self.n_modes * FRAME_COST_S + 2.0
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """Nothing but the telescope."""
+        return ()
+
+    def compute(self, store: Store) -> Record:
+        """Return ``matrix`` ``(n_slopes, n_modes)``, slope per metre of wavefront, seen once.
+
+        ``singular`` are its singular values, largest first.
+        """
+        seen = telescope.optics(self.occasion, self.alpha)
+        rng = telescope.photons(self.occasion)
+        stroke = np.float32(SMALL_STROKE_M)
+        columns = []
+        for mode in range(self.n_modes):
+            opd_m = stroke * seen.opd_per_command[:, mode]
+            push, pull = (seen.slopes(sign * opd_m, None, rng) for sign in (1, -1))
+            columns.append((push - pull).astype(np.float64) / (2 * SMALL_STROKE_M))
+        matrix = np.array(columns).T / self.occasion.passes
+        return {
+            "singular": np.linalg.svd(matrix, compute_uv=False),
+            "matrix": matrix.astype(np.float32),
+        }

@@ -8,16 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.heritier2018 import page, paper
-from studies.heritier2018.closed_remarks import noise_remark, shaken_remark, still_remark
-from studies.heritier2018.influence import record_of_registered
+from studies.heritier2018 import page, paper, table2
+from studies.heritier2018.closed_remarks import noise_remark, shaken_remark
 from studies.heritier2018.loops import SETTLING_FRAMES, wavefront_error_nm
 from studies.heritier2018.plan import (
-    CLOSED_GAIN,
-    N_MEASURED,
     Budget,
     Variant,
     closed_run,
+    gain_tuning,
     hasty,
 )
 from studies.heritier2018.psf import FIELD, OVERSAMPLING, marechal, strehl
@@ -56,13 +54,18 @@ def section(budget: Budget, store: Store) -> page.Section:
     n_frames, n_seeds = budget.closed_frames, len(budget.seeds)
     body = page.paragraph(
         "By day: a turbulence of 1 arcsec is played on the mirror, which also corrects it, the "
-        f"light meets it twice, gain {CLOSED_GAIN:g} of every mode, fibre of magnitude 7. Errors "
-        f"are at the sensor, after both passes. {n_frames} frames a loop after {SETTLING_FRAMES} "
-        f"of settling, {n_seeds} telescope{'s' * (n_seeds > 1)}, each with imperfections, measured "
-        "matrix, fit and turbulence of its own; ± is their scatter."
+        "light meets it twice, fibre of magnitude 7. Gains are tuned by the paper's ramp: tip and "
+        "tilt, modes to 100, the rest, each by its own residual slopes, every reconstructor by "
+        "itself. Errors are at the sensor, after both passes. "
+        f"{n_frames} frames a loop after {SETTLING_FRAMES} of settling, {n_seeds} "
+        f"telescope{'s' * (n_seeds > 1)}, each with imperfections, measured matrix, fit and "
+        "turbulence of its own; ± is their scatter."
     )
+    body += _gains_table(budget, store)
+    body += table2.body(budget, store)
+    body += page.heading("All of the wavefront, with and without vibrations")
     body += _errors_table(budget, store)
-    body += _paper_remarks(budget, store)
+    body += shaken_remark(*_all_modes_nm(budget, store))
     body += _pairs_remark(budget, store)
     body += _noise_table(budget, store)
     well, in_haste = (
@@ -97,8 +100,6 @@ def _errors_table(budget: Budget, store: Store) -> str:
                 for n in LEFT_OUT
             ]
             rows.append([str(variant), word, *cells])
-        quoted = paper.SHAKEN_ERROR if vibrations else paper.STILL_ERROR
-        rows.append([f"paper ({quoted.where})", word, quoted.text, "", ""])
     return page.table(head, rows, words=(1,))
 
 
@@ -108,17 +109,19 @@ def _with_scatter(values: Array) -> str:
     return f"{values.mean():.1f} ± {values.std(ddof=1):.1f}"
 
 
-def _paper_remarks(budget: Budget, store: Store) -> str:
-    still = errors_nm(budget, store, Variant.TUNED, vibrations=False)
-    shaken = errors_nm(budget, store, Variant.TUNED, vibrations=True)
-    night = record_of_registered(budget, store, N_MEASURED)
-    by_night_nm = wavefront_error_nm(night)
-    return still_remark(still, by_night_nm, beyond_mirror_nm(night)) + shaken_remark(still, shaken)
+def _all_modes_nm(budget: Budget, store: Store) -> tuple[Array, Array]:
+    still, shaken = (errors_nm(budget, store, Variant.TUNED, vibrations=v) for v in (False, True))
+    return still, shaken
 
 
-def beyond_mirror_nm(night: Record) -> float:
-    """Return what of the turbulence no mode of the mirror can make, nm."""
-    return float(np.sqrt(night["total_nm2"] - night["modal_nm2"].sum()))
+def _gains_table(budget: Budget, store: Store) -> str:
+    head = ["reconstructor", "telescope", "tip and tilt", "modes to 100", "the rest"]
+    rows = []
+    for variant in (Variant.MEASURED, Variant.TUNED, Variant.MORE):
+        for seed in budget.seeds:
+            gains = store.read(gain_tuning(budget, seed, variant))["by_group"]
+            rows.append([str(variant), str(seed), *(f"{gain:g}" for gain in gains)])
+    return page.heading("Gains that the ramp finds") + page.table(head, rows)
 
 
 def _pairs_remark(budget: Budget, store: Store) -> str:
@@ -224,8 +227,7 @@ def _strehl_table(budget: Budget, store: Store) -> str:
                 f"{marechal(float(error_nm)):.3f}",
             ]
         )
-    quoted = [f"{marechal(value):.2f}" for value in paper.SHAKEN_ERROR.values]
-    rows.append(
-        [f"paper's errors of Table 2 ({paper.SHAKEN_ERROR.text})", "", "", " / ".join(quoted)]
-    )
+    for row in paper.TABLE_2.values():
+        total = row.errors_nm[0]
+        rows.append([f"paper: {row.name}, {total:g} nm", "", "", f"{marechal(total):.2f}"])
     return page.table(head, rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -10,6 +11,7 @@ import time
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 
+import structlog
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from threadpoolctl import threadpool_limits
@@ -83,6 +85,8 @@ def _settle_in() -> None:
     os.nice(_NICENESS)
     # Ctrl-C reaches every process of the terminal: what is nearly done shall be kept.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # what the simulator tells its log would go to standard output, where only the report's name is
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
 
 
 def _work(task: Task, folder: Path) -> None:

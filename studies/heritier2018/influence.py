@@ -144,8 +144,3 @@ def _spectra_remark(budget: Budget, store: Store) -> str:
 def _share_of_last(extra: Array, total: float) -> float:
     first = 2 * len(extra) // 3
     return float(extra[first:].sum()) / total
-
-
-def record_of_registered(budget: Budget, store: Store, n_modes: int) -> Record:
-    """Return the loop by night with everything registered."""
-    return store.read(influence_run(budget, SWEEPS[0].alpha(0.0), n_modes, Kind.TRUNCATED))

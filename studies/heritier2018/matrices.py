@@ -15,7 +15,16 @@ from studies.heritier2018.matrix_figures import (
     spectra_figure,
     variance_figure,
 )
-from studies.heritier2018.plan import ROUGH, TRUTH, Budget, Variant, closed_run, joint_fit
+from studies.heritier2018.plan import (
+    ROUGH,
+    TRUTH,
+    WITHOUT_BORDER,
+    Budget,
+    Variant,
+    answers,
+    closed_run,
+    joint_fit,
+)
 from studies.heritier2018.reconstructors import synthetic_matrix
 from studies.heritier2018.registration import FitRun, fitted_alpha
 from studies.heritier2018.store import Record, Store, Task
@@ -142,6 +151,8 @@ def section(budget: Budget, store: Store) -> page.Section:
         f"Singular values and RMS of the slopes by mode. {n_frames} frames of measurement.",
     )
     body += _condition_table(budget, store) + condition_remark(record)
+    body += page.heading("What the border does to the condition number")
+    body += _border_table(budget, store) + _border_remark(budget, store)
     body += page.picture(
         gains_figure(record),
         "Modal gains, measured over synthetic, before tuning (model at the start of the scans, "
@@ -241,6 +252,65 @@ def _condition_table(budget: Budget, store: Store) -> str:
         found = [float(store.read(run.reconstructor)["condition_number"]) for run in runs]
         rows.append([str(variant), " / ".join(f"{value:.2f}" for value in found), quoted.text])
     return page.table(["condition number, 400 modes", "here, by telescope", "paper"], rows)
+
+
+def _border_conditions(budget: Budget, store: Store) -> dict[str, tuple[float, float]]:
+    """Return condition numbers at the found magnification and at 100 %, free of noise."""
+    there, without = (answers(budget, alpha) for alpha in (TRUTH, WITHOUT_BORDER))
+    found = {
+        name: (
+            condition(store.read(there[name])["singular"]),
+            condition(store.read(other)["singular"]),
+        )
+        for name, other in without.items()
+    }
+    record = store.read(comparison(budget))
+    model = tuple(
+        condition(record[f"singular_{name}"]) for name in ("synthetic", "without_magnification")
+    )
+    return {"the model": (model[0], model[1]), **found}
+
+
+def _border_table(budget: Budget, store: Store) -> str:
+    found, nominal = (telescope.beyond_actuators_subap(m) for m in (TRUTH.magnification, 1.0))
+    head = ["what is not as it is drawn", f"98 %: {found:.2f} subap. beyond the actuators"]
+    head += [f"100 %: {nominal:.2f} subap."]
+    rows = [
+        [name, *(f"{value:.2f}" for value in values)]
+        for name, values in _border_conditions(budget, store).items()
+    ]
+    return page.paragraph(
+        "Telescopes pushed by 1 nm, without noise, where the paper's lay and with the pupil ending "
+        "where the actuators do. Drawn: the mirror has the model's influence functions; its own: a "
+        "plate under tension, which goes on otherwise beyond the outermost actuators."
+    ) + page.table(head, rows)
+
+
+def _border_remark(budget: Budget, store: Store) -> str:
+    """Return what decides whether the synthetic or the measured condition number is larger."""
+    found = dict(_border_conditions(budget, store))
+    model = found.pop("the model")
+    drawn, own = ([v for name, v in found.items() if name.startswith(w)] for w in ("light", "all"))
+    text = ""
+    counts = []
+    for k, where in enumerate(("at 98 %", "at 100 %")):
+        larger = [sum(v[k] > model[k] for v in group) for group in (drawn, own)]
+        counts.append(larger)
+        text += (
+            f"{where.capitalize()} the telescope's condition number is larger than the synthetic "
+            f"one, as in the paper, for {larger[0]} of {len(drawn)} telescopes with the model's "
+            f"influence functions and for {larger[1]} of {len(own)} with their own. "
+        )
+    border = counts[0][0] == len(drawn) and counts[0][1] < len(own)
+    text += (
+        "Uneven light and displaced actuators make it larger, the other shape of the mirror beyond "
+        "its actuators smaller: with the right influence functions there the paper's order comes "
+        "out, with a thin plate's it is reversed."
+        if border
+        else "So the influence functions beyond the outermost actuators are not all that decides "
+        "the order: the light of each telescope matters as much."
+    )
+    return page.remark(text, agrees=border)
 
 
 def _gains_remark(record: Record) -> str:

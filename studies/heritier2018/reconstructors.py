@@ -14,7 +14,7 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from studies.heritier2018 import telescope
 from studies.heritier2018.calibration import Measurement
-from studies.heritier2018.registration import FitRun, fitted_alpha
+from studies.heritier2018.registration import FitRun, Found, fitted_alpha, resolved
 from studies.heritier2018.store import Record, Store, Task
 from studies.heritier2018.telescope import Occasion
 
@@ -35,9 +35,14 @@ class ModelReconstructor:
     occasion: Occasion
     """Whose noise the prior knows."""
 
-    alpha: Misregistration
+    alpha: Misregistration | Found
     n_modes: int
     kind: Kind = Kind.TRUNCATED
+
+    @property
+    def passes(self) -> int:
+        """How often the light meets the mirror whose commands it gives."""
+        return self.occasion.passes
 
     @property
     def label(self) -> str:
@@ -51,15 +56,16 @@ class ModelReconstructor:
 
     @property
     def needs(self) -> tuple[Task, ...]:
-        """Nothing but the model."""
-        return ()
+        """Nothing but the model, and the fit where that says where it lies."""
+        return (self.alpha.fit,) if isinstance(self.alpha, Found) else ()
 
     def compute(self, store: Store) -> Record:
         """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
-        matrix = synthetic_matrix(self.alpha) * self.occasion.passes
+        alpha = resolved(self.alpha, store)
+        matrix = synthetic_matrix(alpha) * self.occasion.passes
         if self.kind is Kind.TRUNCATED:
             return _record(invert(matrix, self.n_modes))
-        seen = telescope.optics(self.occasion, self.alpha)
+        seen = telescope.optics(self.occasion, alpha)
         prior = Prior(
             variance_m2=telescope.basis().variance_m2,
             slope_noise=telescope.detector(self.occasion, seen).sigma.astype(np.float64),
@@ -72,6 +78,11 @@ class MeasuredReconstructor:
     """Inverse of the measured matrix itself, its noise included."""
 
     measurement: Measurement
+
+    @property
+    def passes(self) -> int:
+        """How often the light met the mirror when it was measured."""
+        return self.measurement.occasion.passes
 
     @property
     def label(self) -> str:
@@ -108,6 +119,11 @@ class FittedReconstructor:
     """Whether the columns have the gains of the measurement."""
 
     @property
+    def passes(self) -> int:
+        """How often the light met the mirror when the fitted matrix was measured."""
+        return self.fit.measurement.occasion.passes
+
+    @property
     def label(self) -> str:
         """What the progress bar shows."""
         tuned = ", gains tuned" if self.tuned else ""
@@ -125,11 +141,11 @@ class FittedReconstructor:
 
     def compute(self, store: Store) -> Record:
         """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
-        fit, passes = store.read(self.fit), self.fit.measurement.occasion.passes
+        fit = store.read(self.fit)
         matrix = synthetic_matrix(fitted_alpha(fit))
         if self.tuned:
             matrix = calibration_gains(fit, matrix.shape[1]).tuned(matrix)
-        return _record(invert(passes * matrix, self.n_modes))
+        return _record(invert(self.passes * matrix, self.n_modes))
 
 
 AnyReconstructor = ModelReconstructor | MeasuredReconstructor | FittedReconstructor

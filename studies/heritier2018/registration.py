@@ -103,6 +103,25 @@ def fitted_alpha(record: Mapping[str, NDArray[Any]]) -> Misregistration:
     return Misregistration.from_vector(record["alpha"] / BOUNDARY_SCALE)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """Where a fit found the mirror, or a step away from there."""
+
+    fit: FitRun
+    step: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Shift along x and y in subapertures, rotation in degrees, magnification."""
+
+    def at(self, store: Store) -> Misregistration:
+        """Return the registration."""
+        found = store.read(self.fit)["alpha"]
+        return Misregistration.from_vector((found + np.array(self.step)) / BOUNDARY_SCALE)
+
+
+def resolved(alpha: Misregistration | Found, store: Store) -> Misregistration:
+    """Return a registration, whether it was given or found."""
+    return alpha.at(store) if isinstance(alpha, Found) else alpha
+
+
 def errors(record: Mapping[str, NDArray[Any]], truth: Misregistration) -> Array:
     """Return ``(4,)`` found less true: % of a subaperture (two), degrees, % of magnification."""
     off = record["alpha"] - truth.vector * BOUNDARY_SCALE

@@ -10,7 +10,18 @@ import numpy as np
 import service
 from service.fit.matrix import Method
 from service.model.misregistration import PARAMETERS
-from studies.heritier2018 import closed, curves, influence, matrices, page, paper, scans
+from studies.heritier2018 import (
+    closed,
+    curves,
+    influence,
+    loops,
+    matrices,
+    page,
+    paper,
+    scans,
+    simulator,
+    table2,
+)
 from studies.heritier2018.calibration import MeasuredPart
 from studies.heritier2018.loops import LoopRun
 from studies.heritier2018.plan import (
@@ -36,6 +47,7 @@ def write(budget: Budget, store: Store, path: Path, *, seconds: float) -> None:
         influence.section(budget, store),
         scans.section(budget, store),
         matrices.section(budget, store),
+        simulator.section(budget, store),
         closed.section(budget, store),
         _conditions(budget, seconds),
     )
@@ -67,6 +79,7 @@ def summary(budget: Budget, store: Store) -> list[list[str]]:
         *_registration_rows(budget, store),
         *_influence_rows(budget, store),
         *_matrix_rows(budget, store),
+        *_simulator_rows(budget, store),
         *_loop_rows(budget, store),
     ]
 
@@ -123,21 +136,28 @@ def _matrix_rows(budget: Budget, store: Store) -> list[list[str]]:
     return [["condition number, synthetic / measured", " / ".join(numbers), quoted]]
 
 
+def _simulator_rows(budget: Budget, store: Store) -> list[list[str]]:
+    synthetic, measured = np.array(list(simulator.errors_nm(budget, store).values())).T
+    rows = []
+    for word, found, quoted in (
+        ("synthetic", synthetic, paper.SIMULATED_SYNTHETIC),
+        ("measured", measured, paper.SIMULATED_MEASURED),
+    ):
+        name = f"loop of the simulator, {word} matrix, {len(found)} matrices"
+        rows.append([name, f"{found.min():.1f} to {found.max():.1f} nm", quoted.text])
+    return rows
+
+
 def _loop_rows(budget: Budget, store: Store) -> list[list[str]]:
     rows = []
-    for vibrations, quoted in ((False, paper.STILL_ERROR), (True, paper.SHAKEN_ERROR)):
-        values = [
-            f"{closed.errors_nm(budget, store, variant, vibrations=vibrations).mean():.1f}"
-            for variant in (Variant.MEASURED, Variant.TUNED, Variant.MORE)
-        ]
-        word = "with" if vibrations else "without"
-        rows.append(
-            [
-                f"wavefront error {word} vibrations: measured / synthetic / 500 modes",
-                " / ".join(values) + " nm",
-                quoted.text,
-            ]
-        )
+    for key, variant in table2.ROWS.items():
+        quoted = paper.TABLE_2[key]
+        theirs = " / ".join(f"{value:g}" for value in quoted.errors_nm) + " nm"
+        for over in loops.Over:
+            found = table2.ours_nm(budget, store, variant, over).mean(axis=0)
+            ours = " / ".join(f"{value:.1f}" for value in found) + " nm"
+            name = f"Table 2, {quoted.name}: {', '.join(table2.COLUMNS)}, over {over}"
+            rows.append([name, ours, theirs])
     images = [
         np.mean([strehl(r["image"]) for r in closed.records(budget, store, v, vibrations=True)])
         for v in (Variant.MEASURED, Variant.TUNED, Variant.MORE)

@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.config import load_instrument
 from service.model.instrument import Instrument, Mirror
@@ -20,12 +21,19 @@ from sim_rtc.assembly import build_plant, build_sky
 from sim_rtc.options import Options, parse_options
 from sim_rtc.telescope.detector import Detector, PixelDetector
 from sim_rtc.telescope.diffractive import DiffractiveOptics, DiffractivePlant
+from sim_rtc.telescope.mirror import DrawnSurface, PlantSurface
 from sim_rtc.telescope.sky import Sky
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 INSTRUMENT = "flao-lbt"
+
+DRAWN, DRAWN_USUAL = "drawn", "drawn-usual"
+"""Beside the simulator's named sets: the mirror has the influence functions of the drawing."""
+
+_SETS = {DRAWN: "ideal", DRAWN_USUAL: "usual"}
+"""The simulator's set for all but the mirror."""
 
 _PLANT, _SKY, _PHOTONS, _MEASURING = range(4)
 """Children of an occasion's seed."""
@@ -40,7 +48,8 @@ class Occasion:
 
     seed: int
     imperfections: str = "usual"
-    """How far the telescope is from the drawing, a named set of the simulator."""
+    """How far the telescope is from the drawing, a named set of the simulator, or ``DRAWN``,
+    ``DRAWN_USUAL``."""
 
     vibrations: bool = False
     """By day: whether anything shakes it."""
@@ -74,11 +83,24 @@ class Occasion:
     def options(self) -> Options:
         """Return the simulator's options for it."""
         words = ["--plant=diffractive", f"--seed={self.seed}", f"--mag={self.magnitude}"]
-        words += [f"--seeing={self.seeing_arcsec}", f"--imperfections={self.imperfections}"]
+        departures = _SETS.get(self.imperfections, self.imperfections)
+        words += [f"--seeing={self.seeing_arcsec}", f"--imperfections={departures}"]
         words.append("--scene=daytime" if self.daytime else "--scene=onsky")
         if self.daytime and not self.vibrations:
             words.append("--vibration=none")
         return parse_options(words)
+
+
+class DrawnPlant(DiffractivePlant):
+    """A telescope whose mirror has the influence functions of the service's model.
+
+    It is to a synthetic matrix what the paper's simulator is to its own: the same model.
+    """
+
+    @override
+    def _own_surface(self, mirror: Mirror, strokes: Array) -> tuple[PlantSurface, Array]:
+        surface = DrawnSurface(mirror=mirror, subaperture_m=self._instrument.subaperture_m)
+        return surface, strokes
 
 
 @lru_cache(maxsize=1)
@@ -114,7 +136,16 @@ def plant(occasion: Occasion) -> DiffractivePlant:
 
 @lru_cache(maxsize=4)
 def _plant(occasion: Occasion) -> DiffractivePlant:
-    built = build_plant(occasion.options(), instrument(), basis(), occasion.rng(_PLANT))
+    options, rng = occasion.options(), occasion.rng(_PLANT)
+    if occasion.imperfections in _SETS:
+        return DrawnPlant(
+            instrument(),
+            basis(),
+            rng=rng,
+            imperfections=options.imperfections,
+            scene=options.scene,
+        )
+    built = build_plant(options, instrument(), basis(), rng)
     if not isinstance(built, DiffractivePlant):
         raise TypeError(f"study: found {type(built).__name__}; expected --plant diffractive")
     return built

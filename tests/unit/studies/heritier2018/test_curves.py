@@ -26,6 +26,8 @@ def test_a_sweep_moves_its_own_parameter_alone() -> None:
     assert ROTATION.alpha(0.8).to_boundary()["rotation_deg"] == pytest.approx(0.8)
     assert SHIFT.alpha(40.0).vector == pytest.approx([0.4, 0.0, 0.0, 1.0])
     assert MAGNIFICATION.alpha(2.0).vector == pytest.approx([0.0, 0.0, 0.0, 1.02])
+    assert SHIFT.step(-50.0) == (-0.5, 0.0, 0.0, 0.0)
+    assert ROTATION.step(2.0) == (0.0, 0.0, 2.0, 0.0)
 
 
 def test_a_rehearsal_keeps_the_registered_loop_and_the_papers_marked_values() -> None:

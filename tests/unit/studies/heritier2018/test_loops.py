@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,11 @@ import pytest
 
 from service.model.misregistration import Misregistration
 from studies.heritier2018 import telescope
-from studies.heritier2018.loops import LoopRun, statistics, wavefront_error_nm
+from studies.heritier2018.closing import RAMP_GAINS, GainTuning
+from studies.heritier2018.loops import LoopRun, Over, statistics, wavefront_error_nm
 from studies.heritier2018.psf import strehl
 from studies.heritier2018.reconstructors import Kind, ModelReconstructor
-from studies.heritier2018.store import Record, Store, in_order
+from studies.heritier2018.store import Record, Store, Task, in_order
 from studies.heritier2018.telescope import Occasion
 
 NIGHT = Occasion(daytime=False, seed=1, imperfections="ideal", magnitude=5.0, seeing_arcsec=0.3)
@@ -29,6 +31,10 @@ def closed(tmp_path: Path, alpha: Misregistration, kind: Kind = Kind.TRUNCATED) 
         gain=0.6,
         n_frames=50,
     )
+    return done(tmp_path, task)
+
+
+def done(tmp_path: Path, task: Task) -> Record:
     store = Store(tmp_path)
     for step in in_order((task,)):
         store.write(step, step.compute(store))
@@ -48,6 +54,86 @@ def test_a_registered_loop_leaves_a_fraction_of_the_modes_it_controls(
 def test_a_quarter_turn_of_the_mirror_is_worse_than_no_loop(tmp_path: Path) -> None:
     record = closed(tmp_path, Misregistration(rotation_rad=np.pi / 2))
     assert record["total_nm2"] > record["incoming_total_nm2"]
+
+
+def test_a_residual_is_taken_over_what_is_asked_for() -> None:
+    modal = np.zeros(60)
+    modal[[0, 10, 55]] = 16.0, 9.0, 25.0
+    record = {
+        "modal_nm2": modal,
+        "total_nm2": np.array(modal.sum() + 144.0),
+        "slopes_nm2": np.full(58, 4.0),
+    }
+    assert wavefront_error_nm(record) == pytest.approx(np.sqrt(194.0))
+    assert wavefront_error_nm(record, without_first=2) == pytest.approx(np.sqrt(178.0))
+    assert wavefront_error_nm(record, over=Over.CONTROLLED) == pytest.approx(np.sqrt(50.0))
+    shown = wavefront_error_nm(record, without_first=50, over=Over.SLOPES)
+    assert shown == pytest.approx(np.sqrt(8 * 4.0))
+
+
+def played_by_day(tmp_path: Path, played_modes: int | None) -> Record:
+    day = replace(NIGHT, daytime=True)
+    model = ModelReconstructor(occasion=day, alpha=Misregistration(), n_modes=30)
+    task = LoopRun(
+        occasion=day,
+        alpha=Misregistration(),
+        reconstructor=model,
+        gain=0.6,
+        n_frames=50,
+        played_modes=played_modes,
+    )
+    return done(tmp_path, task)
+
+
+def test_what_is_played_in_other_modes_leaks_where_the_slopes_do_not_show_it(
+    tmp_path: Path,
+) -> None:
+    everything, of_30 = (played_by_day(tmp_path, n) for n in (None, 30))
+    assert of_30["incoming_nm2"][30:].sum() < 1e-3 * everything["incoming_nm2"][30:].sum()
+    (leaked, unseen), (left, shown) = (
+        [wavefront_error_nm(record, over=over) for over in (Over.CONTROLLED, Over.SLOPES)]
+        for record in (everything, of_30)
+    )
+    assert leaked > 1.5 * left
+    assert unseen < leaked / 1.5
+    # what does not leak is shown: the rest is optical gain and the noise of the photons
+    assert shown == pytest.approx(left, rel=0.3)
+
+
+def test_a_matrix_made_by_day_closes_the_same_loop_by_night(tmp_path: Path) -> None:
+    """Its light met the mirror twice, so it would give half of every command."""
+    day, night = (
+        ModelReconstructor(
+            occasion=replace(NIGHT, daytime=by_day), alpha=Misregistration(), n_modes=30
+        )
+        for by_day in (True, False)
+    )
+    one, other = (
+        done(
+            tmp_path,
+            LoopRun(
+                occasion=NIGHT, alpha=Misregistration(), reconstructor=model, gain=0.6, n_frames=50
+            ),
+        )
+        for model in (day, night)
+    )
+    assert one["total_nm2"] == pytest.approx(other["total_nm2"], rel=1e-3)
+
+
+def test_the_ramp_finds_gains_for_every_group_of_modes(tmp_path: Path) -> None:
+    model = ModelReconstructor(occasion=NIGHT, alpha=Misregistration(), n_modes=30)
+    ramp = GainTuning(
+        occasion=NIGHT, alpha=Misregistration(), reconstructor=model, frames_per_gain=20
+    )
+    assert ramp.request(400).groups == ((0, 1), (2, 99), (100, 399))
+    assert ramp.request(30).groups == ((0, 1), (2, 29))
+    found = done(tmp_path, ramp)
+    assert found["gains"].shape == (30,)
+    assert set(found["gains"]) <= set(RAMP_GAINS)
+    for group in (0, 1):
+        tried = found["group"] == group
+        best = found["gain"][tried][np.argmin(found["residual_nm"][tried])]
+        assert found["by_group"][group] == best
 
 
 def test_modal_errors_of_known_modes_are_theirs() -> None:

@@ -161,6 +161,8 @@ class Recorder:
                 self._estimates += found[:room]
                 self._lost += len(found[room:])
         for entry in news:
+            if entry.level is Level.DEBUG:
+                continue
             self.add(
                 AuditEntry(t_ns_utc=entry.t_ns_utc, who="service", name=entry.name, text=entry.text)
             )

@@ -69,7 +69,8 @@ ASK_AGAIN_S = 0.02
 
 OPERATOR = Caller()
 
-_LEVELS = {Level.INFO: "info", Level.WARNING: "warning", Level.ALARM: "error"}
+_LEVELS = {Level.ALARM: "error"}
+"""Names of structlog's where they are others."""
 
 
 class Supervisor:
@@ -489,5 +490,6 @@ class Supervisor:
         entries = new_lines(before, self._engine.state)
         for entry in entries:
             ids = ids_of(entry.text, self._engine.state)
-            getattr(self._log, _LEVELS[entry.level])(entry.name, text=entry.text, **ids)
+            told = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
+            told(entry.name, text=entry.text, **ids)
         self._recorder.changed(before, self._engine.state, entries)

@@ -31,6 +31,7 @@ from service.tracking.dither_request import (
     why_unusable,
 )
 from service.tracking.policy import SECOND_NS
+from service.tracking.state import Level
 from service.tracking.turn import Turn
 from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status
 
@@ -143,7 +144,8 @@ def on_answer(turn: Turn, request: DitherRequest, reply: Reply) -> None:
     if reply.accepted:
         turn.dither = replace(turn.dither, start_seq=reply.start_seq, asked_ns_utc=turn.now_ns)
         turn.calm(alarms.NO_DITHER)
-        turn.log("dither.started", f"{request.id} starts at frame {reply.start_seq}")
+        text = f"{request.id} starts at frame {reply.start_seq}"
+        turn.log("dither.started", text, _level(request))
         return
     turn.put_off(dither_s=10.0)
     turn.dither = None
@@ -178,7 +180,7 @@ def follow_status(turn: Turn, rtc: Status) -> None:
         turn.dithering = replace(turn.dithering, ended_ns_utc=turn.now_ns)
         turn.dither = None
         turn.calm(alarms.DITHER_LOST)
-        turn.log("dither.ended", f"{dither.id} has ended")
+        turn.log("dither.ended", f"{dither.id} has ended", _level(dither.request))
         return
     if turn.state.dither_losses:
         turn.put_off(dither_s=_patience_s(turn))
@@ -350,7 +352,8 @@ def _end_when_done(turn: Turn, rtc: Status, dither: Dither, wish: Wish) -> None:
         # the next one must not overtake the command to stop
         turn.put_off(dither_s=1.0)
         weakness = "" if done or moved else " is too weak"
-        turn.log("dither.stopped", f"{dither.id}{weakness}: {moved or wish.reason}")
+        text = f"{dither.id}{weakness}: {moved or wish.reason}"
+        turn.log("dither.stopped", text, Level.INFO if moved or weakness else Level.DEBUG)
         make_way(turn)
 
 
@@ -375,6 +378,11 @@ def _adopt(turn: Turn, rtc: Status) -> bool:
             turn.log("dither.adopted", f"{running.id} runs since frame {begun_seq}")
             return True
     return False
+
+
+def _level(request: DitherRequest) -> Level:
+    """Return how loudly a dither is told of: the service's own come and go all night."""
+    return Level.DEBUG if request.id.startswith(OWN_DITHER) else Level.INFO
 
 
 def _account(turn: Turn, rtc: Status) -> None:

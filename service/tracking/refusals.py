@@ -1,4 +1,4 @@
-"""Windows refused one after the other: counted, and an alarm when nothing else explains them."""
+"""Windows refused one after the other, or missing: an alarm when nothing else explains it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ from service.telemetry.windows import RefusalKind
 from service.tracking import alarms
 from service.tracking.activity import ramping
 from service.tracking.alarms import Act
+from service.tracking.policy import SECOND_NS
 from service.tracking.turn import Turn
 
 IN_A_ROW = 3
 """Windows refused one after the other that are no chance, and windows used that end it."""
+
+NONE_FOR_S = 60.0
+"""Of a running dither without a window that could be used. A simulated RTC may be ten times slower
+than its timestamps: a window then takes 20 s."""
 
 AS_EXPECTED = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
 """Kinds of refusals that are no fault, and say nothing of the windows before and after."""
@@ -46,10 +51,24 @@ def use(turn: Turn) -> None:
 
 
 def follow(turn: Turn) -> None:
-    """End the alarm, and begin to count anew, where no window is expected any more."""
-    if turn.state.window_run < 0 and _excused(turn):
-        turn.state = replace(turn.state, window_run=0)
-        turn.calm(alarms.WINDOWS_REFUSED)
+    """End the alarm, and begin to count anew, where no window is expected any more.
+
+    One that is expected and does not come is as good as refused.
+    """
+    if _excused(turn):
+        if turn.state.window_run < 0 or turn.state.alarm(alarms.WINDOWS_REFUSED):
+            turn.state = replace(turn.state, window_run=0)
+            turn.calm(alarms.WINDOWS_REFUSED)
+        return
+    known, dither = turn.known, turn.dither
+    if dither is None or dither.start_seq is None:
+        return
+    since_ns = max(known.window_ns_utc if known else 0, dither.asked_ns_utc)
+    patience_s = max(NONE_FOR_S, 3.0 * (dither.window_s or 0.0))
+    raised = turn.state.alarm(alarms.WINDOWS_REFUSED) is not None
+    if not raised and turn.now_ns - since_ns >= patience_s * SECOND_NS:
+        text = f"no window was accepted for {patience_s:.0f} s although a dither runs"
+        turn.alarm(alarms.WINDOWS_REFUSED, text)
 
 
 def _excused(turn: Turn) -> bool:

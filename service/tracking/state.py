@@ -28,6 +28,9 @@ from service.wire import Pointing, Status
 class Level(StrEnum):
     """How loudly an event speaks."""
 
+    DEBUG = "debug"
+    """Of every quiet minute: in no audit trail."""
+
     INFO = "info"
     WARNING = "warning"
     ALARM = "alarm"
@@ -66,6 +69,9 @@ class LogEntry:
 
     last_ns_utc: int = 0
     """The last time, where it was more than once."""
+
+    ranges: tuple[tuple[str, str], ...] = ()
+    """Of a line that was counted: the smallest and the largest of each number in its text."""
 
     @property
     def line(self) -> tuple[int, str, str]:
@@ -387,7 +393,6 @@ class TrackerState:
     windows_refused: int = 0
     window_run: int = 0
     """How many of the last windows could be used one after the other; below 0: were refused."""
-
     windows_outlying: int = 0
     """Believable in themselves, but so far from all others that they were not believed."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Generic, TypeVar
 
 from service.tracking.alarms import ALARMS, Act, Alarm, Kind, Severity, forbidding
@@ -42,6 +43,9 @@ LOOKED_BACK = 30
 """So many lines back the beginning of a burst is looked for."""
 
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
+
+_VALUE = re.compile(r"(?<![\w.-])[-+]?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)?(?![\w-])")
+"""A number that is no part of a name or of a date."""
 
 
 class _Part(Generic[T]):
@@ -164,7 +168,9 @@ def logged(
         # the very last line may be any; what lies between makes a story of two equal ones
         if (back == 1 or name in REPEATING) and _same(before, entry):
             log = list(state.log)
-            log[-back] = replace(before, times=before.times + 1, last_ns_utc=now_ns)
+            ranges = _widened(before.ranges or _ranges(before.text), _ranges(text))
+            times = before.times + 1
+            log[-back] = replace(before, times=times, last_ns_utc=now_ns, ranges=ranges)
             return replace(state, log=tuple(log))
     return replace(state, log=(*state.log, entry)[-LOG_LENGTH:])
 
@@ -177,14 +183,52 @@ def _same(before: LogEntry, entry: LogEntry) -> bool:
     return _NUMBERS.sub("", before.text) == _NUMBERS.sub("", entry.text)
 
 
+def _ranges(text: str) -> tuple[tuple[str, str], ...]:
+    """Return the numbers of a line, each as the smallest and the largest there was."""
+    return tuple((found, found) for found in _VALUE.findall(text))
+
+
+def _widened(
+    known: tuple[tuple[str, str], ...], new: tuple[tuple[str, str], ...]
+) -> tuple[tuple[str, str], ...]:
+    """Return the ranges of both; of a line of another make the first ones stand."""
+    if len(known) != len(new):
+        return known
+    pairs = zip(known, new, strict=True)
+    return tuple(
+        (min(low, one, key=float), max(high, one, key=float)) for (low, high), (one, _) in pairs
+    )
+
+
+def _of_burst(entry: LogEntry) -> str:
+    """Return what a burst has said in all: the range of each number, how often, and when."""
+    left = iter(entry.ranges)
+
+    def spread(found: re.Match[str]) -> str:
+        low, high = next(left, (found.group(), found.group()))
+        return low if low == high else f"{low} to {high}"
+
+    text = _VALUE.sub(spread, entry.text)
+    first, last = (
+        datetime.fromtimestamp(t / SECOND_NS, UTC) for t in (entry.t_ns_utc, entry.last_ns_utc)
+    )
+    lasted_s = (entry.last_ns_utc - entry.t_ns_utc) / SECOND_NS
+    return (
+        f"{text} ({entry.times} times in {lasted_s:.0f} s, {first:%H:%M:%S} to {last:%H:%M:%S} UTC)"
+    )
+
+
 def tell_bursts(turn: Turn) -> None:
-    """Add a line for each burst that is over, which says how often it was."""
+    """Add a line for each burst that is over: when it was, how often, and from what to what.
+
+    It has the time of the burst's end, and not of when it is told.
+    """
     for entry in turn.state.log:
         if entry.times > 1 and turn.now_ns - entry.t_ns_utc >= BURST_NS:
-            lasted_s = (entry.last_ns_utc - entry.t_ns_utc) / SECOND_NS
-            text = f"{entry.text} ({entry.times} times in {lasted_s:.0f} s)"
-            told = replace(entry, t_ns_utc=turn.now_ns, text=text, times=1)
-            log = (replace(e, times=1) if e is entry else e for e in turn.state.log)
+            told = replace(
+                entry, t_ns_utc=entry.last_ns_utc, text=_of_burst(entry), times=1, ranges=()
+            )
+            log = (replace(e, times=1, ranges=()) if e is entry else e for e in turn.state.log)
             turn.state = replace(turn.state, log=(*log, told)[-LOG_LENGTH:])
 
 

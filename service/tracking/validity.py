@@ -37,9 +37,9 @@ USELESS_SIGMA = np.array([0.1, 0.1, np.deg2rad(0.3), 0.01])
 AGEING_SHARE = 0.5
 """Share of the stale limit from which on α is ageing."""
 
-STALE_AFTER_S = 60.0
-"""Of a running dither without an accepted window. A simulated RTC may be ten times slower than its
-timestamps: a window then takes 20 s."""
+NO_LONGER_STALE = 0.8
+"""Share of the stale limit that σ must be below before α is stale no more: one that wavers about
+the limit does not come and go."""
 
 CANDIDATE_FOR_S = 60.0
 """A jump that nothing has confirmed or denied for so long is no longer waited for."""
@@ -195,8 +195,10 @@ def age(turn: Turn) -> None:
         standing = _standing(turn, known)
         if standing.validity in _WORTHLESS:
             want_window(turn, standing.reason)
+        elif turn.dither is None and _too_wide_for_the_gate(turn.state, known):
+            want_window(turn, "σ has grown beyond what the stability gate accepts")
         turn.known = replace(known, standing=standing)
-    text = _why_stale(turn.state, turn.now_ns)
+    text = _why_stale(turn.state)
     if text is None:
         turn.calm(STALE)
     else:
@@ -244,10 +246,12 @@ def _standing(turn: Turn, known: Registration) -> Standing:
     policy, reason = turn.policy, _why_invalid(turn.state, known, turn.policy)
     if reason is not None:
         return Standing(validity=Validity.INVALID, reason=reason)
-    sigma, limit = known.sigma, policy.stale_sigma
+    sigma, limit, before = known.sigma, policy.stale_sigma, turn.before.registration
     if known.n_windows == 0:
         return Standing(validity=Validity.STALE, reason="no window has confirmed it yet")
-    if np.any(sigma > limit):
+    was_stale = before is not None and before.standing.validity is Validity.STALE
+    ends = NO_LONGER_STALE if was_stale and before and before.n_windows else 1.0
+    if np.any(sigma > ends * limit):
         return Standing(validity=Validity.STALE, reason=_worst(sigma, limit))
     rate = np.maximum(policy.drift_rate**2, np.finfo(float).tiny)
     left_s = float(np.min((limit**2 - sigma**2) / rate))
@@ -286,24 +290,21 @@ def _without_old_candidate(known: Registration, now_ns: int) -> Registration:
     return replace(known, candidate=None, doubt=doubt, doubt_voids=True)
 
 
-def _why_stale(state: TrackerState, now_ns: int) -> str | None:
-    known, dither = state.registration, state.dither
-    if dither is not None:
-        since_ns = max(known.window_ns_utc if known else 0, dither.asked_ns_utc)
-        patience_s = max(STALE_AFTER_S, 3.0 * (dither.window_s or 0.0))
-        if now_ns - since_ns >= patience_s * SECOND_NS:
-            return (
-                f"no window was accepted for {patience_s:.0f} s although a dither runs: α may "
-                "have moved; see the log for the reasons"
-            )
+def _why_stale(state: TrackerState) -> str | None:
+    """Return why α is worth too little for a closed loop, in the words of its validity, or None."""
+    known = state.registration
     if known is None or state.rtc is None or not state.rtc.in_loop or known.n_windows == 0:
         return None
     if known.standing.validity in _WORTHLESS and not known.doubt:
         return f"{known.standing.reason}: have it dithered"
+    return None
+
+
+def _too_wide_for_the_gate(state: TrackerState, known: Registration) -> bool:
+    """Return whether the margin is short only because σ has grown since the last window."""
     margin = state.margin
     # an edge that would slip is refused whatever σ is
-    if margin is not None and margin.worst_pole_radius > margin.bound:
-        own = np.sqrt(np.diag(known.covariance) + known.floor**2)
-        if np.any(known.sigma > 2.0 * own):
-            return "σ has grown beyond what the stability gate accepts: have it dithered"
-    return None
+    if margin is None or margin.worst_pole_radius <= margin.bound:
+        return False
+    own = np.sqrt(np.diag(known.covariance) + known.floor**2)
+    return bool(np.any(known.sigma > 2.0 * own))

@@ -11,7 +11,7 @@ from service.runtime import recording
 from service.runtime.recording import Recorder
 from service.tracking import events as ev
 from service.tracking.registration import MoveState
-from service.tracking.state import TrackerState
+from service.tracking.state import Level, LogEntry, TrackerState
 from service.wire import OffloadRequest
 from tests.system.pace import patience
 from tests.unit.test_archive_nights import NOON, entry
@@ -45,6 +45,17 @@ async def test_estimates_wait_for_one_write_and_are_written_once(recorder, archi
     await recorder.flush()
     await recorder.flush()
     assert kept(archive) == [0, 1, 2, 3, 4, 5]
+
+
+async def test_what_comes_and_goes_all_night_is_in_no_audit_trail(recorder, archive):
+    lines = [
+        LogEntry(t_ns_utc=NOON + k, level=level, name=f"a.{level}", text="x")
+        for k, level in enumerate(Level)
+    ]
+    recorder.changed(EMPTY, EMPTY, lines)
+    await recorder.flush()
+    names = {line.name for line in archive.audit_trail()}
+    assert names == {f"a.{level}" for level in Level if level is not Level.DEBUG}
 
 
 async def test_two_estimates_of_one_event_keep_their_order_when_the_oldest_are_forgotten(

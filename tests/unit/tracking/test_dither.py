@@ -8,7 +8,7 @@ import pytest
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither import LONGEST_PATIENCE_S, PATIENCE_S
-from service.tracking.state import Mode
+from service.tracking.state import Level, Mode
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import Story, dither_answered, of_kind, rtc
 
@@ -149,3 +149,15 @@ def test_the_rtcs_word_counts_where_it_plays_something_else(story, changes):
     status(story, START + 200, dither=playing)
     assert story.state.dither == before.dither
     assert story.logged.count("dither.other") == 1
+
+
+def test_the_services_own_come_and_go_without_a_word_in_the_audit_and_an_operators_do_not(story):
+    stop_seq = START + round(story.state.dither.request.duration_s * 1000)
+    status(story, stop_seq)
+    told = {line.name: line.level for line in story.state.log}
+    assert told["dither.started"] is told["dither.ended"] is Level.DEBUG
+    story.tell(cmd.StopDither())
+    story.tell(cmd.StartDither(amplitude_m=1e-9))
+    accept(story, stop_seq + 500)
+    told = {line.name: line.level for line in story.state.log}
+    assert told["dither.started"] is told["dither.stopped"] is Level.INFO

@@ -9,7 +9,7 @@ from service.tracking.activity import Operation, operating
 from service.tracking.alarms import WINDOWS_REFUSED
 from service.tracking.refusals import IN_A_ROW
 from service.tracking.state import Mode
-from tests.unit.tracking.situations import ALPHA, Story, moved, rtc
+from tests.unit.tracking.situations import ALPHA, Story, dither_answered, moved, rtc
 
 MISSING = "150 of 2000 frames missing, more than 5%: check the link to the RTC"
 
@@ -93,4 +93,17 @@ def test_it_ends_where_no_window_is_expected_and_does_not_begin_there(story, eve
     assert WINDOWS_REFUSED not in story.alarms
     refuse(story, 5)
     story.tell(ev.Tick(), after_s=1.0)
+    assert WINDOWS_REFUSED not in story.alarms
+
+
+def test_a_dither_of_a_minute_without_any_window_is_one_as_well(story):
+    accepted = dither_answered(story.state.dither.id, accepted=True, reason="", start_seq=1)
+    story.tell(accepted)
+    for _ in range(58):
+        story.tell(ev.Tick(), after_s=1.0)
+    assert WINDOWS_REFUSED not in story.alarms
+    for _ in range(4):
+        story.tell(ev.Tick(), after_s=1.0)
+    assert "no window was accepted for 60 s although a dither runs" in text_of(story)
+    story.see(n_windows=IN_A_ROW)
     assert WINDOWS_REFUSED not in story.alarms

@@ -38,9 +38,24 @@ def test_a_burst_of_refused_windows_is_one_line_and_then_one_with_a_count():
     assert [entry.times for entry in lines] == [600]
     state = counted(state, 61 * SECOND_NS)
     lines = [entry for entry in state.log if entry.name == "window.refused"]
-    assert lines[-1].text == "mode 3 carries 0.00 nm of dither (600 times in 54 s)"
+    assert lines[-1].text == (
+        "mode 3 carries 0.00 to 59.90 nm of dither (600 times in 54 s, 00:00:00 to 00:00:54 UTC)"
+    )
+    assert lines[-1].t_ns_utc == 599 * SECOND_NS // 11, "and has the time of its end"
     assert [entry.times for entry in lines] == [1, 1]
     assert counted(state, 200 * SECOND_NS) is state
+
+
+def test_the_names_in_a_burst_are_no_numbers():
+    state = STATE
+    for k in range(3):
+        text = f"cm-20270115T08000{k}.350-45 -> dither-18{k}: {5 - 2 * k} of 2e-09 m"
+        state = logged(state, "window.refused", text, k * SECOND_NS)
+    state = counted(state, 61 * SECOND_NS)
+    assert state.log[-1].text == (
+        "cm-20270115T080000.350-45 -> dither-180: 1 to 5 of 2e-09 m (3 times in 2 s, 00:00:00 to "
+        "00:00:02 UTC)"
+    )
 
 
 def test_after_a_minute_a_repeated_line_is_told_again():

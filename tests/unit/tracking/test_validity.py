@@ -114,7 +114,7 @@ class TestTime:
         assert worth(story) is Validity.STALE
         assert "estimate-stale" not in story.alarms
 
-    def test_a_margin_that_only_a_grown_sigma_takes_away_is_an_alarm_of_its_age(self, story):
+    def test_a_margin_that_only_a_grown_sigma_takes_away_has_it_dithered_and_is_no_age(self, story):
         edge = verdict(accepted=False, radius=0.7)
         story.tell(ev.MarginJudged(id="initial", verdict=edge))
         story.wait(10)
@@ -124,10 +124,37 @@ class TestTime:
         story.tell(ev.MarginJudged(id="initial", verdict=short))
         story.wait(0.2, every_s=0.2)
         assert "estimate-stale" not in story.alarms
+        story.state = replace(story.state, dither=None, no_dither_before_ns_utc=2**63)
         story.wait(5)
-        assert "stability gate" in next(
-            a.text for a in story.state.alarms if a.name == "estimate-stale"
+        assert "estimate-stale" not in story.alarms
+        assert "stability gate" in story.state.dither_due_reason
+
+    def test_the_alarm_and_the_validity_say_the_same_at_every_moment(self, story):
+        """It had come and gone with every window, four times in six seconds, while α was fresh."""
+        short = verdict(accepted=False, radius=0.97)
+        story.tell(ev.MarginJudged(id="initial", verdict=short))
+        for second in range(300):
+            story.wait(1)
+            if second < 30 and second % 3 == 0:
+                story.see()
+            stale = worth(story) in {Validity.STALE, Validity.INVALID}
+            assert stale is ("estimate-stale" in story.alarms)
+        assert story.logged.count("estimate-stale") == 1
+
+    @pytest.mark.parametrize(("share", "stale"), [(0.9, True), (0.7, False)])
+    def test_a_sigma_that_wavers_about_the_limit_does_not_come_and_go(self, story, share, stale):
+        """A faint window brings σ a little below the limit, and the next seconds above it again."""
+        story.wait(80)
+        assert "estimate-stale" in story.alarms
+        known = story.state.registration
+        sigma = share * POLICY.stale_sigma
+        after = replace(
+            known, covariance=np.diag(sigma**2 - known.floor**2), t_ns_utc=story.state.rtc.t_ns
         )
+        story.state = replace(story.state, registration=replace(after, arrived_ns_utc=story.now_ns))
+        story.tell(ev.Tick())
+        assert ("estimate-stale" in story.alarms) is stale
+        assert (worth(story) is Validity.STALE) is stale
 
     def test_what_is_judged_is_judged_with_the_sigma_of_now(self, story):
         story.wait(40)

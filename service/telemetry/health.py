@@ -40,6 +40,10 @@ ABSURD_RATIO = 1e4
 
 _MEMORY_S = 0.5
 
+_CALMING_S = 0.05
+"""The same for a loop that diverged and carries less: one that was a thousand times beyond and
+holds again shows it within a second, not after seven memories."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHealth:
@@ -79,8 +83,11 @@ def observe(
     absurd = _absurd(health, levels)
     if absurd != health.absurd:
         health = LoopHealth(ratio=float(np.sqrt(np.mean(levels**2))))
-    fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / _MEMORY_S))
-    ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * np.mean(levels**2)))
+    power = float(np.mean(levels**2))
+    calming = health.diverging and power < health.ratio**2
+    memory_s = _CALMING_S if calming else _MEMORY_S
+    fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / memory_s))
+    ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * power))
     limit = CALM_RATIO if health.diverging else DIVERGING_RATIO
     return LoopHealth(ratio=ratio, diverging=not absurd and ratio > limit, absurd=absurd)
 

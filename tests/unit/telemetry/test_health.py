@@ -76,6 +76,13 @@ def test_a_burst_of_one_frame_is_forgotten_within_three_seconds():
     assert health.ratio == pytest.approx(1.0, rel=0.1)
 
 
+def test_a_loop_that_was_a_thousand_times_beyond_and_holds_again_is_calm_within_a_second():
+    """The service waits so long before it opens a loop that it has given its old matrix back."""
+    lost = after(LoopHealth(), 1000.0)
+    assert lost.diverging
+    assert not after(lost, 1.0, n_blocks=9).diverging
+
+
 def test_the_split_into_blocks_hardly_matters():
     block = times_expectation(4.0, 400)
     whole = observe(LoopHealth(), block, VARIANCE, IN_LOOP)

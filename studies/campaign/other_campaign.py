@@ -18,6 +18,7 @@ from studies.campaign.other_modes import WORSE_S, run, table
 from studies.campaign.other_night import N_CONTROLLED, N_TARGET, Plan
 from studies.campaign.other_truth import Kind, Truth
 from studies.campaign.rows import Row, heading, line, range_of, tell
+from studies.campaign.small import SMALL
 
 _SEED = 20261123
 FACTORS = (-1.0, -1.0, -1.0, -0.5, 0.1, 0.5, 2.0, 3.0)
@@ -33,27 +34,25 @@ def differing(seed: int) -> Plan:
     """Return the night of an RTC whose modes differ: the same for the same seed."""
     rng = np.random.default_rng([_SEED, seed])
     kind = KINDS[seed % len(KINDS)]
+    diffractive = seed % DIFFRACTIVE_EVERY == DIFFRACTIVE_EVERY - 1
+    n_first, n_all = (45, 60) if diffractive else (N_CONTROLLED, N_TARGET)
     modes: tuple[int, ...] = ()
     factor = 1.0
     if kind is Kind.SCALE:
         factor = float(rng.choice(FACTORS))
         n_modes = int(rng.choice([1, 1, 3]))
         # one in three among those that are not controlled at first
-        low, high = (N_CONTROLLED, N_TARGET) if rng.random() < 1 / 3 else (0, N_CONTROLLED)
+        low, high = (n_first, n_all) if rng.random() < 1 / 3 else (0, n_first)
         modes = tuple(sorted(rng.choice(np.arange(low, high), n_modes, replace=False).tolist()))
     elif kind is Kind.EXCHANGE:
-        modes = tuple(sorted(rng.choice(N_TARGET, 2, replace=False).tolist()))
-    truth = Truth(
-        kind=kind,
-        modes=modes,
-        factor=factor,
-        offered=(seed + seed // DIFFRACTIVE_EVERY) % 2 == 0,
-        seed=seed,
-    )
-    plant = "diffractive" if seed % DIFFRACTIVE_EVERY == 3 else "linear"
-    return Plan(
-        truth=truth, plant=plant, seed=seed, seconds=25.0 if plant == "diffractive" else 40.0
-    )
+        modes = tuple(sorted(rng.choice(n_all, 2, replace=False).tolist()))
+    offered = (seed + seed // DIFFRACTIVE_EVERY) % 2 == 0
+    truth = Truth(kind=kind, modes=modes, factor=factor, offered=offered, seed=seed)
+    plan = Plan(truth=truth, seed=seed, seconds=40.0, n_controlled=n_first, n_target=n_all)
+    if not diffractive:
+        return plan
+    # the small one: of the other a second takes two
+    return replace(plan, instrument=SMALL, plant="diffractive", seconds=25.0)
 
 
 def killed(seed: int) -> Plan:

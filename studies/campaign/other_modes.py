@@ -14,7 +14,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from service.wire import Loop, LoopRequest
 from studies.campaign.observatory_checks import Swap
-from studies.campaign.observatory_dome import Dome, Moment
+from studies.campaign.observatory_dome import Moment
 from studies.campaign.other_night import GAINS, N_CONTROLLED, N_TARGET, OtherNight, Plan
 from studies.campaign.other_truth import LIES, STANDING, Kind, Truth
 from studies.campaign.rows import Row, RowFile, heading, line, tell
@@ -52,18 +53,27 @@ def play(plan: Plan) -> Row:
             night.kill()
         night.pass_(plan.seconds)
         night.close()
-        alone = plan.dome()
-        while alone.time_s < plan.seconds:
-            alone.play()
+        alone = untouched(
+            replace(plan, truth=replace(plan.truth, offered=True), killed_s=None, n_target=0)
+        )
     return {**asdict(plan), "name": plan.name, **came_of(plan, night, alone)} | {
         "cpu_s": round(time.process_time() - begun, 1)
     }
 
 
-def came_of(plan: Plan, night: OtherNight, alone: Dome) -> Row:
+@lru_cache(maxsize=1)
+def untouched(plan: Plan) -> tuple[Moment, ...]:
+    """Return the same night without a service."""
+    dome = plan.dome()
+    while dome.time_s < plan.seconds:
+        dome.play()
+    return tuple(dome.moments)
+
+
+def came_of(plan: Plan, night: OtherNight, alone: Sequence[Moment]) -> Row:
     """Return what the service did to the loop, and what it said."""
     begun = round(CLOSED_S / SMOOTHED_S)
-    with_nm, without_nm = (smoothed(d.moments)[begun:] for d in (night.dome, alone))
+    with_nm, without_nm = (smoothed(m)[begun:] for m in (night.dome.moments, alone))
     worse = with_nm > WORSE * without_nm
     late = round(LATE_S / SMOOTHED_S)
     said = [(at, name, text) for (name, text), at in night.said.items()]

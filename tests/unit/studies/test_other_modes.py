@@ -109,7 +109,7 @@ def test_what_is_worse_is_counted_against_the_night_without_a_service():
     log = [LogEntry(name="ready", text="", t_ns_utc=0, level=Level.INFO)]
     state = SimpleNamespace(log=log)
     night = SimpleNamespace(dome=other, said={("probation", "worse"): 1.0}, swaps=(), state=state)
-    row = came_of(plan, night, dome)
+    row = came_of(plan, night, dome.moments)
     assert row["worse_s"] == pytest.approx(1.25)
     assert row["first_worse_s"] == 2.0
     assert row["named_s"] is None
